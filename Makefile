@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := venv
-.PHONY: venv demo demo-kill demo-start test test-bare tests style format types imports fuzz soak bench experiment wheel ros clean
+.PHONY: venv demo demo-kill demo-start test test-bare tests style format types imports reference fuzz soak bench experiment wheel ros clean
 
 $(STAMP): pyproject.toml constraints.txt scripts/bootstrap
 	scripts/bootstrap $(PYTHON) $(VENV)
@@ -43,6 +43,9 @@ types: $(STAMP)  ## mypy, strict
 
 imports: $(STAMP)  ## the rooms import one way only; pure rooms stay pure
 	$(BIN)/lint-imports
+
+reference: $(STAMP)  ## write docs/settings.md and docs/rmpa.schema.json from the declarations of the settings
+	$(BIN)/python scripts/write-reference
 
 fuzz: $(STAMP)  ## every fuzz target for longer: make fuzz [SECONDS=60]
 	$(BIN)/python -m tests.fuzz --seconds $(or $(SECONDS),60)

@@ -8,11 +8,13 @@
 
 #include <algorithm>
 #include <atomic>
+#include <chrono>
 #include <cstdint>
 #include <cstdio>
 #include <cstring>
 #include <map>
 #include <string>
+#include <thread>
 #include <vector>
 
 namespace node {
@@ -22,6 +24,12 @@ inline uint64_t now_ns() {
   timespec now;
   clock_gettime(CLOCK_MONOTONIC, &now);
   return uint64_t(now.tv_sec) * 1000000000u + uint64_t(now.tv_nsec);
+}
+
+// Nanoseconds since 1970, as ros::Rate and the payload of the tests have them.
+inline uint64_t wall_ns() {
+  using namespace std::chrono;
+  return uint64_t(duration_cast<nanoseconds>(system_clock::now().time_since_epoch()).count());
 }
 
 inline void sleep_until(uint64_t ns) {

@@ -39,6 +39,7 @@ class Ping:
 
 def main() -> None:
     options = parser(__doc__)
+    options.add_argument("--topic", default="/ping")
     options.add_argument("--reply", default="/pong")
     args = options.parse_args(rospy.myargv(sys.argv)[1:])
     rospy.init_node(args.name or "ping", anonymous=not args.name)

@@ -17,6 +17,7 @@ from node import parser, say
 
 def main() -> None:
     options = parser(__doc__)
+    options.add_argument("--topic", default="/chatter")
     options.add_argument("--rate", type=float, default=100.0)
     args = options.parse_args(rospy.myargv(sys.argv)[1:])
     rospy.init_node(args.name or "timed_loop", anonymous=not args.name)

@@ -14,7 +14,7 @@ import pytest
 from rmpa.agent import Agent
 from rmpa.bridge import limits
 from rmpa.bridge.proxy_names import proxied_node
-from rmpa.config.settings import PolicySettings, Settings
+from rmpa.config.settings import Multicast, PolicySettings, Settings
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.ros.http.client import call_api
@@ -57,8 +57,8 @@ def hears(subscriber: Subscriber, publishers: int) -> bool:
 
 def flows_to(agent: Agent, peers: int) -> bool:
     """Whether what the agent's module publishes goes to that many peers."""
-    flows = agent.bridge.outbound.flows
-    return bool(flows) and all(len(agent.bridge.exports.flowing(source)) == peers for source in flows)
+    flows = agent.bridge.topics.outbound.flows
+    return bool(flows) and all(len(agent.bridge.topics.exports.flowing(source)) == peers for source in flows)
 
 
 def has_subscribers(publisher: Publisher) -> bool:
@@ -74,7 +74,7 @@ def settings(tmp_path: Path) -> Callable[..., Settings]:
             name=name,
             core_port=core_port,
             interfaces=("lo",),
-            group_port=group_port,
+            multicast=Multicast(port=group_port),
             policy=policy or PolicySettings(),
             runtime_dir=str(tmp_path),
         )
@@ -91,7 +91,7 @@ async def running(*all_settings: Settings) -> AsyncIterator[list[Agent]]:
             await agent.start()
             started.append(agent)
         wanted = len(agents) - 1
-        await until(lambda: all(len(list(agent.bridge.attached())) == wanted for agent in agents))
+        await until(lambda: all(len(list(agent.bridge.sessions.linked())) == wanted for agent in agents))
         yield agents
     finally:
         for agent in reversed(started):
@@ -172,7 +172,7 @@ async def test_one_copy_crosses_for_many_subscribers(settings: Callable[..., Set
                     async for received in subscriber:
                         assert received.message.data == "x"
                         break
-            [flow] = a.bridge.outbound.flows.values()
+            [flow] = a.bridge.topics.outbound.flows.values()
             assert flow.messages == 1
 
 
@@ -197,7 +197,7 @@ async def test_a_peer_that_is_gone_leaves_nothing_in_the_graph(settings: Callabl
             await until(lambda: "/chatter" in b.core.state().publishers)
             assert [proxied_node(n) for n in b.core.state().publishers["/chatter"]] == [("a", "/talker")]
         await until(lambda: "/chatter" not in b.core.state().publishers)
-        assert not list(b.bridge.attached())
+        assert not list(b.bridge.sessions.linked())
 
 
 @asynccontextmanager
@@ -205,7 +205,7 @@ async def running_more(other: Agent, more: Settings) -> AsyncIterator[Agent]:
     agent = Agent(more)
     await agent.start()
     try:
-        await until(lambda: list(agent.bridge.attached()) and list(other.bridge.attached()))
+        await until(lambda: list(agent.bridge.sessions.linked()) and list(other.bridge.sessions.linked()))
         yield agent
     finally:
         await agent.close()

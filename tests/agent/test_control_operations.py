@@ -35,7 +35,7 @@ ARGS: Final[dict[str, dict[str, Any]]] = {
 
 async def test_each_operation_replies_with_its_type(settings: Callable[..., Settings], tmp_path: Path) -> None:
     async with running(settings("a"), settings("b")) as (a, b):
-        await until(lambda: list(a.bridge.attached()) and list(b.bridge.attached()))
+        await until(lambda: list(a.bridge.sessions.linked()) and list(b.bridge.sessions.linked()))
         a.reloader._load = lambda: Loaded(settings("a"))
 
         def ask() -> dict[str, object]:
@@ -66,7 +66,7 @@ async def test_wrong_arguments_are_refused(
     settings: Callable[..., Settings], tmp_path: Path, op: str, args: dict[str, Any], text: str
 ) -> None:
     async with running(settings("a"), settings("b")) as (a, _b):
-        await until(lambda: list(a.bridge.attached()))
+        await until(lambda: list(a.bridge.sessions.linked()))
 
         def ask() -> object:
             with ControlClient(tmp_path / "a.sock") as client:
@@ -78,7 +78,7 @@ async def test_wrong_arguments_are_refused(
 
 async def test_nodes_of_all_peers_are_listed(settings: Callable[..., Settings]) -> None:
     async with running(settings("a"), settings("b")) as (a, _b):
-        await until(lambda: list(a.bridge.attached()))
+        await until(lambda: list(a.bridge.sessions.linked()))
         (nodes,) = await a.operations.node({"what": "node.list"})
     assert isinstance(nodes, PeerNodes)
     assert (nodes.peer, nodes.problem) == ("b", "")

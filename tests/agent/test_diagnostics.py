@@ -6,7 +6,7 @@ import asyncio
 import os
 from typing import TYPE_CHECKING
 
-from rmpa.config.settings import Settings
+from rmpa.config.settings import Multicast, Settings
 from rmpa.core.contract import ContractRule
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.observe.io.diagnostics import TOPIC
@@ -26,7 +26,7 @@ def settings(name: str, place: Path, contracts: tuple[ContractRule, ...] = ()) -
         name=name,
         core_port=0,
         interfaces=("lo",),
-        group_port=20000 + os.getpid() % 20000,
+        multicast=Multicast(port=20000 + os.getpid() % 20000),
         runtime_dir=str(place),
         contracts=contracts,
     )
@@ -74,11 +74,13 @@ async def test_figures_of_a_topic_that_crosses(tmp_path: Path) -> None:
         publisher = await talker.advertise("/chatter", "std_msgs/String")
         subscriber = await hearer.subscribe("/chatter")
         await until(lambda: publisher.subscribers and subscriber.publishers)
-        await until(lambda: all(at.link.clock_offset is not None for at in b.bridge.attached()))
+        await until(lambda: all(at.link.clock_offset is not None for at in b.bridge.sessions.linked()))
         await send(publisher, 20, 0.01)
         await until(
             lambda: all(
-                flow.quality.messages == 20 for at in b.bridge.attached() for flow in at.inbound.flows.values()
+                flow.quality.messages == 20
+                for at in b.bridge.sessions.linked()
+                for flow in b.bridge.topics.of(at).flows.values()
             )
         )
         route = await shown("b", tmp_path, "/chatter")

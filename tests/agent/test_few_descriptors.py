@@ -223,7 +223,7 @@ async def test_a_topic_without_a_proxy_says_why_and_comes_later(
         with descriptors_left(2 * runtime_limits.DESCRIPTORS_RESERVED - 1):
             for number in range(5):
                 await talker.advertise(f"/t{number}", "std_msgs/String")
-            await until(lambda: any(at.inbound.problems for at in b.bridge.attached()))
+            await until(lambda: any(at.proxies.problems for at in b.bridge.sessions.linked()))
             await until(lambda: len(routes(b)) == 5)
             assert all("no file descriptor is left for its proxy" in route.problem for route in routes(b))
             (found,) = await b.operations.why({"peer": "a", "name": "/t1"})

@@ -27,7 +27,7 @@ import pytest
 
 from rmpa.agent import Agent
 from rmpa.config import limits as config_limits
-from rmpa.config.settings import PeerRule, PolicySettings, Settings
+from rmpa.config.settings import Multicast, PeerRule, PolicySettings, Settings
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import UnreachableError
 from rmpa.core.guid import Guid
@@ -155,13 +155,15 @@ class World:
         return sum(topic.startswith(namespace) for topic in self.near.core.state().publishers)
 
     def linked(self) -> bool:
-        return all(len(list(agent.bridge.attached())) == 1 for agent in (self.near, self.far))
+        return all(len(list(agent.bridge.sessions.linked())) == 1 for agent in (self.near, self.far))
 
 
 @asynccontextmanager
 async def worlds(tmp_path: Path, master: str = "") -> AsyncIterator[World]:
     group = (config_limits.MULTICAST_GROUP, 20000 + (os.getpid() + 7919) % 20000)
-    settings = Settings(core_port=0, interfaces=("lo",), group_port=group[1], runtime_dir=str(tmp_path))
+    settings = Settings(
+        core_port=0, interfaces=("lo",), multicast=Multicast(port=group[1]), runtime_dir=str(tmp_path)
+    )
     near = replace(settings, name="near")
     if master:
         near = replace(near, core_mode="external", core_master=master)
@@ -246,7 +248,7 @@ async def somebody_looks_at_everything(world: World) -> None:
 
 async def somebody_asks_why(world: World) -> None:
     """Of topics that nobody listens to and of one with no such name: both agents look at all that they have."""
-    topic = next(iter(world.near.bridge.imports.offered_by(next(world.near.bridge.attached()).peer)))
+    topic = next(iter(world.near.bridge.topics.imports.offered_by(next(world.near.bridge.sessions.linked()).peer)))
 
     def work() -> None:
         path = next(world.near._control.path.parent.glob("near.sock"))
@@ -264,7 +266,7 @@ async def plans_are_reconciled(world: World) -> None:
             assert agent.bridge._reconciler is not None
             agent.bridge._reconciler.cancel()
             agent.bridge._reconcile()
-        await world.until(lambda: not (world.near.bridge._changed or world.far.bridge._changed))
+        await world.until(lambda: world.near.bridge.topics.idle and world.far.bridge.topics.idle)
 
 
 async def other_rules_hold(world: World) -> None:
@@ -280,9 +282,9 @@ async def other_rules_hold(world: World) -> None:
 
 async def the_link_falls_and_comes_back(world: World) -> None:
     for _ in range(4):
-        attached = next(iter(world.near.bridge.attached()))
+        attached = next(iter(world.near.bridge.sessions.linked()))
         attached.link.abort("pulled")
-        await world.until(lambda attached=attached: attached.away is None and world.linked())  # type: ignore[misc]
+        await world.until(lambda attached=attached: attached.linked and world.linked())  # type: ignore[misc]
         await world.until(lambda: world.shown() == TOPICS)
 
 
@@ -330,7 +332,7 @@ async def thousands_of_peers_are_invented(world: World) -> None:
 
     await world.beside(work)
     assert world.near.network.endpoint is not None
-    assert len(world.near.network.endpoint.discovery.peers()) > core_limits.ROSTER_PEERS_MAX / 2
+    assert len(world.near.network.endpoint.discovery.peers()) > core_limits.PEERS_MAX / 2
     assert world.near.network.endpoint.discovery.counters["roster.full"] > 0
     assert world.linked()
 

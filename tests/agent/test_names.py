@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from rmpa.agent import Agent
-    from rmpa.bridge.topics.imports import RemoteTopic
+    from rmpa.bridge.topics.remote_topic import RemoteTopic
     from rmpa.observe.snapshot import TopicInfo
 
 __all__ = ["settings"]  # the fixture
@@ -41,7 +41,7 @@ def info(agent: Agent, topic: str) -> TopicInfo:
 
 def imported(agent: Agent, topic: str) -> RemoteTopic:
     """A topic of the other module."""
-    return next(entry for _, source, entry in agent.bridge.imports if source.topic == topic)
+    return next(entry for _, source, entry in agent.bridge.topics.imports if source.topic == topic)
 
 
 async def test_topics_have_each_sides_names_both_ways(agents: tuple[Agent, Agent]) -> None:
@@ -107,7 +107,7 @@ async def test_a_reload_keeps_unchanged_routes_and_connections(agents: tuple[Age
         await until(lambda: all(listener.publishers for listener in listeners.values()))
         steady, talker = imported(pc, "/steady"), talkers["steady"]
         route = steady.route
-        link = next(iter(pc.bridge.attached())).link
+        link = next(iter(pc.bridge.sessions.linked())).link
         for number in range(20):
             talker.publish(talker.make({"data": str(number)}))
         agent, prefix = (robot, "/") if far else (pc, "/robot/")
@@ -132,7 +132,7 @@ async def test_a_reload_keeps_unchanged_routes_and_connections(agents: tuple[Age
         assert heard["steady"].heard == [str(number) for number in range(40)]
         assert (steady.route, steady.state.name) == (route, "OPEN")
         assert imported(pc, "/steady") is steady
-        assert next(iter(pc.bridge.attached())).link is link
+        assert next(iter(pc.bridge.sessions.linked())).link is link
         tuned = imported(pc, "/tuned").contract
         assert tuned is not None
         assert tuned.depth == 3

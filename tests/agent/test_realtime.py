@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from rmpa.agent import Agent
-from rmpa.config.settings import Settings
+from rmpa.config.settings import Multicast, Settings
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.http.client import call_api
@@ -40,7 +40,9 @@ def settings(tmp_path: Path) -> Callable[[str], Settings]:
     port = 20000 + os.getpid() % 20000
 
     def make(name: str) -> Settings:
-        return Settings(name=name, core_port=0, interfaces=("lo",), group_port=port, runtime_dir=str(tmp_path))
+        return Settings(
+            name=name, core_port=0, interfaces=("lo",), multicast=Multicast(port=port), runtime_dir=str(tmp_path)
+        )
 
     return make
 
@@ -50,7 +52,7 @@ async def pair(settings: Callable[[str], Settings]) -> AsyncIterator[tuple[Agent
     a, b = Agent(settings("a")), Agent(settings("b"))
     await a.start()
     await b.start()
-    await until(lambda: len(list(a.bridge.attached())) == len(list(b.bridge.attached())) == 1)
+    await until(lambda: len(list(a.bridge.sessions.linked())) == len(list(b.bridge.sessions.linked())) == 1)
     yield a, b
     await b.close()
     await a.close()

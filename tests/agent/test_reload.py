@@ -18,7 +18,7 @@ import pytest
 from rmpa.agent import reload
 from rmpa.agent.reload import Reloader, SighupHandler
 from rmpa.config.settings import HostPort, PeerRule, PolicySettings, Settings
-from rmpa.config.sources import Flags, Loaded, load_settings
+from rmpa.config.sources import Loaded, load_settings
 from rmpa.core.contract import ContractRule
 from rmpa.core.errors import ConfigError
 
@@ -88,7 +88,7 @@ async def test_an_agent_that_a_program_made_says_so() -> None:
 
 
 def test_a_file_is_read_again(tmp_path: Path) -> None:
-    load = partial(load_settings, Flags(), {}, host_name="a", cwd=tmp_path)
+    load = partial(load_settings, {}, {}, host_name="a", cwd=tmp_path)
     before = load().settings
     (tmp_path / "rmpa.toml").write_text('[bridge]\ndeny = ["/x"]\n')
     assert (before.policy.deny, load().settings.policy.deny) == ((), ("/x",))

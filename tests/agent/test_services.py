@@ -19,9 +19,10 @@ from rmpa.ros.wire.services import ServiceDescription
 from tests.agent.test_agent import running, settings, until
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator, Callable, Iterable
 
     from rmpa.agent import Agent
+    from rmpa.mesh.io.link import PeerLink
 
 __all__ = ["settings"]
 
@@ -72,20 +73,20 @@ async def connect(agent: Agent, service: str = "/add", md5sum: str = "*") -> Ser
     return await ServiceConnection.open(uri, service, "/client", md5sum=md5sum)
 
 
-def fall_silent(*agents: Agent) -> None:
-    """The link between two agents falls silent, as far as services hear of it."""
-    for agent in agents:
-        for attached in agent.bridge.attached():
-            attached.link.silent = True
-            agent.services.link_down(attached)
-            attached.takers.clear()
+def fall_silent(*agents: Agent) -> list[tuple[Agent, PeerLink]]:
+    """The link between two agents falls silent, as far as their bridges are told."""
+    links = [(agent, session.link) for agent in agents for session in agent.bridge.sessions.linked()]
+    for agent, link in links:
+        link.silent = True
+        agent.bridge.sessions.link_down(link)
+    return links
 
 
-def come_back(*agents: Agent) -> None:
-    for agent in agents:
-        for attached in agent.bridge.attached():
-            attached.link.silent = False
-            agent.services.link_up(attached)
+def come_back(links: Iterable[tuple[Agent, PeerLink]]) -> None:
+    """They have a link again; what the first one sends may come before the second one knows of it: it is dropped."""
+    for agent, link in links:
+        link.silent = False
+        agent.bridge.sessions.link_up(link)
 
 
 async def test_a_call_is_counted_on_both_sides(settings: Callable[..., Settings]) -> None:
@@ -124,7 +125,7 @@ async def test_a_short_outage_keeps_services_and_answers_calls(
         asked = asyncio.create_task(connection.call(b"1", 20.0))
         await until(lambda: server.calls)
         changes = b.core.state().services
-        fall_silent(a, b)
+        links = fall_silent(a, b)
         ok, text = await asked
         assert not ok
         assert b"the link to a was lost" in text
@@ -132,7 +133,7 @@ async def test_a_short_outage_keeps_services_and_answers_calls(
         waiting = asyncio.create_task(connection.call(b"2", 20.0))
         await asyncio.sleep(limits.AWAY_GRACE / 5)
         assert b.core.state().services == changes, "nobody was told of it"
-        come_back(a, b)
+        come_back(links)
         assert await waiting == (True, b"2")
         connection.close()
 
@@ -143,12 +144,12 @@ async def test_a_link_that_stays_away_takes_its_services_and_tells_who_waits(
     async with running(settings("a"), settings("b")) as (a, b), serving(a):
         await until(lambda: provider(b) == "/rmpa/a/adder")
         connection = await connect(b)
-        fall_silent(a, b)
+        links = fall_silent(a, b)
         ok, text = await connection.call(b"1", 20.0)
         assert not ok
         assert b"/add] of a: a is gone" in text
         assert provider(b) == ""
-        come_back(a, b)
+        come_back(reversed(links))
         await until(lambda: provider(b) == "/rmpa/a/adder")
         connection = await connect(b)
         assert await connection.call(b"2", 20.0) == (True, b"2")

@@ -56,7 +56,7 @@ async def plans_are_reconciled(world: World) -> None:
     for _ in range(4):
         for agent in (world.near, world.far):
             agent.services.reconcile()
-        await world.until(lambda: not (world.near.services._changed or world.far.services._changed))
+        await world.until(lambda: world.near.services.idle and world.far.services.idle)
 
 
 async def somebody_looks_at_everything(world: World) -> None:
@@ -93,9 +93,9 @@ async def large_calls_are_made(world: World) -> None:
 
 async def the_link_falls_and_comes_back(world: World) -> None:
     for _ in range(3):
-        attached = next(iter(world.near.bridge.attached()))
+        attached = next(iter(world.near.bridge.sessions.linked()))
         attached.link.abort("pulled")
-        await world.until(lambda attached=attached: attached.away is None and world.linked())  # type: ignore[misc]
+        await world.until(lambda attached=attached: attached.linked and world.linked())  # type: ignore[misc]
         await world.until(lambda: shown(world) == SERVICES)
 
 

@@ -60,7 +60,7 @@ async def test_each_stage_until_a_topic_flows(settings: Callable[..., Settings])
         assert stopped_at(await ask(b, "/chatter", "a")) == ("publisher", "no node of a publishes /chatter")
         assert stopped_at(await ask(b, "/chatter"))[0] == "publisher"
         publisher = await talker.advertise("/chatter", "std_msgs/String")
-        await until(lambda: b.bridge.imports.offered_by(next(iter(b.bridge.attached())).peer))
+        await until(lambda: b.bridge.topics.imports.offered_by(next(iter(b.bridge.sessions.linked())).peer))
         stage, text = stopped_at(await ask(b, "/chatter", "a"))
         assert (stage, text) == ("subscriber", "no node here subscribes to /chatter, so nothing is sent")
         (near,) = await ask(b, "/chater", "a")
@@ -90,7 +90,7 @@ async def test_policy_of_either_side(settings: Callable[..., Settings], where: s
     async with running(a, b) as (first, second), node("talker", first) as talker:
         await talker.advertise("/secret", "std_msgs/String")
         if where == "here":
-            await until(lambda: next(iter(second.bridge.imports), None))
+            await until(lambda: next(iter(second.bridge.topics.imports), None))
         for found in (await ask(second, "/secret", "a"), await ask(second, "/secret")):
             stage, text = stopped_at(found)
             assert stage == f"policy {where}"
@@ -105,7 +105,7 @@ async def test_built_in_rules_and_other_types(settings: Callable[..., Settings])
         assert "time stays home" in text
         await one.advertise("/x", "std_msgs/String")
         await two.advertise("/x", "std_msgs/Bool")
-        await until(lambda: any(entry.conflict for _, _, entry in b.bridge.imports))
+        await until(lambda: any(entry.conflict for _, _, entry in b.bridge.topics.imports))
         stage, text = stopped_at(await ask(b, "/x", "a"))
         assert stage == "type"
         assert "std_msgs/String" in text

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.bridge.actions import Action, Publish, Retract, Send, Warn
-from rmpa.bridge.bounds import Beyond, NodePlaces, Surplus, from_json, to_json
+from rmpa.bridge.catalogue.bounds import Beyond, NodePlaces, Surplus, from_json, to_json
 from rmpa.bridge.messages import Advertise, AdvertiseServices, ServiceOffer, Source, TopicOffer
 from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy
@@ -19,7 +19,7 @@ from rmpa.bridge.services.imports import ImportAction, Provide, ServiceImports, 
 from rmpa.bridge.topics.imports import Imports
 from rmpa.config.settings import LimitSettings, PolicySettings, ServiceSettings
 from rmpa.core.contract import Contracts
-from tests.bridge.services.test_rules import obey, rules
+from tests.bridge.services.test_rules import apply_rules, rules
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -97,7 +97,7 @@ def test_a_limit_that_is_raised_and_lowered_holds_at_once(kind: str) -> None:
     def reload(value: int) -> list[Action]:
         most = LimitSettings(**{kind: value})
         policy = Policy(PolicySettings(deny=("/secret",)))
-        return [a for some in made.rules(policy, Contracts(), Names(), 0.0, most) for a in some]
+        return [a for some in made.apply_rules(policy, Contracts(), Names(), 0.0, most) for a in some]
 
     made = imports(**{kind: 2})
     made.advertised(1, Advertise(added=offers(range(5))))
@@ -130,7 +130,7 @@ def test_a_link_that_was_away_for_a_moment_keeps_who_stands_and_who_waits() -> N
     made.link_away(1, briefly=True)
     made.link_up(1, "far")
     for portion in made.portions(1, Advertise(added=offers(range(5)), full=True)):
-        assert published(made.advertised(1, portion)) == []
+        assert published(made.take_in(1, portion, 0.0)) == []
     assert shown(made) == {"/n0"}
     assert (len(made.crowded(1)), made.beyond(1).hidden) == (2, 2)
 
@@ -165,7 +165,7 @@ def test_whatever_comes_and_goes_the_limits_hold_and_no_place_stays_empty(
 def reload_nodes(made: Imports, nodes: int, *denied: str) -> Iterator[list[Action]]:
     """One reload: another limit of nodes, and all topics of some nodes denied."""
     policy = Policy(PolicySettings(deny=tuple(f"{node}/*" for node in denied)))
-    return made.rules(policy, Contracts(), Names(), 0.0, LimitSettings(nodes=nodes))
+    return made.apply_rules(policy, Contracts(), Names(), 0.0, LimitSettings(nodes=nodes))
 
 
 def of_nodes(nodes: str, *topics: str) -> tuple[TopicOffer, ...]:
@@ -297,13 +297,13 @@ def test_the_services_limits_are_reloaded() -> None:
     made = services(nodes=1, count=2)
     made.advertised(1, provided("/a", node="/first"))
     made.advertised(1, provided("/b", "/c", node="/second"))
-    changed = [a for some in made.obey(rules(), LimitSettings(nodes=2, services=3)) for a in some]
+    changed = [a for some in made.apply_rules(rules(), LimitSettings(nodes=2, services=3)) for a in some]
     assert changed == [Provide(1, "/b", "/second"), Provide(1, "/c", "/second")]
 
 
 def reload_services(made: ServiceImports, nodes: int, *denied: str) -> Iterator[list[ImportAction]]:
     settings = ServiceSettings(deny=tuple(f"{node}/*" for node in denied))
-    return made.obey(rules(settings), LimitSettings(nodes=nodes))
+    return made.apply_rules(rules(settings), LimitSettings(nodes=nodes))
 
 
 @pytest.mark.timeout(10)
@@ -386,10 +386,10 @@ def test_our_own_services_beyond_the_limit_are_offered_when_there_is_room() -> N
     made.graph("/add", None)
     assert dict(made.offered) == {"/mul": mul}
     assert made.beyond.hidden == 0
-    told = [action.message for action in made.tell() if isinstance(action, Send)]
+    told = [action.message for action in made.advertise() if isinstance(action, Send)]
     assert told == [AdvertiseServices(added=(ServiceOffer("/mul", "/multiplier"),))]
     made.graph("/add", add)
-    assert obey(made, rules()) == []
+    assert apply_rules(made, rules()) == []
     assert set(made.offered) == {"/add", "/mul"}, "the default limit is higher"
 
 

@@ -34,7 +34,8 @@ from rmpa.bridge.messages import (
 )
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.topics.exports import Exports, LocalSource
-from rmpa.bridge.topics.imports import Imports, RouteState
+from rmpa.bridge.topics.imports import Imports
+from rmpa.bridge.topics.remote_topic import RouteState
 from rmpa.config.settings import PolicySettings
 
 SOURCES = [Source("/a", "/n"), Source("/a", "/m"), Source("/b", "/n")]
@@ -131,8 +132,8 @@ class World:
 
     def settle(self) -> None:
         for _ in range(200):
-            while self.deliver() or self.exports.untold:
-                self.act(self.exports.tell())
+            while self.deliver() or self.exports.pending:
+                self.act(self.exports.advertise())
             for source in list(self.connected):
                 self.act(self.exports.described(source, ABOUT))
             timer = self.imports.next_timer()
@@ -179,7 +180,7 @@ def _step(world: World, what: str, index: int) -> None:
         world.local.pop(source, None)
         world.graph_changed(source.topic)
     elif what == "tell":
-        world.act(world.exports.tell())
+        world.act(world.exports.advertise())
     elif what == "describe" and source in world.connected:
         world.act(world.exports.described(source, ABOUT))
     elif what == "lose" and source in world.connected:

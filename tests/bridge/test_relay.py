@@ -174,10 +174,10 @@ class Map:
     def settle(self) -> None:
         for _ in range(20_000):
             for here, module in self.modules.items():
-                while module.exports.untold:
-                    self.act(here, module.exports.tell())
-                while module.service_exports.untold:
-                    self.act(here, module.service_exports.tell())
+                while module.exports.pending:
+                    self.act(here, module.exports.advertise())
+                while module.service_exports.pending:
+                    self.act(here, module.service_exports.advertise())
             full = [wire for wire, waiting in self.wires.items() if waiting]
             if not full:
                 return
@@ -188,8 +188,7 @@ class Map:
                 self.act(here, module.service_imports.advertised(module.links[there], message))
                 continue
             assert isinstance(message, Advertise)
-            for portion in module.imports.portions(module.links[there], message):
-                self.act(here, module.imports.advertised(module.links[there], portion))
+            self.act(here, module.imports.advertised(module.links[there], message))
         raise AssertionError("it never settles")
 
     def reachable(self, start: int) -> set[int]:
@@ -280,11 +279,11 @@ def test_the_way_is_told_and_what_came_round_is_not_shown() -> None:
     ways = RelayPaths()
     ways.instance = instance(9)
     ways.linked(1, LinkedPeer("r", instance(2), Guid(2)))
-    assert not ways.learn(1, origin(9, 2))
+    assert not ways.add(1, origin(9, 2))
     assert ways.why_not(1, origin(9, 2)) == "it is ours, and came back by a relay"
-    assert not ways.learn(1, origin(1, 9, 2))
+    assert not ways.add(1, origin(1, 9, 2))
     assert ways.why_not(1, origin(1, 9, 2)) == "we passed it on ourselves"
-    assert ways.learn(1, origin(1, 2))
+    assert ways.add(1, origin(1, 2))
     assert not ways.why_not(1, origin(1, 2))
-    assert ways.forget(1, origin(1, 2))
+    assert ways.remove(1, origin(1, 2))
     assert list(ways) == []

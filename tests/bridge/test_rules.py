@@ -38,7 +38,8 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.topics.exports import Exports, LocalSource
-from rmpa.bridge.topics.imports import Imports, RouteState
+from rmpa.bridge.topics.imports import Imports
+from rmpa.bridge.topics.remote_topic import RouteState
 from rmpa.config.settings import PeerRule, PolicySettings, Remap
 from rmpa.core.contract import Contract, ContractRule, Contracts, Priority, Reliability
 
@@ -80,8 +81,8 @@ def say(exports: Exports, *names: str, node: str = "/n") -> list[Action]:
     actions: list[Action] = []
     for topic in (*exports.topics, *names):
         actions += exports.graph(topic, {node: LocalSource(TYPE, "http://127.0.0.1:4000/")} if topic in names else {})
-    while exports.untold:
-        actions += exports.tell()
+    while exports.pending:
+        actions += exports.advertise()
     return actions
 
 
@@ -90,7 +91,7 @@ def learn(imports: Imports, *names: str, peer: int = 1, node: str = "/n") -> lis
 
 
 def changed(imports: Imports, side: Side) -> list[Action]:
-    return [a for actions in imports.rules(side.policy, side.contracts, side.names, 0.0) for a in actions]
+    return [a for actions in imports.apply_rules(side.policy, side.contracts, side.names, 0.0) for a in actions]
 
 
 # --- outbound -------------------------------------------------------------------------------------------------------
@@ -126,8 +127,8 @@ def test_peers_with_rules_are_told_in_turn_and_all_others_at_once() -> None:
         exports.link_up(number, name)
     exports.graph("/a", {"/n": LocalSource(TYPE, "http://127.0.0.1:4000/")})
     told = []
-    while exports.untold:
-        told.append([action.peer for action in exports.tell() if isinstance(action, Send)])
+    while exports.pending:
+        told.append([action.peer for action in exports.advertise() if isinstance(action, Send)])
     assert told == [[1, 3, 4], [2]]
 
 
@@ -171,14 +172,14 @@ def test_new_rules_end_and_begin_what_they_are_about_and_nothing_else() -> None:
         exports.described(Source(topic, "/n"), ABOUT)
     rule = PeerRule("robot*", "", (), (Remap("/b", "/bee"),), PolicySettings(deny=("/c",)))
     new = Side(rule)
-    actions = exports.rules(new.policy, new.contracts, new.names) + say(exports, "/a", "/b", "/c")
+    actions = exports.apply_rules(new.policy, new.contracts, new.names) + say(exports, "/a", "/b", "/c")
     assert [(a.peer, a.source.topic) for a in actions if isinstance(a, RemoveRoute)] == [(1, "/b"), (1, "/c")]
     assert [a.peer for a in actions if isinstance(a, Send)] == [1, 1, 1]
     assert sorted(offered(actions)) == [("+", "/bee"), ("-", "/b"), ("-", "/c")]
     assert not any(isinstance(action, Disconnect) for action in actions)
     assert exports.flowing(Source("/a", "/n")) == (1, 2)
     back = Side()
-    actions = exports.rules(back.policy, back.contracts, back.names) + say(exports, "/a", "/b", "/c")
+    actions = exports.apply_rules(back.policy, back.contracts, back.names) + say(exports, "/a", "/b", "/c")
     assert sorted(offered(actions)) == [("+", "/b"), ("+", "/c"), ("-", "/bee")]
 
 
@@ -187,7 +188,7 @@ def test_the_policy_for_all_can_change_too() -> None:
     exports.link_up(1, "base")
     say(exports, "/a", "/b")
     new = Side(policy=PolicySettings(deny=("/b",)))
-    assert exports.rules(new.policy, new.contracts, new.names) == []
+    assert exports.apply_rules(new.policy, new.contracts, new.names) == []
     assert offered(say(exports, "/a", "/b")) == [("-", "/b")]
 
 
@@ -200,7 +201,7 @@ def test_a_route_whose_contract_changes_here_is_closed_so_that_its_peer_asks_aga
         exports.opened(1, OpenRoute(route, topic, "/n", asked))
         exports.described(Source(topic, "/n"), ABOUT)
     new = Side(contracts=(ContractRule(("/b",), (), {"depth": 7}),))
-    actions = exports.rules(new.policy, new.contracts, new.names)
+    actions = exports.apply_rules(new.policy, new.contracts, new.names)
     assert actions == [
         RemoveRoute(Source("/b", "/n"), 1, 2),
         Disconnect(Source("/b", "/n")),
@@ -208,7 +209,7 @@ def test_a_route_whose_contract_changes_here_is_closed_so_that_its_peer_asks_aga
     ]
     exports.opened(1, OpenRoute(3, "/b", "/n", asked))
     assert exports.contract(Source("/b", "/n"), 1) == replace(asked, depth=7)
-    assert exports.rules(new.policy, new.contracts, new.names) == []
+    assert exports.apply_rules(new.policy, new.contracts, new.names) == []
 
 
 # --- inbound --------------------------------------------------------------------------------------------------------
@@ -382,11 +383,11 @@ class World:
         self.rules[side] = rules
         new = Side(*rules)
         if side == 0:
-            self.act(self.exports.rules(new.policy, new.contracts, new.names))
+            self.act(self.exports.apply_rules(new.policy, new.contracts, new.names))
             for topic in TOPICS:
                 self.graph(topic)
         else:
-            for actions in self.imports.rules(new.policy, new.contracts, new.names, self.now):
+            for actions in self.imports.apply_rules(new.policy, new.contracts, new.names, self.now):
                 self.act(actions)
 
     def deliver(self) -> bool:
@@ -411,8 +412,8 @@ class World:
 
     def settle(self) -> None:
         for _ in range(200):
-            while self.deliver() or self.exports.untold:
-                self.act(self.exports.tell())
+            while self.deliver() or self.exports.pending:
+                self.act(self.exports.advertise())
             for source in list(self.connected):
                 self.act(self.exports.described(source, ABOUT))
             if not self.to_importer and not self.to_exporter:
@@ -428,7 +429,7 @@ class World:
             for _ in range(number):
                 self.deliver()
         elif what == "tell":
-            self.act(self.exports.tell())
+            self.act(self.exports.advertise())
         elif what == "describe":
             for source in list(self.connected):
                 self.act(self.exports.described(source, ABOUT))

@@ -86,5 +86,5 @@ def test_other_rules_at_once() -> None:
     machine = imports("sim", "sim", "base")
     advertise(machine, 1, FIRST)
     advertise(machine, 2, SECOND)
-    actions = [a for some in machine.rules(policy("base"), Contracts(), Names(), 0.0) for a in some]
+    actions = [a for some in machine.apply_rules(policy("base"), Contracts(), Names(), 0.0) for a in some]
     assert actions == [Retract(1, FIRST), Publish(2, SECOND, CLOCK)]

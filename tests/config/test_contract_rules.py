@@ -13,10 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.config import limits
-from rmpa.config.contract_rules import read_duration, read_rate
-from rmpa.config.file import LISTS, line_of
+from rmpa.config.file import LISTS
+from rmpa.config.quantities import read_duration, read_rate
 from rmpa.config.settings import Settings
-from rmpa.config.sources import Flags, Loaded, load_settings
+from rmpa.config.sources import Loaded, load_settings
+from rmpa.config.toml_lines import line_of
 from rmpa.config.values import BadValue
 from rmpa.core.contract import (
     KEYS,
@@ -40,7 +41,7 @@ Load = Callable[[str], Loaded]
 def load(tmp_path: Path) -> Load:
     def load(text: str) -> Loaded:
         (tmp_path / "rmpa.toml").write_text(text)
-        return load_settings(Flags(), {}, host_name="base", cwd=tmp_path)
+        return load_settings({}, {}, host_name="base", cwd=tmp_path)
 
     return load
 

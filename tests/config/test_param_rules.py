@@ -10,7 +10,7 @@ import pytest
 from rmpa.config import limits
 from rmpa.config.param_rules import overlap, untouchable
 from rmpa.config.settings import FollowRule, ParamSettings, TimeSettings
-from rmpa.config.sources import Flags, Loaded, load_settings
+from rmpa.config.sources import Loaded, load_settings
 from rmpa.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ Load = Callable[..., Loaded]
 def load(tmp_path: Path) -> Load:
     def load(text: str, **environ: str) -> Loaded:
         (tmp_path / "rmpa.toml").write_text(text)
-        return load_settings(Flags(), environ, host_name="pad", cwd=tmp_path)
+        return load_settings({}, environ, host_name="pad", cwd=tmp_path)
 
     return load
 

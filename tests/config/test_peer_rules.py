@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from rmpa.config.settings import PeerRule, PolicySettings, Remap
-from rmpa.config.sources import Flags, Loaded, load_settings
+from rmpa.config.sources import Loaded, load_settings
 from rmpa.core.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]
@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 
 def load(tmp_path: Path, text: str) -> Loaded:
     (tmp_path / "rmpa.toml").write_text(text)
-    return load_settings(Flags(), {}, host_name="pc", cwd=tmp_path)
+    return load_settings({}, {}, host_name="pc", cwd=tmp_path)
 
 
 def refused(tmp_path: Path, text: str) -> str:

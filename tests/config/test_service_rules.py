@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.config.settings import ServiceRule, ServiceSettings
-from rmpa.config.sources import Flags, load_settings
+from rmpa.config.sources import load_settings
 from rmpa.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def _load(tmp_path: Path, text: str, **environ: str) -> ServiceSettings:
     path = tmp_path / "rmpa.toml"
     path.write_text(text)
-    return load_settings(Flags(config=str(path)), environ, host_name="robot", cwd=tmp_path).settings.services
+    return load_settings({"config": str(path)}, environ, host_name="robot", cwd=tmp_path).settings.services
 
 
 def test_defaults_let_all_but_loggers_cross_for_a_minute(tmp_path: Path) -> None:

@@ -12,9 +12,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.config import limits
-from rmpa.config.file import LISTS, known_keys, line_of, parse_config
-from rmpa.config.settings import HostPort, LaneSettings, LimitSettings, PolicySettings, RealtimeSettings, Settings
-from rmpa.config.sources import Flags, Loaded, find_config_file, load_settings
+from rmpa.config.file import LISTS, SCHEMAS, parse_config
+from rmpa.config.settings import (
+    SETTINGS,
+    HostPort,
+    LaneSettings,
+    LimitSettings,
+    Multicast,
+    PolicySettings,
+    RealtimeSettings,
+    Settings,
+)
+from rmpa.config.sources import Loaded, find_config_file, load_settings
+from rmpa.config.toml_lines import line_of
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import ContractRule
 from rmpa.core.errors import ConfigError
@@ -29,13 +39,13 @@ def load(tmp_path: Path) -> Load:
     def load(
         text: str | None = None,
         *,
-        flags: Flags | None = None,
+        options: dict[str, object] | None = None,
         environ: dict[str, str] | None = None,
         host_name: str = "base",
     ) -> Loaded:
         if text is not None:
             (tmp_path / "rmpa.toml").write_text(text)
-        return load_settings(flags or Flags(), environ or {}, host_name=host_name, cwd=tmp_path)
+        return load_settings(options or {}, environ or {}, host_name=host_name, cwd=tmp_path)
 
     return load
 
@@ -50,7 +60,7 @@ def refuse(load: Load, tmp_path: Path) -> Refuse:
     return refuse
 
 
-def test_nothing_given_gives_the_defaults_and_the_host_name(load: Load) -> None:
+def test_defaults_and_the_host_name_without_any_source(load: Load) -> None:
     assert load(host_name="my-robot.local").settings == Settings(name="my_robot")
 
 
@@ -72,7 +82,7 @@ def test_the_example_shows_every_key_and_its_commented_lines_load() -> None:
     text = ""
     for name in dict.fromkeys(t for t, _ in kept):
         text += name + "\n" + "\n".join(line for (t, _), line in kept.items() if t == name) + "\n"
-    assert set(parse_config(text.encode(), None)) == set(known_keys()) - {(name,) for name in LISTS}
+    assert set(parse_config(text.encode(), None)) == set(SCHEMAS) - {(name,) for name in LISTS}
 
 
 def test_the_examples_lists_of_tables_load_and_show_every_key(load: Load) -> None:
@@ -93,7 +103,7 @@ def test_each_source_outweighs_the_one_before(load: Load) -> None:
         "RMPA_PORT": "3",
         "RMPA_NAME": "from_var",
     }
-    settings = load(text, environ=environ, flags=Flags(name="from_flag")).settings
+    settings = load(text, environ=environ, options={"name": "from_flag"}).settings
     assert (settings.domain, settings.core_port, settings.port, settings.name) == (2, 2222, 3, "from_flag")
 
 
@@ -148,8 +158,7 @@ json = true
         port=40001,
         interfaces=("wlan0",),
         seeds=(HostPort("10.0.0.5", 40001), HostPort("far.example.org")),
-        group="239.1.2.3",
-        group_port=5000,
+        multicast=Multicast(True, "239.1.2.3", 5000),
         policy=PolicySettings(("/cmd/**",), ("/cmd/secret",), ("sensor_msgs/*",), ("sensor_msgs/Image",)),
         contracts=(ContractRule(("/cmd/**",), (), {"depth": 1}),),
         limits=LimitSettings(7, 8, 9, 10),
@@ -162,24 +171,24 @@ json = true
 
 
 def test_every_flag(load: Load) -> None:
-    flags = Flags(
-        "a",
-        "localhost",
-        "1",
-        "external",
-        "http://h:1",
-        "2",
-        "3",
-        ("lo", "eth0"),
-        ("h:1",),
-        "off",
-        None,
-        "error",
-        True,
-        True,
-        True,
-    )
-    settings = load(flags=flags).settings
+    options = {
+        "name": "a",
+        "core_host": "localhost",
+        "core_port": "1",
+        "core": "external",
+        "master": "http://h:1",
+        "fresh": True,
+        "port": "2",
+        "domain": "3",
+        "interface": ("lo", "eth0"),
+        "seed": ("h:1",),
+        "multicast": "off",
+        "log_level": "error",
+        "log_json": True,
+        "realtime": True,
+    }
+    assert set(options) == {setting.option_name for setting in SETTINGS if setting.option}
+    settings = load(options=options).settings
     assert settings == Settings(
         name="a",
         core_host="localhost",
@@ -191,14 +200,14 @@ def test_every_flag(load: Load) -> None:
         domain=3,
         interfaces=("lo", "eth0"),
         seeds=(HostPort("h", 1),),
-        multicast=False,
+        multicast=Multicast(False),
         log_level="error",
         log_json=True,
         realtime=RealtimeSettings(True),
     )
 
 
-def test_an_external_core_is_that_of_ROS_MASTER_URI_or_another_one_that_is_named(load: Load) -> None:  # noqa: N802
+def test_external_core_is_ROS_MASTER_URI_unless_named(load: Load) -> None:  # noqa: N802
     environ = {"ROS_MASTER_URI": "http://robot:11312", "RMPA_CORE": "external"}
     loaded = load(environ=environ)
     assert loaded.settings == Settings(name="base", core_mode="external", core_master="http://robot:11312")
@@ -209,14 +218,14 @@ def test_an_external_core_is_that_of_ROS_MASTER_URI_or_another_one_that_is_named
     assert loaded.notes == ()
 
 
-def test_what_does_not_fit_the_kind_of_core_is_told(load: Load) -> None:
+def test_settings_of_the_other_kind_of_core_are_reported(load: Load) -> None:
     with pytest.raises(ConfigError, match=r"--master: is of no use with the embedded core; .*--core external"):
-        load(flags=Flags(core_master="http://h:1/"))
+        load(options={"master": "http://h:1/"})
     with pytest.raises(ConfigError, match=r"'robot:11311' is not a master's URI.*did you mean .*http://robot:11311/"):
         load(environ={"RMPA_CORE": "external", "RMPA_MASTER": "robot:11311"})
     with pytest.raises(ConfigError, match=r"rmpa\.toml:2: core\.mode: 'extern' is not a kind.* \"external\""):
         load('[core]\nmode = "extern"\n')
-    notes = load("", flags=Flags(core_mode="external", core_port="1", core_fresh=True)).notes
+    notes = load("", options={"core": "external", "core_port": "1", "fresh": True}).notes
     assert notes == (
         "--core-port: is of no use with an external core",
         "--fresh: is of no use with an external core",
@@ -264,7 +273,7 @@ def test_every_variable(load: Load) -> None:
         port=2,
         interfaces=("lo", "eth0"),
         seeds=(HostPort("h", 1), HostPort("10.0.0.1")),
-        group="239.0.0.1",
+        multicast=Multicast(True, "239.0.0.1"),
         policy=PolicySettings(("/a", "/b/**"), ("/c",), ("std_msgs/*",), ("std_msgs/Header",)),
         lanes=LaneSettings(46, 5, 8, 1),
         realtime=RealtimeSettings(True, 80, (1, 3), False, True),
@@ -291,7 +300,7 @@ def test_every_variable(load: Load) -> None:
         ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, Settings(name="base")),
         ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT"}, Settings(name="base")),
         ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}, Settings(name="base", interfaces=("lo",))),
-        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "off"}, Settings(name="base", multicast=False)),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "off"}, Settings(name="base", multicast=Multicast(False))),
     ],
 )
 def test_the_ros_environment(load: Load, environ: dict[str, str], expected: Settings) -> None:
@@ -415,45 +424,45 @@ def test_a_flag_outweighs_realtime_of_the_variable_and_of_the_file(load: Load) -
     text = "[realtime]\nenabled = true\npriority = 7"
     assert load(text).settings.realtime == RealtimeSettings(True, 7)
     assert load(text, environ={"RMPA_REALTIME": "0"}).settings.realtime == RealtimeSettings(False, 7)
-    flags = Flags(realtime=False)
-    assert load(text, environ={"RMPA_REALTIME": "1"}, flags=flags).settings.realtime == RealtimeSettings(False, 7)
+    options = {"realtime": False}
+    assert load(text, environ={"RMPA_REALTIME": "1"}, options=options).settings.realtime == RealtimeSettings(False, 7)
 
 
-def test_a_mistake_in_the_file_is_told_even_where_a_flag_outweighs_it(refuse: Refuse) -> None:
-    assert refuse("domain = 999", flags=Flags(domain="1")).startswith("rmpa.toml:1: domain: 999")
+def test_file_mistake_is_reported_although_an_option_overrides_it(refuse: Refuse) -> None:
+    assert refuse("domain = 999", options={"domain": "1"}).startswith("rmpa.toml:1: domain: 999")
 
 
 @pytest.mark.parametrize(
-    ("flags", "message"),
+    ("options", "message"),
     [
         (
-            Flags(name="robot-1"),
+            {"name": "robot-1"},
             (
                 "--name: 'robot-1' is not a ROS base name (a letter, then letters, digits and _); "
                 "did you mean --name robot_1?"
             ),
         ),
         (
-            Flags(name="x" * 65),
+            {"name": "x" * 65},
             f"--name: a peer's name has at most {core_limits.PEER_NAME_MAX} characters; did you mean",
         ),
-        (Flags(port="x"), "--port: 'x' is not a whole number; a port (0: any) is between 0 and 65535"),
-        (Flags(port="-1"), "--port: -1 is out of range"),
-        (Flags(port="1_0"), "--port: '1_0' is not a whole number"),
-        (Flags(port="9" * 5000), "--port: '999"),
-        (Flags(seeds=("a", "a")), "--seed: 'a' stands there twice"),
-        (Flags(seeds=(":1",)), "--seed: ':1' is not HOST:PORT"),
-        (Flags(seeds=("a:0",)), "--seed: 'a:0' is not HOST:PORT: 0 is out of range"),
-        (Flags(seeds=("a b",)), "--seed: 'a b' is not a host name"),
-        (Flags(interfaces=("wlan 0",)), "--interface: 'wlan 0' is not the name of a network interface"),
-        (Flags(multicast="239.0.0.1:65500", domain="100"), "--multicast: port 65500 plus domain 100 is beyond 6553"),
-        (Flags(log_level="loud"), "--log-level: 'loud' is not a log level"),
-        (Flags(config="/no/such.toml"), "--config: /no/such.toml: no such file"),
-        (Flags(config="/"), "--config: /: is a directory"),
+        ({"port": "x"}, "--port: 'x' is not a whole number; a port (0: any) is between 0 and 65535"),
+        ({"port": "-1"}, "--port: -1 is out of range"),
+        ({"port": "1_0"}, "--port: '1_0' is not a whole number"),
+        ({"port": "9" * 5000}, "--port: '999"),
+        ({"seed": ("a", "a")}, "--seed: 'a' stands there twice"),
+        ({"seed": (":1",)}, "--seed: ':1' is not HOST:PORT"),
+        ({"seed": ("a:0",)}, "--seed: 'a:0' is not HOST:PORT: 0 is out of range"),
+        ({"seed": ("a b",)}, "--seed: 'a b' is not a host name"),
+        ({"interface": ("wlan 0",)}, "--interface: 'wlan 0' is not the name of a network interface"),
+        ({"multicast": "239.0.0.1:65500", "domain": "100"}, "--multicast: port 65500 plus domain 100 is beyond 6553"),
+        ({"log_level": "loud"}, "--log-level: 'loud' is not a log level"),
+        ({"config": "/no/such.toml"}, "--config: /no/such.toml: no such file"),
+        ({"config": "/"}, "--config: /: is a directory"),
     ],
 )
-def test_each_mistake_in_a_flag_names_the_flag(refuse: Refuse, flags: Flags, message: str) -> None:
-    assert refuse(flags=flags).startswith(message)
+def test_each_mistake_in_a_flag_names_the_flag(refuse: Refuse, options: dict[str, object], message: str) -> None:
+    assert refuse(options=options).startswith(message)
 
 
 @pytest.mark.parametrize(
@@ -506,7 +515,7 @@ def test_where_the_file_is_looked_for(tmp_path: Path) -> None:
     assert find_config_file(str(place("flag.toml")), environ, cwd, []) == tmp_path / "flag.toml"
 
 
-def test_a_place_that_this_user_may_not_look_into_counts_as_empty_and_is_told_of(
+def test_unreadable_directory_counts_as_empty_and_is_noted(
     load: Load, refuse: Refuse, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real = Path.is_file
@@ -521,7 +530,7 @@ def test_a_place_that_this_user_may_not_look_into_counts_as_empty_and_is_told_of
     loaded = load(environ={"HOME": str(home)})
     assert loaded.settings.config_file is None
     assert loaded.notes == (f"{home / '.config/rmpa/rmpa.toml'} is not looked for: Permission denied",)
-    assert f"--config: {home}/rmpa.toml: Permission denied" in refuse(None, flags=Flags(config=f"{home}/rmpa.toml"))
+    assert f"--config: {home}/rmpa.toml: Permission denied" in refuse(None, options={"config": f"{home}/rmpa.toml"})
     assert "~nobody_of_that_name/rmpa.toml: there is no such home" in refuse(
         None, environ={"RMPA_CONFIG": "~nobody_of_that_name/rmpa.toml"}
     )
@@ -571,7 +580,7 @@ def test_limits_come_from_variables_too_and_are_positive(load: Load, refuse: Ref
     assert "did you mean limits.nodes?" in refuse("[limits]\nnode = 1")
 
 
-def test_more_followed_parameters_than_their_limit_are_refused_with_it(load: Load, refuse: Refuse) -> None:
+def test_too_many_followed_parameters_are_refused(load: Load, refuse: Refuse) -> None:
     rules = "".join(f'[[param]]\nkey = "/a{n}"\nfrom = "arm"\n' for n in range(3))
     assert "3 rules, more than limits.params = 2; raise that" in refuse(f"{rules}[limits]\nparams = 2\n")
     assert len(load(f"{rules}[limits]\nparams = 3\n").settings.params.follow) == 3

@@ -328,12 +328,12 @@ class Model:
         assert box._data_bytes == counted
         assert box.pending_bytes == committed + urgent + counted + others
         assert counted <= max(self.max_bytes, self.newest)
-        assert set(box._flows) == set(self.flows), "a key without entries is forgotten"
+        assert set(box._queues) == set(self.flows), "a key without entries is forgotten"
         for key, flow in self.flows.items():
             assert box.waiting(key) == len(flow)
-            assert box._flows[key].size == sum(e.held for e in flow if e.counts)
+            assert box._queues[key].size == sum(e.held for e in flow if e.counts)
         ready = sorted(key for key, flow in self.flows.items() if flow[0].held)
-        assert sorted(box._turns) == ready == sorted(self.served)
+        assert sorted(box._round_robin) == ready == sorted(self.served)
         assert bool(box) == bool(committed or self.urgent or ready)
         assert box.pending_entries == len(box._committed) + len(self.urgent) + len(waiting)
         assert box.waiting_entries == sum(not entry.pinned for entry in waiting)

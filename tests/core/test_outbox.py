@@ -82,7 +82,7 @@ def test_what_is_dropped_is_freed() -> None:
     box.push(b"in front", 99)
     for _ in range(10_000):
         box.push(bytes(100), 1)
-    assert sum(p.held for f in box._flows.values() for p in f.parcels) == box.pending_bytes == 1008
+    assert sum(p.held for f in box._queues.values() for p in f.messages) == box.pending_bytes == 1008
     assert box.pending_entries == 11
 
 
@@ -153,7 +153,7 @@ def test_messages_of_several_keys_take_turns() -> None:
     assert drain(box) == b"now 10 20 30 11 21 31 12 22 32 "
 
 
-def test_a_large_message_leaves_in_fragments_and_a_small_one_between_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_small_message_is_sent_between_fragments(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "COMMIT_BYTES", 1)  # nothing is prepared beyond what leaves
     box = framed()
     large = QueuedMessage(1, 10)
@@ -165,7 +165,7 @@ def test_a_large_message_leaves_in_fragments_and_a_small_one_between_them(monkey
     assert large.sent == large.size
 
 
-def test_what_comes_while_it_leaves_follows_and_a_parcel_without_bytes_holds_nobody_up() -> None:
+def test_message_without_bytes_does_not_block_others() -> None:
     box = framed()
     growing = QueuedMessage(1, 9)
     box.extend(growing, b"abc")
@@ -181,7 +181,7 @@ def test_what_comes_while_it_leaves_follows_and_a_parcel_without_bytes_holds_nob
         box.extend(growing, growing_rest + b"j")
 
 
-def test_bytes_of_a_message_behind_which_another_was_queued_are_never_put_in_front_of_it() -> None:
+def test_later_bytes_of_a_message_stay_behind_its_first() -> None:
     """A leg sends the parts of one message in one go; this is what keeps the model honest."""
     box = framed()
     growing = QueuedMessage(1, 6)
@@ -191,7 +191,7 @@ def test_bytes_of_a_message_behind_which_another_was_queued_are_never_put_in_fro
     assert drain(box) == b"<1:4F>abcd<1:2L>efnext"
 
 
-def test_a_parcel_in_many_small_pieces_leaves_in_as_few_fragments_as_there_can_be() -> None:
+def test_small_pieces_are_joined_into_full_fragments() -> None:
     box = framed()
     parcel = QueuedMessage(1, 10)
     for byte in b"0123456789":
@@ -289,7 +289,7 @@ def test_marks_are_never_dropped_and_push_nothing_out() -> None:
 # --- terms of a key -----------------------------------------------------------------------------------------------
 
 
-def test_what_is_too_old_gives_way_to_what_is_newer_and_the_newest_leaves_however_old() -> None:
+def test_expired_entries_are_dropped_but_the_newest_is_sent() -> None:
     box = Outbox(10, 1000)
     box.set_terms(1, 10, 0.5)
     for tenth in range(4):
@@ -341,7 +341,7 @@ def test_terms_hold_for_what_waits_already_and_end_with_the_route() -> None:
 # --- another connection -------------------------------------------------------------------------------------------
 
 
-def test_a_lost_connection_takes_what_was_begun_and_leaves_the_rest_for_the_next(
+def test_reset_drops_begun_entries_and_keeps_the_rest(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(limits, "COMMIT_BYTES", 1)
@@ -420,10 +420,10 @@ class AgainstModel(RuleBasedStateMachine):
     @invariant()
     def bounds_hold(self) -> None:
         assert self.box._data_bytes <= max(BYTES, self.newest)
-        assert all(0 < len(f.parcels) <= ENTRIES for f in self.box._flows.values())
-        assert all(f.size == sum(p.held for p in f.parcels if not p.sent) for f in self.box._flows.values())
+        assert all(0 < len(f.messages) <= ENTRIES for f in self.box._queues.values())
+        assert all(f.size == sum(p.held for p in f.messages if not p.sent) for f in self.box._queues.values())
         assert bool(self.box) == bool(self.box.pending_bytes)
-        assert sorted(self.box._turns) == sorted(k for k, f in self.box._flows.items() if f.turning)
+        assert sorted(self.box._round_robin) == sorted(k for k, f in self.box._queues.items() if f.scheduled)
 
     def teardown(self) -> None:
         self.wire += drain(self.box)

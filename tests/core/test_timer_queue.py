@@ -18,7 +18,7 @@ def test_the_first_is_known_and_what_is_due_comes_in_order() -> None:
     assert (table.next(), len(table)) == (9.0, 1)
 
 
-def test_one_that_is_moved_or_cancelled_is_due_when_it_was_said_last() -> None:
+def test_moved_or_cancelled_key_is_due_at_its_last_time() -> None:
     table: TimerQueue[int] = TimerQueue()
     for at in (5.0, 1.0, 3.0, 3.0):
         table.set(1, at)
@@ -31,7 +31,7 @@ def test_one_that_is_moved_or_cancelled_is_due_when_it_was_said_last() -> None:
     assert table.take(3.0) == [1]
 
 
-def test_it_says_what_a_list_of_all_would_and_keeps_no_more_than_a_few_times_as_much() -> None:
+def test_queue_agrees_with_a_list_and_stays_small() -> None:
     rng = random.Random(5)
     table: TimerQueue[int] = TimerQueue()
     plain: dict[int, float] = {}

@@ -16,7 +16,7 @@ def test_a_burst_then_the_rate_and_after_a_rest_a_burst_again() -> None:
     assert [bucket.take(60.0) for _ in range(4)] == [True, True, True, False]
 
 
-def test_what_is_put_back_may_be_taken_again_and_is_no_more_than_a_burst() -> None:
+def test_returned_token_can_be_taken_again_up_to_the_burst() -> None:
     bucket = TokenBucket(rate=1, burst=2)
     assert bucket.take(0.0)
     assert bucket.take(0.0)

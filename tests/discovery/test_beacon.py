@@ -45,11 +45,11 @@ def test_text_is_short_and_safe() -> None:
 
 
 def test_where_gossiped_peers_are_heard_follows_if_it_is_said() -> None:
-    elsewhere = replace(BEACON, elsewhere=(("192.168.7.3", 40003), ("10.9.0.2", 1)))
+    observed = replace(BEACON, observed=(("192.168.7.3", 40003), ("10.9.0.2", 1)))
     wire = GOLDEN + bytes.fromhex("02 c0a807039c43 0a0900020001")
-    assert elsewhere.serialize() == wire
-    assert Beacon.parse(wire, 5) == elsewhere
-    assert Beacon.parse(wire + b"later", 5) == elsewhere
+    assert observed.serialize() == wire
+    assert Beacon.parse(wire, 5) == observed
+    assert Beacon.parse(wire + b"later", 5) == observed
     for length in range(len(GOLDEN) + 1, len(wire)):
         with pytest.raises(BeaconMalformed):
             Beacon.parse(wire[:length], 5)
@@ -91,7 +91,7 @@ def test_another_domain_is_told_first() -> None:
         Beacon.parse(GOLDEN[:4] + b"\x02" + GOLDEN[5:8], 6)
 
 
-def test_another_version_is_told_from_eight_bytes_and_says_what_to_do() -> None:
+def test_other_version_is_recognised_by_eight_bytes() -> None:
     with pytest.raises(
         BeaconOtherVersion, match="speaks version 2 of the protocol, we speak 1: update the older one"
     ):
@@ -133,8 +133,8 @@ def test_malformed(offset: int, replacement: bytes, problem: str) -> None:
         {"lease_ms": 1 << 32},
         {"sequence": 1 << 32},
         {"gossip": (Guid.of("10.0.0.1", 1),) * 65},
-        {"elsewhere": (("10.0.0.1", 1),) * 65},
-        {"elsewhere": (("224.0.0.1", 1),)},
+        {"observed": (("10.0.0.1", 1),) * 65},
+        {"observed": (("224.0.0.1", 1),)},
     ],
 )
 def test_what_cannot_be_written_is_not_made(change: dict[str, object]) -> None:

@@ -7,31 +7,20 @@ from pathlib import Path
 
 from rmpa.bridge.messages import OpenRoute, decode, encode
 from rmpa.bridge.naming import PeerNames
-from rmpa.config import limits, values
-from rmpa.config.contract_rules import read_contracts, read_duration, read_rate
-from rmpa.config.file import known_keys, parse_config
-from rmpa.config.param_rules import overlap, read_follow_rules, untouchable
-from rmpa.config.peer_rules import read_peers
+from rmpa.config import limits
+from rmpa.config.contract_rules import CONTRACT_RULES
+from rmpa.config.file import SCHEMAS, parse_config
+from rmpa.config.param_rules import PARAM_RULES, overlap, untouchable
+from rmpa.config.peer_rules import PEER_RULES
+from rmpa.config.quantities import read_duration, read_rate
+from rmpa.config.settings import SETTINGS
+from rmpa.config.values import BadValue
 from rmpa.core.contract import Contracts
 from rmpa.core.errors import ConfigError
 from rmpa.core.names import is_global_name
 
 _EXAMPLE = Path(__file__).parents[2] / "examples" / "rmpa.toml"
-_READERS = (
-    values.read_name,
-    values.read_bool,
-    values.read_domain,
-    values.read_port_or_any,
-    values.read_level,
-    values.read_host_port,
-    values.read_interface,
-    values.read_multicast,
-    values.read_topic_glob,
-    values.read_type_glob,
-    lambda raw: values.read_list(raw, values.read_host_port),
-    read_duration,
-    read_rate,
-)
+_READERS = (*(s.type.read for s in SETTINGS if not s.is_list_of_tables), read_duration, read_rate)
 
 SEEDS: list[bytes] = [
     b"".join(line for line in _EXAMPLE.read_bytes().splitlines(keepends=True) if not line.startswith(b"#")),
@@ -72,8 +61,8 @@ def fuzz(data: bytes) -> None:
         rules = found.pop(("contract",), [])
         _check_follow_rules(found.pop(("param",), []))
         _check_peers(found.pop(("peer",), []))
-        if not set(found) <= set(known_keys()):
-            raise AssertionError(f"unknown keys came through: {set(found) - set(known_keys())}")
+        if not set(found) <= set(SCHEMAS):
+            raise AssertionError(f"unknown keys came through: {set(found) - set(SCHEMAS)}")
         _check_contracts(rules)
     except ConfigError as error:
         if error.line is not None and not 1 <= error.line <= data.count(b"\n") + 1:
@@ -81,15 +70,15 @@ def fuzz(data: bytes) -> None:
         str(error)
     text = data[:200].decode("utf-8", "replace")
     for read in _READERS:
-        with contextlib.suppress(values.BadValue):
+        with contextlib.suppress(BadValue):
             read(text)
 
 
 def _check_follow_rules(raw: object) -> None:
     """Rules of which no two touch each other, or a BadValue that says where."""
     try:
-        rules = read_follow_rules(raw)
-    except values.BadValue as error:
+        rules = PARAM_RULES.read(raw)
+    except BadValue as error:
         if error.at == () and isinstance(raw, list) and len(raw) <= limits.FOLLOW_RULES_MAX:
             raise AssertionError("a wrong rule, but nothing says which") from error
         return
@@ -101,13 +90,13 @@ def _check_follow_rules(raw: object) -> None:
 def _check_peers(raw: object) -> None:
     """Rules that make names of names, never two of one list the same, or a BadValue that says where."""
     try:
-        read = read_peers(raw)
-    except values.BadValue as error:
+        rules = PEER_RULES.read(raw)
+    except BadValue as error:
         if not error.at or not isinstance(error.at[0], int):
             raise AssertionError(f"a wrong peer, but nothing says which: {error.at}") from error
         return
     for peer in ("robot1", "base", "r"):
-        names = PeerNames(peer, read.rules)
+        names = PeerNames(peer, rules)
         for way in (names.local_name, names.wire_name):
             for name in ("/a", "/a/b", "/arm/joints", "/tf", "/robot1/odom"):
                 if not is_global_name(way(name)):
@@ -117,12 +106,12 @@ def _check_peers(raw: object) -> None:
 def _check_contracts(raw: object) -> None:
     """Rules, or a BadValue that says where; what they come to is what a peer would take for a contract."""
     try:
-        read = read_contracts(raw)
-    except values.BadValue as error:
+        rules = CONTRACT_RULES.read(raw)
+    except BadValue as error:
         if not error.at or not isinstance(error.at[0], int):
             raise AssertionError(f"a wrong contract, but nothing says which: {error.at}") from error
         return
-    contracts = Contracts(read.rules)
+    contracts = Contracts(rules)
     for topic, type_name in (("/a/b", "a/B"), ("/cmd_vel", "geometry_msgs/Twist"), ("/map", "*"), ("/a", "")):
         contract = contracts.of(topic, type_name)
         message = OpenRoute(7, topic, "/n", contract)

@@ -107,7 +107,7 @@ def test_forged_beacons_from_another_host(modules: ModuleFactory, lab: Lab) -> N
     siege.held()
     for module in siege.both:
         snapshot = siege.snapshot(module)
-        assert len(snapshot.peers) <= limits.ROSTER_PEERS_MAX
+        assert len(snapshot.peers) <= limits.PEERS_MAX
         for refused in ("beacon.malformed", "beacon.version", "beacon.other_domain", "roster.full"):
             assert snapshot.counters.get(refused, 0) > 0, snapshot.counters
     # A real peer that comes now finds the rosters full of forgeries, and is linked all the same.

@@ -8,7 +8,7 @@ import signal
 import struct
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import pytest
 
@@ -16,7 +16,10 @@ from lab.bed.processes import eventually
 from rmpa.bridge.actions import Describe, Publish
 from rmpa.bridge.messages import Description as About
 from rmpa.bridge.messages import Source
-from rmpa.bridge.topics.io.proxies import PeerProxies
+from rmpa.bridge.session.peer_proxies import PeerProxies
+from rmpa.bridge.session.peer_session import PeerSession
+from rmpa.bridge.session.proxy_nodes import ProxyNodes
+from rmpa.bridge.topics.io.peer_topics import PeerTopics
 from rmpa.core.contract import Contract
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.ros.core.embedded import RosCore
@@ -35,6 +38,7 @@ if TYPE_CHECKING:
 
     from lab.bed.agents import Agent
     from lab.bed.processes import Process
+    from rmpa.mesh.io.link import PeerLink
     from tests.interop.conftest import AgentFactory, ShellFactory
     from tests.interop.ros import Ros
 
@@ -176,8 +180,7 @@ async def test_listeners_follow_a_remote_publisher_with_a_new_header(
     core: RosCore, ros: Ros, library: str, closing: AsyncExitStack
 ) -> None:
     """They are promised another definition by hanging up; rospy comes again only if the master names the proxy."""
-    inbound, listener = await proxied(core, ros.node(library, "listener", each=True))
-    closing.push_async_callback(inbound.close)
+    inbound, listener = await proxied(core, ros.node(library, "listener", each=True), closing)
     for route, latching in ((1, False), (2, True)):
         describe(inbound, route, latching=latching)
         await heard(inbound, route, listener, str(route))
@@ -189,8 +192,7 @@ async def test_listeners_cut_off_within_a_message_come_back(
     core: RosCore, ros: Ros, library: str, closing: AsyncExitStack
 ) -> None:
     """A remote publisher was killed in the middle of an image: TCPROS cannot take half of it back."""
-    inbound, listener = await proxied(core, ros.node(library, "listener", each=True))
-    closing.push_async_callback(inbound.close)
+    inbound, listener = await proxied(core, ros.node(library, "listener", each=True), closing)
     describe(inbound, 1)
     sequence = await heard(inbound, 1, listener, "1")
     publication = inbound.publication(SOURCE)
@@ -213,21 +215,24 @@ async def test_listeners_cut_off_within_a_message_come_back(
 SOURCE = Source("/chatter", "/speaker")
 
 
-async def proxied(core: RosCore, listener: Process) -> tuple[PeerProxies, Process]:
+async def proxied(core: RosCore, listener: Process, closing: AsyncExitStack) -> tuple[PeerTopics, Process]:
     """A peer's side with one source, and a listener of that source that is connected to its proxy."""
-    inbound = PeerProxies(
+    proxies = PeerProxies("/rmpa/peer", ProxyNodes(core))
+    closing.push_async_callback(proxies.close)
+    inbound = PeerTopics(
         core,
-        "/rmpa/peer",
+        PeerSession(1, cast("PeerLink", None), proxies),
         on_demand=lambda _s, _w: None,
         on_mismatch=lambda _s, _c, _t: None,
         on_occurred=lambda _s, _o: None,
     )
+    closing.callback(inbound.close)
     inbound.publish(Publish(1, SOURCE, BYTES))
     await until(lambda: (p := inbound.publication(SOURCE)) is not None and p.subscribers)
     return inbound, listener
 
 
-def describe(inbound: PeerProxies, route: int, *, latching: bool = False) -> None:
+def describe(inbound: PeerTopics, route: int, *, latching: bool = False) -> None:
     """A route of the source is open."""
     kind = MessageType(BYTES)
     about = About(BYTES, kind.md5sum, kind.definition, latching)
@@ -235,7 +240,7 @@ def describe(inbound: PeerProxies, route: int, *, latching: bool = False) -> Non
 
 
 async def heard(
-    inbound: PeerProxies, route: int, listener: Process, source: str, *, first: int = 1, after: int = 0
+    inbound: PeerTopics, route: int, listener: Process, source: str, *, first: int = 1, after: int = 0
 ) -> int:
     """Send messages on a route until the listener has heard one; return the last one's number."""
     sequence = first - 1

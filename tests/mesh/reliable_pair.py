@@ -1,4 +1,4 @@
-"""A reliable sender and receiver with a link between them that falls, and a plain model of what must come of it.
+"""A reliable sender and receiver with a link between them that falls, and a plain model of the right result.
 
 Every payload begins with the number of the message as it was published, so that what was delivered, lost or doubled
 is read from the payloads alone, whatever the sequences say.
@@ -17,18 +17,18 @@ MASK = 0xFFFFFFFF
 
 
 def payload(number: int, size: int = 0) -> bytes:
-    """A message that says its number."""
+    """A message that holds its number."""
     return number.to_bytes(4, "big") + bytes(size)
 
 
 def number_of(data: bytes) -> int:
-    """The number that a message says."""
+    """The number in a message."""
     return int.from_bytes(data[:4], "big")
 
 
 @dataclass(frozen=True)
 class Fragment:
-    """A piece of a message under way."""
+    """A piece of a message in flight."""
 
     epoch: int
     message: Outgoing
@@ -38,7 +38,7 @@ class Fragment:
 
 @dataclass(frozen=True)
 class Bounds:
-    """What a sender is made with."""
+    """The bounds of a sender."""
 
     depth: int = 8
     max_bytes: int = 400
@@ -53,7 +53,7 @@ class Bounds:
 
 
 class Pair:
-    """Both machines, what is under way between them, and the model.
+    """Both machines, what is in flight between them, and the model.
 
     Args:
         bounds: Of the sender, and of those that follow it.

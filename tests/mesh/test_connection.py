@@ -1,4 +1,4 @@
-"""Two link machines back to back."""
+"""Two connection machines back to back."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_handshake_control_data_and_bye_in_pieces(chunk: int) -> None:
     assert dialler.link.state is ConnectionState.CLOSING
     deliver(dialler.link.take_output(), acceptor.link, time.now, chunk)
     assert acceptor.last() == ConnectionClosed("low left: shutting down", orderly=True)
-    dialler.link.drained()
+    dialler.link.lost("the other side closed the connection")
     assert dialler.last() == ConnectionClosed("shutting down", orderly=True)
 
 
@@ -85,7 +85,7 @@ def test_a_refusal_reaches_the_dialler_and_both_end() -> None:
         Refused(refuse, by_us=False),
         ConnectionClosed("? refused: busy: come later", orderly=True),
     ]
-    acceptor.link.drained()
+    acceptor.link.lost("the other side closed the connection")
     assert acceptor.last() == ConnectionClosed("refused: busy: come later", orderly=True)
 
 
@@ -188,7 +188,7 @@ def test_a_length_is_refused_before_its_bytes_come(kind: FrameKind) -> None:
         acceptor.link.receive(memoryview(header), time.now)
 
 
-def test_keepalive_holds_an_idle_link_for_ever_and_its_clock_is_known() -> None:
+def test_keepalive_holds_an_idle_link() -> None:
     time = Time()
     dialler, acceptor = pair(time)
     pings = 0
@@ -237,7 +237,7 @@ def test_a_pause_of_our_own_is_no_silence_of_the_others() -> None:
     assert not is_up(dialler), "what was excused is over with the next word"
 
 
-def test_the_reason_names_the_lease_and_our_own_pause_apart() -> None:
+def test_reason_names_lease_and_pause() -> None:
     time = Time()
     dialler, _ = pair(time, lease=2.0)
     pass_time(dialler.link, time, 0.3)
@@ -249,7 +249,7 @@ def test_the_reason_names_the_lease_and_our_own_pause_apart() -> None:
     assert "silent for its lease of 2 s, our own pauses of 1." in closed.reason
 
 
-def test_a_peer_that_died_in_our_pause_is_given_up_within_its_lease() -> None:
+def test_peer_that_died_in_a_pause_is_given_up_within_its_lease() -> None:
     time = Time()
     dialler, _ = pair(time)
     time.now += 60.0
@@ -288,7 +288,7 @@ def test_a_pong_that_answers_nothing_is_ignored() -> None:
     assert dialler.link.clock.estimate(time.now) == before
 
 
-def test_what_comes_while_leaving_is_ignored_and_the_drain_ends_in_time() -> None:
+def test_frames_are_ignored_while_closing() -> None:
     time = Time()
     dialler, acceptor = pair(time)
     dialler.link.close("done", time.now)
@@ -309,7 +309,7 @@ def test_the_driver_loses_the_connection() -> None:
     assert sum(isinstance(e, ConnectionClosed) for e in dialler.events) == 1
 
 
-def test_closing_from_within_the_data_callback_stops_the_reading() -> None:
+def test_close_within_the_data_callback_stops_reading() -> None:
     time = Time()
     _, acceptor = pair(time)
     got: list[int] = []
@@ -379,7 +379,7 @@ def test_identity_of_the_other_side_comes_with_the_hello() -> None:
 
 
 @pytest.mark.parametrize("one_way", [0.05, 0.6, 1.4])
-def test_a_link_with_a_long_round_trip_comes_up_and_stays(one_way: float) -> None:
+def test_link_with_a_long_round_trip_stays_up(one_way: float) -> None:
     """Where a foreign flow fills a slow radio's queue: each side hears the other steadily, only late."""
     time = Time()
     dialler = side(ConnectionRole.DIALLER, LOW, time, expected=HIGH.guid)

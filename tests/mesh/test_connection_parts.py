@@ -1,4 +1,4 @@
-"""Messages in parts, marks between them, and what a bulk lane's machine does otherwise."""
+"""Messages in parts, marks between them, and how a bulk lane's machine differs."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def fragments(route: int, sequence: int, payload: bytes, sizes: list[int]) -> li
 
 
 @pytest.mark.parametrize("chunk", [1, 7, 24, 25, 4096, 1 << 20])
-def test_fragments_of_several_routes_in_turn_and_in_pieces(chunk: int) -> None:
+def test_fragments_of_several_routes_interleave(chunk: int) -> None:
     time = Time()
     _, acceptor = pair(time)
     one, two = bytes(range(256)) * 4, b"two" * 300
@@ -72,7 +72,7 @@ def test_a_large_frame_is_handed_on_while_it_arrives(flags: int, chunk: int) -> 
     assert acceptor.last() == ControlReceived(b"{}"), "the next frame begins behind it"
 
 
-def test_a_frame_up_to_the_bound_comes_in_one_piece_however_it_arrives() -> None:
+def test_short_frame_is_delivered_whole() -> None:
     time = Time()
     _, acceptor = pair(time)
     payload = bytes(core_limits.CUT_THROUGH_BYTES)
@@ -81,7 +81,7 @@ def test_a_frame_up_to_the_bound_comes_in_one_piece_however_it_arrives() -> None
     assert acceptor.parts == []
 
 
-def test_a_header_alone_says_how_much_is_awaited_and_hands_nothing_on() -> None:
+def test_header_alone_delivers_nothing() -> None:
     time = Time()
     _, acceptor = pair(time)
     for size in (100, limits.DATA_PAYLOAD_MAX):
@@ -116,7 +116,7 @@ def test_an_abort_that_is_none_ends_the_link(flags: int) -> None:
 
 @pytest.mark.parametrize("size", [limits.DATA_PAYLOAD_MAX + 1, 0xFFFFFFFF])
 @pytest.mark.parametrize("flags", [0, FIRST, LAST, WHOLE, LAST | ABORT])
-def test_a_frame_that_is_too_long_is_refused_before_its_bytes_come(size: int, flags: int) -> None:
+def test_too_long_frame_is_refused_by_its_header(size: int, flags: int) -> None:
     time = Time()
     _, acceptor = pair(time)
     header = size.to_bytes(4, "big") + bytes([FrameKind.DATA, flags]) + bytes(18)
@@ -148,7 +148,7 @@ def test_closing_from_within_a_part_stops_the_reading() -> None:
     assert acceptor.data == []
 
 
-def test_the_rest_of_a_frame_that_was_begun_is_dropped_while_leaving() -> None:
+def test_rest_of_a_begun_frame_is_dropped_while_closing() -> None:
     time = Time()
     _, acceptor = pair(time)
     wire = pack_data_header(200_000, 1, 1, 0) + bytes(200_000)
@@ -158,7 +158,7 @@ def test_the_rest_of_a_frame_that_was_begun_is_dropped_while_leaving() -> None:
     assert len(acceptor.parts) == 1
 
 
-def test_a_half_read_frame_keeps_the_link_no_longer_than_its_bytes_come() -> None:
+def test_half_read_frame_renews_the_lease_only_with_bytes() -> None:
     time = Time()
     _, acceptor = pair(time)
     acceptor.link.receive(memoryview(pack_data_header(200_000, 1, 1, 0) + bytes(1000)), time.now)
@@ -197,7 +197,7 @@ def test_a_mark_has_no_bytes(kind: FrameKind) -> None:
         acceptor.link.receive(memoryview(bytes([0, 0, 0, 1, kind, 3]) + bytes(18)), time.now)
 
 
-def test_a_bulk_lane_says_what_it_is_and_promises_its_own_lease() -> None:
+def test_bulk_lane_has_its_own_lease() -> None:
     time = Time()
     dialler, acceptor = pair(time, lane=Lane.BULK, lease=limits.BULK_LEASE)
     hello = next(e.hello for e in acceptor.events if isinstance(e, HelloReceived))
@@ -206,7 +206,7 @@ def test_a_bulk_lane_says_what_it_is_and_promises_its_own_lease() -> None:
     assert hello.lease == welcome.lease == limits.BULK_LEASE
 
 
-def test_an_acceptor_promises_for_a_bulk_lane_what_bulk_lanes_have() -> None:
+def test_acceptor_promises_the_bulk_lease() -> None:
     time = Time()
     dialler = side(ConnectionRole.DIALLER, LOW, time, expected=HIGH.guid, lease=limits.BULK_LEASE, lane=Lane.BULK)
     acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time, lease=limits.LINK_LEASE)

@@ -81,7 +81,7 @@ def test_the_sequence_wraps() -> None:
 
 
 @pytest.mark.parametrize("kind", list(FrameKind))
-def test_lengths_are_limited_by_kind_from_the_header_alone(kind: FrameKind) -> None:
+def test_header_alone_limits_the_length_by_kind(kind: FrameKind) -> None:
     header = (PAYLOAD_MAX[kind] + 1).to_bytes(4, "big") + bytes([kind, 3]) + bytes(18)
     with pytest.raises(LimitExceeded, match=kind.name.lower()):
         Frame.parse(header)
@@ -126,7 +126,7 @@ def test_flags_of_a_later_version_are_ignored(flags: int) -> None:
         check_header(1, FrameKind.DATA, own | flags)
 
 
-def test_the_longest_fragment_that_is_sent_is_read_and_one_byte_more_than_may_be_is_not() -> None:
+def test_fragment_length_is_bounded() -> None:
     check_header(core_limits.FRAGMENT_BYTES, FrameKind.DATA, 0)
     check_header(limits.DATA_PAYLOAD_MAX, FrameKind.DATA, WHOLE)
     with pytest.raises(LimitExceeded, match="data"):

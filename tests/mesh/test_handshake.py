@@ -1,4 +1,4 @@
-"""Hello, welcome, refuse: golden bytes, malformed, and every reason to say no."""
+"""Hello, welcome, refuse: golden bytes, malformed, and every reason to refuse."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_every_shorter_hello_is_malformed(cut: int) -> None:
     assert caught.value.refuse.code == Refusal.MALFORMED
 
 
-def test_another_version_is_told_from_garbage_whatever_follows() -> None:
+def test_other_version_is_distinguished_from_garbage() -> None:
     with pytest.raises(HandshakeError, match="same release") as caught:
         Hello.parse(b"RMPA\x02\x01\x00\x00")
     assert caught.value.refuse.code == Refusal.VERSION
@@ -92,7 +92,7 @@ def test_refused(hello: Hello, links: list[KnownLink], code: Refusal, advice: st
 
 @pytest.mark.parametrize("dialled", [False, True])
 @pytest.mark.parametrize("alive", [False, True])
-def test_a_bulk_lane_is_welcome_beside_its_express_lane_whoever_dialled_that(dialled: bool, alive: bool) -> None:
+def test_bulk_lane_is_accepted_beside_its_express_lane(dialled: bool, alive: bool) -> None:
     there = KnownLink(LOW.guid, LOW.instance, dialled=dialled, alive=alive)
     assert judge(replace(hello_of(LOW), lane=Lane.BULK), HIGH, [there]) is None
     assert judge(replace(hello_of(LOW), lane=Lane.BULK), HIGH, [there], busy=True) is None
@@ -137,7 +137,7 @@ def test_the_answer_is_judged_too() -> None:
 
 
 @pytest.mark.parametrize("place", ["0.0.0.0:0", "0.1.2.3:40001", "224.0.0.1:40001", "240.0.0.1:1", "10.0.0.1:0"])
-def test_a_guid_where_nobody_can_be_reached_is_malformed(place: str) -> None:
+def test_unreachable_guid_is_malformed(place: str) -> None:
     """Discovery gossips the GUIDs of its links; one that no beacon may carry stopped all its beacons."""
     with pytest.raises(HandshakeError, match="no peer can be reached") as caught:
         Hello.parse(replace(HELLO, guid=Guid.parse(place)).serialize())

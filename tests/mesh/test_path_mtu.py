@@ -17,7 +17,7 @@ HOST = "10.0.0.2"
 
 
 class Lane:
-    """A connection whose data stands still, looked at from time to time."""
+    """A connection whose data stalls, sampled from time to time."""
 
     def __init__(self, segment: int | None = None, **changes: float) -> None:
         self.now = 100.0
@@ -35,7 +35,7 @@ class Lane:
         return self.watch.look(self.sample, self.now)
 
 
-def test_large_segments_that_are_lost_while_a_small_packet_passes_are_a_black_hole() -> None:
+def test_lost_large_segments_are_a_black_hole() -> None:
     lane = Lane()
     assert lane.look(0.1, 0) is Progress.FLOWING
     assert lane.look(0.15, 1) is Progress.WAITING
@@ -49,7 +49,7 @@ def test_large_segments_that_are_lost_while_a_small_packet_passes_are_a_black_ho
     assert lane.now - 100.0 < limits.LINK_LEASE
 
 
-def test_without_an_answer_to_a_small_packet_nothing_is_said_of_the_path() -> None:
+def test_unanswered_probe_proves_nothing() -> None:
     lane = Lane()
     for retransmits in range(1, 8):
         assert lane.look(0.4, retransmits) is Progress.STALLED
@@ -69,7 +69,7 @@ def test_a_cable_that_is_in_again_is_no_black_hole() -> None:
     assert lane.look(0.35, 1, queued=9000) is Progress.STALLED, "a later stall needs a proof of its own"
 
 
-def test_an_acknowledgement_that_takes_long_is_waited_for() -> None:
+def test_slow_acknowledgement_is_awaited() -> None:
     lane = Lane(rtt=0.4)
     lane.look(0.5, 1)
     lane.watch.small_passed()
@@ -78,14 +78,14 @@ def test_an_acknowledgement_that_takes_long_is_waited_for() -> None:
     assert lane.look(0.2, 2) is Progress.BLACK_HOLE
 
 
-def test_where_large_segments_have_passed_it_is_not_their_size() -> None:
+def test_passed_large_segments_rule_out_a_black_hole() -> None:
     lane = Lane()
     lane.look(0.1, 0, acked=139 + 100 * 1448, delivered=104)
     for retransmits in range(1, 5):
         assert lane.look(0.5, retransmits) is Progress.WAITING
 
 
-def test_small_messages_that_passed_say_nothing_of_large_ones() -> None:
+def test_passed_small_segments_prove_nothing() -> None:
     lane = Lane()
     lane.look(0.1, 0, acked=139 + 100 * 200, delivered=104)
     assert lane.look(0.5, 1) is Progress.STALLED
@@ -97,7 +97,7 @@ def test_little_data_that_stands_still_is_no_sign() -> None:
 
 
 def test_a_window_that_is_closed_is_no_sign() -> None:
-    """A stopped peer: its kernel acknowledges what it took, and nothing is repeated."""
+    """A stopped peer: its kernel acknowledges what it took, and nothing is retransmitted."""
     lane = Lane()
     for _ in range(20):
         assert lane.look(0.5, 0) is Progress.FLOWING
@@ -164,14 +164,14 @@ def test_smaller_segments_that_arrive_are_news_once() -> None:
     assert str(problem) == f"{problem.text}; {problem.remedy}"
 
 
-def test_a_connection_outlives_what_is_remembered() -> None:
+def test_connection_outlives_the_remembered_path() -> None:
     table = PathTable()
     problem = table.problem(HOST, FIRST, 0.0)
     assert problem is not None
     assert "1252 bytes" in problem.text
 
 
-def test_further_connections_take_what_is_known() -> None:
+def test_further_connections_use_the_known_size() -> None:
     table = PathTable()
     table.black_hole(HOST, None, 0.0)
     assert table.black_hole(HOST, None, 0.1) is PathState.TRYING, "the other lane, or another agent of that host"
@@ -180,7 +180,7 @@ def test_further_connections_take_what_is_known() -> None:
     assert table.segment(HOST, 1.1) == LEAST
 
 
-def test_where_nothing_helps_large_packets_are_sent_again() -> None:
+def test_large_packets_return_where_nothing_helps() -> None:
     table = PathTable()
     for segment in (None, FIRST):
         table.black_hole(HOST, segment, 0.0)

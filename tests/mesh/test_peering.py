@@ -1,4 +1,4 @@
-"""Who dials whom, when, and which of two links stays."""
+"""Which side dials, when, and which of two links stays."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def until_dial(peering: Peering, now: float) -> tuple[float, tuple[str, int]]:
     return now, made[0]
 
 
-def test_the_lower_dials_at_once_and_the_higher_after_a_while() -> None:
+def test_higher_guid_dials_later() -> None:
     low, high = of(LOW), of(HIGH)
     low.peer_found(HIGH, 0.0)
     high.peer_found(LOW, 0.0)
@@ -46,7 +46,7 @@ def test_the_lower_dials_at_once_and_the_higher_after_a_while() -> None:
     assert until_dial(high, 0.0) == (limits.DIAL_FALLBACK, LOW.guid.endpoint)
 
 
-def test_all_addresses_at_once_the_beacons_source_first_then_a_growing_pause() -> None:
+def test_all_addresses_are_dialled_before_a_pause() -> None:
     low = of(LOW)
     low.peer_found(DUAL, 0.0, source="172.16.0.2")
     now, seen = 0.0, []
@@ -64,7 +64,7 @@ def test_all_addresses_at_once_the_beacons_source_first_then_a_growing_pause() -
     assert (status.state, status.last_error, status.attempts) == ("waiting", "no answer anywhere", 3)
 
 
-def test_somebody_else_at_one_address_leaves_the_others_to_try_at_once() -> None:
+def test_wrong_peer_at_one_address_leaves_the_others() -> None:
     low = of(LOW)
     low.peer_found(DUAL, 0.0)
     stranger, *rest = DUAL.endpoints
@@ -89,7 +89,7 @@ def test_retries_for_ever_with_a_cap() -> None:
     assert pauses[-1] > 0.9 * limits.BACKOFF_MAX
 
 
-def test_a_flapping_link_is_dialled_slower_and_a_stable_one_at_once() -> None:
+def test_flapping_link_is_dialled_slower_than_a_stable_one() -> None:
     low = of(LOW)
     low.peer_found(HIGH, 0.0)
     now, before, pauses = 0.0, 0.0, []
@@ -125,7 +125,7 @@ def test_since_when_a_peer_is_linked_or_not() -> None:
     assert [status.since for status in low.peers()] == [9.0]
 
 
-def test_a_link_from_an_unknown_peer_is_up_and_is_forgotten_a_while_after_it_fell() -> None:
+def test_unannounced_peer_is_forgotten_after_its_link() -> None:
     low = of(LOW)
     low.link_up(7, HIGH, 0.0, dialled=False)
     assert low.take() == [LinkUp(7, HIGH)]
@@ -159,7 +159,7 @@ def test_gone_stops_dialling_but_not_a_live_link() -> None:
 
 
 @pytest.mark.parametrize("code", [Refusal.VERSION, Refusal.DOMAIN, Refusal.DUPLICATE])
-def test_a_no_that_lasts_is_said_once_and_retried_slowly(code: Refusal) -> None:
+def test_lasting_refusal_is_reported_once_and_retried_slowly(code: Refusal) -> None:
     low = of(LOW)
     low.peer_found(HIGH, 0.0)
     now, said = 0.0, 0
@@ -199,7 +199,7 @@ def test_a_new_instance_replaces_its_ghost() -> None:
     assert low.peers()[0].state == "linked"
 
 
-def test_a_new_instance_that_links_before_its_beacon_comes() -> None:
+def test_new_instance_links_before_its_beacon() -> None:
     low = of(LOW, alive=False)
     low.link_up(1, HIGH, 0.0, dialled=False)
     assert low.judge(Hello.of(AGAIN, lease=1.0, expected=None)) is None
@@ -235,14 +235,14 @@ def test_of_one_direction_the_newer_stays() -> None:
 
 def test_invented_identities_do_not_fill_the_memory() -> None:
     low = of(LOW)
-    for i in range(2 * core_limits.ROSTER_PEERS_MAX):
+    for i in range(2 * core_limits.PEERS_MAX):
         stranger = Identity(Guid.of("10.1.0.0", i + 1), i.to_bytes(16, "big"), "x")
         low.link_up(i + 1, stranger, 0.0, dialled=False)
         low.link_down(i + 1, "lost", 0.0)
-    assert len(low.peers()) <= core_limits.ROSTER_PEERS_MAX
+    assert len(low.peers()) <= core_limits.PEERS_MAX
 
 
-def test_ourselves_is_nobody() -> None:
+def test_own_identity_is_no_peer() -> None:
     low = of(LOW)
     low.peer_found(LOW, 0.0)
     low.peer_found(replace(LOW, instance=b"x" * 16), 0.0)
@@ -250,7 +250,7 @@ def test_ourselves_is_nobody() -> None:
 
 
 class Crossing:
-    """Both dial at once; what is under way is delivered in an order that the test chooses.
+    """Both dial at once; what is in flight is delivered in an order that the test chooses.
 
     Link ids are 1 for the lower's call and 2 for the higher's, on both sides. What one side sends on one
     connection stays in order, as TCP keeps it.
@@ -305,7 +305,7 @@ class Crossing:
         self.wires.setdefault((link, to), []).append(what)
 
 
-def test_in_every_order_of_two_calls_the_lower_ones_link_stays() -> None:
+def test_lower_guids_link_stays_in_any_order() -> None:
     todo: list[list[tuple[int, str]]] = [[]]
     ends = 0
     while todo:
@@ -329,7 +329,7 @@ def stranger(number: int) -> Identity:
 
 
 class Network:
-    """Answers the dials of one peering at once: who is there is linked, nobody else answers."""
+    """Answers the dials of one peering at once: existing peers are linked, others do not answer."""
 
     def __init__(self, *there: Identity) -> None:
         self.peering = of(LOW)
@@ -376,7 +376,7 @@ class Network:
 
 
 @pytest.mark.parametrize("count", [100, 512])
-def test_peers_that_never_answer_share_what_all_of_them_may_be_dialled(count: int) -> None:
+def test_silent_peers_share_one_dial_rate(count: int) -> None:
     network = Network()
     network.find(*map(stranger, range(count)))
     first = network.run(60.0) + limits.DIAL_STRANGERS_BURST
@@ -386,7 +386,7 @@ def test_peers_that_never_answer_share_what_all_of_them_may_be_dialled(count: in
     assert 30 * limits.DIAL_STRANGERS_RATE <= network.run(60.0) <= 60 * limits.DIAL_STRANGERS_RATE + 1
 
 
-def test_a_few_peers_that_do_not_answer_are_dialled_as_if_there_were_no_bound() -> None:
+def test_bound_does_not_slow_down_a_few_silent_peers() -> None:
     network = Network()
     network.find(*map(stranger, range(10)))
     network.run(10.0)
@@ -396,7 +396,7 @@ def test_a_few_peers_that_do_not_answer_are_dialled_as_if_there_were_no_bound() 
         assert max(b - a for a, b in itertools.pairwise(at)) <= limits.BACKOFF_MAX
 
 
-def test_a_newcomer_among_many_that_do_not_answer_is_dialled_at_once() -> None:
+def test_new_peer_is_dialled_at_once_among_many_silent_ones() -> None:
     network = Network(HIGH)
     network.find(*map(stranger, range(512)))
     network.run(0.5)
@@ -406,7 +406,7 @@ def test_a_newcomer_among_many_that_do_not_answer_is_dialled_at_once() -> None:
     assert network.first(HIGH) - 0.5 <= 2 / limits.DIAL_STRANGERS_RATE + 1e-6
 
 
-def test_one_that_was_linked_before_is_dialled_as_often_as_ever() -> None:
+def test_verified_peer_is_dialled_without_the_bound() -> None:
     network = Network(HIGH)
     network.find(HIGH)
     network.find(*map(stranger, range(512)))
@@ -420,7 +420,7 @@ def test_one_that_was_linked_before_is_dialled_as_often_as_ever() -> None:
     assert network.linked() == ["high"]
 
 
-def test_invented_peers_that_come_and_go_do_not_keep_one_waiting_for_ever() -> None:
+def test_forged_peers_do_not_starve_a_waiting_one() -> None:
     """Each second a hundred new ones, of which none was dialled; a real one that was not there at first comes up."""
     network = Network()
     network.find(HIGH)

@@ -1,4 +1,4 @@
-"""Reliable delivery: each message once, in order, or counted; whatever becomes of the links."""
+"""Reliable delivery: each message once, in order, or counted as lost, however often links fall."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def numbers(machine: ReliableSender, most: int | None = None) -> list[int]:
 # --- the sender -----------------------------------------------------------------------------------------------
 
 
-def test_messages_are_numbered_from_one_and_sent_in_order() -> None:
+def test_messages_are_numbered_and_sent_in_order() -> None:
     machine = sender()
     machine.offer(b"a", 5)
     machine.offer(b"b", 6)
@@ -47,7 +47,7 @@ def test_messages_are_numbered_from_one_and_sent_in_order() -> None:
     assert (machine.pending, machine.pending_bytes, machine.in_flight) == (2, 2, 2)
 
 
-def test_the_window_bounds_what_is_under_way() -> None:
+def test_window_bounds_messages_in_flight() -> None:
     machine = sender(window=3)
     fill(machine, 5)
     assert numbers(machine) == [0, 1, 2]
@@ -57,7 +57,7 @@ def test_the_window_bounds_what_is_under_way() -> None:
     assert machine.in_flight == 3
 
 
-def test_the_window_counts_bytes_and_lets_one_large_message_through() -> None:
+def test_one_large_message_passes_the_byte_window() -> None:
     machine = sender(window_bytes=100)
     fill(machine, 3, size=36)
     machine.offer(payload(3, 500), 0)
@@ -72,7 +72,7 @@ def test_the_window_counts_bytes_and_lets_one_large_message_through() -> None:
     assert len(machine.take()) == 1
 
 
-def test_acknowledged_messages_are_let_go() -> None:
+def test_acknowledged_messages_are_dropped() -> None:
     machine = sender()
     fill(machine, 5)
     machine.take()
@@ -87,7 +87,7 @@ def test_acknowledged_messages_are_let_go() -> None:
 
 
 @pytest.mark.parametrize("sequence", [3, 4, 1000, (1 << 31) - 1])
-def test_what_was_never_sent_cannot_be_acknowledged(sequence: int) -> None:
+def test_unsent_messages_cannot_be_acknowledged(sequence: int) -> None:
     machine = sender()
     fill(machine, 5)
     machine.take(2)
@@ -118,7 +118,7 @@ def test_a_new_link_begins_behind_what_the_receiver_has(after: int, again: list[
     assert machine.pending == len(again)
 
 
-def test_a_link_that_replaces_another_one_needs_no_suspend() -> None:
+def test_replacing_link_needs_no_suspend() -> None:
     machine = sender()
     fill(machine, 4)
     machine.take()
@@ -127,7 +127,7 @@ def test_a_link_that_replaces_another_one_needs_no_suspend() -> None:
 
 
 @pytest.mark.parametrize("after", [0, 1, 4, 5, (1 << 31) + 2])
-def test_a_position_that_cannot_be_is_the_other_sides_fault_and_changes_nothing(after: int) -> None:
+def test_impossible_position_is_a_remote_error(after: int) -> None:
     machine = sender()
     fill(machine, 5)
     machine.take(3)
@@ -140,7 +140,7 @@ def test_a_position_that_cannot_be_is_the_other_sides_fault_and_changes_nothing(
     assert numbers(machine) == [3, 4]
 
 
-def test_beyond_the_depth_the_oldest_is_dropped_and_counted() -> None:
+def test_depth_drops_the_oldest_and_counts_it() -> None:
     machine = sender(depth=3)
     machine.suspend()
     fill(machine, 10)
@@ -149,7 +149,7 @@ def test_beyond_the_depth_the_oldest_is_dropped_and_counted() -> None:
     assert [m.sequence for m in machine.take()] == [8, 9, 10]
 
 
-def test_beyond_the_bytes_the_oldest_are_dropped_but_the_newest_always_fits() -> None:
+def test_byte_bound_drops_the_oldest() -> None:
     machine = sender(max_bytes=20)
     machine.suspend()
     fill(machine, 5)
@@ -162,7 +162,7 @@ def test_beyond_the_bytes_the_oldest_are_dropped_but_the_newest_always_fits() ->
     assert (machine.overflowed, machine.pending, machine.pending_bytes) == (7, 1, 0)
 
 
-def test_a_message_dropped_under_way_is_lost_only_if_it_did_not_arrive() -> None:
+def test_message_dropped_in_flight_may_have_arrived() -> None:
     machine = sender(depth=2, window=4)
     fill(machine, 2)
     machine.take()
@@ -178,7 +178,7 @@ def test_a_message_dropped_under_way_is_lost_only_if_it_did_not_arrive() -> None
     assert numbers(machine) == [2, 3]
 
 
-def test_a_message_dropped_without_a_link_is_lost_only_if_it_did_not_arrive() -> None:
+def test_message_dropped_without_a_link_may_have_arrived() -> None:
     machine = sender(depth=4)
     fill(machine, 4)
     machine.take(3)
@@ -192,7 +192,7 @@ def test_a_message_dropped_without_a_link_is_lost_only_if_it_did_not_arrive() ->
 
 
 @pytest.mark.parametrize(("window", "window_bytes"), [(2, 1000), (100, 10)])
-def test_what_is_dropped_under_way_still_fills_the_window(window: int, window_bytes: int) -> None:
+def test_messages_dropped_in_flight_fill_the_window(window: int, window_bytes: int) -> None:
     machine = sender(depth=1, window=window, window_bytes=window_bytes)
     for number in range(10):
         machine.offer(payload(number, 1), 0)
@@ -204,7 +204,7 @@ def test_what_is_dropped_under_way_still_fills_the_window(window: int, window_by
     assert machine.overflowed == 7
 
 
-def test_an_acknowledgement_may_be_ahead_of_what_the_new_link_has_sent() -> None:
+def test_acknowledgement_may_be_ahead_of_the_new_link() -> None:
     machine = sender()
     fill(machine, 5)
     machine.take()
@@ -227,7 +227,7 @@ def test_what_cannot_go_after_all_is_the_next_one_again() -> None:
         machine.put_back()
 
 
-def test_what_a_lane_lost_is_sent_again_behind_the_last_acknowledgement() -> None:
+def test_lost_lane_is_replayed_from_the_acknowledgement() -> None:
     machine = sender(depth=4)
     fill(machine, 4)
     machine.take()
@@ -251,7 +251,7 @@ def test_bounds_that_cannot_be_are_our_own_fault(depth: int, window: int) -> Non
 
 
 def cost(waiting: int, *, dropping: bool) -> float:
-    """Seconds of this process for 2000 messages, with so many others waiting, half of them under way."""
+    """Seconds of this process for 2000 messages, with so many others waiting, half of them in flight."""
     depth = waiting + 10 * (not dropping)
     machine = sender(depth=depth, max_bytes=1 << 30, window=depth, window_bytes=1 << 30)
     fill(machine, waiting)
@@ -332,7 +332,7 @@ def test_the_same_epoch_goes_on() -> None:
     assert receiver.breaks == 0
 
 
-def test_a_first_fragment_is_judged_and_counts_only_with_its_last() -> None:
+def test_message_counts_with_its_last_fragment() -> None:
     receiver = ReliableReceiver(7, first=1)
     assert receiver.judge(1, 7) is DELIVER
     assert receiver.judge(3, 7) == ReceiveResult(deliver=True, gap=2)
@@ -357,7 +357,7 @@ def test_it_acknowledges_after_a_delay() -> None:
     assert receiver.next_timer() == 60.0 + limits.ACK_DELAY
 
 
-def test_it_acknowledges_at_once_when_many_messages_or_bytes_came() -> None:
+def test_many_messages_or_bytes_are_acknowledged_at_once() -> None:
     receiver = ReliableReceiver(7, first=1)
     for sequence in range(1, limits.ACK_MESSAGES + 1):
         assert receiver.due_ack(0.0) is None
@@ -429,7 +429,7 @@ def test_another_epoch_has_no_use_for_it(epoch: int | None) -> None:
     assert len(table) == 0
 
 
-def test_each_keeps_for_a_time_of_its_own_and_then_only_counts() -> None:
+def test_each_sender_keeps_messages_for_its_own_time() -> None:
     table: ResumeTable[str] = ResumeTable()
     long, _ = parked(table, "long", until=300.0)
     short, _ = parked(table, "short", until=20.0)
@@ -458,7 +458,7 @@ def test_parking_again_begins_a_new_time() -> None:
     assert table.claim("a", 7) is machine
 
 
-def test_one_that_only_counts_goes_on_counting_when_it_is_parked_again() -> None:
+def test_counting_sender_goes_on_counting_when_parked() -> None:
     table: ResumeTable[str] = ResumeTable()
     machine, _ = parked(table, "a", until=1.0)
     table.expire(1.0)
@@ -488,7 +488,7 @@ def test_the_number_of_those_that_count_is_bounded(monkeypatch: pytest.MonkeyPat
     assert table.claim("c", 7) is not None
 
 
-def test_its_bytes_are_bounded_and_the_oldest_is_given_up_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_table_bytes_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "RESUME_BYTES_MAX", 100)
     table: ResumeTable[str] = ResumeTable()
     machines = [parked(table, key)[0] for key in "abc"]
@@ -502,7 +502,7 @@ def test_its_bytes_are_bounded_and_the_oldest_is_given_up_first(monkeypatch: pyt
     assert parked(table, "d", count=26)[1] == ["d"]
 
 
-def test_what_is_offered_while_parked_is_kept_within_the_senders_own_bounds() -> None:
+def test_parked_sender_keeps_its_own_bounds() -> None:
     table: ResumeTable[str] = ResumeTable()
     machine = sender(depth=3)
     table.park("a", machine, 30.0)
@@ -517,13 +517,13 @@ def test_what_is_offered_while_parked_is_kept_within_the_senders_own_bounds() ->
 # --- senders that keep nothing any more -----------------------------------------------------------------------------
 
 
-def test_only_a_sender_without_a_link_lets_go_of_its_messages() -> None:
+def test_linked_sender_cannot_stop_keeping() -> None:
     machine = sender()
     with pytest.raises(LocalProtocolError):
         machine.stop_keeping()
 
 
-def test_what_was_under_way_when_all_was_let_go_of_may_have_come() -> None:
+def test_messages_in_flight_may_arrive_after_stop_keeping() -> None:
     machine = sender()
     fill(machine, 5)
     machine.take(3)
@@ -537,7 +537,7 @@ def test_what_was_under_way_when_all_was_let_go_of_may_have_come() -> None:
     assert [message.sequence for message in machine.take()] == [8]
 
 
-def test_a_count_that_no_receiver_could_tell_from_an_old_message_stays_below(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_counted_losses_stay_below_half_the_range(monkeypatch: pytest.MonkeyPatch) -> None:
     machine = sender()
     monkeypatch.setattr("rmpa.mesh.reliable.SERIAL_HALF", 100)
     machine.suspend()
@@ -550,7 +550,7 @@ def test_a_count_that_no_receiver_could_tell_from_an_old_message_stays_below(mon
 
 
 @given(st.data())
-def test_an_ended_numbering_knows_what_it_cost_wherever_its_receiver_was(data: st.DataObject) -> None:
+def test_ended_numbering_knows_all_losses(data: st.DataObject) -> None:
     first = data.draw(st.sampled_from([1, 0xFFFFFFF8]))
     machine = ReliableSender(data.draw(st.integers(1, 6)), 1 << 20, 4, 1 << 20, 7, first=first)
     receiver = ReliableReceiver(7, first)

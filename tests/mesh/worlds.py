@@ -1,4 +1,4 @@
-"""Peers, links in pairs and what comes on them, for the tests of this room."""
+"""Peers, and connection machines in pairs, for the tests of this room."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WALL = 1_700_000_000_000_000_000
 
 @dataclass
 class Side:
-    """One link machine and what it said."""
+    """One connection machine, its events and its data."""
 
     link: ConnectionProtocol
     events: list[ConnectionEvent] = field(default_factory=list)
@@ -58,7 +58,7 @@ class Time:
 
 
 def pass_time(link: ConnectionProtocol, time: Time, seconds: float) -> None:
-    """Let time go by as a driver has it: the link's timers are handled when they are due."""
+    """Let time pass as a driver does: timers are handled when they are due."""
     end = time.now + seconds
     while (due := link.next_timer()) is not None and due <= end:
         time.now = max(time.now, due)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.runtime.event_loop import AgentLoop, DirectSelector, breathing_sorted, yield_to_data, yielding_to_data
+from rmpa.runtime.event_loop import AgentLoop, DirectSelector, sorted_yielding, yield_to_data, yielding_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Iterator
@@ -220,7 +220,7 @@ def test_data_goes_before_every_ordinary_callback(pair: tuple[socket.socket, soc
     run(main())
 
 
-def test_work_that_breathes_lets_data_go_first(pair: tuple[socket.socket, socket.socket]) -> None:
+def test_data_is_handled_when_work_yields(pair: tuple[socket.socket, socket.socket]) -> None:
     one, other = pair
 
     async def main() -> None:
@@ -240,7 +240,7 @@ def test_work_that_breathes_lets_data_go_first(pair: tuple[socket.socket, socket
     run(main())
 
 
-def test_a_reader_that_breathes_is_not_called_within_itself(pair: tuple[socket.socket, socket.socket]) -> None:
+def test_a_reader_that_yields_is_not_called_within_itself(pair: tuple[socket.socket, socket.socket]) -> None:
     one, other = pair
 
     async def main() -> None:
@@ -305,7 +305,7 @@ def test_a_socket_that_was_closed_first_is_forgotten(pair: tuple[socket.socket, 
     run(main())
 
 
-def test_who_goes_through_many_things_breathes_now_and_then(pair: tuple[socket.socket, socket.socket]) -> None:
+def test_a_long_iteration_yields_regularly(pair: tuple[socket.socket, socket.socket]) -> None:
     one, other = pair
 
     async def main() -> None:
@@ -326,9 +326,9 @@ def test_who_goes_through_many_things_breathes_now_and_then(pair: tuple[socket.s
 
 
 @pytest.mark.parametrize("count", [0, 1, 255, 256, 257, 5000])
-def test_sorting_breathes_and_sorts(count: int) -> None:
+def test_sorting_yields_and_sorts(count: int) -> None:
     words = [f"/{(index * 7919) % 4999}" for index in range(count)]
-    assert list(breathing_sorted(words)) == sorted(words)
+    assert list(sorted_yielding(words)) == sorted(words)
 
 
 def test_a_chore_is_done_now_and_then_but_not_where_data_is_read(pair: tuple[socket.socket, socket.socket]) -> None:
@@ -338,7 +338,7 @@ def test_a_chore_is_done_now_and_then_but_not_where_data_is_read(pair: tuple[soc
         loop = agent_loop()
         done: list[str] = []
         where = "work"
-        loop.between(lambda: done.append(where))
+        loop.set_yield_hook(lambda: done.append(where))
         for _ in range(100):
             yield_to_data()
         assert 5 < len(done) < 50
@@ -356,7 +356,7 @@ def test_a_chore_is_done_now_and_then_but_not_where_data_is_read(pair: tuple[soc
         yield_to_data()
         assert set(done) == {"work"}
         loop.remove_reader(one.fileno())
-        loop.between(None)
+        loop.set_yield_hook(None)
         done.clear()
         for _ in range(100):
             yield_to_data()
@@ -365,7 +365,7 @@ def test_a_chore_is_done_now_and_then_but_not_where_data_is_read(pair: tuple[soc
     run(main())
 
 
-def test_breathing_elsewhere_does_nothing() -> None:
+def test_yielding_on_another_loop_has_no_effect() -> None:
     async def main() -> None:
         yield_to_data()
 

@@ -10,7 +10,7 @@ import pytest
 from rmpa.core.counters import Counters
 from rmpa.runtime import limits
 from rmpa.runtime.event_loop import AgentLoop, yielding_to_data
-from rmpa.runtime.garbage_collector import Due, GarbageCollector, what_is_due
+from rmpa.runtime.garbage_collector import Collection, GarbageCollector, choose_collection
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -52,22 +52,22 @@ async def until_no_more_than(knots: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("young", "grown", "quiet", "due"),
+    ("young", "grown", "quiet", "collection"),
     [
-        (0, 0, True, Due.NOTHING),
-        (limits.COLLECT_YOUNG - 1, 0, True, Due.NOTHING),
-        (limits.COLLECT_YOUNG, 0, True, Due.YOUNG),
-        (limits.COLLECT_YOUNG, 0, False, Due.YOUNG),
-        (limits.COLLECT_YOUNG, -10, True, Due.YOUNG),
-        (0, limits.COLLECT_GROWTH, False, Due.NOTHING),
-        (limits.COLLECT_YOUNG, limits.COLLECT_GROWTH, False, Due.YOUNG),
-        (0, limits.COLLECT_GROWTH - 1, True, Due.NOTHING),
-        (0, limits.COLLECT_GROWTH, True, Due.FULL),
-        (0, limits.COLLECT_GROWTH_MAX, False, Due.FULL),
+        (0, 0, True, Collection.NOTHING),
+        (limits.COLLECT_YOUNG - 1, 0, True, Collection.NOTHING),
+        (limits.COLLECT_YOUNG, 0, True, Collection.YOUNG),
+        (limits.COLLECT_YOUNG, 0, False, Collection.YOUNG),
+        (limits.COLLECT_YOUNG, -10, True, Collection.YOUNG),
+        (0, limits.COLLECT_GROWTH, False, Collection.NOTHING),
+        (limits.COLLECT_YOUNG, limits.COLLECT_GROWTH, False, Collection.YOUNG),
+        (0, limits.COLLECT_GROWTH - 1, True, Collection.NOTHING),
+        (0, limits.COLLECT_GROWTH, True, Collection.FULL),
+        (0, limits.COLLECT_GROWTH_MAX, False, Collection.FULL),
     ],
 )
-def test_what_is_due(young: int, grown: int, quiet: bool, due: Due) -> None:
-    assert what_is_due(young, grown, quiet=quiet) is due
+def test_what_is_due(young: int, grown: int, quiet: bool, collection: Collection) -> None:
+    assert choose_collection(young, grown, quiet=quiet) is collection
 
 
 async def test_it_takes_over_and_gives_back(collector: GarbageCollector) -> None:

@@ -113,7 +113,7 @@ def test_nothing_is_asked_unless_it_is_enabled() -> None:
 
 
 @needs_nice
-def test_the_loop_gets_fifo_its_workers_one_less_and_children_nothing() -> None:
+def test_workers_get_one_priority_less_and_children_none() -> None:
     answer = run_child(priority=42, lock_memory=False)
     assert wish(answer, "SCHED_FIFO") == {
         "name": "SCHED_FIFO",
@@ -167,7 +167,7 @@ def test_memory_is_locked_and_does_not_balloon() -> None:
     assert answer["limit"] in ([*resource.getrlimit(resource.RLIMIT_MEMLOCK)], [INFINITY, INFINITY])
 
 
-def test_an_unprivileged_agent_is_told_what_would_grant_it_and_runs_on() -> None:
+def test_unprivileged_agent_runs_on_and_logs_remedies() -> None:
     answer = run_child(unprivileged())
     fifo, memory = wish(answer, "SCHED_FIFO"), wish(answer, "memory lock")
     if fifo["granted"] or memory["granted"]:
@@ -339,7 +339,7 @@ def test_a_filter_is_suspected_where_the_limits_allow_it(kernel: Kernel) -> None
     assert "although" in wishes["memory lock"].text
 
 
-def test_memory_is_locked_in_two_steps_only_where_nothing_limits_it(kernel: Kernel) -> None:
+def test_memory_is_locked_only_without_a_limit(kernel: Kernel) -> None:
     kernel.limits[resource.RLIMIT_MEMLOCK] = (65536, INFINITY)
     assert ask()["memory lock"].granted
     assert kernel.locked == [1, 2 | 4]

@@ -61,7 +61,7 @@ def test_no_packet_is_larger_and_no_byte_is_lost(messages: list[list[bytes]], ro
     assert all(len(packet) <= size for packet in taker.packets)
 
 
-def test_a_size_that_shrinks_below_what_was_taken_begins_a_new_packet() -> None:
+def test_smaller_size_begins_a_new_packet() -> None:
     taker = Taker([700, 300, 300, 300])
     sock = SegmentedSocket(taker, 1200)  # type: ignore[arg-type]  # what it uses of one
     assert sock.sendmsg([bytes(1000)]) == 700

@@ -121,7 +121,7 @@ async def test_a_claim_is_not_allocated(sockets: Sockets) -> None:
     end.stream.close()
 
 
-async def test_a_slow_reader_costs_bounded_memory_and_gets_whole_messages(sockets: Sockets) -> None:
+async def test_slow_reader_costs_bounded_memory_and_gets_whole_messages(sockets: Sockets) -> None:
     sockets[0].setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65536)
     sockets[1].setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
     one = End(sockets[0], Outbox(10, 4 * MIB))
@@ -313,7 +313,7 @@ async def test_batches_keep_order_and_bytes_through_full_buffers(sockets: Socket
     end.stream.close()
 
 
-async def test_what_is_sent_in_a_read_leaves_before_a_close_in_the_same_read(sockets: Sockets) -> None:
+async def test_messages_of_a_read_are_sent_before_a_close_in_it(sockets: Sockets) -> None:
     """As a publisher refuses a subscriber: an error header, then the end."""
     one, other = End(sockets[0]), End(sockets[1])
 

@@ -250,7 +250,7 @@ async def drain_zeros(sock: socket.socket, count: int) -> None:
 
 
 @pytest.mark.parametrize("sizes", [[10, 20, 300, 30, 400, 40], [300, 20], [10, 300], [10, 70_000, 5], [70_000, 5]])
-async def test_small_messages_in_front_of_a_large_one_of_the_same_read_stay_in_front(
+async def test_small_messages_stay_in_front_of_a_large_one_of_the_same_read(
     sockets: Sockets, sizes: list[int]
 ) -> None:
     zeros = stuff(sockets[0])
@@ -307,7 +307,7 @@ class Corked:
         self.far.close()
 
 
-async def test_what_is_corked_does_not_get_into_the_middle_of_what_the_outbox_sends(sockets: Sockets) -> None:
+async def test_corked_messages_follow_what_the_outbox_sends(sockets: Sockets) -> None:
     """A message that waits for its bytes, bytes for it, and others before and behind them, all in one read."""
     sender, receiver, opened = await half_sent(sockets)
 
@@ -325,7 +325,7 @@ async def test_what_is_corked_does_not_get_into_the_middle_of_what_the_outbox_se
     receiver.stream.close()
 
 
-async def test_a_route_that_is_closed_within_a_read_does_not_disturb_what_is_corked(sockets: Sockets) -> None:
+async def test_route_closed_during_a_read_keeps_corked_messages(sockets: Sockets) -> None:
     sender, receiver, _ = await half_sent(sockets)
 
     def action() -> None:
@@ -422,7 +422,7 @@ async def test_abandoned_where_the_other_side_has_a_part_it_is_told(sockets: Soc
     receiver.stream.close()
 
 
-async def test_one_that_waits_for_its_bytes_in_the_outbox_leaves_its_place_when_abandoned(sockets: Sockets) -> None:
+async def test_abandoned_message_leaves_the_outbox(sockets: Sockets) -> None:
     """Its key was silent for ever: the dead message stood in front of all that followed."""
     sender, receiver, opened = await half_sent(sockets)
     assert sender.stream.abandon(opened.parcel) is False
@@ -479,7 +479,7 @@ async def test_more_than_a_message_was_said_to_have_is_our_own_fault(sockets: So
 # --- outboxes that outlive their stream ---------------------------------------------------------------------------
 
 
-async def test_an_adopted_outbox_leaves_behind_what_the_connection_had_to_say(sockets: Sockets) -> None:
+async def test_adopted_outbox_is_sent_behind_the_connections_own_bytes(sockets: Sockets) -> None:
     zeros = stuff(sockets[0])
     sender = Sender(sockets[0], Outbox(1, 1))
     sender.stream.send([Frame(FrameKind.HELLO, b"hello").serialize()], URGENT)
@@ -504,7 +504,7 @@ async def test_an_adopted_outbox_leaves_behind_what_the_connection_had_to_say(so
     receiver.stream.close()
 
 
-async def test_an_outbox_that_is_adopted_within_a_read_follows_what_that_read_said(sockets: Sockets) -> None:
+async def test_outbox_adopted_during_a_read_is_sent_behind_it(sockets: Sockets) -> None:
     """As a welcome, which the lane's messages must not overtake."""
     sender, receiver = Sender(sockets[0], Outbox(1, 1)), Receiver(sockets[1])
     box = large_outbox()
@@ -521,7 +521,7 @@ async def test_an_outbox_that_is_adopted_within_a_read_follows_what_that_read_sa
     receiver.stream.close()
 
 
-async def test_what_was_not_begun_when_the_connection_fell_leaves_by_the_next(sockets: Sockets) -> None:
+async def test_whole_entries_are_sent_by_the_next_connection(sockets: Sockets) -> None:
     box = large_outbox(fragment=1000)
     first = Sender(sockets[0], Outbox(1, 1))
     first.stream.adopt(box, pack_fragment_header)

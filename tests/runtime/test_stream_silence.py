@@ -51,7 +51,7 @@ def test_a_pause_is_none() -> None:
     assert run(0.0, mesh_limits.STALE_TICK) == -math.inf
 
 
-def test_a_silence_that_was_watched_until_a_pause_ends_where_the_pause_began() -> None:
+def test_silence_ends_where_a_pause_of_this_process_begins() -> None:
     """What was sent during the pause did not wait for the network."""
 
     async def watch() -> tuple[float, float]:

@@ -11,7 +11,7 @@ from rmpa.core.contract import Reliability
 from rmpa.mesh import limits
 from tests.simulation.mesh_scenario import MeshScenario
 from tests.simulation.scenario import CALM
-from tests.simulation.traffic import Courier
+from tests.simulation.traffic import TrafficPeer
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -29,12 +29,12 @@ class LanesScenario(MeshScenario):
     def __init__(self, seed: int, count: int, *, keep: bool = False, calm: bool = False) -> None:
         self.before: dict[bytes, int] = {}
         self.breaks = 0
-        """Reliable routes that had to begin anew though both sides lived: their links crossed, and they were told."""
-        super().__init__(seed, count, keep=keep, calm=calm, make_peer=Courier)
+        """Reliable routes that began a new numbering though both sides were alive, because their links crossed."""
+        super().__init__(seed, count, keep=keep, calm=calm, make_peer=TrafficPeer)
 
     @contextmanager
     def simulated(self) -> Iterator[None]:
-        """And topics change their lanes after a few messages."""
+        """As ``MeshScenario``, and topics change their lanes after a few messages."""
         with (
             super().simulated(),
             mock.patch("rmpa.bridge.data.io.export_flow.time", self.world),
@@ -44,7 +44,7 @@ class LanesScenario(MeshScenario):
             yield
 
     def heal(self) -> None:
-        """Behind it, when all are linked, each publishes a series that crosses the lanes to and fro."""
+        """Heal; when all are linked, each publishes a series of messages that changes lanes several times."""
         super().heal()
         begin = self.world.now + CALM - len(_LAST_SERIES) * _PAUSE - 3
         for peer in self.peers:
@@ -53,19 +53,19 @@ class LanesScenario(MeshScenario):
             for number, size in enumerate(_LAST_SERIES):
                 self.world.at(begin + number * _PAUSE, partial(self._publish, peer, size))
 
-    def _stop(self, peer: Courier) -> None:
+    def _stop(self, peer: TrafficPeer) -> None:
         peer.stopped = True
 
-    def _note_last(self, peer: Courier) -> None:
+    def _note_last(self, peer: TrafficPeer) -> None:
         if peer.alive:
             self.before[peer.identity.instance] = peer.published[-1] if peer.published else 0
 
-    def _publish(self, peer: Courier, size: int) -> None:
+    def _publish(self, peer: TrafficPeer, size: int) -> None:
         if peer.alive:
             peer.process.run(peer.publish, size)
 
     def check(self) -> None:
-        """And each has what the others published."""
+        """Check links and rosters, and that each has what the others published."""
         super().check()
         living = [peer for peer in self.peers if peer.alive]
         for peer in living:
@@ -76,7 +76,7 @@ class LanesScenario(MeshScenario):
             for link in peer.mesh.links():
                 assert not link.queue_bytes, f"{peer.name} has not sent all"
 
-    def _check_messages(self, source: Courier, peer: Courier) -> None:
+    def _check_messages(self, source: TrafficPeer, peer: TrafficPeer) -> None:
         inbox = peer.inboxes[source.identity.instance]
         who = f"{peer.name} from {source.name} ({source.contract.reliability}, {source.contract.priority})"
         published = source.published

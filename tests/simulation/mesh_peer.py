@@ -61,7 +61,7 @@ class MeshPeer(RosterPeer):
     """A roster, and links with two lanes to all in it."""
 
     def prepare(self, rng: random.Random) -> None:
-        """A process of its own for the new run, and a mesh in it."""
+        """Start a process with a mesh for the new run."""
         self.process = Process(self.world, f"{self.name}#{self.run}")  # type: ignore[abstract]
         self.processes = [*getattr(self, "processes", []), self.process]
         self.process.run(self._build, rng)
@@ -70,7 +70,7 @@ class MeshPeer(RosterPeer):
         run = self.run
 
         def ours(action: Callable[..., None]) -> Callable[..., None]:
-            """What a run that is over still says has nothing to do with the next one."""
+            """Ignore callbacks of a run that is over."""
             return lambda *values: action(*values) if self.alive and self.run == run else None
 
         self.mesh = Mesh(
@@ -89,7 +89,7 @@ class MeshPeer(RosterPeer):
         self.process.create_task(self.mesh.start())
 
     async def connect(self, endpoint: Address) -> SimSocket:
-        """A connection, or the error of a port where nobody listens; nothing at all where no answer comes."""
+        """Connect; raises where no process listens, and never returns where no answer comes."""
         self.note(f"> dials {endpoint[0]}")
         process = self.process
         done: asyncio.Future[SimSocket] = process.create_future()
@@ -111,14 +111,14 @@ class MeshPeer(RosterPeer):
         return await done
 
     def kill(self) -> None:
-        """Gone without a word; the kernel resets its connections."""
+        """Die without a bye; the kernel resets the connections."""
         super().kill()
         self.network.tcp.pop(self.address, None)
         self.process.kill()
         self.network.kill(self.host)
 
     def end(self) -> None:
-        """Says bye on each link, then goodbye; the last bytes have a second to leave."""
+        """Say bye on each link, then send the goodbye beacon; the last bytes have a second to leave."""
         super().end()
         self.process.run(lambda: self.process.create_task(self._leave(self.mesh, self.process)))
 
@@ -127,10 +127,10 @@ class MeshPeer(RosterPeer):
         process.kill()
 
     def note(self, text: str) -> None:
-        """Into the trace."""
+        """Write a line of the trace."""
         self.world.note(self.name, text)
 
-    # --- what the mesh says ---------------------------------------------------------------------------------
+    # --- events of the mesh ---------------------------------------------------------------------------------
 
     def link_up(self, link: PeerLink) -> None:
         """A peer is linked."""
@@ -162,10 +162,10 @@ class MeshPeer(RosterPeer):
     def lane_lost(self, link: PeerLink) -> None:
         """The bulk lane fell; nothing here."""
 
-    # --- what discovery says --------------------------------------------------------------------------------
+    # --- events of discovery --------------------------------------------------------------------------------
 
     def on_event(self, event: RosterEvent) -> None:
-        """What discovery tells the mesh."""
+        """Pass an event of discovery to the mesh."""
         super().on_event(event)
         if isinstance(event, PeerFound | PeerRestarted):
             source = event.source[0] if event.source else None

@@ -1,4 +1,4 @@
-"""The scenario with links: after healing every pair has one, with both lanes, and both ends mean the same one."""
+"""The scenario with links: after healing each pair has one with both lanes, the same at both ends."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class MeshScenario(Scenario):
 
     @contextmanager
     def simulated(self) -> Iterator[None]:
-        """What the code would ask the system for, the simulation tells."""
+        """Replace what the code would ask of the operating system."""
         slower = _SLOWER if self.count > _MANY else 1
         with (
             mock.patch("rmpa.mesh.io.mesh.unacknowledged", lambda sock: sock.in_flight),
@@ -83,7 +83,7 @@ class MeshScenario(Scenario):
             super()._mischief()
 
     def _hit_connection(self) -> None:
-        """One connection alone breaks, or is forgotten by something on its way."""
+        """Break one connection, or let a router on its way forget it."""
         there = list(self.network.connections.values())
         if not there:
             return

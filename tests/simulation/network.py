@@ -23,12 +23,12 @@ OnAccept = Callable[["End"], None]
 OnDialled = Callable[["End | None"], None]
 
 _RETRY: Final = 0.2
-"""Seconds between two looks whether a stalled stream may go on, like TCP's retransmissions."""
+"""Seconds between two attempts of a stalled stream to go on, like TCP's retransmissions."""
 _KEPT_LINES: Final = 400
 
 
 class World:
-    """The simulated clock, what is to happen, and the trace of what did.
+    """The simulated clock, the scheduled actions, and the trace of what happened.
 
     Args:
         seed: Everything that happens follows from it.
@@ -44,12 +44,12 @@ class World:
         self._digest = hashlib.sha256()
 
     def at(self, when: float, action: Callable[[], None]) -> None:
-        """Do ``action`` at ``when``; what is due at one time happens in the order of these calls."""
+        """Schedule ``action`` at ``when``; actions of one moment run in the order of these calls."""
         self._count += 1
         heapq.heappush(self._queue, (max(when, self.now), self._count, action))
 
     def after(self, delay: float, action: Callable[[], None]) -> None:
-        """Do ``action`` in ``delay`` seconds."""
+        """Schedule ``action`` in ``delay`` seconds."""
         self.at(self.now + delay, action)
 
     def time_ns(self) -> int:
@@ -57,7 +57,7 @@ class World:
         return round(self.now * 1e9)
 
     def run(self, until: float) -> None:
-        """Let everything happen up to ``until``."""
+        """Run all actions up to ``until``."""
         while self._queue and self._queue[0][0] <= until:
             self.now, _, action = heapq.heappop(self._queue)
             action()
@@ -86,7 +86,7 @@ class Weather:
 
 @dataclass
 class Network:
-    """Hosts, who can reach whom, and what is under way between them.
+    """Hosts, which of them reach each other, and what is in flight between them.
 
     Args:
         world: Clock and chance.
@@ -96,20 +96,20 @@ class Network:
     world: World
     weather: Weather = field(default_factory=Weather)
     segments: dict[str, int] = field(default_factory=dict)
-    """Host to multicast domain: only within one do multicasts travel. A missing host has none."""
+    """Host to multicast domain, within which multicasts travel. A missing host has none."""
     sides: dict[str, int] = field(default_factory=dict)
     """Host to side of a partition; empty while the network is whole."""
     sockets: dict[Address, OnDatagram] = field(default_factory=dict)
     listeners: dict[Address, OnAccept] = field(default_factory=dict)
     streams: list[Stream] = field(default_factory=list)
     tcp: dict[Address, SimListener] = field(default_factory=dict)
-    """Who accepts connections; ``listeners`` and ``streams`` are a simpler kind, without sockets."""
+    """Listening sockets by address; ``listeners`` and ``streams`` are a simpler kind, without sockets."""
     connections: dict[int, SimSocket] = field(default_factory=dict)
     """Every open end of a connection, by its descriptor."""
     walled: set[str] = field(default_factory=set)
     """Hosts behind a firewall: they can dial but not be dialled."""
     slowness: tuple[float, ...] = (1.0, 1.0, 3.0)
-    """How many times the delay a connection takes, by chance one of these."""
+    """A connection takes the delay times one of these, by chance."""
     datagrams: int = 0
 
     def reaches(self, host: str, other: str) -> bool:
@@ -117,7 +117,7 @@ class Network:
         return self.sides.get(host, 0) == self.sides.get(other, 0)
 
     def delay(self) -> float:
-        """One packet's way."""
+        """Deliver one packet, or lose, repeat or delay it."""
         return self.world.rng.uniform(*self.weather.delay)
 
     def unicast(self, source: Address, to: Address, data: bytes) -> None:
@@ -147,7 +147,7 @@ class Network:
             receive(data, source, multicast)
 
     def dial(self, host: str, to: Address, on_done: OnDialled) -> None:
-        """Connect a byte stream; ``on_done(None)`` if nobody listens there, nothing at all while parted."""
+        """Connect a byte stream; ``on_done(None)`` if no process listens there, no call while hosts are parted."""
 
         def arrive() -> None:
             if to[0] in self.walled or not self.reaches(host, to[0]):
@@ -164,7 +164,7 @@ class Network:
         self.world.after(self.delay(), arrive)
 
     def kill(self, host: str) -> None:
-        """A process dies without a word: its kernel resets its streams."""
+        """A process dies: its kernel resets its streams."""
         for stream in [s for s in self.streams if host in {s.caller.host, s.callee.host}]:
             for end in (stream.caller, stream.callee):
                 if end.host == host:
@@ -197,7 +197,7 @@ class End:
         self.on_close: Callable[[bool], None] = lambda _: None
         self._network = network
         self._stream = stream
-        self._under_way: deque[tuple[float, bytes | bool]] = deque()
+        self._packets: deque[tuple[float, bytes | bool]] = deque()
         self._pumping = False
         self._early: list[bytes | bool] = []
         self.ready = False
@@ -211,23 +211,23 @@ class End:
             data = data[size:]
 
     def close(self, *, reset: bool = False) -> None:
-        """Close this end; the other one learns it behind the bytes under way (at once and instead if reset)."""
+        """Close this end; the other one notices after the bytes in flight (if reset: at once, and they are lost)."""
         if self.closed:
             return
         self.closed = True
         if reset:
-            self._under_way.clear()
+            self._packets.clear()
         self._push(reset)
 
     def begin(self) -> None:
-        """The callbacks are set: hand over what came meanwhile."""
+        """The callbacks are set: deliver what came meanwhile."""
         self.ready = True
         early, self._early = self._early, []
         for item in early:
             self.arrive(item)
 
     def arrive(self, item: bytes | bool) -> None:
-        """One piece, or the end, has come."""
+        """Deliver one piece, or the end."""
         if self.closed:
             return
         if not self.ready:
@@ -241,27 +241,27 @@ class End:
 
     def _push(self, item: bytes | bool) -> None:
         when = self._network.world.now + self._network.delay()
-        if self._under_way:
-            when = max(when, self._under_way[-1][0])
-        self._under_way.append((when, item))
+        if self._packets:
+            when = max(when, self._packets[-1][0])
+        self._packets.append((when, item))
         if not self._pumping:
             self._pumping = True
             self._network.world.at(when, self._pump)
 
     def _pump(self) -> None:
         world = self._network.world
-        while self._under_way and self._under_way[0][0] <= world.now:
+        while self._packets and self._packets[0][0] <= world.now:
             if self.other.closed:
-                self._under_way.clear()
+                self._packets.clear()
                 break
             if not self._network.reaches(self.host, self.other.host):
                 world.after(_RETRY, self._pump)
                 return
-            _, item = self._under_way.popleft()
+            _, item = self._packets.popleft()
             self.other.arrive(item)
-        self._pumping = bool(self._under_way)
+        self._pumping = bool(self._packets)
         if self._pumping:
-            world.at(self._under_way[0][0], self._pump)
+            world.at(self._packets[0][0], self._pump)
         else:
             self._forget()
 

@@ -1,4 +1,4 @@
-"""One message in fragments, and trouble at one byte of it: nobody gets a half message, and the next one comes."""
+"""One message in fragments and a failure at one byte of it: no half message is delivered, and the next one is."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rmpa.mesh.io.connection import Connection
-    from tests.simulation.traffic import Courier
+    from tests.simulation.traffic import TrafficPeer
 
 TROUBLES: Final = ("break", "swallow", "part", "kill receiver", "kill sender", "abort")
 _FRAGMENT: Final = 64
@@ -27,14 +27,14 @@ _SIZE: Final = 300
 _LINKED: Final = 2.0
 """Seconds until two agents that start are linked, for sure."""
 _NOTICED: Final = 5.0
-"""Seconds after which both know of a trouble: the bulk lane's lease is the longest."""
+"""Seconds after which both sides have noticed a failure: the bulk lane's lease is the longest."""
 _HEALED: Final = 8.0
 """Seconds after which they are linked again."""
 
 
 @dataclass(frozen=True)
 class Course:
-    """How the message goes.
+    """How the message is sent.
 
     Args:
         reliability: Of its contract.
@@ -74,7 +74,7 @@ class PointScenario(LanesScenario):
 
     @contextmanager
     def simulated(self) -> Iterator[None]:
-        """And fragments are as short as can be read in a trace."""
+        """As ``LanesScenario``, with fragments short enough to be read in a trace."""
         with (
             super().simulated(),
             mock.patch("rmpa.mesh.io.lane.Outbox", partial(Outbox, fragment=_FRAGMENT)),
@@ -84,7 +84,7 @@ class PointScenario(LanesScenario):
             yield
 
     def run(self) -> None:
-        """Link, publish, trouble, healing; and the check."""
+        """Link, publish, fail, heal, check."""
         world = self.world
         sender, receiver = self.peers
         with self.simulated():
@@ -103,14 +103,14 @@ class PointScenario(LanesScenario):
             self.check_all(sender, receiver)
 
     def heal_all(self) -> None:
-        """The network is whole, and whoever was killed is back."""
+        """Make the network whole and start the killed agents again."""
         self.network.sides = {}
         for peer in self.peers:
             if not peer.alive:
                 peer.start()
 
-    def check_all(self, sender: Courier, receiver: Courier) -> None:
-        """The two last messages came; the first as its contract says; whole or not at all, the inbox sees to that."""
+    def check_all(self, sender: TrafficPeer, receiver: TrafficPeer) -> None:
+        """Check that the two last messages came, and the first one as its contract says."""
         inbox = receiver.inboxes[sender.identity.instance]
         *earlier, one, other = inbox.got
         assert [one, other] == sender.published[-2:]
@@ -125,7 +125,7 @@ class PointScenario(LanesScenario):
             assert not peer.mesh.counters["link.malformed"]
             assert not any(process.failures for process in peer.processes)
 
-    def _publish_one(self, sender: Courier, receiver: Courier) -> None:
+    def _publish_one(self, sender: TrafficPeer, receiver: TrafficPeer) -> None:
         link = sender.mesh.link(receiver.identity.guid)
         assert link is not None
         lane = link.connection if self.course.priority is Priority.HIGH else link.bulk_connection
@@ -141,7 +141,7 @@ class PointScenario(LanesScenario):
         self.carried = link.bytes_out - before
         sock.trap = None
 
-    def _happen(self, sender: Courier, receiver: Courier, lane: Connection) -> None:
+    def _happen(self, sender: TrafficPeer, receiver: TrafficPeer, lane: Connection) -> None:
         self.happened = True
         match self.trouble:
             case "break":

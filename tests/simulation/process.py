@@ -1,4 +1,4 @@
-"""An agent's process in the simulated world: an event loop that asyncio's own futures and tasks run on.
+"""An agent's process in the simulated world: an event loop on which asyncio's own futures and tasks run.
 
 What the agent is made of is the real code, down to the sockets' callbacks; only the time, and who is called next,
 come from the ``World``. A process that is killed does nothing more, wherever it was.
@@ -18,7 +18,7 @@ _T = TypeVar("_T")
 
 
 class Handle:
-    """A call that is to come."""
+    """A scheduled call."""
 
     __slots__ = ("_action", "_args", "_process")
 
@@ -28,7 +28,7 @@ class Handle:
         self._args = args
 
     def cancel(self) -> None:
-        """It does not come."""
+        """Cancel the call."""
         self._process = None
         self._args = ()
 
@@ -40,7 +40,7 @@ class Handle:
 
 
 class Process(asyncio.AbstractEventLoop):
-    """The loop of one run of one agent: what asyncio and the agent ask of one, and no more.
+    """The event loop of one run of one agent, as far as asyncio and the agent need it.
 
     Args:
         world: Clock and queue.
@@ -54,13 +54,13 @@ class Process(asyncio.AbstractEventLoop):
         self.readers: dict[int, Callable[[], object]] = {}
         self.writers: dict[int, Callable[[], object]] = {}
         self.on_reader: dict[int, Callable[[], None]] = {}
-        """By descriptor: the socket looks whether there is something to read, or room to write."""
+        """By descriptor: makes the socket check whether it is readable or writable."""
         self.on_writer: dict[int, Callable[[], None]] = {}
         self.failures: list[str] = []
-        """What asyncio would only log: exceptions that nobody fetched."""
+        """Exceptions that were never retrieved, which asyncio would only log."""
 
     def run(self, action: Callable[..., _T], *args: Any) -> _T | None:
-        """Call something in this process, unless it is dead."""
+        """Call ``callback`` in this process, unless it is dead."""
         if self.dead:
             return None
         before = asyncio._get_running_loop()
@@ -71,12 +71,12 @@ class Process(asyncio.AbstractEventLoop):
             asyncio._set_running_loop(before)
 
     def kill(self) -> None:
-        """Nothing of it happens any more."""
+        """Cancel all that is scheduled."""
         self.dead = True
         self.readers.clear()
         self.writers.clear()
 
-    # --- what asyncio and the agent ask of a loop ------------------------------------------------------------
+    # --- the methods of an event loop that asyncio and the agent use -----------------------------------------
 
     def time(self) -> float:
         return self.world.now

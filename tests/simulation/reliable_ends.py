@@ -30,7 +30,7 @@ _REDIAL: Final = 0.01
 
 @dataclass(frozen=True)
 class Bounds:
-    """What a sender is made with: depth and bytes of what it keeps, and of its window."""
+    """The bounds of a sender: depth and bytes of what it keeps, and of its window."""
 
     depth: int = 100_000
     max_bytes: int = 1 << 30
@@ -60,7 +60,7 @@ class Wire:
         self.end = end
         self.epoch: int | None = None
         self.pieces: list[bytes] | None = None
-        """Of the message whose last fragment has not come yet; ``None`` where it is skipped."""
+        """Fragments of the message whose last one has not come yet; ``None`` where it is skipped."""
         self.on_lost = on_lost
         self._on_frame = on_frame
         self._allow = allow
@@ -81,7 +81,7 @@ class Wire:
             self.end.send(Frame(FrameKind.DATA, piece, ROUTE, sequence, stamp_ns, flags).serialize())
 
     def cut(self) -> None:
-        """The stream breaks: noticed here now, by the other end a little later; what is under way is lost."""
+        """Break the stream: noticed here now, by the other end a little later; what is in flight is lost."""
         self.end.close(reset=True)
         self.on_lost(self)
 
@@ -105,7 +105,7 @@ class Wire:
 
 
 class Exporter:
-    """Publishes numbered messages; sends them to whoever opens the route; parks its sender while nobody does."""
+    """Publishes numbered messages to the peer that opens the route; parks its sender while there is none."""
 
     def __init__(
         self, network: Network, bounds: Bounds, allow: Callable[[int], int], on_spent: Callable[[], None]
@@ -114,7 +114,7 @@ class Exporter:
         self.world = network.world
         self.published = 0
         self.gave_up = False
-        """Whether it ever let go of what waited for too long."""
+        """Whether it ever dropped what waited for too long."""
         self.starts: dict[int, int] = {}
         """Epoch to the number of its first message."""
         self.senders: dict[int, ReliableSender] = {}
@@ -131,7 +131,7 @@ class Exporter:
         self._newest = 0
 
     def restart(self) -> None:
-        """It dies and is at once there again, with nothing."""
+        """Die and start again at once, without state."""
         self.world.note("exporter", "restarts")
         for wire in self._wires:
             wire.end.close(reset=True)
@@ -256,7 +256,7 @@ class Importer:
         return self.lives[-1].receiver
 
     def restart(self) -> None:
-        """It dies and is at once there again, with nothing."""
+        """Die and start again at once, without state."""
         self.world.note("importer", "restarts")
         for wire in self.wires:
             wire.end.close(reset=True)

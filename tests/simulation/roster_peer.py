@@ -1,4 +1,4 @@
-"""One simulated agent that has a roster and nothing else."""
+"""One simulated agent that has only a roster."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.discovery.beacon import Beacon
 from rmpa.discovery.events import Event, SendMulticast
-from rmpa.discovery.roster import Roster
+from rmpa.discovery.membership import MembershipProtocol
 
 if TYPE_CHECKING:
     from tests.simulation.network import Address, Network
@@ -41,16 +41,16 @@ class RosterPeer:
         self.run = 0
         self.alive = False
         self.refused = 0
-        self.roster: Roster
+        self.roster: MembershipProtocol
         self.identity: Identity
 
     def start(self) -> None:
-        """A new run: new instance, next incarnation."""
+        """Start a new run: new instance, next incarnation."""
         self.run += 1
         self.alive = True
         rng = random.Random(self.world.rng.getrandbits(64))
         self.identity = Identity(Guid.of(*self.address, self.run & 0xFFFF), rng.randbytes(16), self.name)
-        self.roster = Roster(self.identity, rng=rng.random, multicast=self.multicast)
+        self.roster = MembershipProtocol(self.identity, rng=rng.random, multicast=self.multicast)
         self.prepare(rng)
         self.network.sockets[self.address] = self._datagram
         self.world.note(self.name, f"starts run {self.run}")
@@ -59,15 +59,15 @@ class RosterPeer:
         self.flush()
 
     def prepare(self, rng: random.Random) -> None:
-        """What else a run has; nothing here."""
+        """Set up more for the new run; nothing here."""
 
     def kill(self) -> None:
-        """Gone without a word."""
+        """Die without a goodbye."""
         self.world.note(self.name, "is killed")
         self._gone()
 
     def end(self) -> None:
-        """Leaves in order."""
+        """Leave with a goodbye."""
         self.world.note(self.name, "ends")
         self.roster.goodbye(self.world.now)
         self.flush()
@@ -78,7 +78,7 @@ class RosterPeer:
         self.network.sockets.pop(self.address, None)
 
     def view(self) -> tuple[Identity, ...]:
-        """Who is in the roster."""
+        """The identities in the roster."""
         return tuple(v.identity for v in self.roster.peers() if v.present)
 
     def troubles(self) -> list[str]:
@@ -86,7 +86,7 @@ class RosterPeer:
         return [text for v in self.roster.peers() for text in v.conflicts]
 
     def on_event(self, event: Event) -> None:
-        """What a mesh would be told; here it is only written down."""
+        """Write an event of the roster into the trace."""
         self.world.note(self.name, f"= {type(event).__name__} {event.identity}")
 
     def _datagram(self, data: bytes, source: Address, multicast: bool) -> None:
@@ -101,7 +101,7 @@ class RosterPeer:
         self.flush()
 
     def flush(self) -> None:
-        """Send what the roster wants sent, tell what it has to tell, set its timer."""
+        """Send the roster's datagrams, report its events, set its timer."""
         for output in self.roster.outputs():
             data = output.beacon.serialize()
             if isinstance(output, SendMulticast):
@@ -134,5 +134,5 @@ class RosterPeer:
 
 
 def stranger(identity: Identity, number: int) -> Identity:
-    """An identity that nobody has, for forged packets."""
+    """An identity of no peer, for forged packets."""
     return replace(identity, guid=Guid.of("10.66.0.1", 1 + number), instance=bytes([number]) * 16, name=f"x{number}")

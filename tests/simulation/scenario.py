@@ -1,4 +1,4 @@
-"""What happens in one simulated network: bad times, then it heals, then all must agree.
+"""One simulated network: random failures, then it heals, then all rosters must agree.
 
 ``python -m tests.simulation --seed N --peers M`` replays one with its whole trace.
 """
@@ -17,9 +17,9 @@ from rmpa.discovery.beacon import Beacon, BeaconKind
 from tests.simulation.network import Network, Weather, World
 from tests.simulation.roster_peer import RosterPeer, stranger
 
-CALM: Final = core_limits.ROSTER_LEASE + 2 * discovery_limits.HEARTBEAT_INTERVAL + 2.0
-"""Seconds after healing within which all rosters agree: a lease for the dead, two heartbeats for the found."""
-AFTER_FORGERY: Final = discovery_limits.ROSTER_LEASE_MAX + CALM
+CALM: Final = core_limits.PEER_LEASE + 2 * discovery_limits.HEARTBEAT_INTERVAL + 2.0
+"""Seconds after healing within which all rosters agree: a lease for dead peers, two heartbeats for new ones."""
+AFTER_FORGERY: Final = discovery_limits.LEASE_MAX + CALM
 """The same where forged beacons asked for the longest lease."""
 
 MakePeer = Callable[..., Any]
@@ -31,7 +31,7 @@ class Disagreement(AssertionError):  # noqa: N818 - it is no error of the code t
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one run came to."""
+    """The result of one run."""
 
     trace_hash: str
     lines: tuple[str, ...]
@@ -39,7 +39,7 @@ class Outcome:
 
 
 class Scenario:
-    """One network through bad and good times.
+    """One network through failures and healing.
 
     Args:
         seed: Everything follows from it.
@@ -60,7 +60,7 @@ class Scenario:
         self.prepare()
 
     def play(self) -> Outcome:
-        """Bad times, healing, agreement.
+        """Play the failures, heal the network, and check.
 
         Raises:
             Disagreement: They do not agree.
@@ -82,10 +82,10 @@ class Scenario:
         return Outcome(self.world.trace_hash, tuple(self.world.lines), self.network.datagrams)
 
     def prepare(self) -> None:
-        """What else is set up before the first peer starts; nothing here."""
+        """Set up more before the first peer starts; nothing here."""
 
     def heal(self) -> None:
-        """The network is whole and quiet again; the dead that others need are started again."""
+        """Make the network whole and quiet; start the dead peers again that others need."""
         self.world.note("network", "heals")
         self.network.weather = Weather()
         self.network.sides = {}
@@ -94,7 +94,7 @@ class Scenario:
                 peer.start()
 
     def check(self) -> None:
-        """All that live see each other, in their present run, and nobody else."""
+        """Check that each living peer sees exactly the other living ones, in their present run."""
         living = sorted((p.identity for p in self.peers if p.alive), key=lambda i: i.guid)
         for peer in self.peers:
             if peer.alive:
@@ -118,7 +118,7 @@ class Scenario:
         return peers
 
     def _needed(self, peer: RosterPeer) -> bool:
-        """Whether the others can only find each other with this one's help."""
+        """Whether the others can only find each other through this peer."""
         return bool(peer.seeds) or any(peer.address in p.seeds for p in self.peers)
 
     def _worsen(self) -> None:
@@ -158,14 +158,14 @@ class Scenario:
                 pass
 
     def _noise(self, peer: RosterPeer) -> None:
-        """Bytes that are no beacon, from nowhere."""
+        """Send bytes that are no beacon, from an unknown address."""
         rng = self.world.rng
         for _ in range(5):
             data = rng.choice([b"", b"RMPA", b"RMPA\x02\x01\x00\x00", b"RMPA\x01\x01\x00\x07"])
             self.network.unicast((peer.host, 6666), peer.address, data + rng.randbytes(rng.randint(0, 80)))
 
     def _forge(self, peer: RosterPeer) -> None:
-        """Well-formed beacons that lie: peers that do not exist, damaged copies, a made-up run of a real one."""
+        """Send forged beacons: peers that do not exist, damaged copies, an invented run of a real peer."""
         rng = self.world.rng
         self.hostile = True
         self.world.note("network", f"forges against {peer.name}")

@@ -55,7 +55,7 @@ class SimSocket:
         self._fd = next(_descriptors)
         self._window = network.world.rng.choice([16 * KIB, 64 * KIB, 400 * KIB])
         self._slower = network.world.rng.choice(network.slowness)
-        self._under_way: deque[tuple[float, bytes]] = deque()
+        self._packets: deque[tuple[float, bytes]] = deque()
         self._pumping = False
         self._stalled: float | None = None
         self._got = bytearray()
@@ -142,7 +142,7 @@ class SimSocket:
         if self.closed or self._error is not None:
             return
         self._error = OSError(code, errno.errorcode[code])
-        self._under_way.clear()
+        self._packets.clear()
         self._got.clear()
         self._soon(self._wake_reader)
 
@@ -150,7 +150,7 @@ class SimSocket:
         """Its process is gone; its kernel resets the connection."""
         if not self.closed:
             self.closed = True
-            self._under_way.clear()
+            self._packets.clear()
             self._reset_other()
             self._network.connections.pop(self._fd, None)
 
@@ -181,16 +181,16 @@ class SimSocket:
         when = network.world.now + network.delay() * self._slower
         while network.world.rng.random() < network.weather.loss:
             when += _RETRY
-        if self._under_way:
-            when = max(when, self._under_way[-1][0])
-        self._under_way.append((when, item))
+        if self._packets:
+            when = max(when, self._packets[-1][0])
+        self._packets.append((when, item))
         if not self._pumping:
             self._pumping = True
             network.world.at(when, self._pump)
 
     def _pump(self) -> None:
         world = self._network.world
-        while self._under_way and self._under_way[0][0] <= world.now:
+        while self._packets and self._packets[0][0] <= world.now:
             if not self.reaches():
                 self._stall()
                 return
@@ -198,25 +198,25 @@ class SimSocket:
             item = self._next()
             self.in_flight -= len(item) if item is not _FIN else 0
             if self.other.closed:
-                self._under_way.clear()
+                self._packets.clear()
                 world.after(self._network.delay(), lambda: self.fail(errno.ECONNRESET))
                 break
             self.other._arrive(item)
             if self.trap is not None and self.trap[0] == 0:
                 happen, self.trap = self.trap[1], None
                 happen()
-        self._pumping = bool(self._under_way)
+        self._pumping = bool(self._packets)
         if self._pumping:
-            world.at(self._under_way[0][0], self._pump)
+            world.at(self._packets[0][0], self._pump)
         self._wake_writer()
 
     def _next(self) -> bytes:
         """The next piece, cut where a trap is."""
-        item = self._under_way.popleft()[1]
+        item = self._packets.popleft()[1]
         if self.trap is not None and item is not _FIN:
             left, happen = self.trap
             if len(item) > left:
-                self._under_way.appendleft((self._network.world.now, item[left:]))
+                self._packets.appendleft((self._network.world.now, item[left:]))
                 item = item[:left]
             self.trap = (left - len(item), happen)
         return item
@@ -227,7 +227,7 @@ class SimSocket:
         if self._stalled is None:
             self._stalled = world.now
         if world.now - self._stalled >= limits.LINK_UNACKED:
-            self._under_way.clear()
+            self._packets.clear()
             self._pumping = False
             self.fail(errno.ETIMEDOUT)
             return

@@ -20,7 +20,7 @@ BLOCKS = [(count, block) for count, blocks in ((2, 12), (3, 2)) for block in ran
 
 
 @pytest.mark.parametrize(("count", "block"), BLOCKS)
-def test_what_arrives_is_whole_and_in_order_and_after_healing_it_is_all(count: int, block: int) -> None:
+def test_healed_network_delivers_all_in_order(count: int, block: int) -> None:
     breaks = 0
     for seed in range(block * BLOCK, (block + 1) * BLOCK):
         scenario = LanesScenario(seed, count)
@@ -53,7 +53,7 @@ def test_undisturbed_it_arrives_in_as_many_bytes(course: Course) -> None:
 
 
 @pytest.mark.parametrize("trouble", TROUBLES)
-def test_trouble_at_every_byte_of_a_message_leaves_no_half_one_and_the_next_comes(trouble: str) -> None:
+def test_failure_at_every_byte_leaves_no_half_message(trouble: str) -> None:
     """Each byte meets one of the courses; with more seeds, more of them."""
     for point in range(TROUBLES.index(trouble), LENGTH, len(TROUBLES)):
         for turn in range(min(FACTOR, len(COURSES))):

@@ -42,9 +42,7 @@ def test_where_both_can_dial_the_lower_guid_did(seed: int, count: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_calls_that_cross_leave_the_lower_guids_link_and_no_flapping(
-    seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_crossing_dials_leave_one_link(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "DIAL_FALLBACK", 0.0)  # the higher GUID does not wait: calls cross
     scenario = MeshScenario(seed, 3, keep=True, calm=True)
     scenario.network.weather = Weather(delay=(0.1, 0.3))

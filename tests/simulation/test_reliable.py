@@ -46,7 +46,7 @@ def short(seed: int) -> ReliableScenario:
 
 @pytest.mark.parametrize("trouble", ["cut", "replace", "exporter", "importer"])
 @pytest.mark.parametrize("side", ["exporter", "importer"])
-def test_trouble_at_every_byte_of_a_message_and_of_an_acknowledgement(
+def test_failure_at_every_byte_of_message_and_acknowledgement(
     side: str, trouble: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     undisturbed = short(0)
@@ -80,7 +80,7 @@ def test_ten_thousand_messages_at_1_khz_across_five_cuts() -> None:
     assert [got.number for got in scenario.importer.lives[0].received] == list(range(10_000))
 
 
-def test_an_outage_longer_than_the_buffer_is_reported_with_its_exact_count() -> None:
+def test_loss_in_a_long_outage_is_counted_exactly() -> None:
     scenario = ReliableScenario(2, Bounds(depth=100))
     scenario.world.run(scenario.world.now + 0.1)
     for _ in range(3):
@@ -97,7 +97,7 @@ def test_an_outage_longer_than_the_buffer_is_reported_with_its_exact_count() -> 
 
 @pytest.mark.parametrize("seconds", [core_limits.RESUME_WINDOW + 1, 600.0])
 @pytest.mark.parametrize("goes_on", [True, False])
-def test_an_outage_longer_than_the_window_is_counted_exactly(seconds: float, goes_on: bool) -> None:
+def test_outage_beyond_the_window_is_counted_exactly(seconds: float, goes_on: bool) -> None:
     scenario = ReliableScenario(3, Bounds())
     scenario.world.run(scenario.world.now + 0.1)
     scenario.exporter.publish(4)

@@ -1,7 +1,7 @@
-"""Messages between simulated agents: the real legs and flows of the bridge over the real lanes of the mesh.
+"""Messages between simulated agents: the real flows and route senders of the bridge over the real lanes of the mesh.
 
-Each agent has one source, and wants those of all others. What the bridge's plans would say to each other is said here
-in two words, ``open`` and ``opened``; everything that touches a message is the agent's own code.
+Each agent has one source, and opens a route to those of all others. The control messages of the bridge are replaced
+by two, ``open`` and ``opened``; everything that touches a message is the agent's own code.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ _RING: Final = bytes(range(256))
 _SIZES: Final = (20, 300, 300, 5000, 9000, 40_000, 150_000, 400_000)
 _CUT_THROUGH: Final = 131_072
 _HEAD: Final = 12
-"""Bytes in front: the length, as ROS has it, and the message's number."""
+"""Bytes in front: the length, as in TCPROS, and the message's number."""
 
 
 def framed(number: int, size: int) -> bytes:
-    """A message with its length in front, whose every byte tells where it belongs."""
+    """A message with its length in front; each byte depends on its place and on the message's number."""
     start = number * 31 & 0xFF
     body = number.to_bytes(8, "big") + (_RING * (size // 256 + 2))[start : start + size]
     return len(body).to_bytes(4, "little") + body
 
 
 def number_of(message: bytes) -> int:
-    """Which message this is; it must be one, and whole."""
+    """The number of a message, which must be whole and unchanged."""
     number = int.from_bytes(message[4:_HEAD], "big")
     assert message == framed(number, len(message) - _HEAD), f"message {number} is not what was published"
     return number
@@ -48,7 +48,7 @@ def number_of(message: bytes) -> int:
 
 @dataclass
 class Inbox:
-    """What one agent got of one run of another one.
+    """The messages that one agent received from one run of another one.
 
     Args:
         contract: What holds for it.
@@ -63,17 +63,17 @@ class Inbox:
     _size: int = 0
 
     def publish_framed(self, message: bytes | bytearray | memoryview) -> None:
-        """A whole one."""
+        """Take a whole message."""
         assert self._begun is None, "a message in the middle of another one"
         self._take(bytes(message))
 
     def begin(self, size: int) -> None:
-        """One in parts."""
+        """Begin a message in parts."""
         assert self._begun is None, "a message in the middle of another one"
         self._begun, self._size = bytearray(), size
 
     def extend(self, part: bytes | bytearray | memoryview) -> None:
-        """A part of it."""
+        """Take a part of it."""
         assert self._begun is not None
         self._begun += part
         assert len(self._begun) <= self._size
@@ -82,7 +82,7 @@ class Inbox:
             self._take(whole)
 
     def abort(self) -> int:
-        """Nobody gets the half of it."""
+        """Drop the message in parts; return whether there was one."""
         was = self._begun is not None
         self._begun = None
         self.torn += was
@@ -94,27 +94,27 @@ class Inbox:
         self.got.append(number)
 
 
-class Courier(MeshPeer):
-    """An agent with a source of its own; the contract is its run's."""
+class TrafficPeer(MeshPeer):
+    """An agent with a source; each run has a contract of its own."""
 
     stopped = False
-    """Whether it publishes nothing of itself any more."""
+    """Whether it only publishes on request."""
     fixed: Contract | None = None
-    """The contract, where it is not left to chance."""
+    """The contract, where it is not random."""
 
     def prepare(self, rng: random.Random) -> None:
-        """Nothing was published or got yet."""
+        """Begin with nothing published or received."""
         self.contract = self.fixed or Contract(
             reliability=rng.choice(list(Reliability)),
             priority=rng.choice([Priority.NORMAL, Priority.NORMAL, *Priority]),
             depth=1000,
         )
         self.published: list[int] = []
-        """Numbers of the messages that were published whole, in order; of one run, but never used again."""
+        """Numbers of the messages that this run published whole, in order; later runs use other numbers."""
         self.first: dict[bytes, int] = {}
-        """By instance: the number of the first message that this reliable receiver must have."""
+        """By instance: the number of the first message that a reliable receiver must get."""
         self.inboxes: dict[bytes, Inbox] = {}
-        self.legs: dict[tuple[PeerLink, int], RouteSender] = {}
+        self.senders: dict[tuple[PeerLink, int], RouteSender] = {}
         self.flows: dict[tuple[PeerLink, int], ImportFlow] = {}
         self.times: dict[PeerLink, LinkTime] = {}
         self._peers: dict[bytes, int] = {}
@@ -141,7 +141,7 @@ class Courier(MeshPeer):
         self._publish_later()
 
     def publish(self, size: int) -> None:
-        """One more message; a large one comes from its publisher in parts, perhaps, and perhaps not to its end."""
+        """Publish a message; a large one perhaps in parts, and perhaps not to its end."""
         if self._streaming:
             return  # its publisher's connection carries one at a time
         if size >= _CUT_THROUGH and self._rng.random() < 0.7:
@@ -152,7 +152,7 @@ class Courier(MeshPeer):
         self.exports.message(memoryview(framed(self._next, size)))
 
     def publish_in_parts(self, size: int, part: int | None = None) -> None:
-        """One that comes in parts, of so many bytes each."""
+        """Publish a message in parts of ``part`` bytes each."""
         self._next += 1
         self._streaming = True
         message = framed(self._next, size)
@@ -160,7 +160,7 @@ class Courier(MeshPeer):
         self._stream(message, 0, self._next, part)
 
     def abort(self) -> None:
-        """The publisher dies; in the middle of a message, perhaps."""
+        """The publisher dies, perhaps in the middle of a message."""
         if self._streaming:
             self._streaming = False
             self.aborted += 1
@@ -183,7 +183,7 @@ class Courier(MeshPeer):
     # --- links ----------------------------------------------------------------------------------------------
 
     def link_up(self, link: PeerLink) -> None:
-        """Ask for the peer's source; one that restarted is not waited for any more."""
+        """Open a route to the peer's source; stop waiting for its earlier run."""
         super().link_up(link)
         instance = link.identity.instance
         for other in [i for i in self.inboxes if i != instance and self._place[i] == link.guid.place]:
@@ -196,10 +196,10 @@ class Courier(MeshPeer):
         self.times[link] = LinkTime()
         position = inbox.flow.position if inbox.flow is not None else None
         epoch, after = position or (0, 0)
-        self._say(link, op="open", epoch=epoch, after=after)
+        self._send_message(link, op="open", epoch=epoch, after=after)
 
     def link_down(self, link: PeerLink, down: LinkDown) -> None:
-        """Half messages are dropped; what is reliable waits."""
+        """Drop half messages; suspend reliable routes."""
         super().link_down(link, down)
         self.times.pop(link, None)
         for key in [key for key in self.flows if key[0] is link]:
@@ -208,33 +208,33 @@ class Courier(MeshPeer):
             if inbox.contract.reliability is not Reliability.RELIABLE and inbox.flow is not None:
                 inbox.flow.close()
                 inbox.flow = None
-        for key in [key for key in self.legs if key[0] is link]:
-            leg = self.legs.pop(key)
+        for key in [key for key in self.senders if key[0] is link]:
+            sender = self.senders.pop(key)
             peer = self._peers[link.identity.instance]
-            if isinstance(leg, ReliableRouteSender):
+            if isinstance(sender, ReliableRouteSender):
                 self.exports.suspend(peer)
             else:
                 self.exports.remove(peer)
 
     def lane_lost(self, link: PeerLink) -> None:
-        """As the bridge."""
+        """Do what the bridge does."""
         self.note(f"= link {link.id} lost its bulk lane")
         for (of, _), flow in self.flows.items():
             if of is link and flow.contract.priority is not Priority.HIGH:
                 flow.torn()
-        for (of, _), leg in list(self.legs.items()):
+        for (of, _), sender in list(self.senders.items()):
             if of is link:
-                leg.lane_lost()
+                sender.lane_lost()
 
     def clock_known(self, link: PeerLink) -> None:
-        """As the bridge."""
+        """Do what the bridge does."""
         if link in self.times:
             self.times[link].set(link.clock_offset, link.clock_error)
 
     # --- what comes -----------------------------------------------------------------------------------------
 
     def control(self, link: PeerLink, payload: bytes) -> None:
-        """The two words."""
+        """Take the two control messages."""
         said: dict[str, Any] = json.loads(payload)
         if said["op"] == "open":
             self._opened(link, said["epoch"], said["after"])
@@ -255,32 +255,32 @@ class Courier(MeshPeer):
 
     def mark(self, link: PeerLink, kind: FrameKind, route: int, sequence: int) -> None:
         """An acknowledgement, or a fence's answer."""
-        leg = self.legs.get((link, route))
-        if leg is not None and kind is FrameKind.ACK:
-            leg.acknowledged(sequence)
-        elif leg is not None and kind is FrameKind.FENCED:
-            leg.fenced(sequence)
+        sender = self.senders.get((link, route))
+        if sender is not None and kind is FrameKind.ACK:
+            sender.acknowledged(sequence)
+        elif sender is not None and kind is FrameKind.FENCED:
+            sender.fenced(sequence)
 
     # --- inside ---------------------------------------------------------------------------------------------
 
-    def _say(self, link: PeerLink, **what: object) -> None:
+    def _send_message(self, link: PeerLink, **what: object) -> None:
         self.note(f"> link {link.id} {what}")
         link.send_control(json.dumps(what).encode())
 
     def _opened(self, link: PeerLink, epoch: int, after: int) -> None:
-        """Somebody wants our source, by the only route of this link."""
+        """A peer opens the only route of this link."""
         peer = self._peers[link.identity.instance]
-        leg = self.exports.by_peer.get(peer)
+        sender = self.exports.by_peer.get(peer)
         contract = {"reliability": self.contract.reliability, "priority": self.contract.priority}
-        if epoch and isinstance(leg, ReliableRouteSender) and leg.sender.epoch == epoch:
-            self._say(link, op="opened", epoch=epoch, first=leg.sender.first, **contract)
-            leg.resume(link, 1, after)
+        if epoch and isinstance(sender, ReliableRouteSender) and sender.sender.epoch == epoch:
+            self._send_message(link, op="opened", epoch=epoch, first=sender.sender.first, **contract)
+            sender.resume(link, 1, after)
         else:
             self._epoch += 1
             self.first[link.identity.instance] = self._next + 1
-            self._say(link, op="opened", epoch=self._epoch, first=1, **contract)
-            leg = self.exports.add(peer, link, 1, self.contract, self._epoch)
-        self.legs[link, 1] = leg
+            self._send_message(link, op="opened", epoch=self._epoch, first=1, **contract)
+            sender = self.exports.add(peer, link, 1, self.contract, self._epoch)
+        self.senders[link, 1] = sender
 
     def _begin(self, link: PeerLink, said: dict[str, Any]) -> None:
         inbox = self.inboxes[link.identity.instance]

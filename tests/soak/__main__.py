@@ -1,4 +1,4 @@
-"""``python -m tests.soak [--seconds N] [--seed N]``: disturb three modules for long, and see that nothing leaks.
+"""``python -m tests.soak [--seconds N] [--seed N]``: disturb three modules for long, and check that nothing leaks.
 
 Network namespaces and real nodes, so root and Debian's ROS 1 are needed. The seed of a run is printed; it brings the
 same disturbances again. Logs stay in the folder that is named at the end if something went wrong.
@@ -22,7 +22,7 @@ from tests.soak.held import MB, Held, growth, left, look, too_much
 from tests.soak.stage import STEADY, Stage, leftovers
 
 _GIVEN_BACK = 30.0
-"""Seconds in which an agent closes what its nodes have left."""
+"""Seconds in which an agent releases what its nodes no longer use."""
 
 
 class Soak:
@@ -44,7 +44,7 @@ class Soak:
         self._disturbances = 0
 
     def run(self) -> None:
-        """Do it; see ``problems``."""
+        """Run the soak; see ``problems``."""
         try:
             with Stage(self._home) as stage:
                 stage.open()
@@ -67,7 +67,7 @@ class Soak:
         self.problems += stage.settle()
 
     def _disturb(self, stage: Stage) -> None:
-        """One disturbance, or two at once; then wait for calm and look."""
+        """Cause one disturbance, or two at once; then wait for calm and take a sample."""
         texts = []
         for _ in range(self._rng.choice((1, 1, 2))):
             text, act = chaos.draw(self._rng, stage)
@@ -88,7 +88,7 @@ class Soak:
         return [f"{problem} (after {what})" for problem in problems]
 
     def _end(self, stage: Stage, before: dict[str, Held]) -> None:
-        """Take the nodes away: then the agents must hold what they held before there were any."""
+        """End the nodes: then the agents must hold what they held before there were any."""
         self.problems += stage.drain()
         self.problems += stage.depopulate()
         for name, was in before.items():
@@ -106,7 +106,7 @@ class Soak:
 
 
 def main() -> int:
-    """Run; 1 if something went wrong."""
+    """Run the soak; return 1 if something went wrong."""
     parser = argparse.ArgumentParser(prog="python -m tests.soak", description=__doc__)
     parser.add_argument("--seconds", type=float, default=600.0, help="how long (default: 600)")
     parser.add_argument("--seed", type=int, default=None, help="of the disturbances (default: a new one, printed)")

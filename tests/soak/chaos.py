@@ -1,4 +1,4 @@
-"""What befalls the stage, drawn from a seed: the same seed brings the same disturbances, if not the same moments."""
+"""Disturbances of the stage, drawn from a seed: the same seed gives the same ones, though not at the same moments."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from lab.bed.agents import Agent
-from tests.soak.stage import EARS, MOUTHS, STEADY
+from tests.soak.stage import LISTENERS, STEADY, TALKERS
 
 if TYPE_CHECKING:
     import random
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from tests.soak.stage import Stage
 
 Disturbance = tuple[str, "Callable[[], list[str]]"]
-"""What it is called, and how it is done; it returns what went wrong."""
+"""Its description, and the function that does it and returns what went wrong."""
 
 
 def draw(rng: random.Random, stage: Stage) -> Disturbance:
@@ -73,36 +73,39 @@ def _restart(rng: random.Random, stage: Stage) -> Disturbance:
 
 
 def _talker(rng: random.Random, stage: Stage) -> Disturbance:
-    mouth = rng.choice(MOUTHS)
+    talker = rng.choice(TALKERS)
 
     def again() -> list[str]:
-        stage.hang_up(mouth)
+        stage.restart_talker(talker)
         return []
 
-    return f"{mouth} gets SIGKILL", again
+    return f"{talker} gets SIGKILL", again
 
 
 def _listener(rng: random.Random, stage: Stage) -> Disturbance:
-    ear = rng.choice(EARS)
+    listener = rng.choice(LISTENERS)
 
     def again() -> list[str]:
-        problems = stage.silence(ear)
-        stage.listen(ear)
+        problems = stage.kill_listener(listener)
+        stage.listen(listener)
         return problems
 
-    return f"{ear} gets SIGKILL", again
+    return f"{listener} gets SIGKILL", again
 
 
 def _stuck(rng: random.Random, stage: Stage) -> Disturbance:
-    ear, seconds = rng.choice([ear for ear in EARS if not ear.reliable]), rng.uniform(1.0, 4.0)
+    listener, seconds = (
+        rng.choice([listener for listener in LISTENERS if not listener.reliable]),
+        rng.uniform(1.0, 4.0),
+    )
 
     def stop() -> list[str]:
-        stage.listening[ear].freeze()
+        stage.listeners[listener].freeze()
         time.sleep(seconds)
-        stage.listening[ear].thaw()
+        stage.listeners[listener].thaw()
         return []
 
-    return f"{ear} hangs for {seconds:.1f} s", stop
+    return f"{listener} hangs for {seconds:.1f} s", stop
 
 
 _KINDS: Final[dict[str, tuple[int, Callable[[random.Random, Stage], Disturbance]]]] = {
@@ -115,4 +118,4 @@ _KINDS: Final[dict[str, tuple[int, Callable[[random.Random, Stage], Disturbance]
     "listener": (2, _listener),
     "stuck": (1, _stuck),
 }
-"""How often, relative to each other, and what."""
+"""By name: relative frequency, and the function that draws the details."""

@@ -1,4 +1,4 @@
-"""What an agent holds, seen from outside; and what of it grows that should not."""
+"""The resources that an agent holds, measured from outside, and whether they grow without a reason."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ MB: Final = 1 << 20
 PATIENCE: Final = 60.0
 """Seconds in which an agent answers, however busy the machine is."""
 OWN_FAULT: Final = 3.0
-"""Seconds by which a loop is later than a thread beside it: then it was busy, and not the machine."""
+"""Seconds by which a loop is later than a thread of its process: then the agent was busy, and not the machine."""
 FLOOR_SPAN: Final = 5
-"""Samples of which the least counts: what a queue or a snapshot held for a moment is no growth."""
+"""Samples of which the minimum counts: what a queue or a snapshot held for a moment is no growth."""
 GROWTH_MAX: Final = 3 * MB
 """That the floor of the resident memory may rise by in the second half, and by no more than a twentieth: an
 allocator's holes are worth a megabyte."""
@@ -38,7 +38,7 @@ allocator's holes are worth a megabyte."""
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """One look at an agent.
+    """One sample of an agent.
 
     Args:
         at: Seconds since the soak began.
@@ -67,7 +67,7 @@ class Held:
 
 
 def look(agent: Agent, at: float) -> Held:
-    """Look at a running agent, a ``stage.WatchedAgent``."""
+    """Take a sample of a running ``stage.WatchedAgent``."""
     process = psutil.Process(agent.pid)
     path = held_path(agent)
     path.unlink(missing_ok=True)
@@ -126,7 +126,7 @@ def lateness(agent: Agent) -> dict[str, float]:
 
 
 def _open_files(pid: int) -> list[str]:
-    """What each file descriptor of a process leads to."""
+    """The target of each file descriptor of a process."""
     found = []
     for entry in Path(f"/proc/{pid}/fd").iterdir():
         with contextlib.suppress(FileNotFoundError):  # closed since
@@ -135,12 +135,12 @@ def _open_files(pid: int) -> list[str]:
 
 
 def held_path(agent: Agent) -> Path:
-    """Where an agent writes what it holds."""
+    """The file into which an agent writes what it holds."""
     return agent.home / f"{agent.name}.held"
 
 
 def left(before: Held, after: Held) -> list[str]:
-    """What an agent still holds of what it had to give back; both looks are at an agent alone."""
+    """What an agent still holds though it had to release it; both samples are of an agent without nodes."""
     problems = [
         f"{name}: {was} before, {now} afterwards"
         for name, was, now in (
@@ -156,13 +156,13 @@ def left(before: Held, after: Held) -> list[str]:
 
 
 def floors(samples: Sequence[Held]) -> list[tuple[float, int]]:
-    """The least resident memory of each few samples, and when that began."""
+    """Start and least resident memory of each ``FLOOR_SPAN`` samples."""
     spans = [samples[begin : begin + FLOOR_SPAN] for begin in range(0, len(samples), FLOOR_SPAN)]
     return [(span[0].at, min(held.rss for held in span)) for span in spans if len(span) == FLOOR_SPAN]
 
 
 def slope(points: Sequence[tuple[float, float]]) -> float:
-    """Of the straight line that fits best (least squares); 0 for fewer than two points."""
+    """The slope of the straight line that fits best (least squares); 0 for fewer than two points."""
     if len(points) < 2:
         return 0.0
     mean_x = sum(x for x, _ in points) / len(points)

@@ -1,7 +1,7 @@
-"""Three modules with commands, images and reliable topics among them, and what can befall them.
+"""Three modules with commands, images and reliable topics between them, and how they are disturbed.
 
 ``a`` and ``b`` keep their agents for the whole soak, ``c`` loses its own now and then. Cables are pulled, agents
-hang, nodes are killed. Each listener checks what it hears; a listener that is killed has its account kept.
+hang, nodes are killed. Each listener checks what it receives; the errors of a listener that is killed are kept.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ liveliness = "manual_by_topic"
 liveliness_lease_duration = 1
 """
 CALM: Final = 40.0
-"""Seconds in which everything must flow again, on a busy machine too."""
+"""Seconds in which all topics must flow again, on a busy machine too."""
 RELIABLE_RATE: Final = 200
 STEADY: Final = ("a", "b")
 _WATCHED: Final = Path(__file__).with_name("watched.py")
 
 
 class WatchedAgent(Agent):
-    """An agent that can be asked what it holds."""
+    """An agent that writes what it holds on SIGUSR1."""
 
     @property
     def env(self) -> dict[str, str]:
-        """With the file for that."""
+        """The environment, with the file for that."""
         return {**super().env, "SOAK_HELD": str(held_path(self))}
 
     def peers(self) -> dict[str, dict[str, object]]:
@@ -67,7 +67,7 @@ class WatchedAgent(Agent):
 
 
 @dataclass(frozen=True, slots=True)
-class Ear:
+class Listener:
     """A listener that runs, or is started again.
 
     Args:
@@ -86,12 +86,12 @@ class Ear:
 
     @property
     def reliable(self) -> bool:
-        """Whether nothing may be missing."""
+        """Whether no message may be missing."""
         return self.topic.startswith("/sure/")
 
 
 @dataclass(frozen=True, slots=True)
-class Mouth:
+class Talker:
     """A talker that runs, or is started again; its numbers begin anew then, under another source.
 
     Args:
@@ -111,30 +111,30 @@ class Mouth:
         return f"talker of {self.topic} at {self.module}"
 
 
-MOUTHS: Final = (
-    Mouth("a", "/command", 64, 100),
-    Mouth("a", "/image", 1 << 20, 4),
-    Mouth("c", "/chat", 2000, 20),
-    Mouth("b", "/sure/from_b", 64, RELIABLE_RATE),
-    Mouth("a", "/sure/from_a", 20_000, 20),
+TALKERS: Final = (
+    Talker("a", "/command", 64, 100),
+    Talker("a", "/image", 1 << 20, 4),
+    Talker("c", "/chat", 2000, 20),
+    Talker("b", "/sure/from_b", 64, RELIABLE_RATE),
+    Talker("a", "/sure/from_a", 20_000, 20),
 )
-EARS: Final = (
-    Ear("b", "/command"),
-    Ear("c", "/command", "rospy"),
-    Ear("b", "/image"),
-    Ear("c", "/image"),
-    Ear("a", "/chat"),
-    Ear("b", "/chat", "rospy"),
-    Ear("a", "/sure/from_b"),
-    Ear("a", "/sure/from_b", "rospy"),
-    Ear("c", "/sure/from_b"),
-    Ear("b", "/sure/from_a", "rospy"),
-    Ear("c", "/sure/from_a"),
+LISTENERS: Final = (
+    Listener("b", "/command"),
+    Listener("c", "/command", "rospy"),
+    Listener("b", "/image"),
+    Listener("c", "/image"),
+    Listener("a", "/chat"),
+    Listener("b", "/chat", "rospy"),
+    Listener("a", "/sure/from_b"),
+    Listener("a", "/sure/from_b", "rospy"),
+    Listener("c", "/sure/from_b"),
+    Listener("b", "/sure/from_a", "rospy"),
+    Listener("c", "/sure/from_a"),
 )
 
 
 class Stage:
-    """Everything that runs.
+    """All processes of the soak.
 
     Args:
         home: Existing directory for logs.
@@ -144,11 +144,11 @@ class Stage:
         self._stack = ExitStack()
         self.home = home
         self.modules: dict[str, Module] = {}
-        self.talking: dict[Mouth, Process] = {}
-        self.listening: dict[Ear, Process] = {}
+        self.talkers: dict[Talker, Process] = {}
+        self.listeners: dict[Listener, Process] = {}
         self.heard = 0
         """Messages of reliable topics, over all listeners that were checked."""
-        self._sources: dict[Mouth, int] = {}
+        self._sources: dict[Talker, int] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -185,65 +185,72 @@ class Stage:
 
     def populate(self, only: str = "") -> None:
         """Start the nodes, all or those of one module."""
-        for ear in EARS:
-            if only in ("", ear.module):
-                self.listen(ear)
-        for mouth in MOUTHS:
-            if only in ("", mouth.module):
-                self.talk(mouth)
+        for listener in LISTENERS:
+            if only in ("", listener.module):
+                self.listen(listener)
+        for talker in TALKERS:
+            if only in ("", talker.module):
+                self.talk(talker)
 
-    def talk(self, mouth: Mouth) -> None:
+    def talk(self, talker: Talker) -> None:
         """Start a talker, in place of the one before."""
-        self._sources[mouth] = max(self._sources.values(), default=0) + 1
-        ros = self.modules[mouth.module].ros
-        self.talking[mouth] = ros.roscpp(
-            "talker", topic=mouth.topic, size=mouth.size, rate=mouth.rate, source=self._sources[mouth], nodelay=True
+        self._sources[talker] = max(self._sources.values(), default=0) + 1
+        ros = self.modules[talker.module].ros
+        self.talkers[talker] = ros.roscpp(
+            "talker",
+            topic=talker.topic,
+            size=talker.size,
+            rate=talker.rate,
+            source=self._sources[talker],
+            nodelay=True,
         )
 
-    def listen(self, ear: Ear) -> None:
+    def listen(self, listener: Listener) -> None:
         """Start a listener, in place of the one before."""
-        self.listening[ear] = self.modules[ear.module].ros.node(ear.kind, "listener", topic=ear.topic, nodelay=True)
+        self.listeners[listener] = self.modules[listener.module].ros.node(
+            listener.kind, "listener", topic=listener.topic, nodelay=True
+        )
 
     def depopulate(self, only: str = "") -> list[str]:
         """End the nodes, all or those of one module; return what was wrong with what the listeners heard."""
         problems = []
-        for ear in [ear for ear in self.listening if only in ("", ear.module)]:
-            problems += self.silence(ear)
-        for mouth in [mouth for mouth in self.talking if only in ("", mouth.module)]:
-            self.talking.pop(mouth).end()
+        for listener in [listener for listener in self.listeners if only in ("", listener.module)]:
+            problems += self.kill_listener(listener)
+        for talker in [talker for talker in self.talkers if only in ("", talker.module)]:
+            self.talkers.pop(talker).end()
         return problems
 
-    def silence(self, ear: Ear) -> list[str]:
-        """Kill a listener; return what was wrong with what it heard."""
-        process = self.listening.pop(ear)
+    def kill_listener(self, listener: Listener) -> list[str]:
+        """Kill a listener; return the errors in what it received."""
+        process = self.listeners.pop(listener)
         process.kill()
-        problems = self.account(ear, process)
+        problems = self.errors_of(listener, process)
         reports = process.events("report")
-        if ear.reliable and reports:
+        if listener.reliable and reports:
             self.heard += int(str(reports[-1]["count"]))
         return problems
 
-    def hang_up(self, mouth: Mouth) -> None:
+    def restart_talker(self, talker: Talker) -> None:
         """Kill a talker and start it again."""
-        self.talking.pop(mouth).kill()
-        self.talk(mouth)
+        self.talkers.pop(talker).kill()
+        self.talk(talker)
 
-    def account(self, ear: Ear, process: Process) -> list[str]:
-        """What was wrong with what a listener has heard so far."""
+    def errors_of(self, listener: Listener, process: Process) -> list[str]:
+        """The errors in what a listener has received so far."""
         reports = process.events("report")
         if not reports:
             return []
-        words = ("bad", "doubled", "gaps") if ear.reliable else ("bad", "doubled")
-        return [f"{ear}: {reports[-1][word]} {word}: {reports[-1]}" for word in words if reports[-1][word]]
+        words = ("bad", "doubled", "gaps") if listener.reliable else ("bad", "doubled")
+        return [f"{listener}: {reports[-1][word]} {word}: {reports[-1]}" for word in words if reports[-1][word]]
 
-    def accounts(self) -> list[str]:
-        """The same for all that listen."""
-        return [text for ear, process in self.listening.items() for text in self.account(ear, process)]
+    def all_errors(self) -> list[str]:
+        """The same for all listeners."""
+        return [text for listener, process in self.listeners.items() for text in self.errors_of(listener, process)]
 
-    # --- what befalls them --------------------------------------------------------------------------------------
+    # --- disturbances -------------------------------------------------------------------------------------------
 
     def restart(self, name: str, end: Callable[[Agent], object]) -> list[str]:
-        """End an agent and start it again, and its module's nodes: a core that is new knows none of them."""
+        """End an agent and start it again, with its module's nodes, which the new core does not know."""
         agent = self.modules[name].agent
         end(agent)
         problems = self.depopulate(name)
@@ -252,34 +259,36 @@ class Stage:
         return problems
 
     def settle(self) -> list[str]:
-        """Wait until all are linked and every listener hears; return what does not come back, or was wrong."""
+        """Wait until all are linked and each listener receives; return what stays silent, or was wrong."""
         self.wait_linked()
-        counts = {ear: _count(process) for ear, process in self.listening.items()}
+        counts = {listener: _count(process) for listener, process in self.listeners.items()}
         deadline = time.monotonic() + CALM
-        while waiting := [ear for ear, process in self.listening.items() if _count(process) <= counts[ear] + 2]:
+        while waiting := [
+            listener for listener, process in self.listeners.items() if _count(process) <= counts[listener] + 2
+        ]:
             if time.monotonic() > deadline:
-                return [f"{ear}: silent for {CALM:g} s" for ear in waiting]
+                return [f"{listener}: silent for {CALM:g} s" for listener in waiting]
             time.sleep(0.05)
-        return self.accounts()
+        return self.all_errors()
 
     def drain(self) -> list[str]:
         """Stop the talkers of reliable topics; return which listeners do not all get the same last message."""
         problems = []
-        for mouth in [mouth for mouth in self.talking if mouth.topic.startswith("/sure/")]:
-            process = self.talking.pop(mouth)
-            process.freeze()  # whoever ends takes with it what is still under way
+        for talker in [talker for talker in self.talkers if talker.topic.startswith("/sure/")]:
+            process = self.talkers.pop(talker)
+            process.freeze()  # ending it would lose what is still in flight
             deadline = time.monotonic() + CALM
-            while len(lasts := self._lasts(mouth)) > 1 and time.monotonic() < deadline:
+            while len(lasts := self._lasts(talker)) > 1 and time.monotonic() < deadline:
                 time.sleep(0.1)
             if len(lasts) > 1:
-                problems.append(f"{mouth} has stopped, and its listeners have messages up to {sorted(lasts)}")
+                problems.append(f"{talker} has stopped, and its listeners have messages up to {sorted(lasts)}")
             process.end()
         return problems
 
-    def _lasts(self, mouth: Mouth) -> set[int]:
+    def _lasts(self, talker: Talker) -> set[int]:
         """The last messages of a talker, as its listeners have them."""
-        heard = [process for ear, process in self.listening.items() if ear.topic == mouth.topic]
-        source = str(self._sources[mouth])
+        heard = [process for listener, process in self.listeners.items() if listener.topic == talker.topic]
+        source = str(self._sources[talker])
         return {process.events("report")[-1]["sources"][source]["last"] for process in heard}  # type: ignore[index]
 
 

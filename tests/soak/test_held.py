@@ -45,13 +45,13 @@ def test_a_leak_is_found_beneath_peaks() -> None:
     assert "memory rose by" in too_much(samples)
 
 
-def test_few_samples_tell_nothing() -> None:
+def test_few_samples_have_no_statistics() -> None:
     samples = row([40 + number for number in range(20)])
     assert growth(samples) is None
     assert too_much(samples) == ""
 
 
-def test_what_was_given_back_is_named() -> None:
+def test_report_names_what_was_given_back() -> None:
     assert left(IDLE, IDLE) == []
     assert left(IDLE, replace(IDLE, fds=20, sockets=14, rss=90 * MB, tasks=Counter({"Agent.close": 1}))) == []
     kept = replace(IDLE, sockets=19, fds=25, routes=1, proxies=2, tasks=IDLE.tasks + Counter({"Mesh._dial": 1}))

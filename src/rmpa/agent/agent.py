@@ -84,10 +84,27 @@ class Agent:
             relay=settings.relay,
             most=settings.limits,
         )
-        self.params = Params(self.core, self.bridge, settings.params, settings.time, settings.limits.params)
+        self.params = Params(
+            self.core,
+            self.bridge.node,
+            self.bridge.rpc,
+            self.bridge.sessions.linked,
+            self.bridge.counters,
+            settings.params,
+            settings.time,
+            settings.limits.params,
+        )
         rules = ServiceRules(settings.services, policy, names)
-        self.services = Services(self.core, self.bridge, rules, settings.limits)
-        bounds = Bounds(self.bridge, self.services, settings.limits)
+        self.services = Services(
+            self.core,
+            self.bridge.sessions,
+            self.bridge.rpc,
+            self.bridge.relay,
+            rules,
+            settings.limits,
+            self.bridge.counters,
+        )
+        bounds = Bounds(self.bridge.sessions, self.bridge.rpc, self.bridge.topics, self.services, settings.limits)
         for part in (self.params, self.services, bounds):
             self.bridge.add(part)
         self.network = Network(settings, self.bridge)
@@ -108,7 +125,7 @@ class Agent:
             requests=requests,
         )
         self.snapshots = SnapshotBuilder(settings, sources)
-        self._nodes = NodeRequests(settings, self.core, self.bridge.asks)
+        self._nodes = NodeRequests(settings, self.core, self.bridge.rpc)
         self._why = WhyService(settings, self.core, self.bridge, self.services, self.snapshots)
         self.operations = ControlOperations(
             settings.name, self.bridge, self.params, self.snapshots, self._why, self.reloader.reload
@@ -152,7 +169,7 @@ class Agent:
         await self._undo.aclose()
 
     def _bytes_carried(self) -> int:
-        links = (session.link for session in self.bridge.attached())
+        links = (session.link for session in self.bridge.sessions.linked())
         return sum(link.bytes_in + link.bytes_out for link in links)
 
     def _notes(self) -> Iterator[str]:

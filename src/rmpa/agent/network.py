@@ -57,6 +57,7 @@ class NetworkEndpoint:
         clock = SystemClock()
         self._settings = settings
         self._bridge = bridge
+        sessions, receiver = bridge.sessions, bridge.receiver
         self._on_displaced = on_displaced
         tcp, udp = open_mesh_port(port)
         self.port: int = tcp.getsockname()[1]
@@ -78,7 +79,7 @@ class NetworkEndpoint:
             on_link_up=self._link_up,
             on_link_down=self._link_down,
             on_control=bridge.control,
-            handlers=LinkHandlers(bridge.data, bridge.part, bridge.mark, bridge.clock, bridge.lane_lost),
+            handlers=LinkHandlers(receiver.data, receiver.part, receiver.mark, sessions.clock, sessions.lane_lost),
             lanes=settings.lanes,
             clock=clock,
         )
@@ -119,10 +120,10 @@ class NetworkEndpoint:
     def _link_up(self, link: PeerLink) -> None:
         # Its beacons come from its mesh port; an accepted connection may come from any port.
         self.discovery.link_up(link.identity, (link.remote_endpoint[0], link.identity.guid.port))
-        self._bridge.link_up(link)
+        self._bridge.sessions.link_up(link)
 
     def _link_down(self, link: PeerLink, down: LinkDown) -> None:
-        self._bridge.link_down(link)
+        self._bridge.sessions.link_down(link)
         if down.cause is not LinkDownCause.REPLACED:  # else its peer stays linked, and keeps its endpoint
             self.discovery.link_down(link.identity.guid, link.identity.instance)
 

@@ -7,9 +7,10 @@ import logging
 import os
 import signal
 import time
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+from rmpa.config.settings import SETTINGS
 from rmpa.core.errors import ConfigError
 from rmpa.observe.reload_reply import ReloadReply
 from rmpa.runtime.service_manager import notify_service_manager
@@ -17,37 +18,14 @@ from rmpa.runtime.service_manager import notify_service_manager
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from rmpa.config.schema import Setting
     from rmpa.config.settings import Settings
     from rmpa.config.sources import Loaded
 
 _log = logging.getLogger(__name__)
 
-LIVE: Final = frozenset(
-    {"policy", "peers", "contracts", "services", "nodes", "params", "time", "limits", "log_level"}
-)
-"""The settings that a running agent applies; all others need a restart."""
-_KEYS: Final = {
-    "core_mode": "core.mode",
-    "core_fresh": "core.fresh",
-    "core_master": "core.master",
-    "core_host": "core.host",
-    "core_port": "core.port",
-    "port": "mesh.port",
-    "interfaces": "discovery.interfaces",
-    "seeds": "discovery.seeds",
-    "group": "discovery.multicast",
-    "group_port": "discovery.multicast",
-    "multicast": "discovery.multicast",
-    "policy": "bridge",
-    "contracts": "[[contract]]",
-    "peers": "[[peer]]",
-    "params.follow": "[[param]]",
-    "services.rules": "[[service]]",
-    "relay": "relay.enabled",
-    "log_level": "log.level",
-    "log_json": "log.json",
-}
-"""The users' names of settings, where they differ from the fields'."""
+LIVE: Final = frozenset(setting.path[0] for setting in SETTINGS if setting.live)
+"""The fields of ``Settings`` that a running agent takes; all others need a restart."""
 _VALUE_SHOWN: Final = 60
 """Characters of a value that a text has."""
 
@@ -99,11 +77,11 @@ class Reloader:
         differences = list(_differences(self._settings, loaded.settings))
         return ReloadReply(
             file=str(loaded.settings.config_file or ""),
-            changed=tuple(dict.fromkeys(key for name, key, _, _ in differences if name in LIVE)),
+            changed=tuple(setting.title for setting, _, _ in differences if setting.live),
             restart=tuple(
-                f"{key} ({_shown(new)} instead of {_shown(old)})"
-                for name, key, old, new in differences
-                if name not in LIVE
+                f"{setting.title} ({_shown(new)} instead of {_shown(old)})"
+                for setting, old, new in differences
+                if not setting.live
             ),
             notes=loaded.notes,
         )
@@ -180,20 +158,12 @@ def _has_terminal() -> bool:
     return True
 
 
-def _differences(old: Settings, new: Settings) -> Iterator[tuple[str, str, object, object]]:
-    """``(setting, its key, old value, new value)`` of each that differs."""
-    for item in fields(old):
-        before, after = getattr(old, item.name), getattr(new, item.name)
-        if before == after or item.name == "config_file":
-            continue
-        key = _KEYS.get(item.name, item.name)
-        if is_dataclass(before) and is_dataclass(after):
-            for part in fields(before):
-                one, other = getattr(before, part.name), getattr(after, part.name)
-                if one != other:
-                    yield item.name, _KEYS.get(f"{item.name}.{part.name}", f"{key}.{part.name}"), one, other
-        else:
-            yield item.name, key, before, after
+def _differences(old: Settings, new: Settings) -> Iterator[tuple[Setting, object, object]]:
+    """``(setting, old value, new value)`` of each that differs."""
+    for setting in SETTINGS:
+        before, after = setting.value_in(old), setting.value_in(new)
+        if before != after:
+            yield setting, before, after
 
 
 def _shown(value: object) -> str:

@@ -49,7 +49,7 @@ class AddRoute:
 
     Args:
         source: Which.
-        peer: To whom.
+        peer: The peer's number.
         route: The route's id.
         contract: What holds for it.
         epoch: Names the numbering of a reliable route.
@@ -71,7 +71,7 @@ class RemoveRoute:
 
     Args:
         source: Which.
-        peer: To whom no longer.
+        peer: The peer's number.
         route: The route's id; 0: one that was suspended.
         wished: Whether the peer wants no more of it; else it may ask what it missed.
         over: Whether nothing more is published that it could miss until it asks again.
@@ -90,7 +90,7 @@ class SuspendRoute:
 
     Args:
         source: Which.
-        peer: To whom.
+        peer: The peer's number.
         outage: Seconds for which it is kept; after them it is only counted.
     """
 
@@ -107,11 +107,11 @@ class Publish:
     """Let a peer's source appear in the local graph.
 
     Args:
-        peer: Whose.
+        peer: The peer's number.
         source: Which, by the name that its peer has for it.
         type: Its message type.
         topic: What it is called here; empty: the same.
-        origin: Whose it is, if its peer only passes it on.
+        origin: Its module and node, if its peer only passes it on.
     """
 
     peer: int
@@ -134,7 +134,7 @@ class Describe:
     """Tell the waiting local subscribers what the messages are; from now on data comes on ``route``.
 
     Args:
-        peer: Whose.
+        peer: The peer's number.
         source: Which.
         route: The route's id.
         description: What the messages are.
@@ -163,11 +163,11 @@ class Detach:
     """No more data comes on this route; forget the latched message (a new route brings it again).
 
     Args:
-        peer: Whose.
+        peer: The peer's number.
         source: Which.
         route: The route's id.
         keep: The link is gone, and a new one will go on behind the last message that came.
-        missed: Somebody listens all the same: what is not received until a route is open again counts as lost.
+        missed: Local nodes listen all the same: what is not received until a route is open again counts as lost.
     """
 
     peer: int

@@ -23,7 +23,7 @@ ADVERTISEMENT_MAX: Final = 1 * MIB
 """One advertisement, which is read in one piece: ours are 200 KB with the longest names, and 5 KB with usual ones."""
 ADVERTISED_WAITING_BYTES: Final = 4 * MIB
 """Advertisements of all peers that wait to be read: some 40,000 topics. Beyond it they are read at once."""
-LEARNT_AT_ONCE: Final = 16
+APPLIED_AT_ONCE: Final = 16
 """Sources of an advertisement that are dealt with at once, some 100 microseconds; then data goes first."""
 RESCANNED_AT_ONCE: Final = 16
 """Topics of the local graph that are looked at in one turn of the loop, after a change or to reconcile."""
@@ -41,7 +41,7 @@ SERVICE_ROUTES: Final = 1 << 31
 SERVICE_GRACE: Final = 1.0
 """The serving agent waits this much longer than the calling one, whose text says more."""
 SERVICE_IDLE: Final = 30.0
-"""A service, and a connection to its server, that nobody uses for this long is closed."""
+"""A service, and a connection to its server, that is not used for this long is closed."""
 SERVICE_POOL: Final = 32
 """Calls of one service that its server gets at once, each by a connection (and in rospy a thread) of its own."""
 SERVICE_QUEUE: Final = 1024
@@ -83,10 +83,10 @@ A peer may read and write ``PARAM_TRANSFERS`` of these at a time: 128 MiB."""
 PARAM_TRANSFERS: Final = 4
 """Parameters that one peer reads or writes at a time; the one that was begun first gives way."""
 PARAM_TRANSFER_IDLE: Final = 30.0
-"""A parameter that is read or written in portions is forgotten when nobody went on for this long."""
+"""A parameter that is read or written in portions is forgotten when it does not go on for this long."""
 PARAM_ASK_TIMEOUT: Final = 25.0
 """For a peer's answer about a parameter: its core may need seconds for megabytes of numbers, data going first. Less
-than CONTROL_HANDLER_TIMEOUT, so that the user hears who did not answer."""
+than CONTROL_HANDLER_TIMEOUT, so that the user is told which agent did not answer."""
 PARAM_LEAVE_TIMEOUT: Final = 1.0
 """For leaving all parameters that the agent was told of, when it ends."""
 PARAM_GATHER: Final = 0.05
@@ -106,13 +106,13 @@ NODE_KILL_ALL: Final = 2.0
 """Seconds in which the caller that asked the agent's own node to end ends no node of another module, counted anew
 from each such call: `rosnode kill -a` asks all nodes of the graph, one after the other."""
 CALL_BACK_DELAYS: Final = (0.05, 1.0)
-"""When a proxy is registered again whose subscribers were hung up on: at once, and for those that noticed late."""
+"""When a proxy is registered again whose subscribers were hung up on: at once, and later for slow ones."""
 RECONCILE_INTERVAL: Final = 5.0
 """The plan is compared with what is really open this often, so that nothing stays stuck."""
 WATCH_RECENT: Final = 16
 """Last events of a topic's contract that are remembered for the user; the counts tell of the others."""
 WATCH_LOOK: Final = 0.25
-"""A source that is not alive is looked at this often: its messages leave their time behind, and wake nobody."""
+"""A source that is not alive is looked at this often: its messages only leave their time behind, and call nothing."""
 WATCH_RUN: Final = 1.0
 """Losses of one kind that follow each other within this time are remembered as one event."""
 QUALITY_WINDOW: Final = 512
@@ -127,4 +127,4 @@ QUALITY_SPAN: Final = 60.0
 QUALITY_CLOCKS: Final = 128
 """Estimates remembered of each link's clock: one or two a second over QUALITY_SPAN."""
 QUALITY_CLOCK_STEP: Final = 0.9
-"""Seconds in which at most two of them are remembered; they come once a second, and whenever somebody asks."""
+"""Seconds in which at most two of them are remembered; they come once a second, and whenever they are asked for."""

@@ -40,7 +40,7 @@ class Source(msgspec.Struct, frozen=True, order=True):
 
 
 class Origin(msgspec.Struct, frozen=True):
-    """Whose a source is that a relay passes on.
+    """The module and node that a relayed source belongs to.
 
     Args:
         name: The name of the module that publishes it.
@@ -64,7 +64,7 @@ class TopicOffer(msgspec.Struct, frozen=True, omit_defaults=True):
         topic: Its topic.
         node: Its node; where it is relayed: what stands for it in the sender's graph.
         type: Its message type.
-        origin: Whose it is, if it is not the sender's own.
+        origin: Its module and node, if it is not the sender's own.
     """
 
     topic: str
@@ -79,7 +79,7 @@ class TopicOffer(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class Description(msgspec.Struct, frozen=True):
-    """What the publisher's own connection header says; known only once somebody is connected to it.
+    """What the publisher's own connection header says; known only once a connection to it stands.
 
     Args:
         type: Message type.
@@ -203,7 +203,7 @@ class Mismatch(msgspec.Struct, frozen=True, tag_field="op", tag="mismatch"):
 
 
 class Audience(msgspec.Struct, frozen=True, tag_field="op", tag="audience"):
-    """Which nodes of mine listen to a route of yours; said where a publisher looks at who listens (actions).
+    """Which nodes of mine listen to a route of yours; sent where a publisher looks at its listeners' names (actions).
 
     Args:
         route: The id.
@@ -220,7 +220,7 @@ class ServiceOffer(msgspec.Struct, frozen=True, omit_defaults=True):
     Args:
         service: Its global name, as the receiver is to see it unless it renames it.
         node: The node that provides it; where it is relayed: what stands for it in the sender's graph.
-        origin: Whose it is, if it is not the sender's own.
+        origin: Its module and node, if it is not the sender's own.
     """
 
     service: str
@@ -318,7 +318,7 @@ class Response(msgspec.Struct, frozen=True, tag_field="op", tag="answer"):
 
 
 class Notification(msgspec.Struct, frozen=True, tag_field="op", tag="tell"):
-    """News for another agent that nobody answers; its handler is found by ``what``, as for ``Request``."""
+    """News for another agent, without an answer; its handler is found by ``what``, as for ``Request``."""
 
     what: str
     args: dict[str, Any] = {}
@@ -336,6 +336,10 @@ _MD5: Final = re.compile(r"[0-9a-f]{32}")
 _INSTANCE: Final = re.compile(r"[0-9a-f]{32}")
 
 
+_OP: Final = b'{"op":"'
+_OP_MAX: Final = 32
+
+
 def is_crossing_name(name: str) -> bool:
     """Whether a topic's or node's name may be in a message: a global one that is not too long."""
     return len(name) <= config_limits.CROSSING_NAME_MAX and is_global_name(name)
@@ -349,6 +353,15 @@ def is_crossing_type(name: str) -> bool:
 def encode(message: Message) -> bytes:
     """One message as the payload of a control frame."""
     return _ENCODER.encode(message)
+
+
+def op_of(payload: bytes | bytearray | memoryview) -> str:
+    """The kind of a control message, without parsing it; empty if its text does not begin with it.
+
+    Those of our encoder do; others are parsed at once, which costs only time.
+    """
+    head = bytes(payload[:_OP_MAX])
+    return head[len(_OP) :].partition(b'"')[0].decode("ascii", "replace") if head.startswith(_OP) else ""
 
 
 def decode(payload: bytes | bytearray | memoryview) -> Message:

@@ -101,7 +101,7 @@ class PeerNames:
 
 
 class Names:
-    """The names of every peer; one value for all who rename, replaced when the rules change.
+    """The names of every peer; one value for every room that renames, replaced when the rules change.
 
     Args:
         rules: All ``[[peer]]``, in the order of the file.

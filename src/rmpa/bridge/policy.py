@@ -43,7 +43,7 @@ class Policy:
     Args:
         settings: The user's globs for all peers.
         peers: And those for single ones, on top.
-        time: Whether ``/clock`` crosses, and from whom: nothing else decides about that.
+        time: Whether ``/clock`` crosses, and from which peer: nothing else decides about that.
     """
 
     def __init__(

@@ -16,7 +16,7 @@ def proxy_prefix(peer: Identity, taken: Collection[str]) -> str:
     """The namespace of one peer's proxies: ``/rmpa/<name>``.
 
     Args:
-        peer: Who it is.
+        peer: The peer.
         taken: Prefixes of the other links; two peers of one name must not share one, or their nodes would push
             each other out of the graph.
     """
@@ -33,7 +33,7 @@ def proxy_name(prefix: str, node: str) -> str:
 
 
 def proxied_node(name: str) -> tuple[str, str] | None:
-    """Whom a local node's name stands for: ``(peer's name, its node)``, or ``None`` for a node of this module."""
+    """What a proxy's name stands for: ``(peer's name, its node)``, or ``None`` for a node of this module."""
     if not name.startswith(OWN_NODE + "/"):
         return None
     peer, slash, node = name[len(OWN_NODE) + 1 :].partition("/")

@@ -6,8 +6,8 @@
     a ──── /cmd ───► r (relay) ──── /cmd, origin a, path r ───► b     shown there as /rmpa/a/…
 
 The relay offers what stands for another module's nodes in its own graph, with the *origin* beside it; that lists
-every relay on the way, so nothing goes round: it is not offered to its origin, nor to who passed it on, and who is
-on its list does not show it. Who can reach the origin itself, or by a better relay, leaves the offer hidden.
+every relay on the way, so nothing goes round: it is not offered to its origin, nor to the relay it came from, and a
+relay on its list does not show it. A module that reaches the origin itself, or by a better relay, keeps it hidden.
 """
 
 from __future__ import annotations
@@ -18,19 +18,21 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from rmpa.bridge import limits
+from rmpa.bridge.messages import Origin
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.bridge.messages import Origin, Source
+    from rmpa.bridge.messages import Source
     from rmpa.core.guid import Guid
+    from rmpa.core.identity import Identity
 
 Place = tuple[str, str]
 """A topic and the proxy that publishes it, as they are in the local graph."""
 
 
 class Relay:
-    """The passing side: which proxies of the local graph are offered on, and as whose.
+    """The passing side: which proxies of the local graph are offered on, and with which origin.
 
     Args:
         enabled: Whether this module relays at all.
@@ -43,14 +45,28 @@ class Relay:
         self._origins: dict[Place, tuple[int, Source, Origin]] = {}
         self._places: dict[tuple[int, Source], Place] = {}
 
+    def pass_on(self, peer: int, relay: Identity, source: Source, place: Place, origin: Origin | None) -> None:
+        """Offer what a peer brings to others, if this module relays.
+
+        Args:
+            peer: The peer whose link it came by.
+            relay: That peer.
+            source: As that peer knows it.
+            place: What it is here.
+            origin: Its module and node; ``None``: that peer's own.
+        """
+        if self.enabled:
+            own = Origin(relay.name, str(relay.guid), relay.instance.hex(), source.node)
+            self.shown(peer, source, place, origin or own)
+
     def shown(self, peer: int, source: Source, place: Place, origin: Origin) -> None:
         """A peer's source is about to appear in the local graph.
 
         Args:
-            peer: Whose link it came by.
+            peer: The peer whose link it came by.
             source: As that peer knows it.
             place: What it is here.
-            origin: Whose it is; its path does not name us.
+            origin: Its module and node; its path does not name this one.
         """
         self._places[peer, source] = place
         self._origins[place] = (peer, source, origin)
@@ -147,7 +163,7 @@ class RelayPaths:
                     del self._origins[instance]
         return changed
 
-    def learn(self, peer: int, origin: Origin) -> bool:
+    def add(self, peer: int, origin: Origin) -> bool:
         """A peer offers one more source of a module; whether that is now reached another way."""
         if self._ours(origin) or peer not in self._linked:
             return False
@@ -158,7 +174,7 @@ class RelayPaths:
         known.ways[peer] = [count + 1, len(origin.path)]
         return self._best(origin.instance) != before
 
-    def forget(self, peer: int, origin: Origin) -> bool:
+    def remove(self, peer: int, origin: Origin) -> bool:
         """A peer offers one source of a module less; whether that is now reached another way."""
         known = self._origins.get(origin.instance)
         if known is None or self._ours(origin) or peer not in known.ways:

@@ -40,6 +40,7 @@ COMMANDS = {
     "why": ("rmpa.cli.why", "Say why a topic of a peer does not arrive, and what to do."),
     "doctor": ("rmpa.cli.doctor", "Check this machine: network, clock, rights, ROS environment."),
     "multicast": (_GROUPS, "Send and receive multicast packets by hand."),
+    "config": ("rmpa.cli.config", "Show the settings and where each comes from; print their JSON Schema."),
     "reload": ("rmpa.cli.reload", "Let the agent read its settings again."),
     "completion": ("rmpa.cli.completion", "Print the script that completes rmpa's commands in a shell."),
 }

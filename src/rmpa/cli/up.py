@@ -8,19 +8,24 @@ import os
 import socket
 import sys
 from functools import partial
+from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.config.sources import Flags, load_settings
-from rmpa.config.values import LOG_LEVELS
+from rmpa.config.settings import SETTINGS
+from rmpa.config.sources import load_settings
 from rmpa.core.log import configure_logging
 from rmpa.runtime.log_writer import LogWriter
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 _log = logging.getLogger("rmpa.up")
 EPILOG = """\
 \b
 Settings, each stronger than the last: the ROS environment (ROS_MASTER_URI's port, ROS_DOMAIN_ID,
-ROS_STATIC_PEERS, ROS_AUTOMATIC_DISCOVERY_RANGE), rmpa.toml, RMPA_* variables, flags.
+ROS_STATIC_PEERS, ROS_AUTOMATIC_DISCOVERY_RANGE), rmpa.toml, RMPA_* variables, options.
+`rmpa config show` prints those that hold, each with its source.
 
 \b
 Examples:
@@ -34,76 +39,28 @@ Examples:
 """
 
 
+def _setting_options(command: Callable[..., int]) -> Callable[..., int]:
+    """An option for each setting that has one, in the order of their declarations."""
+    for setting in reversed([setting for setting in SETTINGS if setting.option]):
+        default = setting.shown_default or ("" if setting.is_switch or setting.is_list else str(setting.default))
+        shown = setting.help + (" Repeatable." if setting.is_list else "")
+        command = click.option(
+            setting.option,
+            is_flag=setting.is_switch,
+            default=None,
+            multiple=setting.is_list,
+            metavar=None if setting.is_switch else setting.type.metavar,
+            help=f"{shown} [default: {default}]" if default else shown,
+        )(command)
+    return command
+
+
 @click.command(epilog=EPILOG)
-@click.option("--name", metavar="NAME", help="The module's name among its peers. [default: from the host's name]")
-@click.option("--core-port", metavar="PORT", help="The ROS core's port. [default: 11311]")
-@click.option(
-    "--core-host", metavar="HOST", help="The address it listens at. [default: 127.0.0.1, this machine only]"
-)
-@click.option(
-    "--core",
-    "core_mode",
-    metavar="MODE",
-    help="embedded: run the ROS core; external: use the roscore of ROS_MASTER_URI. [default: embedded]",
-)
-@click.option("--master", "core_master", metavar="URI", help="The external core, if not ROS_MASTER_URI's.")
-@click.option(
-    "--fresh",
-    is_flag=True,
-    default=None,
-    help="Begin with an empty core, as roscore does; else nodes and parameters of the run before are taken up.",
-)
-@click.option("--port", metavar="PORT", help="The mesh's port, TCP and UDP. [default: 0, any]")
-@click.option("--domain", metavar="N", help="Only agents of one domain join, 0 to 232. [default: 0]")
-@click.option("--interface", "interfaces", metavar="NAME", multiple=True, help="Use only this interface; repeatable.")
-@click.option("--seed", "seeds", metavar="HOST:PORT", multiple=True, help="An agent to greet by unicast; repeatable.")
-@click.option(
-    "--multicast", metavar="GROUP:PORT", help="Where beacons go; off for none. [default: 239.255.82.77:11411]"
-)
+@_setting_options
 @click.option("--config", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]")
-@click.option("--log-level", metavar="LEVEL", help=f"{', '.join(LOG_LEVELS)}. [default: info]")
-@click.option("--log-json", is_flag=True, default=None, help="Log one JSON object a line.")
-@click.option(
-    "--realtime/--no-realtime",
-    default=None,
-    help="Ask for SCHED_FIFO, locked memory and the CPUs of [realtime] in rmpa.toml. [default: no]",
-)
-def up(
-    name: str | None,
-    core_port: str | None,
-    core_host: str | None,
-    core_mode: str | None,
-    core_master: str | None,
-    fresh: bool | None,
-    port: str | None,
-    domain: str | None,
-    interfaces: tuple[str, ...],
-    seeds: tuple[str, ...],
-    multicast: str | None,
-    config: str | None,
-    log_level: str | None,
-    log_json: bool | None,
-    realtime: bool | None,
-) -> int:
+def up(**options: object) -> int:
     """Run this machine's agent: ROS core, discovery, mesh and bridge."""
-    flags = Flags(
-        name,
-        core_host,
-        core_port,
-        core_mode,
-        core_master,
-        port,
-        domain,
-        interfaces,
-        seeds,
-        multicast,
-        config,
-        log_level,
-        log_json,
-        realtime,
-        fresh,
-    )
-    load = partial(load_settings, flags, dict(os.environ), host_name=socket.gethostname())
+    load = partial(load_settings, options, dict(os.environ), host_name=socket.gethostname())
     loaded = load()
     writer = LogWriter(sys.stderr.fileno())
     configure_logging(loaded.settings.log_level, writer, as_json=loaded.settings.log_json)

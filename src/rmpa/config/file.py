@@ -1,246 +1,43 @@
-"""The file ``rmpa.toml``: its shape, and where in it something is written."""
+"""The file ``rmpa.toml``: parsed, and its shape checked against the settings that ``config.settings`` declares."""
 
 from __future__ import annotations
 
 import re
 import tomllib
-from typing import TYPE_CHECKING, Any, Final, get_args
-
-import msgspec
-from msgspec import UNSET, UnsetType
+from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.config import limits
-from rmpa.config.values import did_you_mean
+from rmpa.config.settings import SETTINGS
+from rmpa.config.toml_lines import line_of, value_at
+from rmpa.config.values import JsonSchema, Place, did_you_mean, shown
 from rmpa.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-Key = tuple[str, ...]
-"""A key of the file: ``("core", "port")``."""
-Place = tuple[str | int, ...]
-"""A key, or what is below it: ``("contract", 1, "topics", 0)``."""
+    from rmpa.config.schema import Key
+
 _AT_LINE: Final = re.compile(r" \(at line (\d+), column \d+\)$")
-_AT_PATH: Final = re.compile(r" - at `\$\.?([^`]*)`$")
-_TYPES: Final = {
-    "str": "a text in quotes",
-    "int": "a whole number",
-    "bool": "true or false",
-    "array": "a list",
-    "object": "a table",
-    "float": "a number with a point",
+_TYPES: Final[dict[str, tuple[type, str]]] = {
+    "string": (str, "a text in quotes"),
+    "integer": (int, "a whole number"),
+    "boolean": (bool, "true or false"),
+    "array": (list, "a list"),
+    "object": (dict, "a table"),
 }
+"""By the name of a type in JSON Schema: the type of TOML values, and its name in errors."""
+SCHEMAS: Final[dict[Key, JsonSchema]] = {s.key: s.type.json_schema for s in SETTINGS if s.key}
+"""Every key that a file may have, ``("name",)``, ``("core", "port")`` and so on, and what its value may be.
 
-
-class _Table(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
-    pass
-
-
-class CoreTable(_Table, kw_only=True):
-    """``[core]``: where the ROS core listens, or which roscore is used instead of it."""
-
-    mode: str | UnsetType = UNSET
-    master: str | UnsetType = UNSET
-    fresh: bool | UnsetType = UNSET
-    host: str | UnsetType = UNSET
-    port: int | UnsetType = UNSET
-
-
-class MeshTable(_Table, kw_only=True):
-    """``[mesh]``: the links to the peers."""
-
-    port: int | UnsetType = UNSET
-
-
-class DiscoveryTable(_Table, kw_only=True):
-    """``[discovery]``: how peers find each other."""
-
-    interfaces: list[str] | UnsetType = UNSET
-    seeds: list[str] | UnsetType = UNSET
-    multicast: str | bool | UnsetType = UNSET
-
-
-class BridgeTable(_Table, kw_only=True):
-    """``[bridge]``: what may cross."""
-
-    allow: list[str] | UnsetType = UNSET
-    deny: list[str] | UnsetType = UNSET
-    allow_types: list[str] | UnsetType = UNSET
-    deny_types: list[str] | UnsetType = UNSET
-
-
-class ContractTable(_Table, kw_only=True):
-    """``[[contract]]``: what the topics of one rule need; ``config.contract_rules`` reads the values."""
-
-    topics: list[str] | UnsetType = UNSET
-    types: list[str] | UnsetType = UNSET
-    reliability: str | UnsetType = UNSET
-    durability: str | UnsetType = UNSET
-    history: str | UnsetType = UNSET
-    depth: int | UnsetType = UNSET
-    deadline: object | UnsetType = UNSET
-    lifespan: object | UnsetType = UNSET
-    liveliness: str | UnsetType = UNSET
-    liveliness_lease_duration: object | UnsetType = UNSET
-    priority: str | UnsetType = UNSET
-    max_rate: object | UnsetType = UNSET
-    outage: object | UnsetType = UNSET
-
-
-class PeerTable(_Table, kw_only=True):
-    """``[[peer]]``: what holds between us and peers of some names; ``config.peer_rules`` reads the values."""
-
-    name: str | UnsetType = UNSET
-    prefix: str | UnsetType = UNSET
-    remap_in: dict[str, str] | UnsetType = UNSET
-    remap_out: dict[str, str] | UnsetType = UNSET
-    remap: list[dict[str, object]] | UnsetType = UNSET
-    allow: list[str] | UnsetType = UNSET
-    deny: list[str] | UnsetType = UNSET
-    allow_types: list[str] | UnsetType = UNSET
-    deny_types: list[str] | UnsetType = UNSET
-
-
-class ServicesTable(_Table, kw_only=True):
-    """``[services]``: which services cross, and how long a call may take."""
-
-    allow: list[str] | UnsetType = UNSET
-    deny: list[str] | UnsetType = UNSET
-    loggers: bool | UnsetType = UNSET
-    timeout: object | UnsetType = UNSET
-
-
-class ServiceTable(_Table, kw_only=True):
-    """``[[service]]``: what holds for services of some names; ``config.service_rules`` reads the values."""
-
-    names: list[str] | UnsetType = UNSET
-    timeout: object | UnsetType = UNSET
-
-
-class NodesTable(_Table, kw_only=True):
-    """``[nodes]``: what peers may do with this module's nodes."""
-
-    kill: list[str] | UnsetType = UNSET
-
-
-class ParamsTable(_Table, kw_only=True):
-    """``[params]``: what peers may do with this module's parameters."""
-
-    remote_get: list[str] | UnsetType = UNSET
-    remote_set: list[str] | UnsetType = UNSET
-
-
-class ParamTable(_Table, kw_only=True):
-    """``[[param]]``: a parameter of a peer that is followed; ``config.param_rules`` reads the values."""
-
-    key: str | UnsetType = UNSET
-    from_: str | UnsetType = msgspec.field(default=UNSET, name="from")
-    to: str | UnsetType = UNSET
-
-
-class TimeTable(_Table, kw_only=True):
-    """``[time]``: whose simulated time this module has, and who may have ours."""
-
-    follow: str | UnsetType = UNSET
-    share: bool | UnsetType = UNSET
-
-
-class LimitsTable(_Table, kw_only=True):
-    """``[limits]``: how much of one peer is taken."""
-
-    nodes: int | UnsetType = UNSET
-    topics: int | UnsetType = UNSET
-    services: int | UnsetType = UNSET
-    params: int | UnsetType = UNSET
-
-
-class LanesTable(_Table, kw_only=True):
-    """``[lanes]``: how the packets of each lane are marked."""
-
-    express_dscp: int | UnsetType = UNSET
-    express_priority: int | UnsetType = UNSET
-    bulk_dscp: int | UnsetType = UNSET
-    bulk_priority: int | UnsetType = UNSET
-
-
-class RealtimeTable(_Table, kw_only=True):
-    """``[realtime]``: what is asked of the kernel."""
-
-    enabled: bool | UnsetType = UNSET
-    priority: int | UnsetType = UNSET
-    cpus: list[int] | UnsetType = UNSET
-    lock_memory: bool | UnsetType = UNSET
-    keep_awake: bool | UnsetType = UNSET
-
-
-class RelayTable(_Table, kw_only=True):
-    """``[relay]``: whether this module joins networks that are not routed to each other."""
-
-    enabled: bool | UnsetType = UNSET
-
-
-class LogTable(_Table, kw_only=True):
-    """``[log]``: what is written about it."""
-
-    level: str | UnsetType = UNSET
-    json: bool | UnsetType = UNSET
-
-
-class ConfigFile(_Table, kw_only=True):
-    """A whole ``rmpa.toml``."""
-
-    name: str | UnsetType = UNSET
-    domain: int | UnsetType = UNSET
-    core: CoreTable = msgspec.field(default_factory=CoreTable)
-    mesh: MeshTable = msgspec.field(default_factory=MeshTable)
-    discovery: DiscoveryTable = msgspec.field(default_factory=DiscoveryTable)
-    bridge: BridgeTable = msgspec.field(default_factory=BridgeTable)
-    contract: list[ContractTable] | UnsetType = UNSET
-    peer: list[PeerTable] | UnsetType = UNSET
-    services: ServicesTable = msgspec.field(default_factory=ServicesTable)
-    service: list[ServiceTable] | UnsetType = UNSET
-    nodes: NodesTable = msgspec.field(default_factory=NodesTable)
-    params: ParamsTable = msgspec.field(default_factory=ParamsTable)
-    param: list[ParamTable] | UnsetType = UNSET
-    time: TimeTable = msgspec.field(default_factory=TimeTable)
-    limits: LimitsTable = msgspec.field(default_factory=LimitsTable)
-    lanes: LanesTable = msgspec.field(default_factory=LanesTable)
-    realtime: RealtimeTable = msgspec.field(default_factory=RealtimeTable)
-    relay: RelayTable = msgspec.field(default_factory=RelayTable)
-    log: LogTable = msgspec.field(default_factory=LogTable)
-
-
-def _keys(table: type[msgspec.Struct]) -> dict[str, type[msgspec.Struct] | None]:
-    """A table's keys; a sub-table's struct beside those that are tables."""
-    found: dict[str, type[msgspec.Struct] | None] = {}
-    for info in msgspec.structs.fields(table):
-        is_table = isinstance(info.type, type) and not get_args(info.type) and issubclass(info.type, msgspec.Struct)
-        found[info.encode_name] = info.type if is_table else None
-    return found
-
-
-def known_keys() -> list[Key]:
-    """Every key that a file may have: ``("name",)``, ``("core", "port")`` and so on.
-
-    Each of ``LISTS`` is one: ``("contract",)`` has the list of all ``[[contract]]``, each a dict of its keys.
-    """
-    found: list[Key] = []
-    for name, table in _keys(ConfigFile).items():
-        found += [(name,)] if table is None else [(name, inner) for inner in _keys(table)]
-    return found
-
-
-LISTS: Final = {
-    name: tuple(_keys(table))
-    for name, table in (
-        ("contract", ContractTable),
-        ("param", ParamTable),
-        ("service", ServiceTable),
-        ("peer", PeerTable),
-    )
-}
+Each of ``LISTS`` is one: ``("contract",)`` has the list of all ``[[contract]]``.
+"""
+LISTS: Final = {s.key[0]: tuple(s.type.json_schema["items"]["properties"]) for s in SETTINGS if s.is_list_of_tables}
 """The tables that there may be many of (``[[contract]]``), and the keys that each may have."""
+_TOP: Final = tuple(dict.fromkeys(key[0] for key in SCHEMAS))
+"""The keys and tables of the file itself."""
+_TABLES: Final = {top: [key[1] for key in SCHEMAS if key[0] == top and len(key) > 1] for top in _TOP}
+"""By name: the keys of each table; none for a key that is not a table."""
 
 
 def parse_config(data: bytes, path: Path | None) -> dict[Key, object]:
@@ -267,21 +64,14 @@ def parse_config(data: bytes, path: Path | None) -> dict[Key, object]:
         raise ConfigError("the file", "not UTF-8 text", "save it as UTF-8", path, line) from None
     table = _parse_toml(text, path)
     for place, suggestion in _unknown(table):
-        what = "an unknown table" if isinstance(_at(table, place), dict) else "an unknown key"
+        what = "an unknown table" if isinstance(value_at(table, place), dict) else "an unknown key"
         raise ConfigError(dotted(place), what, suggestion, path, line_of(text, place))
-    try:
-        parsed = msgspec.convert(table, ConfigFile)
-    except msgspec.ValidationError as error:
-        raise _wrong_type(error, table, text, path) from None
-    found: dict[Key, object] = {}
-    for key in known_keys():
-        value: object = parsed
-        for part in key:
-            value = getattr(value, part)
-        if value is not UNSET:
-            found[key] = value
-    found.update(((name,), table[name]) for name in LISTS if name in table)
-    return found
+    for place, value, types in _mistyped(table):
+        problem, remedy = _type_mistake(place, value, types)
+        raise ConfigError(dotted(place), problem, remedy, path, line_of(text, place))
+    return {
+        key: value_at(table, key) for key in SCHEMAS if key[0] in table and (len(key) == 1 or key[1] in table[key[0]])
+    }
 
 
 def _parse_toml(text: str, path: Path | None) -> dict[str, Any]:
@@ -315,29 +105,28 @@ def dotted(place: Place) -> str:
 
 def _unknown(table: dict[str, Any]) -> Iterator[tuple[Place, str]]:
     """Unknown keys, each with what was probably meant."""
-    everywhere = [key for key in known_keys() if key[0] not in LISTS]
+    everywhere = [key for key in SCHEMAS if key[0] not in LISTS]
     everywhere += [(name, key) for name, keys in LISTS.items() for key in keys]
-    tables = _keys(ConfigFile)
     for name, value in table.items():
-        if name not in tables:
-            yield (name,), _meant(name, (), everywhere, list(tables))
-        for place, inside, inner in _inside(name, value, tables.get(name)):
+        if name not in _TOP:
+            yield (name,), _suggestion(name, (), everywhere, list(_TOP))
+        for place, inside, known in _tables_below(name, value):
             for key in inside:
-                if key not in inner:
-                    yield (*place, key), _meant(key, (name,), everywhere, inner)
+                if key not in known:
+                    yield (*place, key), _suggestion(key, (name,), everywhere, list(known))
 
 
-def _inside(name: str, value: object, struct: type[msgspec.Struct] | None) -> Iterator[tuple[Place, Any, list[str]]]:
+def _tables_below(name: str, value: object) -> Iterator[tuple[Place, dict[str, Any], Sequence[str]]]:
     """The tables below one key of the file, each with its place and the keys that it may have."""
-    if struct is not None and isinstance(value, dict):
-        yield (name,), value, list(_keys(struct))
-    if name in LISTS:
-        for index, element in enumerate(value if isinstance(value, list) else ()):
-            if isinstance(element, dict):
-                yield (name, index), element, list(LISTS[name])
+    if isinstance(value, dict) and (known := _TABLES.get(name)):
+        yield (name,), value, known
+    for index, element in enumerate(value if name in LISTS and isinstance(value, list) else ()):
+        if isinstance(element, dict):
+            yield (name, index), element, LISTS[name]
 
 
-def _meant(word: str, table: Key, everywhere: list[Key], here: list[str]) -> str:
+def _suggestion(word: str, table: Key, everywhere: list[Key], here: list[str]) -> str:
+    """What to do about an unknown key: the key that was probably meant, or the table that it belongs in."""
     homes = [key for key in everywhere if key[-1] == word]
     near = did_you_mean(word, here)
     if near is not None and (table or not homes):
@@ -357,74 +146,36 @@ def _home(key: Key) -> str:
     return f"in a [[{key[0]}]]" if key[0] in LISTS else f"in [{key[0]}]"
 
 
-def _wrong_type(error: msgspec.ValidationError, table: dict[str, Any], text: str, path: Path | None) -> ConfigError:
-    message = str(error)
-    match = _AT_PATH.search(message)
-    place: Place = ()
-    if match:
-        place = tuple(int(part) if part.isdecimal() else part for part in re.findall(r"[^.\[\]]+", match[1]))
-    value = _at(table, place)
-    expected = re.search(r"Expected `([^`]*)`", message)
-    wanted = " or ".join(_TYPES.get(t, t) for t in (expected[1].split(" | ") if expected else []))
-    problem = f"{_shown(value)} is not {wanted}" if wanted else message
-    remedy = ""
+def _mistyped(table: dict[str, Any]) -> Iterator[tuple[Place, object, list[str]]]:
+    """Values of a wrong type: place, value, and the types (in JSON Schema's words) that it may have."""
+    for name, value in table.items():
+        if not _TABLES[name]:
+            yield from _mismatches((name,), value, SCHEMAS[(name,)])
+        elif not isinstance(value, dict):
+            yield (name,), value, ["object"]
+        else:
+            for key, inner in value.items():
+                yield from _mismatches((name, key), inner, SCHEMAS[name, key])
+
+
+def _mismatches(place: Place, value: object, schema: JsonSchema) -> Iterator[tuple[Place, object, list[str]]]:
+    """Mismatches of JSON Schema's ``type`` in a value and its elements; all else is checked by the readers."""
+    expected = schema.get("type", [])
+    types = [expected] if isinstance(expected, str) else expected
+    if types and type(value) not in [_TYPES[name][0] for name in types]:
+        yield place, value, types
+    elif isinstance(value, list):
+        for index, element in enumerate(value):
+            yield from _mismatches((*place, index), element, schema.get("items", {}))
+    elif isinstance(value, dict):
+        known, other = schema.get("properties", {}), schema.get("additionalProperties")
+        for key, inner in value.items():
+            yield from _mismatches((*place, key), inner, known.get(key) or other or {})
+
+
+def _type_mistake(place: Place, value: object, types: list[str]) -> tuple[str, str]:
+    """The problem and the remedy for a value of a wrong type."""
     if len(place) == 1 and place[0] in LISTS and isinstance(value, dict):
-        problem, remedy = "one table, where a list of them is expected", f"write [[{place[0]}]], in two brackets"
-    elif expected and expected[1] == "array" and isinstance(value, str):
-        remedy = f'did you mean ["{value}"]?'
-    return ConfigError(dotted(place) or "the file", problem, remedy, path, line_of(text, place))
-
-
-def _shown(value: object) -> str:
-    shown = str(value).lower() if isinstance(value, bool) else repr(value)
-    return shown if len(shown) <= 60 else shown[:57] + "..."
-
-
-def _at(table: object, key: Sequence[str | int]) -> object:
-    for part in key:
-        in_table = isinstance(table, dict) and part in table
-        in_list = isinstance(table, list) and isinstance(part, int) and part < len(table)
-        if not in_table and not in_list:
-            return None
-        table = table[part]  # type: ignore[index] # one of the two, as just seen
-    return table
-
-
-def line_of(text: str, place: Place) -> int | None:
-    """The line, from 1, on which what is at a place begins in a valid TOML text.
-
-    ``tomllib`` does not tell. A prefix of whole lines parses exactly where no statement is open, so the first
-    prefix that has the place ends with its statement, and the one before that shows where it begins. An element of
-    a list is looked for within its statement.
-    """
-    lines = text.split("\n")
-    begin = 0
-    for end in range(1, len(lines) + 1):
-        try:
-            table = tomllib.loads("\n".join(lines[:end]))
-        except (ValueError, RecursionError):
-            continue
-        if _at(table, place) is not None:
-            return _element_line(lines, begin, end, place)
-        begin = end
-    return None
-
-
-def _element_line(lines: list[str], begin: int, end: int, place: Place) -> int:
-    """The line of a place in the statement between two lines: not its first only for an element of a list."""
-    if begin + 1 == end:
-        return end
-    inline = _at(tomllib.loads("\n".join(lines[begin:end])), place) is not None
-    indices = [part for part in (place if inline else place[-1:]) if isinstance(part, int)]
-    if not indices:
-        return begin + 1
-    for stop in range(begin + 1, end):
-        try:
-            value: object = tomllib.loads("\n".join(lines[begin:stop]) + "\n]")
-        except ValueError:
-            continue
-        while isinstance(value, dict) and value:
-            value = next(iter(value.values()))
-        if isinstance(value, list) and len(value) > indices[0]:
-            return stop
-    return end
+        return "one table, where a list of them is expected", f"write [[{place[0]}]], in two brackets"
+    problem = f"{shown(value)} is not {' or '.join(_TYPES[name][1] for name in types)}"
+    return problem, f'did you mean ["{value}"]?' if types == ["array"] and isinstance(value, str) else ""

@@ -13,13 +13,13 @@ from rmpa.core.sizes import KIB
 CONFIG_FILE_MAX: Final = 256 * KIB
 """A settings file; ours is some 4 KB, and finding a line in a huge one takes long."""
 NAMES_REMEMBERED: Final = 256
-"""Peers for whom the rules of names are remembered: as many as a large network has; found again by the rules."""
+"""Peers whose result of the naming rules is cached: as many as a large network has."""
 REMAPS_MAX: Final = 256
-"""Rules for names in one direction of a ``[[peer]]``; each is held against each other one."""
+"""Renaming rules in one direction of a ``[[peer]]``; each is compared with each other one."""
 CONTRACT_DEPTH_MAX: Final = 100_000
 """Messages that a contract may let wait: 100 s of a 1 kHz topic. ``LINK_QUEUE_BYTES`` bounds their bytes."""
 CONTRACT_TIME_MIN: Final = 0.001
-"""Shortest deadline, lifespan and lease: a timer that is due more often would hold up what it watches."""
+"""Shortest deadline, lifespan and lease: a timer that is due more often would delay the messages it watches."""
 CONTRACT_TIME_MAX: Final = 86_400.0
 """Longest deadline, lifespan and lease, a day: more is a mistake in the unit."""
 CONTRACT_RATE_MIN: Final = 0.001
@@ -30,7 +30,7 @@ FOLLOWED_MAX: Final = 256
 """Default of ``limits.params``: parameters that one module follows, and that one peer may follow here; a namespace
 counts as one."""
 FOLLOW_RULES_MAX: Final = 2048
-"""Tables ``[[param]]`` in a file, whatever ``limits.params`` says: each is held against each other one."""
+"""Tables ``[[param]]`` in a file, whatever ``limits.params`` says: each is compared with each other one."""
 BOUND_MAX: Final = 1_000_000
 """Highest value of a setting in ``[limits]``: such a graph takes some gigabytes."""
 CPU_MAX: Final = 1023
@@ -50,7 +50,7 @@ OUTAGE_MAX: Final = 86_400.0
 
 # --- ROS --------------------------------------------------------------------------------------------------------
 SERVICE_TIMEOUT: Final = 60.0
-"""For a call, where nobody says otherwise: planners take tens of seconds; rospy and roscpp wait for ever."""
+"""Default time-out of a call: planners take tens of seconds; rospy and roscpp wait for ever."""
 
 # --- bridge -----------------------------------------------------------------------------------------------------
 TOPICS_PER_PEER_MAX: Final = 32_768
@@ -63,6 +63,6 @@ SERVICES_PER_PEER_MAX: Final = 16_384
 """Default of ``limits.services``: services of one peer that are known here, those that this module offers, and those
 that one peer has open at once. A large robot's nodes have some 500, loggers left out."""
 SERVICE_TIMEOUT_MAX: Final = 3600.0
-"""Longest time that a call may be given: a caller of a server that hangs is told so within the hour."""
+"""Longest time-out of a call: the caller of a server that hangs gets an error within the hour."""
 CROSSING_NAME_MAX: Final = 1024
 """Characters of a topic's, node's or type's name that crosses the mesh; the longest seen have some 200."""

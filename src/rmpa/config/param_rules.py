@@ -1,17 +1,17 @@
-"""Reads ``[params]``, ``[[param]]`` and ``[time]`` of ``rmpa.toml``: which parameters are followed, and from whom."""
+"""The tables ``[[param]]`` of ``rmpa.toml``: which parameters of which peers are followed, and under which name."""
 
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config import limits
-from rmpa.config.settings import FollowRule
-from rmpa.config.values import BadValue, read_name, read_text, read_topic_glob
+from rmpa.config.values import NAME, BadValue, Place, RuleKey, ValueType, read_at, read_keys, read_text, table_schema
 from rmpa.core.names import is_global_name, is_legal_name, matches
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
 SIM_TIME: Final = "/use_sim_time"
 CLOCK: Final = "/clock"
@@ -22,12 +22,31 @@ UNTOUCHABLE: Final = {
     "/rosversion": "it tells which ROS this core is",
     SIM_TIME: "time is followed by [time] alone",
 }
-"""Parameters that nothing from another module ever sets or deletes, and why."""
+"""Parameters that another module never sets or deletes, and why."""
 _OWNER_ALONE: Final = "a parameter has one owner: leave one of the rules out"
 
 
+@dataclass(frozen=True, slots=True)
+class FollowRule:
+    """One ``[[param]]``: a parameter, or a namespace as a whole, of a peer that this module follows.
+
+    Args:
+        key: Its global name at the peer.
+        owner: The peer's name.
+        to: Its global name here.
+    """
+
+    key: str
+    owner: str
+    to: str
+
+    def __str__(self) -> str:
+        """``base:/robot_description as /base/robot_description``."""
+        return f"{self.owner}:{self.key}" + (f" as {self.to}" if self.to != self.key else "")
+
+
 def untouchable(key: str) -> str:
-    """Why a key may not be changed from another module: it, one below it or one above it is untouchable; or empty."""
+    """Why another module may not change a key: it, one below it or one above it is ``UNTOUCHABLE``; empty: it may."""
     for pattern, why in UNTOUCHABLE.items():
         if matches(pattern, key) or overlap(pattern.removesuffix("/**"), key):
             return why if pattern == key.rstrip("/") else f"{pattern}: {why}"
@@ -35,20 +54,9 @@ def untouchable(key: str) -> str:
 
 
 def overlap(one: str, other: str) -> bool:
-    """Whether two keys are one, or one of them is the namespace of the other."""
+    """Whether two keys are the same, or one of them is a namespace around the other."""
     first, second = one.rstrip("/") + "/", other.rstrip("/") + "/"
     return first.startswith(second) or second.startswith(first)
-
-
-def read_key_glob(raw: object) -> str:
-    """A glob over parameters, as ``core.names.matches`` reads it."""
-    try:
-        return read_topic_glob(raw)
-    except BadValue as error:
-        problem, remedy = (text.replace("topics", "parameters") for text in (error.problem, error.remedy))
-        raise BadValue(
-            problem.replace("topic", "parameter"), remedy.replace("topic", "parameter"), error.better
-        ) from None
 
 
 def read_key(raw: object) -> str:
@@ -67,38 +75,41 @@ def read_key(raw: object) -> str:
     return key.rstrip("/")
 
 
-def read_follow_rules(raw: object) -> tuple[FollowRule, ...]:
-    """Every ``[[param]]`` of a file, each as a table of its keys (of known names, as ``config.file`` checks).
+_PARAM: Final = ValueType(read_key, {"type": "string", "examples": ["/robot_description"]})
+_KEYS: Final = (
+    RuleKey("key", _PARAM, "The parameter's name at its owner; a namespace is followed as a whole.", required=True),
+    RuleKey("from", NAME, "The peer that owns it.", required=True),
+    RuleKey("to", _PARAM, "Its name here; without it: the same."),
+)
 
-    Raises:
-        BadValue: ``at`` says which rule and key: a bad value, or one that contradicts a rule before it.
-    """
+
+def _read_rules(raw: object) -> tuple[FollowRule, ...]:
+    """Every ``[[param]]`` of a file; the error about a rule that contradicts an earlier one is at the later one."""
     if not isinstance(raw, list | tuple):
         raise BadValue(f"{raw!r} is not a list")
     if len(raw) > limits.FOLLOW_RULES_MAX:
         raise BadValue(f"{len(raw)} rules", f"at most {limits.FOLLOW_RULES_MAX}; follow a namespace as a whole")
     rules: list[FollowRule] = []
+
+    def read(table: Mapping[str, object]) -> FollowRule:
+        rule = _read_rule(table)
+        _check_against(rules, rule)
+        return rule
+
     for index, table in enumerate(raw):
-        try:
-            rule = _read_rule(table)
-            _check_against(rules, rule)
-        except BadValue as error:
-            error.at = (index, *error.at)
-            raise
-        rules.append(rule)
+        rules.append(read_at((index,), read, table))
     return tuple(rules)
 
 
+PARAM_RULES: Final = ValueType(_read_rules, {"type": "array", "items": table_schema(_KEYS)})
+
+
 def _read_rule(table: Mapping[str, object]) -> FollowRule:
-    for key in ("key", "from"):
-        if key not in table:
-            raise BadValue(f"a rule without {key}", 'one has key = "/robot_description" and from = "base"')
-    key = _at("key", read_key, table["key"])
-    owner = _at("from", read_name, table["from"])
-    to = _at("to", read_key, table["to"]) if "to" in table else key
-    if why := untouchable(to):
-        raise BadValue(f"{to} cannot be followed: {why}", at=("to",) if "to" in table else ("key",))
-    return FollowRule(key, owner, to)
+    values = read_keys(table, _KEYS, 'one has key = "/robot_description" and from = "base"')
+    rule = FollowRule(values["key"], values["from"], values.get("to", values["key"]))
+    if why := untouchable(rule.to):
+        raise BadValue(f"{rule.to} cannot be followed: {why}", at=("to",) if "to" in table else ("key",))
+    return rule
 
 
 def _check_against(rules: Sequence[FollowRule], rule: FollowRule) -> None:
@@ -108,24 +119,20 @@ def _check_against(rules: Sequence[FollowRule], rule: FollowRule) -> None:
             raise BadValue(f"{rule.to} cannot come from {rule.owner} too: {whose}", _OWNER_ALONE)
 
 
-def _at(key: str, read: Callable[[object], str], raw: object) -> str:
-    try:
-        return read(raw)
-    except BadValue as error:
-        error.at = (key, *error.at)
-        raise
-
-
-def problems(rules: Sequence[FollowRule], follow: str, name: str) -> Iterator[tuple[str, tuple[str | int, ...], str]]:
-    """What only shows when all settings are known: ``(setting, place in it, problem)``.
+def follow_problems(rules: Sequence[FollowRule], time_owner: str, name: str) -> Iterator[tuple[str, Place, str]]:
+    """Problems that only show when all settings are known: ``(setting, place in it, problem)``.
 
     Args:
         rules: Of ``[[param]]``.
-        follow: Whose time is followed.
-        name: This module's own.
+        time_owner: The peer whose time is followed; empty for none.
+        name: This module's own name.
     """
     for index, rule in enumerate(rules):
         if rule.owner == name:
-            yield "follow", (index, "from"), f"{name} is this module itself; its own parameters are here already"
-    if follow and follow == name:
-        yield "time_follow", (), f"{name} is this module itself; its own time is here already"
+            yield (
+                "params.follow",
+                (index, "from"),
+                f"{name} is this module itself; its own parameters are here already",
+            )
+    if time_owner and time_owner == name:
+        yield "time.follow", (), f"{name} is this module itself; its own time is here already"

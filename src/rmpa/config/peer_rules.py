@@ -1,40 +1,49 @@
-"""Reads the rules ``[[peer]]`` of ``rmpa.toml``: names and policy for single peers, and whether they fit each other.
+"""The tables ``[[peer]]`` of ``rmpa.toml``: names and policy for single peers (docs/names.md).
 
-Refused are rules that cannot be meant: names that no topic can have or that never cross, two names that would become
-one (whose service would be called?), and names that lead back to themselves.
+Rules that cannot be meant are refused: names that no topic can have or that never cross, two names that would become
+one (which service would be called?), and names that lead back to themselves.
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import combinations
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final
 
 from rmpa.config import limits
 from rmpa.config.contract_rules import ConfigWarning
-from rmpa.config.settings import PeerRule, PolicySettings, Remap
-from rmpa.config.values import BadValue, did_you_mean, read_list, read_text, read_topic_glob, read_type_glob
+from rmpa.config.policy import PolicySettings
+from rmpa.config.values import (
+    TYPE_GLOB,
+    BadValue,
+    JsonSchema,
+    Place,
+    RuleKey,
+    ValueType,
+    did_you_mean,
+    list_of,
+    read_at,
+    read_keys,
+    read_text,
+    read_topic_glob,
+    table_schema,
+)
 from rmpa.core.names import NEVER_CROSSING, is_global_name, matches
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-
-_T = TypeVar("_T")
-_Raw = TypeVar("_Raw")
-Place = tuple[str | int, ...]
+    from collections.abc import Iterator, Mapping, Sequence
 
 PEER: Final = "{peer}"
 """Stands for the peer's name in a rule."""
 _SOME_PEER: Final = "peer"
 _PEER_GLOB: Final = re.compile(r"[A-Za-z0-9_*?]+")
-_REMAP_KEYS: Final = ("direction", "from", "to", "types")
 _DIRECTIONS: Final = ("in", "out")
 
 
-def _read_own_glob(raw: object) -> str:
-    """A glob over topics, with ``{peer}`` in it perhaps."""
+def _read_peer_topic_glob(raw: object) -> str:
+    """A glob over topics that may have ``{peer}`` in it."""
     try:
         read_topic_glob(raw.replace(PEER, _SOME_PEER) if isinstance(raw, str) else raw)
     except BadValue as error:
@@ -44,20 +53,41 @@ def _read_own_glob(raw: object) -> str:
     return read_text(raw).strip()
 
 
-_POLICY: Final = {
-    "allow": _read_own_glob,
-    "deny": _read_own_glob,
-    "allow_types": read_type_glob,
-    "deny_types": read_type_glob,
-}
+_PEER_TOPIC_GLOB: Final = ValueType(_read_peer_topic_glob, {"type": "string", "examples": ["/{peer}/**"]})
 
 
 @dataclass(frozen=True, slots=True)
-class PeerRules:
-    """All rules, in the order of the file, and what is doubtful about them."""
+class Remap:
+    """One name, or a namespace, that has another name at a peer.
 
-    rules: tuple[PeerRule, ...] = ()
-    doubts: tuple[ConfigWarning, ...] = ()
+    Args:
+        source: The name before, or ``/namespace/**``; ``{peer}`` in it is the peer's name.
+        target: The name after, likewise.
+        types: Globs over message types, one of which must fit; empty: topics of any type, and services.
+    """
+
+    source: str
+    target: str
+    types: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class PeerRule:
+    """One ``[[peer]]``: what holds for the peers whose name fits. All rules that fit a peer apply, in order.
+
+    Args:
+        name: A glob over peers' names.
+        prefix: Put in front of their names here, and removed from ours there; ``{peer}`` is the peer's name.
+        remap_in: Their names (before) and the names here (after); the first that fits applies.
+        remap_out: Our names (before) and the names there (after).
+        policy: What may cross to and from them, on top of ``[bridge]``; in our names, with ``{peer}``.
+    """
+
+    name: str
+    prefix: str = ""
+    remap_in: tuple[Remap, ...] = ()
+    remap_out: tuple[Remap, ...] = ()
+    policy: PolicySettings = field(default_factory=PolicySettings)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,28 +99,26 @@ class _Placed:
     source: str
     target: str
 
+    def below(self, key: str | int) -> _Placed:
+        """This renaming with a place that is one level deeper in the file."""
+        return replace(self, at=(key, *self.at))
 
-def read_peers(raw: object) -> PeerRules:
-    """Every ``[[peer]]`` of a file, each as a table of its keys (of known names, as ``config.file`` checks).
 
-    Raises:
-        BadValue: ``at`` says which rule, key and element.
-    """
+def _read_rules(raw: object) -> tuple[PeerRule, ...]:
+    """Every ``[[peer]]`` of a file; ``BadValue.at`` says which rule, key and element is wrong."""
     if not isinstance(raw, list | tuple):
         raise BadValue(f"{raw!r} is not a list")
     rules: list[PeerRule] = []
-    places: list[dict[str, list[_Placed]]] = []
+    remaps: list[dict[str, list[_Placed]]] = []
     for index, table in enumerate(raw):
-        rule, placed = _within((index,), _read_rule, table)
+        rule, placed = read_at((index,), _read_rule, table)
         rules.append(rule)
-        places.append(
-            {way: [replace(place, at=(index, *place.at)) for place in found] for way, found in placed.items()}
-        )
+        remaps.append({direction: [p.below(index) for p in found] for direction, found in placed.items()})
     for index, rule in enumerate(rules):
         together = [i for i in range(index + 1) if i == index or _meet(rules[i].name, rule.name)]
         for direction in _DIRECTIONS:
-            _check([placed for i in together for placed in places[i][direction]])
-    return PeerRules(tuple(rules), tuple(_doubts(rules)))
+            _check([placed for i in together for placed in remaps[i][direction]])
+    return tuple(rules)
 
 
 def _meet(one: str, other: str) -> bool:
@@ -101,46 +129,18 @@ def _meet(one: str, other: str) -> bool:
 def _read_rule(table: Mapping[str, object]) -> tuple[PeerRule, dict[str, list[_Placed]]]:
     if "name" not in table:
         raise BadValue("a rule without a name", 'name = "robot*" makes it one for those peers, "*" for all')
-    name = _within(("name",), _read_peer_glob, table["name"])
-    prefix = _within(("prefix",), _read_prefix, table["prefix"]) if "prefix" in table else ""
+    values = read_keys(table, _KEYS)
     placed: dict[str, list[_Placed]] = {direction: [] for direction in _DIRECTIONS}
-    for index, written in enumerate(_tables(table.get("remap", ()))):
-        direction, read = _within(("remap", index), _read_remap, written)
-        placed[direction].append(replace(read, at=("remap", index)))
-    for direction in _DIRECTIONS:
+    for direction, remap in values.pop("remap", ()):
+        placed[direction].append(remap.below("remap"))
+    for direction, found in placed.items():
         key = f"remap_{direction}"
-        renames = table.get(key, {})
-        assert isinstance(renames, dict)  # noqa: S101 - core.config_file has checked the types
-        for source, target in renames.items():
-            read = _within((key, source), partial(_placed, source), target)
-            placed[direction].append(replace(read, at=(key, source)))
-        if len(placed[direction]) > limits.REMAPS_MAX:
-            raise BadValue(
-                f"{len(placed[direction])} rules", f"at most {limits.REMAPS_MAX}; rename namespaces", at=(key,)
-            )
-    policy = {
-        key: _within((key,), partial(_read_globs, item), table[key]) for key, item in _POLICY.items() if key in table
-    }
+        found += [remap.below(key) for remap in values.pop(key, ())]
+        if len(found) > limits.REMAPS_MAX:
+            raise BadValue(f"{len(found)} rules", f"at most {limits.REMAPS_MAX}; rename namespaces", at=(key,))
     incoming, outgoing = (tuple(p.remap for p in placed[direction]) for direction in _DIRECTIONS)
-    return PeerRule(name, prefix, incoming, outgoing, PolicySettings(**policy)), placed
-
-
-def _read_globs(item: Callable[[object], str], raw: object) -> tuple[str, ...]:
-    return read_list(raw, item)
-
-
-def _tables(raw: object) -> Sequence[Mapping[str, object]]:
-    assert isinstance(raw, list | tuple)  # noqa: S101 - core.config_file has checked the types
-    return raw
-
-
-def _within(at: Place, read: Callable[[_Raw], _T], raw: _Raw) -> _T:
-    """Read something; a mistake in it is at its place."""
-    try:
-        return read(raw)
-    except BadValue as error:
-        error.at = (*at, *error.at)
-        raise
+    name, prefix = values.pop("name"), values.pop("prefix", "")
+    return PeerRule(name, prefix, incoming, outgoing, PolicySettings(**values)), placed
 
 
 def _read_peer_glob(raw: object) -> str:
@@ -163,27 +163,31 @@ def _read_prefix(raw: object) -> str:
 
 
 def _read_remap(table: Mapping[str, object]) -> tuple[str, _Placed]:
+    known = [key.name for key in _REMAP_KEYS]
     for key in table:
-        if key not in _REMAP_KEYS:
-            near = did_you_mean(key, _REMAP_KEYS)
+        if key not in known:
+            near = did_you_mean(key, known)
             raise BadValue(
-                "an unknown key",
-                f"did you mean {near}?" if near else f"known here: {', '.join(_REMAP_KEYS)}",
-                at=(key,),
+                "an unknown key", f"did you mean {near}?" if near else f"known here: {', '.join(known)}", at=(key,)
             )
-    for key in _REMAP_KEYS[:3]:
-        if key not in table:
-            raise BadValue(
-                f"a rule without {key}", 'one has direction = "in", from = "/odom" and to = "/robot1/odom"'
-            )
-    direction = _within(("direction",), _read_direction, table["direction"])
-    types = (
-        _within(("types",), lambda raw: read_list(raw, read_type_glob), table["types"]) if "types" in table else ()
-    )
-    if "types" in table and not types:
-        raise BadValue("an empty list fits nothing", "leave types out, or name some", at=("types",))
-    source = _within(("from",), _read_end, table["from"])
-    return direction, _within(("to",), lambda raw: _placed(source, raw, types), table["to"])
+    example = 'one has direction = "in", from = "/odom" and to = "/robot1/odom"'
+    values = read_keys(table, _REMAP_KEYS, example)
+    placed = read_at(("to",), partial(_placed, values["from"], types=values.get("types", ())), values["to"])
+    return values["direction"], placed
+
+
+def _read_remaps(raw: Sequence[Mapping[str, object]]) -> list[tuple[str, _Placed]]:
+    """Every ``[[peer.remap]]`` of a rule: its direction, and what it renames."""
+    found = []
+    for index, table in enumerate(raw):
+        direction, placed = read_at((index,), _read_remap, table)
+        found.append((direction, placed.below(index)))
+    return found
+
+
+def _read_renames(raw: Mapping[str, str]) -> list[_Placed]:
+    """A table ``remap_in`` or ``remap_out``: the name after, by the name before."""
+    return [read_at((source,), partial(_placed, source), target).below(source) for source, target in raw.items()]
 
 
 def _read_direction(raw: object) -> str:
@@ -192,7 +196,8 @@ def _read_direction(raw: object) -> str:
     return str(raw)
 
 
-def _placed(source: object, target: object, types: tuple[str, ...] = ()) -> _Placed:
+def _placed(source: str, target: object, types: tuple[str, ...] = ()) -> _Placed:
+    """A renaming whose two ends fit each other."""
     before, after = _read_end(source), _read_end(target)
     if before.endswith("/**") is not after.endswith("/**"):
         raise BadValue(
@@ -204,7 +209,7 @@ def _placed(source: object, target: object, types: tuple[str, ...] = ()) -> _Pla
 
 
 def _read_end(raw: object) -> str:
-    """A name, or a namespace with ``/**`` behind it."""
+    """One end of a renaming: a name, or a namespace with ``/**`` behind it."""
     end = read_text(raw).strip()
     stem = end.removesuffix("/**")
     if re.search(r"[*?]", stem):
@@ -229,6 +234,52 @@ def _check_name(name: str) -> None:
             raise BadValue(f"{name} never crosses: {why}", "leave this rule out")
 
 
+# --- the keys of the tables -----------------------------------------------------------------------------------------
+
+_NAME_OR_NAMESPACE: Final = ValueType(_read_end, {"type": "string", "examples": ["/odom", "/arm/**"]})
+_REMAP_KEYS: Final = (
+    RuleKey(
+        "direction",
+        ValueType(_read_direction, {"type": "string", "enum": list(_DIRECTIONS)}),
+        "in renames what they have, out what this module has.",
+        required=True,
+    ),
+    RuleKey("from", _NAME_OR_NAMESPACE, "The name before, or a namespace with /** behind it.", required=True),
+    RuleKey("to", _NAME_OR_NAMESPACE, "The name after, likewise.", required=True),
+    RuleKey(
+        "types",
+        list_of(TYPE_GLOB, if_empty="leave types out, or name some"),
+        "Only topics of these message types; without it: any, and services.",
+    ),
+)
+_RENAMES: Final[JsonSchema] = {"type": "object", "additionalProperties": {"type": "string"}}
+_KEYS: Final = (
+    RuleKey(
+        "name",
+        ValueType(_read_peer_glob, {"type": "string", "examples": ["robot*"]}),
+        "The peers, by a glob over their names.",
+        required=True,
+    ),
+    RuleKey(
+        "prefix",
+        ValueType(_read_prefix, {"type": "string", "examples": [f"/{PEER}"]}),
+        "A namespace for their names here; {peer} is the peer's name.",
+    ),
+    RuleKey(
+        "remap",
+        ValueType(_read_remaps, {"type": "array", "items": table_schema(_REMAP_KEYS)}),
+        "Single renamings, which may be for some message types only.",
+    ),
+    RuleKey("remap_in", ValueType(_read_renames, _RENAMES), "Their names, and what they are here."),
+    RuleKey("remap_out", ValueType(_read_renames, _RENAMES), "Our names, and what they are there."),
+    RuleKey("allow", list_of(_PEER_TOPIC_GLOB), "Topics that may cross, on top of [bridge], by their names here."),
+    RuleKey("deny", list_of(_PEER_TOPIC_GLOB), "Topics that stay home."),
+    RuleKey("allow_types", list_of(TYPE_GLOB), "Message types that may cross."),
+    RuleKey("deny_types", list_of(TYPE_GLOB), "Message types that stay home."),
+)
+PEER_RULES: Final = ValueType(_read_rules, {"type": "array", "items": table_schema(_KEYS)})
+
+
 # --- whether the rules of one direction fit each other --------------------------------------------------------------
 
 
@@ -241,7 +292,7 @@ def _check(rules: Sequence[_Placed]) -> None:
 
 
 def _check_end(rules: Sequence[_Placed], rule: _Placed) -> None:
-    """Refuse names that lead back to themselves: nobody can say which of them is meant."""
+    """Refuse names that lead back to themselves: which of them is meant cannot be known."""
     way = [_sample(rule.source)]
     for _ in range(len(rules) + 1):
         _, name = _first_fit(rules, way[-1])
@@ -256,7 +307,7 @@ def _check_end(rules: Sequence[_Placed], rule: _Placed) -> None:
 
 
 def _check_pair(rules: Sequence[_Placed], one: _Placed, other: _Placed) -> None:
-    """Refuse two names that would become one."""
+    """Refuse two names that would become the same."""
     longer, shorter = (one, other) if len(_stem(one.target)) >= len(_stem(other.target)) else (other, one)
     target = _sample(longer.target)
     sources = [_before(rule, target) for rule in (longer, shorter)]
@@ -275,12 +326,12 @@ def _stem(end: str) -> str:
 
 
 def _sample(end: str) -> str:
-    """A name that an end stands for."""
+    """A name that fits: of ``/a/**`` the name ``/a/x``."""
     return end[:-3] + "/x" if end.endswith("/**") else end
 
 
 def _before(rule: _Placed, target: str) -> str | None:
-    """The name that a rule would make this one of."""
+    """The name that a rule renames to ``target``; ``None`` if there is none."""
     if not rule.target.endswith("/**"):
         return rule.source if target == rule.target else None
     stem = _stem(rule.target)
@@ -288,6 +339,7 @@ def _before(rule: _Placed, target: str) -> str | None:
 
 
 def _first_fit(rules: Sequence[_Placed], name: str) -> tuple[_Placed | None, str | None]:
+    """The first rule that renames a name, and the name after."""
     for rule in rules:
         if not rule.source.endswith("/**"):
             if name == rule.source:
@@ -297,7 +349,8 @@ def _first_fit(rules: Sequence[_Placed], name: str) -> tuple[_Placed | None, str
     return None, None
 
 
-def _doubts(rules: Sequence[PeerRule]) -> Iterator[ConfigWarning]:
+def peer_warnings(rules: Sequence[PeerRule]) -> Iterator[ConfigWarning]:
+    """Warnings about rules that can be used but are probably mistakes."""
     for index, rule in enumerate(rules):
         if rule == PeerRule(rule.name):
             yield ConfigWarning((index,), "a rule that sets nothing")

@@ -1,291 +1,370 @@
-"""The agent's settings, as values; ``config.sources`` reads them from files, variables and flags."""
+"""The agent's settings: each is declared once here; ``config.schema`` says what follows from a declaration.
+
+``config.sources`` reads them from the file, the environment and the command line. The reference for users,
+docs/settings.md, is made from this module by ``scripts/write-reference``.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
 
 from rmpa.config import limits
+from rmpa.config.contract_rules import CONTRACT_RULES
+from rmpa.config.param_rules import PARAM_RULES, FollowRule
+from rmpa.config.peer_rules import PEER_RULES, PeerRule, Remap
+from rmpa.config.policy import PolicySettings
+from rmpa.config.quantities import TIMEOUT
+from rmpa.config.schema import setting, settings_of, table
+from rmpa.config.service_rules import SERVICE_RULES, ServiceRule
+from rmpa.config.values import (
+    BOOL,
+    BOUND,
+    CORE_MODE,
+    CPU,
+    DOMAIN,
+    DSCP,
+    FIFO_PRIORITY,
+    HOST,
+    HOST_PORT,
+    INTERFACE,
+    LOG_LEVEL,
+    MASTER_URI,
+    MULTICAST,
+    NAME,
+    NAME_OR_EMPTY,
+    NODE_GLOB,
+    PACKET_PRIORITY,
+    PARAM_GLOB,
+    PORT,
+    PORT_OR_ANY,
+    SERVICE_GLOB,
+    TEXT,
+    HostPort,
+    Multicast,
+    list_of,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from rmpa.core.contract import ContractRule
 
-
-@dataclass(frozen=True, slots=True)
-class HostPort:
-    """An address as written by a user: a host (name or number) and a port, 0 where none was given."""
-
-    host: str
-    port: int = 0
-
-    def __str__(self) -> str:
-        """``host:port`` or ``host``."""
-        return f"{self.host}:{self.port}" if self.port else self.host
-
-
-@dataclass(frozen=True, slots=True)
-class PolicySettings:
-    """What may cross the mesh, by globs (``core.names.matches``); the stronger of two answers is "no".
-
-    Args:
-        allow: Topics that may cross; empty lets none cross.
-        deny: Topics that stay home, on top of the built-in ones.
-        allow_types: Message types that may cross.
-        deny_types: Message types that stay home.
-    """
-
-    allow: tuple[str, ...] = ("/**",)
-    deny: tuple[str, ...] = ()
-    allow_types: tuple[str, ...] = ("**",)
-    deny_types: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class Remap:
-    """One name that is another one at a peer, or a namespace: both ends with ``/**``.
-
-    Args:
-        source: The name before, or ``/namespace/**``; ``{peer}`` in it is the peer's name.
-        target: The name after, likewise.
-        types: Globs over message types, one of which must fit; empty: topics of any type, and services.
-    """
-
-    source: str
-    target: str
-    types: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class PeerRule:
-    """One ``[[peer]]``: what holds between us and the peers of some name. All that fit a peer apply, in order.
-
-    Args:
-        name: A glob over peers' names.
-        prefix: What is put in front of their names here, and taken from ours there; ``{peer}`` is the peer's name.
-        remap_in: Their names (before) and what they are here (after); the first that fits.
-        remap_out: Our names (before) and what they are there (after).
-        policy: What may cross to and from them, on top of ``[bridge]``; in our names, with ``{peer}``.
-    """
-
-    name: str
-    prefix: str = ""
-    remap_in: tuple[Remap, ...] = ()
-    remap_out: tuple[Remap, ...] = ()
-    policy: PolicySettings = field(default_factory=PolicySettings)
-
-
-@dataclass(frozen=True, slots=True)
-class FollowRule:
-    """A parameter, or a namespace as a whole, of another module that this one follows (``[[param]]``).
-
-    Args:
-        key: Its global name over there.
-        owner: The peer's name.
-        to: Its global name here.
-    """
-
-    key: str
-    owner: str
-    to: str
-
-    def __str__(self) -> str:
-        """``base:/robot_description as /base/robot_description``."""
-        return f"{self.owner}:{self.key}" + (f" as {self.to}" if self.to != self.key else "")
-
-
-@dataclass(frozen=True, slots=True)
-class ParamSettings:
-    """What crosses of the parameters.
-
-    Args:
-        remote_get: Globs over what peers may read and follow.
-        remote_set: Globs over what they may set and delete.
-        follow: What this module follows, no two of them within each other.
-    """
-
-    remote_get: tuple[str, ...] = ("/**",)
-    remote_set: tuple[str, ...] = ("/**",)
-    follow: tuple[FollowRule, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class TimeSettings:
-    """Simulated time (``/use_sim_time`` and ``/clock``) across modules.
-
-    Args:
-        follow: The peer whose time holds here; empty for none.
-        share: Whether peers may have ours.
-    """
-
-    follow: str = ""
-    share: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class ServiceRule:
-    """One ``[[service]]``: what holds for services of some names.
-
-    Args:
-        names: Globs over their names here.
-        timeout: Seconds that a call may take.
-    """
-
-    names: tuple[str, ...]
-    timeout: float
+__all__ = [
+    "SETTINGS",
+    "TABLES",
+    "FollowRule",
+    "HostPort",
+    "LaneSettings",
+    "LimitSettings",
+    "Multicast",
+    "NodeSettings",
+    "ParamSettings",
+    "PeerRule",
+    "PolicySettings",
+    "RealtimeSettings",
+    "Remap",
+    "ServiceRule",
+    "ServiceSettings",
+    "Settings",
+    "TimeSettings",
+]
 
 
 @dataclass(frozen=True, slots=True)
 class ServiceSettings:
-    """What crosses of the services.
+    """Which services cross, and how long a call may take. The first of ``rules`` that fits a service holds for it."""
 
-    Args:
-        allow: Globs over services that may cross, by their names here; empty lets none cross.
-        deny: Globs over those that stay home.
-        loggers: Whether each node's ``get_loggers`` and ``set_logger_level`` cross too.
-        timeout: Seconds that a call may take.
-        rules: Exceptions from that; the first that fits holds.
-    """
-
-    allow: tuple[str, ...] = ("/**",)
-    deny: tuple[str, ...] = ()
-    loggers: bool = False
-    timeout: float = limits.SERVICE_TIMEOUT
-    rules: tuple[ServiceRule, ...] = ()
+    allow: tuple[str, ...] = setting(
+        ("/**",), list_of(SERVICE_GLOB), "Services that may cross, by their names here.", env="RMPA_SERVICE_ALLOW"
+    )
+    deny: tuple[str, ...] = setting((), list_of(SERVICE_GLOB), "Services that stay home.", env="RMPA_SERVICE_DENY")
+    loggers: bool = setting(
+        False, BOOL, "Whether each node's get_loggers and set_logger_level cross too.", env="RMPA_SERVICE_LOGGERS"
+    )
+    timeout: float = setting(
+        limits.SERVICE_TIMEOUT,
+        TIMEOUT,
+        "How long a call may take, in seconds or as a text such as 500 ms; then the caller gets an error.",
+        env="RMPA_SERVICE_TIMEOUT",
+    )
+    rules: tuple[ServiceRule, ...] = setting(
+        (), SERVICE_RULES, "Time-outs of single services; the first that fits holds.", key="service"
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class NodeSettings:
-    """What peers may do with this module's nodes.
+    """Rights of peers over this module's nodes."""
 
-    Args:
-        kill: Globs over the nodes that they may ask to end (``rosnode kill``, ``rmpa node kill``).
-    """
-
-    kill: tuple[str, ...] = ("/**",)
+    kill: tuple[str, ...] = setting(
+        ("/**",), list_of(NODE_GLOB), "Nodes that peers may end (rosnode kill, rmpa node kill).", env="RMPA_NODE_KILL"
+    )
 
 
 @dataclass(frozen=True, slots=True)
-class LaneSettings:
-    """How the packets of each lane are marked.
+class ParamSettings:
+    """Rights of peers over this module's parameters; the peers' parameters that it follows (none within another)."""
 
-    Args:
-        express_dscp: DSCP of the express lane (RFC 2474), 0 to 63. 48 is CS6: Wi-Fi's voice queue, where EF is video.
-        express_priority: SO_PRIORITY of the express lane, 0 to 6; 6 is the first band of pfifo_fast.
-        bulk_dscp: DSCP of the bulk lane.
-        bulk_priority: SO_PRIORITY of the bulk lane.
-    """
-
-    express_dscp: int = 48
-    express_priority: int = 6
-    bulk_dscp: int = 0
-    bulk_priority: int = 0
+    remote_get: tuple[str, ...] = setting(
+        ("/**",), list_of(PARAM_GLOB), "Parameters that peers may read and follow.", env="RMPA_REMOTE_GET"
+    )
+    remote_set: tuple[str, ...] = setting(
+        ("/**",), list_of(PARAM_GLOB), "Parameters that peers may set and delete.", env="RMPA_REMOTE_SET"
+    )
+    follow: tuple[FollowRule, ...] = setting(
+        (), PARAM_RULES, "Parameters of peers that this module follows.", key="param"
+    )
 
 
 @dataclass(frozen=True, slots=True)
-class RealtimeSettings:
-    """What the agent asks the kernel for; what it does not get, it says.
+class TimeSettings:
+    """Simulated time (``/use_sim_time`` and ``/clock``) across modules."""
 
-    Args:
-        enabled: Whether it asks at all (``--realtime``).
-        priority: Of SCHED_FIFO, 1 to 99.
-        cpus: The CPUs to run on; empty: any.
-        lock_memory: Whether its memory stays in RAM (mlockall).
-        keep_awake: Whether the CPUs are kept from idle states that they wake from late; it costs power.
-    """
-
-    enabled: bool = False
-    priority: int = 50
-    cpus: tuple[int, ...] = ()
-    lock_memory: bool = True
-    keep_awake: bool = False
+    follow: str = setting(
+        "", NAME_OR_EMPTY, "The peer whose simulated time holds here; empty for none.", env="RMPA_TIME_FOLLOW"
+    )
+    share: bool = setting(False, BOOL, "Whether peers may follow this module's time.", env="RMPA_TIME_SHARE")
 
 
 @dataclass(frozen=True, slots=True)
 class LimitSettings:
-    """How much of one peer is taken, and how much peers are told; what is beyond stays hidden, and is told as such.
+    """Bounds of what is accepted from one peer and offered to peers; the rest stays hidden and is reported."""
 
-    Args:
-        nodes: Nodes of one peer that stand in the local graph.
-        topics: (topic, node) pairs of one peer, and those that this module offers.
-        services: Services of one peer, and those that this module offers.
-        params: Parameters that this module follows, and that one peer may follow here.
-    """
+    nodes: int = setting(
+        limits.NODES_PER_PEER_MAX, BOUND, "Nodes of one peer that stand in the local graph.", env="RMPA_LIMIT_NODES"
+    )
+    topics: int = setting(
+        limits.TOPICS_PER_PEER_MAX,
+        BOUND,
+        "Pairs of topic and node of one peer, and those that this module offers.",
+        env="RMPA_LIMIT_TOPICS",
+    )
+    services: int = setting(
+        limits.SERVICES_PER_PEER_MAX,
+        BOUND,
+        "Services of one peer, and those that this module offers.",
+        env="RMPA_LIMIT_SERVICES",
+    )
+    params: int = setting(
+        limits.FOLLOWED_MAX,
+        BOUND,
+        "Parameters that this module follows, and that one peer may follow here.",
+        env="RMPA_LIMIT_PARAMS",
+    )
 
-    nodes: int = limits.NODES_PER_PEER_MAX
-    topics: int = limits.TOPICS_PER_PEER_MAX
-    services: int = limits.SERVICES_PER_PEER_MAX
-    params: int = limits.FOLLOWED_MAX
+
+@dataclass(frozen=True, slots=True)
+class LaneSettings:
+    """The marks of each lane's packets: DSCP (RFC 2474) for the network, SO_PRIORITY for this machine."""
+
+    express_dscp: int = setting(
+        48,
+        DSCP,
+        "DSCP of the express lane. 48 is CS6: Wi-Fi's voice queue, where EF would be video.",
+        env="RMPA_EXPRESS_DSCP",
+    )
+    express_priority: int = setting(
+        6,
+        PACKET_PRIORITY,
+        "SO_PRIORITY of the express lane; 6 is the first band of pfifo_fast.",
+        env="RMPA_EXPRESS_PRIORITY",
+    )
+    bulk_dscp: int = setting(0, DSCP, "DSCP of the bulk lane.", env="RMPA_BULK_DSCP")
+    bulk_priority: int = setting(0, PACKET_PRIORITY, "SO_PRIORITY of the bulk lane.", env="RMPA_BULK_PRIORITY")
+
+
+@dataclass(frozen=True, slots=True)
+class RealtimeSettings:
+    """Requests to the kernel for real-time behaviour; refusals are logged."""
+
+    enabled: bool = setting(
+        False,
+        BOOL,
+        "Ask for SCHED_FIFO, locked memory and the CPUs of [realtime] in rmpa.toml.",
+        env="RMPA_REALTIME",
+        option="--realtime/--no-realtime",
+    )
+    priority: int = setting(
+        50,
+        FIFO_PRIORITY,
+        "Priority of SCHED_FIFO; below 50 the kernel's interrupt threads come first.",
+        env="RMPA_REALTIME_PRIORITY",
+    )
+    cpus: tuple[int, ...] = setting((), list_of(CPU), "The CPUs to run on; empty: any.", env="RMPA_REALTIME_CPUS")
+    lock_memory: bool = setting(
+        True, BOOL, "Keep the agent's memory in RAM (mlockall).", env="RMPA_REALTIME_LOCK_MEMORY"
+    )
+    keep_awake: bool = setting(
+        False,
+        BOOL,
+        "Keep the CPUs from idle states that they leave late; it costs power.",
+        env="RMPA_REALTIME_KEEP_AWAKE",
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
     """All settings of one agent.
 
-    Args:
-        name: The module's name, a ROS base name; empty means: from the host's name.
-        domain: Only agents of one domain join.
-        core_host: The address that the ROS core listens at.
-        core_port: Its port.
-        core_mode: ``embedded``: the agent runs the core; ``external``: a roscore that runs already is used.
-        core_master: The external core's URI; empty: ROS's own default.
-        core_fresh: Whether the embedded core begins empty, whatever it has kept of the run before.
-        port: The mesh's port (TCP links, UDP unicast beacons); 0 lets the system choose.
-        interfaces: Names of the interfaces to use; empty means all usable ones.
-        seeds: Agents to greet by unicast, across sub-networks; port 0 means the domain's discovery port.
-        group: Multicast group of the beacons.
-        group_port: Its port before the domain is added.
-        multicast: Whether beacons are sent to the group at all (``ROS_AUTOMATIC_DISCOVERY_RANGE=OFF`` says no).
-        policy: What may cross.
-        peers: What holds for single peers, in the order of the file.
-        contracts: What the topics need, in the order of the file (``core.contract.Contracts``).
-        services: What crosses of the services, and how long a call may take.
-        params: What crosses of the parameters.
-        nodes: What peers may do with this module's nodes.
-        time: Whose simulated time holds.
-        limits: How much of one peer is taken.
-        lanes: How the lanes are marked.
-        realtime: What is asked of the kernel.
-        relay: Whether what comes from one peer is offered to others that do not reach it themselves.
-        log_level: ``debug``, ``info``, ``warning`` or ``error``.
-        log_json: One JSON object a line instead of text.
-        config_file: Where the file's part came from, if there was a file.
-        runtime_dir: Where control sockets live; empty means the usual place of this user.
-        state_dir: Where is kept what survives the agent's end; likewise.
+    ``config_file`` is the file that was read, if there was one; it is not a setting.
     """
 
-    name: str = ""
-    domain: int = 0
-    core_host: str = "127.0.0.1"
-    core_port: int = 11311
-    core_mode: str = "embedded"
-    core_master: str = ""
-    core_fresh: bool = False
-    port: int = 0
-    interfaces: tuple[str, ...] = ()
-    seeds: tuple[HostPort, ...] = ()
-    group: str = limits.MULTICAST_GROUP
-    group_port: int = limits.MULTICAST_PORT
-    multicast: bool = True
-    policy: PolicySettings = field(default_factory=PolicySettings)
-    peers: tuple[PeerRule, ...] = ()
-    contracts: tuple[ContractRule, ...] = ()
-    services: ServiceSettings = field(default_factory=ServiceSettings)
-    params: ParamSettings = field(default_factory=ParamSettings)
-    nodes: NodeSettings = field(default_factory=NodeSettings)
-    time: TimeSettings = field(default_factory=TimeSettings)
-    limits: LimitSettings = field(default_factory=LimitSettings)
-    lanes: LaneSettings = field(default_factory=LaneSettings)
-    realtime: RealtimeSettings = field(default_factory=RealtimeSettings)
-    relay: bool = False
-    log_level: str = "info"
-    log_json: bool = False
+    name: str = setting(
+        "",
+        NAME,
+        "The module's name among its peers, a ROS base name.",
+        env="RMPA_NAME",
+        option="--name",
+        shown_default="from the host's name",
+    )
+    domain: int = setting(
+        0, DOMAIN, "Only agents of one domain join, 0 to 232.", env="RMPA_DOMAIN", option="--domain"
+    )
+    core_mode: str = setting(
+        "embedded",
+        CORE_MODE,
+        "embedded: run the ROS core; external: use the roscore of ROS_MASTER_URI.",
+        key="core.mode",
+        env="RMPA_CORE",
+        option="--core",
+    )
+    core_master: str = setting(
+        "",
+        MASTER_URI,
+        "The external core's URI.",
+        key="core.master",
+        env="RMPA_MASTER",
+        option="--master",
+        shown_default="ROS_MASTER_URI",
+    )
+    core_fresh: bool = setting(
+        False,
+        BOOL,
+        "Begin with an empty core, as roscore does; else nodes and parameters of the run before are taken up.",
+        key="core.fresh",
+        env="RMPA_FRESH",
+        option="--fresh",
+    )
+    core_host: str = setting(
+        "127.0.0.1",
+        HOST,
+        "The address that the ROS core listens at; 127.0.0.1 is this machine only.",
+        key="core.host",
+        env="RMPA_CORE_HOST",
+        option="--core-host",
+    )
+    core_port: int = setting(
+        11311, PORT, "The ROS core's port.", key="core.port", env="RMPA_CORE_PORT", option="--core-port"
+    )
+    port: int = setting(
+        0, PORT_OR_ANY, "The mesh's port, TCP and UDP; 0: any.", key="mesh.port", env="RMPA_PORT", option="--port"
+    )
+    interfaces: tuple[str, ...] = setting(
+        (),
+        list_of(INTERFACE),
+        "Use only these network interfaces.",
+        key="discovery.interfaces",
+        env="RMPA_INTERFACES",
+        option="--interface",
+        shown_default="every usable one",
+    )
+    seeds: tuple[HostPort, ...] = setting(
+        (),
+        list_of(HOST_PORT),
+        "Agents to greet by unicast, where multicast does not reach; without a port: the domain's discovery port.",
+        key="discovery.seeds",
+        env="RMPA_SEEDS",
+        option="--seed",
+    )
+    multicast: Multicast = setting(
+        Multicast(),
+        MULTICAST,
+        "Where beacons go, the domain is added to the port; off (false in the file) for none.",
+        key="discovery.multicast",
+        env="RMPA_MULTICAST",
+        option="--multicast",
+    )
+    policy: PolicySettings = table(PolicySettings, "bridge", live=True)
+    peers: tuple[PeerRule, ...] = setting(
+        (),
+        PEER_RULES,
+        "Names and policy for single peers; all that fit a peer apply, in order.",
+        key="peer",
+        live=True,
+    )
+    contracts: tuple[ContractRule, ...] = setting(
+        (),
+        CONTRACT_RULES,
+        "What topics need; every rule that fits a topic applies, in order.",
+        key="contract",
+        live=True,
+    )
+    services: ServiceSettings = table(ServiceSettings, "services", live=True)
+    nodes: NodeSettings = table(NodeSettings, "nodes", live=True)
+    params: ParamSettings = table(ParamSettings, "params", live=True)
+    time: TimeSettings = table(TimeSettings, "time", live=True)
+    limits: LimitSettings = table(LimitSettings, "limits", live=True)
+    lanes: LaneSettings = table(LaneSettings, "lanes")
+    realtime: RealtimeSettings = table(RealtimeSettings, "realtime")
+    relay: bool = setting(
+        False,
+        BOOL,
+        "Offer what comes from one peer to others that do not reach it themselves.",
+        key="relay.enabled",
+        env="RMPA_RELAY",
+    )
+    log_level: str = setting(
+        "info",
+        LOG_LEVEL,
+        "debug, info, warning or error.",
+        key="log.level",
+        env="RMPA_LOG_LEVEL",
+        option="--log-level",
+        live=True,
+    )
+    log_json: bool = setting(
+        False, BOOL, "Log one JSON object a line.", key="log.json", env="RMPA_LOG_JSON", option="--log-json"
+    )
+    runtime_dir: str = setting(
+        "",
+        TEXT,
+        "The directory of the control sockets.",
+        key="",
+        env="RMPA_RUNTIME_DIR",
+        shown_default="this user's runtime directory",
+    )
+    state_dir: str = setting(
+        "",
+        TEXT,
+        "The directory of what is kept over a restart.",
+        key="",
+        env="RMPA_STATE_DIR",
+        shown_default="this user's state directory",
+    )
     config_file: Path | None = None
-    runtime_dir: str = ""
-    state_dir: str = ""
 
     @property
     def discovery_port(self) -> int:
         """The port of this domain's beacons."""
-        return self.group_port + self.domain
+        return self.multicast.port + self.domain
+
+
+SETTINGS: Final = tuple(settings_of(Settings))
+"""Every setting, in the order of the documentation."""
+TABLES: Final = {
+    "core": "Where the ROS core listens, or which roscore is used instead of it.",
+    "mesh": "The links to the peers.",
+    "discovery": "How peers find each other.",
+    "bridge": "Which topics may cross, by globs.",
+    "services": "Which services may cross, and how long a call may take.",
+    "nodes": "What peers may do with this module's nodes.",
+    "params": "What peers may do with this module's parameters.",
+    "time": "Whose simulated time this module has, and whether peers may have its own.",
+    "limits": "How much is accepted from one peer.",
+    "lanes": "How the packets of each lane are marked.",
+    "realtime": "What the agent asks the kernel for.",
+    "relay": "Whether this module joins networks that are not routed to each other.",
+    "log": "What the log says, and how.",
+}
+"""The tables of ``rmpa.toml``, each with its description."""

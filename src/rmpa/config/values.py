@@ -1,7 +1,8 @@
-"""Reads one setting from what a user wrote: a string of a flag or variable, or a value of a TOML file.
+"""The types of values that settings have: how a raw value is read, and what JSON Schema says of it.
 
-Each reader takes the raw value and returns the typed one, or raises ``BadValue`` with what is wrong and what to
-write instead; where it was written is added by ``config.sources``.
+A raw value is a string of a command-line option or an environment variable, or a value of a TOML file. A reader
+returns the typed value, or raises ``BadValue`` with what is wrong and what to write instead; ``config.sources`` adds
+where the value was written.
 """
 
 from __future__ import annotations
@@ -9,26 +10,30 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from ipaddress import AddressValueError, IPv4Address
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 from rmpa.config import limits
-from rmpa.config.settings import HostPort
 from rmpa.core import limits as core_limits
 from rmpa.core.identity import peer_name_from, peer_name_problem
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Mapping
 
 _T = TypeVar("_T")
+_T_co = TypeVar("_T_co", covariant=True)
+Place = tuple[str | int, ...]
+"""A key of the file, or an element below it: ``("contract", 1, "topics", 0)``."""
+JsonSchema = dict[str, Any]
+"""A JSON Schema (draft 7), or a part of one."""
 
-LOG_LEVELS: Final = ("debug", "info", "warning", "error")
-CORE_MODES: Final = ("embedded", "external")
+_LOG_LEVELS: Final = ("debug", "info", "warning", "error")
+_CORE_MODES: Final = ("embedded", "external")
 _MASTER: Final = re.compile(r"http://(?P<host>[^\s/:\[\]]+):(?P<port>[0-9]{1,5})/?")
 _HOST: Final = re.compile(r"(?=.{1,253}\Z)[A-Za-z0-9_](?:[A-Za-z0-9_.-]*[A-Za-z0-9_])?")
 _NUMERIC: Final = re.compile(r"[0-9.]+")
 _TOPIC_GLOB: Final = re.compile(r"[A-Za-z0-9_/*?]+")
 _INTERFACE: Final = re.compile(r"[^\s/]{1,15}")
-_WORDS: Final = {
+_BOOLEANS: Final = {
     "1": True,
     "true": True,
     "yes": True,
@@ -40,6 +45,21 @@ _WORDS: Final = {
 }
 
 
+@dataclass(frozen=True, slots=True)
+class ValueType(Generic[_T_co]):
+    """A type of values, declared once for all settings that have it.
+
+    Args:
+        read: Reads a raw value; raises ``BadValue``.
+        json_schema: What a value may be in TOML. ``config.file`` checks the ``type`` in it before ``read`` is called.
+        metavar: What ``--help`` shows for the value of an option.
+    """
+
+    read: Callable[[Any], _T_co]
+    json_schema: JsonSchema
+    metavar: str = ""
+
+
 @dataclass
 class BadValue(ValueError):  # noqa: N818 - it becomes a ConfigError, which is the error
     """A value cannot be used.
@@ -48,13 +68,13 @@ class BadValue(ValueError):  # noqa: N818 - it becomes a ConfigError, which is t
         problem: What is wrong with it.
         remedy: What to do, as a sentence part; may be empty.
         better: The value that was probably meant, if there is one.
-        at: What inside of the setting it is about: the index of a list's element, a key of a table, both.
+        at: The part of the setting that is wrong: the index of a list's element, a key of a table, or both.
     """
 
     problem: str
     remedy: str = ""
     better: str | None = None
-    at: tuple[str | int, ...] = ()
+    at: Place = ()
 
     def __str__(self) -> str:
         """The problem alone."""
@@ -71,6 +91,15 @@ def did_you_mean(word: str, known: Iterable[str]) -> str | None:
     return folded[near[0]] if near else None
 
 
+def shown(value: object) -> str:
+    """A TOML value as errors show it, at most 60 characters long."""
+    text = str(value).lower() if isinstance(value, bool) else repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+# --- texts and names ------------------------------------------------------------------------------------------------
+
+
 def read_text(raw: object) -> str:
     """A string that is not empty."""
     if not isinstance(raw, str) or not raw.strip():
@@ -79,108 +108,129 @@ def read_text(raw: object) -> str:
 
 
 def read_name(raw: object) -> str:
-    """A peer's name; the nearest valid one is offered for an invalid one."""
+    """A peer's name; the error for an invalid one offers the nearest valid one."""
     name = read_text(raw)
     if problem := peer_name_problem(name):
         raise BadValue(problem, better=peer_name_from(name))
     return name
 
 
-def read_name_or_none(raw: object) -> str:
-    """A peer's name, or an empty text for none."""
-    return read_name(raw) if raw != "" else ""
+def read_interface(raw: object) -> str:
+    """The name of a network interface, such as ``wlan0``. It need not exist: interfaces come and go."""
+    name = read_text(raw).strip()
+    if not _INTERFACE.fullmatch(name):
+        raise BadValue(
+            f"{name!r} is not the name of a network interface", "one looks like wlan0; `ip link` lists them"
+        )
+    return name
+
+
+TEXT: Final = ValueType(read_text, {"type": "string", "minLength": 1}, "TEXT")
+NAME: Final = ValueType(read_name, {"type": "string", "pattern": "^[A-Za-z][A-Za-z0-9_]*$"}, "NAME")
+NAME_OR_EMPTY: Final = ValueType(
+    lambda raw: read_name(raw) if raw != "" else "",
+    {"type": "string", "pattern": "^([A-Za-z][A-Za-z0-9_]*)?$"},
+    "NAME",
+)
+INTERFACE: Final = ValueType(read_interface, {"type": "string", "examples": ["wlan0"]}, "NAME")
+
+
+def word_of(known: Iterable[str], what: str, remedy: str, metavar: str) -> ValueType[str]:
+    """One of several words, in lower case; texts in upper case are read too.
+
+    Args:
+        known: The words.
+        what: What one of them is, with its article, for the text of errors.
+        remedy: What to do about a wrong one.
+        metavar: What ``--help`` shows for it.
+    """
+    words = list(known)
+
+    def read(raw: object) -> str:
+        text = str(raw).strip().lower()
+        if text not in words:
+            raise BadValue(f"{raw!r} is not {what}", remedy, did_you_mean(text, words))
+        return text
+
+    return ValueType(read, {"type": "string", "enum": words}, metavar)
+
+
+LOG_LEVEL: Final = word_of(_LOG_LEVELS, "a log level", f"the levels are {', '.join(_LOG_LEVELS)}", "LEVEL")
+CORE_MODE: Final = word_of(
+    _CORE_MODES, "a kind of core", "embedded: the agent's own; external: a roscore that runs already", "MODE"
+)
+
+# --- switches and numbers -------------------------------------------------------------------------------------------
 
 
 def read_bool(raw: object) -> bool:
     """``true`` or ``false``, also as 1, 0, yes, no, on, off."""
     if isinstance(raw, bool):
         return raw
-    value = _WORDS.get(str(raw).strip().lower())
+    value = _BOOLEANS.get(str(raw).strip().lower())
     if value is None:
         raise BadValue(f"{raw!r} is neither true nor false")
     return value
 
 
-def read_whole(raw: object, low: int, high: int, what: str) -> int:
-    """A whole number between two bounds; ``what`` names it with its article, for the text of errors."""
-    text = str(raw).strip()
-    # ASCII alone: int() would also take "1_0" and digits of other scripts; nine digits bound its cost.
-    if isinstance(raw, bool) or not re.fullmatch(r"-?[0-9]{1,9}", text):
-        raise BadValue(f"{raw!r} is not a whole number", f"{what} is between {low} and {high}")
-    value = int(text)
-    if not low <= value <= high:
-        raise BadValue(f"{value} is out of range", f"{what} is between {low} and {high}")
-    return value
+def whole_number(low: int, high: int, what: str, metavar: str = "N") -> ValueType[int]:
+    """A whole number between two bounds, both allowed; ``what`` names it with its article, for the text of errors."""
+
+    def read(raw: object) -> int:
+        text = str(raw).strip()
+        # ASCII alone: int() would also take "1_0" and digits of other scripts; nine digits bound its cost.
+        if isinstance(raw, bool) or not re.fullmatch(r"-?[0-9]{1,9}", text):
+            raise BadValue(f"{raw!r} is not a whole number", f"{what} is between {low} and {high}")
+        value = int(text)
+        if not low <= value <= high:
+            raise BadValue(f"{value} is out of range", f"{what} is between {low} and {high}")
+        return value
+
+    return ValueType(read, {"type": "integer", "minimum": low, "maximum": high}, metavar)
 
 
-def read_domain(raw: object) -> int:
-    """A domain id."""
-    return read_whole(raw, 0, core_limits.DOMAIN_MAX, "a domain id")
+BOOL: Final = ValueType(read_bool, {"type": "boolean"})
+DOMAIN: Final = whole_number(0, core_limits.DOMAIN_MAX, "a domain id")
+PORT: Final = whole_number(1, 65535, "a port", "PORT")
+PORT_OR_ANY: Final = whole_number(0, 65535, "a port (0: any)", "PORT")
+DSCP: Final = whole_number(0, 63, "a DSCP (the TOS byte / 4; CS6 is 48)")
+PACKET_PRIORITY: Final = whole_number(0, 6, "SO_PRIORITY without CAP_NET_ADMIN")
+FIFO_PRIORITY: Final = whole_number(1, 99, "a priority of SCHED_FIFO")
+CPU: Final = whole_number(0, limits.CPU_MAX, "the number of a CPU")
+BOUND: Final = whole_number(1, limits.BOUND_MAX, "a limit")
+
+# --- addresses ------------------------------------------------------------------------------------------------------
 
 
-def read_port(raw: object) -> int:
-    """A TCP or UDP port that can be named."""
-    return read_whole(raw, 1, 65535, "a port")
+@dataclass(frozen=True, slots=True)
+class HostPort:
+    """An address as a user writes it: a host (name or number) and a port; 0 where none was given."""
+
+    host: str
+    port: int = 0
+
+    def __str__(self) -> str:
+        """``host:port`` or ``host``."""
+        return f"{self.host}:{self.port}" if self.port else self.host
 
 
-def read_port_or_any(raw: object) -> int:
-    """A port, or 0: the system chooses one."""
-    return read_whole(raw, 0, 65535, "a port (0: any)")
+@dataclass(frozen=True, slots=True)
+class Multicast:
+    """The multicast of the beacons.
 
+    Args:
+        enabled: Whether beacons are sent to the group at all.
+        group: The IPv4 multicast group.
+        port: Its port, before the domain is added.
+    """
 
-def read_dscp(raw: object) -> int:
-    """A DSCP, the upper six bits of IP's TOS."""
-    return read_whole(raw, 0, 63, "a DSCP (the TOS byte / 4; CS6 is 48)")
+    enabled: bool = True
+    group: str = limits.MULTICAST_GROUP
+    port: int = limits.MULTICAST_PORT
 
-
-def read_packet_priority(raw: object) -> int:
-    """An SO_PRIORITY that a user may set."""
-    return read_whole(raw, 0, 6, "SO_PRIORITY without CAP_NET_ADMIN")
-
-
-def read_realtime_priority(raw: object) -> int:
-    """A priority of SCHED_FIFO."""
-    return read_whole(raw, 1, 99, "a priority of SCHED_FIFO")
-
-
-def read_cpu(raw: object) -> int:
-    """The number of a CPU; whether it is there is only known while running."""
-    return read_whole(raw, 0, limits.CPU_MAX, "the number of a CPU")
-
-
-def read_bound(raw: object) -> int:
-    """How many of something one peer may have."""
-    return read_whole(raw, 1, limits.BOUND_MAX, "a limit")
-
-
-def read_level(raw: object) -> str:
-    """A log level."""
-    text = str(raw).strip().lower()
-    if text not in LOG_LEVELS:
-        remedy = f"the levels are {', '.join(LOG_LEVELS)}"
-        raise BadValue(f"{raw!r} is not a log level", remedy, did_you_mean(text, LOG_LEVELS))
-    return text
-
-
-def read_core_mode(raw: object) -> str:
-    """Which ROS core the agent works with."""
-    text = str(raw).strip().lower()
-    if text not in CORE_MODES:
-        remedy = "embedded: the agent's own; external: a roscore that runs already"
-        raise BadValue(f"{raw!r} is not a kind of core", remedy, did_you_mean(text, CORE_MODES))
-    return text
-
-
-def read_master_uri(raw: object) -> str:
-    """The URI of a ROS master."""
-    text = read_text(raw).strip()
-    match = _MASTER.fullmatch(text)
-    if match is None:
-        better = f"http://{text.rstrip('/')}/" if _MASTER.fullmatch(f"http://{text}") else None
-        raise BadValue(f"{raw!r} is not a master's URI", "one looks like http://localhost:11311/", better)
-    read_host(match["host"])
-    read_port(match["port"])
-    return text
+    def __str__(self) -> str:
+        """``group:port``, or ``false``."""
+        return f"{self.group}:{self.port}" if self.enabled else "false"
 
 
 def read_host(raw: object) -> str:
@@ -209,28 +259,21 @@ def read_host_port(raw: object) -> HostPort:
     if not host or ":" in host:
         raise BadValue(f"{text!r} is not HOST:PORT", "an example: 192.168.1.20:40001; IPv6 is not supported")
     try:
-        return HostPort(read_host(host), read_port(port))
+        return HostPort(read_host(host), PORT.read(port))
     except BadValue as error:
         raise BadValue(f"{text!r} is not HOST:PORT: {error.problem}", error.remedy) from None
 
 
-def read_interface(raw: object) -> str:
-    """The name of a network interface, such as ``wlan0``; whether it exists is only known while running."""
-    name = read_text(raw).strip()
-    if not _INTERFACE.fullmatch(name):
-        raise BadValue(
-            f"{name!r} is not the name of a network interface", "one looks like wlan0; `ip link` lists them"
-        )
-    return name
-
-
-@dataclass(frozen=True, slots=True)
-class Multicast:
-    """Where beacons go: whether to a group at all, and which group and port (before the domain is added)."""
-
-    enabled: bool = True
-    group: str = limits.MULTICAST_GROUP
-    port: int = limits.MULTICAST_PORT
+def read_master_uri(raw: object) -> str:
+    """The URI of a ROS master."""
+    text = read_text(raw).strip()
+    match = _MASTER.fullmatch(text)
+    if match is None:
+        better = f"http://{text.rstrip('/')}/" if _MASTER.fullmatch(f"http://{text}") else None
+        raise BadValue(f"{raw!r} is not a master's URI", "one looks like http://localhost:11311/", better)
+    read_host(match["host"])
+    PORT.read(match["port"])
+    return text
 
 
 def read_multicast(raw: object) -> Multicast:
@@ -238,8 +281,8 @@ def read_multicast(raw: object) -> Multicast:
     if isinstance(raw, bool):
         return Multicast(raw)
     text = read_text(raw).strip()
-    if text.lower() in {"off", "false", "no", "on", "true", "yes"}:
-        return Multicast(_WORDS[text.lower()])
+    if text not in {"0", "1"} and text.lower() in _BOOLEANS:
+        return Multicast(_BOOLEANS[text.lower()])
     example = f"GROUP:PORT looks like {limits.MULTICAST_GROUP}:{limits.MULTICAST_PORT}; off sends no multicast"
     host, colon, port = text.partition(":")
     try:
@@ -249,9 +292,17 @@ def read_multicast(raw: object) -> Multicast:
     if not group.is_multicast:
         raise BadValue(f"{host} is not a multicast group", "groups are 224.0.0.0 to 239.255.255.255")
     try:
-        return Multicast(True, str(group), read_port(port) if colon else limits.MULTICAST_PORT)
+        return Multicast(True, str(group), PORT.read(port) if colon else limits.MULTICAST_PORT)
     except BadValue as error:
         raise BadValue(f"{text!r} is not GROUP:PORT: {error.problem}", error.remedy) from None
+
+
+HOST: Final = ValueType(read_host, {"type": "string", "examples": ["127.0.0.1", "0.0.0.0"]}, "HOST")  # noqa: S104 - shown
+HOST_PORT: Final = ValueType(read_host_port, {"type": "string", "examples": ["10.8.0.5:40001"]}, "HOST:PORT")
+MASTER_URI: Final = ValueType(read_master_uri, {"type": "string", "examples": ["http://localhost:11311/"]}, "URI")
+MULTICAST: Final = ValueType(read_multicast, {"type": ["boolean", "string"]}, "GROUP:PORT")
+
+# --- globs ----------------------------------------------------------------------------------------------------------
 
 
 def read_topic_glob(raw: object) -> str:
@@ -280,20 +331,118 @@ def read_type_glob(raw: object) -> str:
     return glob
 
 
-def read_list(raw: object, item: Callable[[object], _T]) -> tuple[_T, ...]:
-    """A list whose elements ``item`` reads; a string is split at ``;`` and ``,``. Nothing may stand there twice."""
-    if isinstance(raw, str):
-        raw = [part.strip() for part in re.split("[;,]", raw) if part.strip()]
-    if not isinstance(raw, list | tuple):
-        raise BadValue(f"{raw!r} is not a list")
-    found: list[_T] = []
-    for index, element in enumerate(raw):
+def _glob_over(what: str) -> ValueType[str]:
+    """A glob over other ROS names than topics; the errors name what it is for."""
+
+    def read(raw: object) -> str:
         try:
-            value = item(element)
+            return read_topic_glob(raw)
         except BadValue as error:
-            error.at = (index, *error.at)
-            raise
-        if value in found:
-            raise BadValue(f"{element!r} stands there twice", "delete one of them", at=(index,))
-        found.append(value)
-    return tuple(found)
+            problem, remedy = (text.replace("topic", what) for text in (error.problem, error.remedy))
+            raise BadValue(problem, remedy, error.better) from None
+
+    return ValueType(read, {"type": "string", "examples": ["/**"]}, "GLOB")
+
+
+TOPIC_GLOB: Final = ValueType(read_topic_glob, {"type": "string", "examples": ["/camera/**"]}, "GLOB")
+TYPE_GLOB: Final = ValueType(read_type_glob, {"type": "string", "examples": ["sensor_msgs/*"]}, "GLOB")
+SERVICE_GLOB: Final = _glob_over("service")
+NODE_GLOB: Final = _glob_over("node")
+PARAM_GLOB: Final = _glob_over("parameter")
+
+# --- lists and tables -----------------------------------------------------------------------------------------------
+
+
+def list_of(item: ValueType[_T], *, if_empty: str = "") -> ValueType[tuple[_T, ...]]:
+    """A list without duplicates; a string is split at ``;`` and ``,``.
+
+    Args:
+        item: The type of its elements.
+        if_empty: What to do about an empty list, where there must be elements.
+    """
+
+    def read(raw: object) -> tuple[_T, ...]:
+        if isinstance(raw, str):
+            raw = [part.strip() for part in re.split("[;,]", raw) if part.strip()]
+        if not isinstance(raw, list | tuple):
+            raise BadValue(f"{raw!r} is not a list")
+        found: list[_T] = []
+        for index, element in enumerate(raw):
+            value = read_at((index,), item.read, element)
+            if value in found:
+                raise BadValue(f"{element!r} stands there twice", "delete one of them", at=(index,))
+            found.append(value)
+        if if_empty and not found:
+            raise BadValue("an empty list fits nothing", if_empty)
+        return tuple(found)
+
+    schema = {"type": "array", "items": item.json_schema, "uniqueItems": True} | ({"minItems": 1} if if_empty else {})
+    return ValueType(read, schema, item.metavar)
+
+
+def read_at(place: Place, read: Callable[[Any], _T], raw: object) -> _T:
+    """Read a part of a setting; a ``BadValue`` gets the place of the part in front of its own."""
+    try:
+        return read(raw)
+    except BadValue as error:
+        error.at = (*place, *error.at)
+        raise
+
+
+@dataclass(frozen=True, slots=True)
+class RuleKey:
+    """One key of the tables of a list such as ``[[contract]]``.
+
+    Args:
+        name: As it is written in the file.
+        type: The type of its value.
+        help: What it says, for the documentation and for editors.
+        required: Whether each table must have it.
+    """
+
+    name: str
+    type: ValueType[object]
+    help: str
+    required: bool = False
+
+
+def read_keys(table: Mapping[str, object], keys: Iterable[RuleKey], example: str = "") -> dict[str, Any]:
+    """The values of a table's keys, by name; keys that are missing are left out.
+
+    Args:
+        table: As written; ``config.file`` has checked the names of its keys.
+        keys: Those that are known.
+        example: What a complete table has, for the error about a required key that is missing.
+    """
+    for key in keys:
+        if key.required and key.name not in table:
+            raise BadValue(f"a rule without {key.name}", example)
+    return {key.name: read_at((key.name,), key.type.read, table[key.name]) for key in keys if key.name in table}
+
+
+def tables_of(keys: Iterable[RuleKey], read_table: Callable[[Any], _T]) -> ValueType[tuple[_T, ...]]:
+    """A list of tables (``[[contract]]``); errors name the table's index.
+
+    Args:
+        keys: The keys that each table may have.
+        read_table: Reads one table.
+    """
+
+    def read(raw: object) -> tuple[_T, ...]:
+        if not isinstance(raw, list | tuple):
+            raise BadValue(f"{shown(raw)} is not a list")
+        return tuple(read_at((index,), read_table, table) for index, table in enumerate(raw))
+
+    return ValueType(read, {"type": "array", "items": table_schema(keys)})
+
+
+def table_schema(keys: Iterable[RuleKey]) -> JsonSchema:
+    """The JSON Schema of a table with these keys."""
+    keys = tuple(keys)
+    schema: JsonSchema = {
+        "type": "object",
+        "additionalProperties": False,
+        "properties": {key.name: key.type.json_schema | {"description": key.help} for key in keys},
+    }
+    required = [key.name for key in keys if key.required]
+    return schema | ({"required": required} if required else {})

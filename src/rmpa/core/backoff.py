@@ -1,4 +1,4 @@
-"""Capped, jittered exponential back-off (retry for ever, never in step with the others)."""
+"""Exponential back-off with a cap and jitter: retries go on for ever, and not in step with those of other agents."""
 
 from __future__ import annotations
 
@@ -31,5 +31,5 @@ class Backoff:
         return base * (0.5 + 0.5 * self._rng())
 
     def reset(self) -> None:
-        """Start again at ``first``: the last attempt was good."""
+        """Start again at ``first``, after a successful attempt."""
         self._next = self._first

@@ -1,7 +1,7 @@
-"""Time as an argument: machines are told ``now`` and never ask.
+"""Time is an argument: protocol machines get ``now`` and never read a clock.
 
-``now`` is a float of seconds on a monotonic clock whose zero means nothing; stamps that cross the wire are
-integers of nanoseconds on the sender's wall clock.
+``now`` is seconds (float) of a monotonic clock with an arbitrary zero; stamps on the wire are nanoseconds (int) of
+the sender's wall clock.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """What an ``aio`` part asks for the time; tests pass a simulated one."""
+    """A source of time for the I/O parts; tests pass a simulated one."""
 
     def now(self) -> float:
         """Monotonic seconds."""
@@ -22,5 +22,5 @@ class Clock(Protocol):
 
 
 def earliest(*timers: float | None) -> float | None:
-    """The first of several timers, where ``None`` is "never"."""
+    """The first of several timers; ``None`` means never."""
     return min((t for t in timers if t is not None), default=None)

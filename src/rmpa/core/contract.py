@@ -1,6 +1,6 @@
-"""What a topic's messages need, in ROS 2's words, and the rules that say so; written in ``rmpa.toml``.
+"""Contracts: the QoS of a topic in ROS 2's terms, and the rules of ``rmpa.toml`` that set it.
 
-Both ends of a route have rules. What holds for the route is ``combine`` of the two: see docs/contracts.md.
+Both ends of a route have rules; ``combine`` of both contracts holds for the route: see docs/contracts.md.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class History(StrEnum):
 
 
 class Liveliness(StrEnum):
-    """Who says that a source lives: its link, or its own messages."""
+    """What shows that a source is alive: its link, or its own messages."""
 
     AUTOMATIC = "automatic"
     MANUAL_BY_TOPIC = "manual_by_topic"
@@ -57,7 +57,7 @@ class Priority(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Contract:
-    """What one topic's messages need; the defaults are what a topic without any rule gets.
+    """The QoS of one topic; the defaults hold for a topic without any rule.
 
     Args:
         reliability: Whether messages survive the loss of a link.
@@ -65,12 +65,12 @@ class Contract:
         history: What a full queue keeps.
         depth: Messages that wait for one slow receiver, at least 1.
         deadline: Seconds from one message to the next at the most; ``None``: no bound.
-        lifespan: Seconds after which a message is worth nothing and is dropped; ``None``: never.
-        liveliness: Who says that a source lives.
-        liveliness_lease: Seconds without a sign of life after which it does not; ``None``: for ever.
+        lifespan: Seconds after which a message is dropped; ``None``: never.
+        liveliness: What shows that a source is alive.
+        liveliness_lease: Seconds without that after which it counts as dead; ``None``: never.
         priority: The lane.
         max_rate: Messages a second at the most, of which the newest are kept; ``None``: as they come.
-        outage: Seconds for which a reliable route keeps its messages when its link is gone.
+        outage: Seconds for which a reliable route keeps its messages when its link is lost.
     """
 
     reliability: Reliability = Reliability.BEST_EFFORT
@@ -87,7 +87,7 @@ class Contract:
 
     @property
     def kept(self) -> int:
-        """Messages kept for late subscribers where durability asks for it: one, as latching does, unless said."""
+        """Messages kept for late subscribers with ``transient_local``: one, as latching does, or ``depth`` if set."""
         return 1 if self.depth == limits.ROUTE_QUEUE_MESSAGES else self.depth
 
 
@@ -95,16 +95,16 @@ KEYS: Final = tuple(item.name for item in fields(Contract))
 """The names of a contract's fields, in order."""
 _DEFAULT: Final = Contract()
 _URGENCY: Final = {Priority.NORMAL: 0, Priority.LOW: 1, Priority.HIGH: 2}
-"""Normal says nothing, so that either other word outweighs it."""
+"""Normal is weaker than either other word."""
 
 
 def combine(offered: Contract, requested: Contract) -> Contract:
-    """What holds for a route: the stronger of the sender's and the receiver's word, key by key.
+    """The contract of a route: the stronger of the sender's and the receiver's values, key by key.
 
     Args:
         offered: The sender's contract for the topic.
         requested: The receiver's. Its deadline and its liveliness (kind and lease together) hold where it has them:
-            the receiver is who waits.
+            it is the receiver that waits.
     """
     watched = requested if requested.liveliness_lease is not None else offered
     return Contract(
@@ -123,7 +123,7 @@ def combine(offered: Contract, requested: Contract) -> Contract:
 
 
 def _larger(one: _Number, other: _Number, default: _Number) -> _Number:
-    """The larger one, but the default says nothing."""
+    """The larger one; the default counts as not set."""
     return max((value for value in (one, other) if value != default), default=default)
 
 
@@ -138,7 +138,7 @@ def _smaller(one: float | None, other: float | None) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class ContractRule:
-    """One ``[[contract]]``: what it sets, and for which topics.
+    """One ``[[contract]]``: the topics that it fits, and the values that it sets.
 
     Args:
         topics: Globs over topics (``core.names.matches``), one of which must fit; empty: any topic.
@@ -151,7 +151,7 @@ class ContractRule:
     values: Mapping[str, object] = field(hash=False)
 
     def fitting(self, topic: str, type_name: str) -> str | None:
-        """The globs that fit, ready to show (``topics /cmd/**``), or ``None`` where the rule does not apply."""
+        """The globs that fit, as text (``topics /cmd/**``); ``None`` where the rule does not apply."""
         shown = []
         for key, globs, name in (("topics", self.topics, topic), ("types", self.types, type_name)):
             if globs:
@@ -167,7 +167,7 @@ def _first(globs: Iterable[str], name: str) -> str | None:
 
 
 class Contracts:
-    """Finds a topic's contract: every rule that fits applies, in order; a later one outweighs key by key.
+    """Finds a topic's contract: every rule that fits applies, in order; a later one overrides key by key.
 
     Args:
         rules: In the order of the file.
@@ -178,7 +178,7 @@ class Contracts:
         self._known: dict[tuple[str, str], Contract] = {}
 
     def of(self, topic: str, type_name: str) -> Contract:
-        """The contract of a topic. ``type_name`` may be empty or ``*`` while nobody knows it."""
+        """The contract of a topic. ``type_name`` may be empty or ``*`` while it is not known."""
         if not self._rules:
             return _DEFAULT
         found = self._known.get((topic, type_name))

@@ -1,4 +1,4 @@
-"""Counting what is refused or dropped, and logging it without flooding the log."""
+"""Counters of refused and dropped things, and a log of refusals that is limited in rate."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class Counters:
-    """Named counts of one room, shown in snapshots (``beacon.malformed``, ``link.refused.version``)."""
+    """Named counters of one room, shown in snapshots (``beacon.malformed``, ``link.refused.version``)."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
@@ -30,30 +30,30 @@ class Counters:
 
 
 class RefusalLog:
-    """Counts each refusal and logs each kind at most once in ``limits.LOG_INTERVAL``.
+    """Counts each refusal, and logs each kind (name and address) at most once in ``limits.LOG_INTERVAL`` seconds.
 
-    Of one name, at most ``limits.LOG_LINES_MAX`` lines are written in that time, whatever the addresses.
+    At most ``limits.LOG_LINES_MAX`` lines of one name are written in that time, over all addresses.
 
     Args:
-        logger: Where the lines go, at WARNING.
-        counters: Where every refusal is counted, logged or not.
+        logger: Gets the lines, at WARNING.
+        counters: Counts every refusal, logged or not.
     """
 
     def __init__(self, logger: logging.Logger, counters: Counters) -> None:
         self._logger = logger
         self._counters = counters
         self._last: OrderedDict[tuple[str, str], tuple[float, int]] = OrderedDict()
-        # For each name: since when its lines are counted, how many there were, and how many more there would be.
+        # By name: the begin of the interval, the lines written in it, and the lines suppressed in it.
         self._lines: dict[str, tuple[float, int, int]] = {}
 
     def refuse(self, now: float, name: str, who: str, text: str) -> None:
-        """Count ``name`` and perhaps log ``text``.
+        """Count ``name``, and log ``text`` within the limits.
 
         Args:
             now: Monotonic seconds.
-            name: The count's name; with ``who`` it makes the kind.
+            name: The counter's name; with ``who`` it makes the kind.
             who: The address it came from, without the port (a port scanner has many).
-            text: What happened and what to do, ready to read.
+            text: What happened and what to do, for the user.
         """
         self._counters.add(name)
         kind = (name, who)

@@ -9,8 +9,8 @@
     ├── RemoteProtocolError    the other side broke a protocol: close that connection, count it
     │   └── LimitExceeded      … by claiming more than ``core.limits`` allows
     ├── PeerRefused            a peer said no, with its reason
-    └── UnreachableError       nobody answers where somebody should
-        └── OutOfDescriptors   … or may well, but this process has no file descriptor left to ask
+    └── UnreachableError       no program answers at an address where one should
+        └── OutOfDescriptors   … or this process has no file descriptor left to ask it
 
 Errors hold fields and build their text in ``__str__``. A text says what happened, where, and what to do.
 """
@@ -97,26 +97,26 @@ class PeerRefused(RmpaError):  # noqa: N818 - an event's name
     remedy: str = ""
 
     def __str__(self) -> str:
-        """Say who refused, why, and what to do."""
+        """``<peer> refused: reason; remedy``."""
         return _advised(f"{self.peer} refused: {self.reason}", self.remedy)
 
 
 @dataclass(eq=False)
 class UnreachableError(RmpaError):
-    """Nobody answers at an address where somebody should."""
+    """No program answers at an address where one should."""
 
     what: str
     where: str
     remedy: str = ""
 
     def __str__(self) -> str:
-        """Say what was looked for, where, and what to do."""
+        """``no <what> answers at <where>; remedy``."""
         return _advised(f"no {self.what} answers at {self.where}", self.remedy)
 
 
 @dataclass(eq=False)
 class OutOfDescriptors(UnreachableError):  # noqa: N818 - the name says what happened
-    """This process has no file descriptor left for a connection; of the other side nothing is known."""
+    """This process has no file descriptor left for a connection; the other side was not asked."""
 
     def __str__(self) -> str:
         """Say what could not be reached, why, and what to do."""

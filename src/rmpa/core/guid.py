@@ -1,4 +1,4 @@
-"""GUIDs: who a peer is and which of two peers dials (paper, section 4.2)."""
+"""GUIDs: they identify a peer, and decide which of two peers dials (paper, section 4.2)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Guid:
     """A 64-bit global unique identifier, ordered as an unsigned integer.
 
     The high 32 bits are the IPv4 address, the next 16 the mesh port, as in the paper; the low 16, which the
-    paper leaves free, count incarnations, so that a restarted peer is told from its ghost.
+    paper leaves free, count incarnations, which distinguishes a restarted peer from its former run.
 
     Args:
         value: The 64 bits.
@@ -86,12 +86,12 @@ class Guid:
 
     @property
     def dialable(self) -> bool:
-        """Whether one peer can be reached there; see ``dialable``."""
-        return _is_of_one(self.value >> 56) and self.port != 0
+        """Whether a single peer can be reached at its address; see the function ``dialable``."""
+        return _is_unicast(self.value >> 56) and self.port != 0
 
     @property
     def is_loopback(self) -> bool:
-        """Whether its address leads back to whoever uses it."""
+        """Whether its address is a loopback address (127.x.x.x)."""
         return self.value >> 56 == _LOOPBACK
 
     def __str__(self) -> str:
@@ -100,13 +100,13 @@ class Guid:
 
 
 def dialable(address: IPv4Address, port: int) -> bool:
-    """Whether one peer can be reached there: no multicast, broadcast or "any" address, no port 0.
+    """Whether a single peer can be reached there: no multicast, broadcast or "any" address, no port 0.
 
-    Who named such an address could make those who believe it shout at a whole network.
+    A forged beacon with such an address could make its receivers send to a whole network.
     """
-    return _is_of_one(int(address) >> 24) and port != 0
+    return _is_unicast(int(address) >> 24) and port != 0
 
 
-def _is_of_one(first: int) -> bool:
-    """Whether an address that begins with this byte is of one machine."""
+def _is_unicast(first: int) -> bool:
+    """Whether an address with this first byte is a unicast address."""
     return 0 < first < _MULTICAST

@@ -1,4 +1,4 @@
-"""What a peer says of itself, in beacons and in the mesh's handshake."""
+"""The identity of a peer, as in beacons and in the mesh's handshake."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 
 def peer_name_problem(name: str) -> str | None:
-    """Say what is wrong with a peer's name, or ``None``.
+    """The error text for an invalid peer name; ``None`` for a valid one.
 
     A peer's name becomes a part of its proxies' names in the ROS graph, so it is a ROS base name (REP 144).
     """
@@ -31,7 +31,7 @@ def peer_name_problem(name: str) -> str | None:
 
 
 def peer_name_from(text: str) -> str:
-    """Make the nearest valid peer name of a host name: ``my-robot.local`` gives ``my_robot``."""
+    """The nearest valid peer name for a host name: ``my-robot.local`` gives ``my_robot``."""
     name = re.sub(r"[^A-Za-z0-9_]", "_", text.partition(".")[0])[: limits.PEER_NAME_MAX - 2]
     if not name or not name[0].isalpha():
         name = f"m_{name}" if name else "module"
@@ -43,8 +43,8 @@ class Identity:
     """One run of one agent.
 
     Args:
-        guid: Its GUID; the address and port in it are where it wants to be reached.
-        instance: 128 random bits (16 bytes), new at each start; tells two peers with one GUID apart.
+        guid: Its GUID, with the address and port at which peers should contact it.
+        instance: 128 random bits (16 bytes), new at each start; distinguishes two peers with the same GUID.
         name: Its name, a ROS base name, unique among its peers.
         domain: Only peers of the same domain join.
         addresses: Its other numeric IPv4 addresses, best first; may be empty.
@@ -69,7 +69,7 @@ class Identity:
 
     @property
     def endpoints(self) -> tuple[tuple[str, int], ...]:
-        """Where to dial, best first, each once: the GUID's own address, then the others."""
+        """The addresses to dial, best first: the GUID's own, then the others, without duplicates."""
         port = self.guid.port
         return tuple(dict.fromkeys([self.guid.endpoint, *((str(a), port) for a in self.addresses)]))
 

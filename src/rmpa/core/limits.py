@@ -11,7 +11,7 @@ from rmpa.core.sizes import KIB
 
 # --- process ----------------------------------------------------------------------------------------------------
 OPEN_FILES_ADVICE: Final = 65_536
-"""What a user is advised to allow: some ten thousand nodes."""
+"""The limit of open files that users are advised to set: enough for some ten thousand nodes."""
 
 # --- identity ---------------------------------------------------------------------------------------------------
 INSTANCE_ID_BYTES: Final = 16
@@ -23,29 +23,29 @@ DOMAIN_MAX: Final = 232
 
 # --- settings ---------------------------------------------------------------------------------------------------
 CONTRACTS_REMEMBERED: Final = 4096
-"""(topic, type) pairs whose contract is remembered; the oldest is forgotten first, and found again by the rules."""
+"""(topic, type) pairs whose contract is cached; the oldest is dropped first."""
 
 # --- discovery --------------------------------------------------------------------------------------------------
-ROSTER_LEASE: Final = 16.0
-"""A peer that has no link and was silent for three heartbeats and a second is gone."""
-ROSTER_PEERS_MAX: Final = 512
-"""Peers in a roster: a hostile sender of invented GUIDs cannot fill the memory."""
+PEER_LEASE: Final = 16.0
+"""A peer without a link is gone when it was silent for three heartbeats and a second."""
+PEERS_MAX: Final = 512
+"""Peers that are known: a hostile sender of forged GUIDs cannot fill the memory."""
 
 # --- mesh -------------------------------------------------------------------------------------------------------
 FRAGMENT_BYTES: Final = 128 * KIB
-"""What one message sends before another of its lane has its turn: 10 ms of a 100 Mbit/s link. Longer messages go in
-several data frames."""
+"""Bytes of one message that are sent before another message of its lane: 10 ms of a 100 Mbit/s link. Longer messages
+are sent in several data frames."""
 COMMIT_BYTES: Final = 64 * KIB
-"""Waiting bytes that are prepared for one write: what is prepared is overtaken by nothing and dropped by no rule."""
+"""Waiting bytes that are committed for one write: nothing overtakes them, and they are not dropped."""
 ROUTE_QUEUE_MESSAGES: Final = 1000
 """Messages of one topic that wait for one slow link."""
 CUT_THROUGH_BYTES: Final = 96 * KIB
-"""Messages above this are handed on while they still arrive."""
+"""Messages above this are forwarded while they still arrive."""
 RESUME_WINDOW: Final = 30.0
-"""How long a reliable route's messages are kept after its link fell, unless its contract says another ``outage``: a
-robot drives through a shadow, an access point restarts. More is for the contract to ask for: a module that is off
+"""How long a reliable route's messages are kept after its link was lost, unless a contract sets ``outage``: a
+robot drives through a shadow, an access point restarts. Longer is left to contracts: a module that is off
 seems to publish for as long, and afterwards its subscribers get all of the old messages. Latched topics of a peer
-that fell silent stay as long, too."""
+that fell silent stay as long."""
 
 # --- logging ----------------------------------------------------------------------------------------------------
 LOG_INTERVAL: Final = 5.0

@@ -1,4 +1,4 @@
-"""How log records look: one line of text, or one JSON object a line. Rooms only ever call ``logging``."""
+"""The formats of log records: one line of text, or one JSON object a line. Rooms only use ``logging``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
-# Looked up now: its module is a file, and a line about having no file descriptors left was lost for want of one.
+# Looked up now: its module is a file, which could not be opened to log that no file descriptors are left.
 _ESCAPE: Final = codecs.getencoder("unicode_escape")
 
 
@@ -22,7 +22,7 @@ def room_of(logger: str) -> str:
 
 
 def _one_line(text: str) -> str:
-    """Text from outside must not forge lines or move the terminal's cursor."""
+    """The text with control characters escaped: a peer's text must not forge lines or move the terminal's cursor."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() or c == "\t" else _ESCAPE(c)[0].decode("ascii") for c in text)
@@ -63,7 +63,7 @@ def configure_logging(level: str, stream: SupportsWrite[str], *, as_json: bool) 
 
     Args:
         level: As in ``Settings.log_level``.
-        stream: Usually stderr, for an agent by ``aio.log_writer``: stdout belongs to a command's answer.
+        stream: Usually stderr, for an agent through ``runtime.log_writer``; stdout is for a command's result.
         as_json: JSON lines instead of text.
     """
     handler = logging.StreamHandler(stream)

@@ -1,4 +1,4 @@
-"""What a user does about a limit of open files (file descriptors) that is too low."""
+"""The advice for a user whose limit of open files (file descriptors) is too low."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from rmpa.core import limits
 
 
 def remedy(pid: int | None = None) -> str:
-    """How to raise the limit for good; with the process's id, how to raise it at once, too."""
+    """How to raise the limit permanently; with a process id also how to raise it for that process at once."""
     enough = limits.OPEN_FILES_ADVICE
     text = (
         f"raise it: LimitNOFILE={enough} of a systemd unit, "

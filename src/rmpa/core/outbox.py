@@ -1,11 +1,11 @@
-"""Bytes that wait for a slow socket: bounded, a turn for each key, drops counted by reason.
+"""Send queues for a slow socket: bounded, round robin between keys, with drops counted by reason. Sans-I/O.
 
-Pure: no socket here. A driver pushes what it could not send at once, asks for ``head()`` when the socket is
-writable again and tells how much of it was ``consumed()``.
+A driver pushes what it could not send at once, takes ``head()`` when the socket is writable again, and reports how
+much of it was ``consumed()``.
 
-Two kinds of entries wait. What is *pushed* goes out as it is, in one piece. What is *opened* is a ``QueuedMessage``
-whose bytes follow while it may already be leaving (cut-through); where the outbox has a framer, a parcel leaves in
-fragments, each with a header of its own, and the fragments of several keys take turns.
+There are two kinds of entries. A *pushed* one is sent as it is, in one piece. An *opened* one is a ``QueuedMessage``
+whose bytes follow while its first ones may already be sent (cut-through); where the outbox has a framer, it is sent
+in fragments, each with a header of its own, and the fragments of several keys take turns.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError
 
 URGENT: Final = -1
-"""The key of entries that are never dropped and go in front of the others."""
+"""The key of entries that are never dropped and go in front of all others."""
 
 FIRST: Final = 1
-"""A fragment's flag: the first of its parcel."""
+"""Flag of a fragment: the first of its message."""
 LAST: Final = 2
-"""A fragment's flag: the last of its parcel."""
+"""Flag of a fragment: the last of its message."""
 ABORT: Final = 4
-"""A fragment's flag: the rest of its parcel will never come."""
+"""Flag of a fragment: the rest of its message will never come."""
 
 
 class QueuedMessage:
     """One message that waits; of an opened one, bytes may still be missing.
 
     Args:
-        key: Its flow.
-        size: How many bytes it has in all.
+        key: The queue that it belongs to.
+        size: All its bytes.
         sequence: For the framer.
         stamp_ns: For the framer.
         born: When it was pushed, monotonic seconds.
@@ -66,17 +66,17 @@ class QueuedMessage:
         self.held = 0
         """Bytes of ``chunks``."""
         self.sent = 0
-        """Bytes that were given to the socket, or are about to be: it can no longer be dropped."""
+        """Bytes that were given to the socket, or are committed: with any of them it can no longer be dropped."""
         self.dropped = False
 
 
 Framer = Callable[[QueuedMessage, int, int], bytes]
-"""``(parcel, length, flags)``: the header of a fragment."""
+"""``(message, length, flags)``: the header of a fragment."""
 
 
 @dataclass(slots=True)
-class _Terms:
-    """What one key may hold."""
+class _KeyBounds:
+    """The bounds of one key's queue; see ``Outbox.set_terms``."""
 
     entries: int
     max_age: float | None = None
@@ -86,26 +86,26 @@ class _Terms:
 
 @dataclass(slots=True)
 class _KeyQueue:
-    terms: _Terms
-    parcels: deque[QueuedMessage] = field(default_factory=deque)
+    bounds: _KeyBounds
+    messages: deque[QueuedMessage] = field(default_factory=deque)
     size: int = 0
     marks: int = 0
-    turning: bool = False
+    scheduled: bool = False
 
 
 class Outbox:
-    """Bounded queues of byte strings, one a key, that take turns; beyond a bound the oldest is dropped.
+    """Bounded queues of byte strings, one a key, that take turns; beyond a bound the oldest entry is dropped.
 
-    Too many entries of one key: the oldest of that key. Too many bytes: the oldest of whichever key holds the
-    most, so that a flood of images does not push commands out. An entry that was sent in part is never dropped
-    (half a message must not stay on the wire) and not counted against the bound, and one message always fits,
-    however large: at most ``max(max_bytes, the newest entry)`` plus the entries half sent is held.
+    Too many entries of one key: the oldest of that key is dropped. Too many bytes: the oldest of the key that holds
+    the most, so that a flood of images does not push commands out. An entry that was sent in part is never dropped
+    (half a message must not stay on the wire) and does not count. One message always fits, however large: at most
+    ``max(max_bytes, the newest entry)`` bytes plus the entries half sent are held.
 
     Args:
         max_entries: Entries of one key that may wait, at least 1.
         max_bytes: Bytes that may wait over all keys but ``URGENT``.
-        frame: Makes the headers of fragments; without it an opened parcel's bytes go out as they are.
-        fragment: Bytes of one turn of a parcel.
+        frame: Makes the headers of fragments; without it an opened message's bytes go out as they are.
+        fragment: Bytes of a message that are sent in one turn.
     """
 
     def __init__(
@@ -116,14 +116,14 @@ class Outbox:
         frame: Framer | None = None,
         fragment: int = limits.FRAGMENT_BYTES,
     ) -> None:
-        self._terms = _Terms(max_entries)
-        self._special: dict[int, _Terms] = {}
+        self._bounds = _KeyBounds(max_entries)
+        self._own_bounds: dict[int, _KeyBounds] = {}
         self._max_bytes = max_bytes
         self._frame = frame
         self._fragment = fragment
         self._urgent: deque[bytes] = deque()
-        self._flows: dict[int, _KeyQueue] = {}
-        self._turns: deque[int] = deque()
+        self._queues: dict[int, _KeyQueue] = {}
+        self._round_robin: deque[int] = deque()
         self._committed: deque[memoryview] = deque()
         self._committed_bytes = 0
         self._urgent_bytes = 0
@@ -136,11 +136,11 @@ class Outbox:
 
     def __bool__(self) -> bool:
         """Whether there is something to send now."""
-        return bool(self._committed or self._urgent or self._turns)
+        return bool(self._committed or self._urgent or self._round_robin)
 
     def set_bounds(self, max_entries: int, max_bytes: int) -> None:
-        """Change the bounds; they count from the next ``push()`` on. A subscriber's are known with its topic only."""
-        self._terms.entries = max_entries
+        """Change the bounds, from the next ``push()`` on: those of a subscriber are only known with its topic."""
+        self._bounds.entries = max_entries
         self._max_bytes = max_bytes
 
     def set_terms(
@@ -149,20 +149,19 @@ class Outbox:
         """Give one key bounds of its own.
 
         Args:
-            key: Which.
+            key: The key.
             max_entries: Entries that may wait.
-            max_age: Seconds that one may wait; ``None``: for ever.
-            strict: Drop one that is too old even if none of its key is behind it (a lifespan); else the newest
-                always leaves.
-            spared: Drop none of it for the bytes of all keys together: its owner bounds it.
+            max_age: Seconds that an entry may wait; ``None``: no bound.
+            strict: Drop also the newest entry when it is too old (a lifespan); otherwise the newest is always sent.
+            spared: Drop none of its entries because of ``max_bytes``: its owner bounds it.
         """
-        terms = self._special[key] = _Terms(max_entries, max_age, strict, spared)
-        if key in self._flows:
-            self._flows[key].terms = terms
+        bounds = self._own_bounds[key] = _KeyBounds(max_entries, max_age, strict, spared)
+        if key in self._queues:
+            self._queues[key].bounds = bounds
 
     @property
     def urgent_bytes(self) -> int:
-        """Bytes of whole urgent entries that wait; they have no bound here, the owner watches this."""
+        """Bytes of whole urgent entries that wait. They have no bound here: the owner must watch this."""
         return self._urgent_bytes
 
     @property
@@ -172,29 +171,29 @@ class Outbox:
 
     @property
     def pending_entries(self) -> int:
-        """Entries that wait, urgent ones and the parts that are about to leave included."""
-        return len(self._committed) + len(self._urgent) + sum(len(f.parcels) for f in self._flows.values())
+        """Entries that wait, urgent ones and committed parts included."""
+        return len(self._committed) + len(self._urgent) + sum(len(f.messages) for f in self._queues.values())
 
     @property
     def waiting_entries(self) -> int:
-        """Entries of all keys that wait, marks between them and what is about to leave not included."""
-        return sum(len(flow.parcels) - flow.marks for flow in self._flows.values())
+        """Entries of all keys that wait, without marks and committed parts."""
+        return sum(len(queue.messages) - queue.marks for queue in self._queues.values())
 
     def waiting(self, key: int) -> int:
         """Entries of one key that wait."""
-        flow = self._flows.get(key)
-        return len(flow.parcels) if flow is not None else 0
+        queue = self._queues.get(key)
+        return len(queue.messages) if queue is not None else 0
 
-    # --- putting in -----------------------------------------------------------------------------------------
+    # --- input ----------------------------------------------------------------------------------------------
 
     def push_urgent(self, data: bytes) -> None:
-        """Queue control bytes: in front of all data but behind what was begun."""
+        """Queue control bytes: in front of all data, but behind what is committed."""
         if data:
             self._urgent.append(data)
             self._urgent_bytes += len(data)
 
-    def push_rest(self, data: bytes, key: int) -> None:  # noqa: ARG002 - whose rest it is, for the reader
-        """Queue the rest of an entry whose first part the driver has sent: it goes first, and stays.
+    def push_rest(self, data: bytes, key: int) -> None:  # noqa: ARG002 - the entry's key, for the caller's reader
+        """Queue the rest of an entry whose first part the driver has sent: it goes first and is never dropped.
 
         Raises:
             LocalProtocolError: Something waits already; the driver sent out of turn.
@@ -205,12 +204,12 @@ class Outbox:
             self._commit_bytes(memoryview(data))
 
     def commit(self, data: bytes) -> None:
-        """Queue a part of a parcel whose parts before it have left or are committed: it stays, in front of turns."""
+        """Queue a part of a message whose former parts are sent or committed: it goes first and is never dropped."""
         if data:
             self._commit_bytes(memoryview(data))
 
     def prepend(self, data: bytes) -> None:
-        """Queue bytes in front of everything: what a connection still had to say before it carried this outbox."""
+        """Queue bytes in front of everything: the rest of what a connection sent before it had this outbox."""
         if data:
             self._committed.appendleft(memoryview(data))
             self._committed_bytes += len(data)
@@ -218,124 +217,123 @@ class Outbox:
     def push(self, data: bytes, key: int, now: float = 0.0, *, pinned: bool = False) -> int:
         """Queue one whole entry; return how many older ones, of any key, were dropped for it.
 
-        An empty entry is nothing to send and not queued. A pinned one, a mark between messages, is never dropped and
-        not counted against the bounds.
+        An empty entry is not queued. A pinned one (a mark between messages) is never dropped and does not count.
         """
         if not data:
             return 0
-        parcel = QueuedMessage(key, len(data), born=now)
-        parcel.framed = False
-        parcel.pinned = pinned
-        return self._enter(parcel, memoryview(data))
+        message = QueuedMessage(key, len(data), born=now)
+        message.framed = False
+        message.pinned = pinned
+        return self._enqueue(message, memoryview(data))
 
-    def extend(self, parcel: QueuedMessage, data: bytes) -> int:
-        """Queue more bytes of a parcel, its first ones or further ones; return as for ``push``.
+    def extend(self, message: QueuedMessage, data: bytes) -> int:
+        """Queue more bytes of a message, its first or further ones; return as for ``push``.
 
-        Nothing happens for a parcel that was dropped.
+        Bytes of a message that was dropped are ignored.
 
         Raises:
-            LocalProtocolError: They are more than it was said to have.
+            LocalProtocolError: The message would exceed its ``size``.
         """
-        if parcel.dropped or not data:
+        if message.dropped or not data:
             return 0
-        if parcel.sent + parcel.held + len(data) > parcel.size:
-            raise LocalProtocolError(f"more than the {parcel.size} bytes that a message was said to have")
-        flow = self._flows.get(parcel.key)
-        # A parcel's bytes come in one go before another of its key: if it waits at all, it is the last one.
-        if flow is None or not flow.parcels or flow.parcels[-1] is not parcel:
-            return self._enter(parcel, memoryview(data))
-        parcel.chunks.append(memoryview(data))
-        parcel.held += len(data)
-        if parcel.sent:
+        if message.sent + message.held + len(data) > message.size:
+            raise LocalProtocolError(f"more than the {message.size} bytes that a message was said to have")
+        queue = self._queues.get(message.key)
+        # All bytes of a message come before the next one of its key: if it waits at all, it is the last one.
+        if queue is None or not queue.messages or queue.messages[-1] is not message:
+            return self._enqueue(message, memoryview(data))
+        message.chunks.append(memoryview(data))
+        message.held += len(data)
+        if message.sent:
             self._begun_bytes += len(data)
         else:
-            flow.size += len(data)
+            queue.size += len(data)
             self._data_bytes += len(data)
-        self._turn(flow, parcel.key)
-        return self._bound(parcel)
+        self._schedule(queue, message.key)
+        return self._enforce_max_bytes(message)
 
-    def abandon(self, parcel: QueuedMessage) -> bool:
-        """The rest of a parcel will never come: drop it, and tell the other side if it has a part of it.
+    def abandon(self, message: QueuedMessage) -> bool:
+        """The rest of a message will never come: drop it, and abort it at the other side if that has a part of it.
 
         Returns:
-            Whether the other side holds half a message that nothing can be done about: there is no framer.
+            Whether the other side holds half a message that cannot be aborted: there is no framer.
         """
-        if parcel.dropped:
+        if message.dropped:
             return False
-        parcel.dropped = True
-        flow = self._flows.get(parcel.key)
-        if flow is not None and parcel in flow.parcels:
-            flow.parcels.remove(parcel)
-            self._release(flow, parcel)
-            if not flow.parcels:
-                self._forget(parcel.key, flow)
-        if not parcel.sent:
+        message.dropped = True
+        queue = self._queues.get(message.key)
+        if queue is not None and message in queue.messages:
+            queue.messages.remove(message)
+            self._release(queue, message)
+            if not queue.messages:
+                self._remove_queue(message.key, queue)
+        if not message.sent:
             return False
         if self._frame is None:
             return True
-        self._commit_bytes(memoryview(self._frame(parcel, 0, LAST | ABORT)))
+        self._commit_bytes(memoryview(self._frame(message, 0, LAST | ABORT)))
         return False
 
     def discard(self, key: int) -> int:
-        """Drop all that waits of one key (its route closed); return how many entries that were, uncounted.
+        """Drop all entries of one key (its route closed), without counting them; return their number.
 
-        One that was begun is abandoned.
+        A message that was begun is aborted.
         """
-        flow = self._flows.pop(key, None)
-        self._special.pop(key, None)
-        if flow is None:
+        queue = self._queues.pop(key, None)
+        self._own_bounds.pop(key, None)
+        if queue is None:
             return 0
         count = 0
-        for parcel in tuple(flow.parcels):
-            self._release(flow, parcel)
-            if parcel.sent and self._frame is not None and not parcel.dropped:
-                self._commit_bytes(memoryview(self._frame(parcel, 0, LAST | ABORT)))
-            parcel.dropped = True
+        for message in tuple(queue.messages):
+            self._release(queue, message)
+            if message.sent and self._frame is not None and not message.dropped:
+                self._commit_bytes(memoryview(self._frame(message, 0, LAST | ABORT)))
+            message.dropped = True
             count += 1
-        flow.parcels.clear()
-        if flow.turning:
-            self._turns.remove(key)
+        queue.messages.clear()
+        if queue.scheduled:
+            self._round_robin.remove(key)
         return count
 
     def reset(self) -> int:
-        """The connection is gone: forget what was begun, keep what was not; return how many entries were torn.
+        """The connection is gone: drop entries that were begun, keep the others; return how many were dropped.
 
-        Urgent entries are what the connection itself had to say: the next one must not begin with its bye.
+        Urgent entries are dropped too: they belong to the connection, and the next one must not begin with its bye.
         """
         torn = 0
         self._committed.clear()
         self._urgent.clear()
         self._committed_bytes = self._urgent_bytes = 0
-        for key, flow in list(self._flows.items()):
-            parcel = flow.parcels[0] if flow.parcels else None
-            if parcel is not None and parcel.sent:
-                parcel.dropped = True
-                flow.parcels.popleft()
-                self._release(flow, parcel)
+        for key, queue in list(self._queues.items()):
+            message = queue.messages[0] if queue.messages else None
+            if message is not None and message.sent:
+                message.dropped = True
+                queue.messages.popleft()
+                self._release(queue, message)
                 torn += 1
-            if not flow.parcels:
-                self._forget(key, flow)
-            elif flow.parcels[0].chunks:
-                self._turn(flow, key)
+            if not queue.messages:
+                self._remove_queue(key, queue)
+            elif queue.messages[0].chunks:
+                self._schedule(queue, key)
         return torn
 
     def clear(self) -> None:
-        """Let go of everything that waits; the counts stay."""
-        for flow in self._flows.values():
-            for parcel in flow.parcels:
-                parcel.dropped = True
+        """Drop everything that waits; the counters stay."""
+        for queue in self._queues.values():
+            for message in queue.messages:
+                message.dropped = True
         self._urgent.clear()
-        self._flows.clear()
-        self._turns.clear()
+        self._queues.clear()
+        self._round_robin.clear()
         self._committed.clear()
         self._committed_bytes = self._urgent_bytes = self._data_bytes = self._begun_bytes = 0
 
-    # --- taking out -----------------------------------------------------------------------------------------
+    # --- output ---------------------------------------------------------------------------------------------
 
     def head(self, max_parts: int = 64, now: float = 0.0) -> list[memoryview]:
-        """The next bytes to send, in order, as parts for ``sendmsg``; nothing is taken out.
+        """The next bytes to send, in order, as parts for ``sendmsg``; they stay until ``consumed``.
 
-        What was shown here has begun: it can no longer be dropped, only followed.
+        They are committed: entries of which a part was returned here are not dropped any more.
         """
         while len(self._committed) < max_parts and self._committed_bytes < limits.COMMIT_BYTES:
             if not self._commit(now):
@@ -346,10 +344,10 @@ class Outbox:
         return [committed[i] for i in range(max_parts)]
 
     def consumed(self, count: int) -> None:
-        """Take out the first ``count`` bytes of what ``head()`` gave.
+        """Remove the first ``count`` bytes of what ``head()`` returned.
 
         Raises:
-            LocalProtocolError: More than waits.
+            LocalProtocolError: Fewer bytes wait.
         """
         while count > 0:
             if not self._committed and not self._commit(0.0):
@@ -370,88 +368,90 @@ class Outbox:
         self._committed_bytes += len(data)
 
     def _commit(self, now: float) -> bool:
-        """Let the next in turn begin, or go on; ``False`` when nobody can."""
+        """Commit the next entry or fragment in turn; ``False`` if there is none."""
         if self._urgent:
             data = self._urgent.popleft()
             self._urgent_bytes -= len(data)
             self._commit_bytes(memoryview(data))
             return True
-        while self._turns:
-            key = self._turns.popleft()
-            flow = self._flows[key]
-            flow.turning = False
+        while self._round_robin:
+            key = self._round_robin.popleft()
+            queue = self._queues[key]
+            queue.scheduled = False
             if now:
-                self._expire(flow, key, now)
-            if not flow.parcels:
-                self._forget(key, flow)
+                self._expire(queue, key, now)
+            if not queue.messages:
+                self._remove_queue(key, queue)
                 continue
-            parcel = flow.parcels[0]
-            if not parcel.chunks:
-                continue  # it comes back with its next bytes
-            self._commit_turn(flow, parcel)
-            if parcel.sent == parcel.size:
-                flow.parcels.popleft()
-                flow.marks -= parcel.pinned
-            if not flow.parcels:
-                self._forget(key, flow)
-            elif flow.parcels[0].chunks:
-                self._turn(flow, key)
+            message = queue.messages[0]
+            if not message.chunks:
+                continue  # scheduled again with its next bytes
+            self._commit_fragment(queue, message)
+            if message.sent == message.size:
+                queue.messages.popleft()
+                queue.marks -= message.pinned
+            if not queue.messages:
+                self._remove_queue(key, queue)
+            elif queue.messages[0].chunks:
+                self._schedule(queue, key)
             return True
         return False
 
-    def _commit_turn(self, flow: _KeyQueue, parcel: QueuedMessage) -> None:
-        """Commit one turn's bytes of a parcel that has some."""
-        flags = 0 if parcel.sent else FIRST
-        if not parcel.sent and not parcel.pinned:  # begun from here on: no longer counted against the bound
-            flow.size -= parcel.held
-            self._data_bytes -= parcel.held
-            self._begun_bytes += parcel.held
-        limit = self._fragment if parcel.framed else parcel.held
+    def _commit_fragment(self, queue: _KeyQueue, message: QueuedMessage) -> None:
+        """Commit one fragment of a message that has bytes."""
+        flags = 0 if message.sent else FIRST
+        if not message.sent and not message.pinned:  # begun from here on: no longer counted against the bound
+            queue.size -= message.held
+            self._data_bytes -= message.held
+            self._begun_bytes += message.held
+        limit = self._fragment if message.framed else message.held
         parts: list[memoryview] = []
         length = 0
-        while parcel.chunks and length < limit:
-            chunk = parcel.chunks.popleft()
+        while message.chunks and length < limit:
+            chunk = message.chunks.popleft()
             if length + len(chunk) > limit:
-                parcel.chunks.appendleft(chunk[limit - length :])
+                message.chunks.appendleft(chunk[limit - length :])
                 chunk = chunk[: limit - length]
             parts.append(chunk)
             length += len(chunk)
-        parcel.held -= length
-        parcel.sent += length
+        message.held -= length
+        message.sent += length
         self._begun_bytes -= length
-        if parcel.framed and self._frame is not None:
-            self._commit_bytes(memoryview(self._frame(parcel, length, flags | LAST * (parcel.sent == parcel.size))))
+        if message.framed and self._frame is not None:
+            self._commit_bytes(
+                memoryview(self._frame(message, length, flags | LAST * (message.sent == message.size)))
+            )
         for part in parts:
             self._commit_bytes(part)
 
-    def _enter(self, parcel: QueuedMessage, data: memoryview) -> int:
-        """Put a parcel, with its first bytes, at the end of its flow."""
-        flow = self._flows.get(parcel.key)
-        if flow is None:
-            flow = self._flows[parcel.key] = _KeyQueue(self._special.get(parcel.key, self._terms))
+    def _enqueue(self, message: QueuedMessage, data: memoryview) -> int:
+        """Append a message, with its first bytes, to its queue; return how many entries were dropped."""
+        queue = self._queues.get(message.key)
+        if queue is None:
+            queue = self._queues[message.key] = _KeyQueue(self._own_bounds.get(message.key, self._bounds))
         dropped = 0
-        if parcel.pinned:
-            flow.marks += 1
+        if message.pinned:
+            queue.marks += 1
         else:
-            while len(flow.parcels) - flow.marks >= flow.terms.entries and self._drop_oldest(flow, parcel):
+            while len(queue.messages) - queue.marks >= queue.bounds.entries and self._drop_oldest(queue, message):
                 dropped += 1
-        parcel.chunks.append(data)
-        parcel.held = len(data)
-        flow.parcels.append(parcel)
-        if parcel.sent or parcel.pinned:
+        message.chunks.append(data)
+        message.held = len(data)
+        queue.messages.append(message)
+        if message.sent or message.pinned:
             self._begun_bytes += len(data)
         else:
-            flow.size += len(data)
+            queue.size += len(data)
             self._data_bytes += len(data)
-        self._turn(flow, parcel.key)
-        return dropped + self._bound(parcel)
+        self._schedule(queue, message.key)
+        return dropped + self._enforce_max_bytes(message)
 
-    def _turn(self, flow: _KeyQueue, key: int) -> None:
-        if not flow.turning and flow.parcels and flow.parcels[0].chunks:
-            flow.turning = True
-            self._turns.append(key)
+    def _schedule(self, queue: _KeyQueue, key: int) -> None:
+        if not queue.scheduled and queue.messages and queue.messages[0].chunks:
+            queue.scheduled = True
+            self._round_robin.append(key)
 
-    def _bound(self, newest: QueuedMessage) -> int:
+    def _enforce_max_bytes(self, newest: QueuedMessage) -> int:
         dropped = 0
         while self._data_bytes > self._max_bytes:
             count = self._drop_largest(newest)
@@ -460,72 +460,72 @@ class Outbox:
             dropped += count
         return dropped
 
-    def _release(self, flow: _KeyQueue, parcel: QueuedMessage) -> None:
-        """Let go of a parcel's bytes, and of their account."""
-        if parcel.sent or parcel.pinned:
-            self._begun_bytes -= parcel.held
+    def _release(self, queue: _KeyQueue, message: QueuedMessage) -> None:
+        """Drop a message's bytes, and subtract them from the sums."""
+        if message.sent or message.pinned:
+            self._begun_bytes -= message.held
         else:
-            flow.size -= parcel.held
-            self._data_bytes -= parcel.held
-        parcel.held = 0
-        parcel.chunks.clear()
+            queue.size -= message.held
+            self._data_bytes -= message.held
+        message.held = 0
+        message.chunks.clear()
 
-    def _forget(self, key: int, flow: _KeyQueue) -> None:
-        del self._flows[key]
-        if flow.turning:
-            self._turns.remove(key)
+    def _remove_queue(self, key: int, queue: _KeyQueue) -> None:
+        del self._queues[key]
+        if queue.scheduled:
+            self._round_robin.remove(key)
 
-    def _drop_oldest(self, flow: _KeyQueue, newest: QueuedMessage) -> bool:
-        """Drop a flow's oldest parcel that was not begun and is not ``newest``; whether there was one."""
+    def _drop_oldest(self, queue: _KeyQueue, newest: QueuedMessage) -> bool:
+        """Drop a queue's oldest message that was not begun and is not ``newest``; return whether there was one."""
         index = 0
-        while index < len(flow.parcels) and (flow.parcels[index].sent or flow.parcels[index].pinned):
+        while index < len(queue.messages) and (queue.messages[index].sent or queue.messages[index].pinned):
             index += 1
-        if index == len(flow.parcels) or flow.parcels[index] is newest:
+        if index == len(queue.messages) or queue.messages[index] is newest:
             return False
-        parcel = flow.parcels[index]
-        del flow.parcels[index]
-        self._release(flow, parcel)
-        parcel.dropped = True
-        self.dropped[parcel.key] += 1
+        message = queue.messages[index]
+        del queue.messages[index]
+        self._release(queue, message)
+        message.dropped = True
+        self.dropped[message.key] += 1
         return True
 
     def _drop_largest(self, newest: QueuedMessage) -> int:
-        """Drop the oldest of the key that holds the most bytes, but never the entry just pushed.
+        """Drop the oldest entries of the key that holds the most bytes, but never the entry just pushed.
 
-        Half of what the key holds may go at once, so that room for one large entry is not searched for by
-        looking at all keys before each of a thousand small drops.
+        Up to half of the key's bytes are dropped at once: otherwise room for one large entry would take a search
+        over all keys for each of a thousand small drops.
         """
         own = 0 if newest.sent else newest.held
         sizes = [
-            (flow.size - own * (flow.parcels[-1] is newest), key)
-            for key, flow in self._flows.items()
-            if not flow.terms.spared
+            (queue.size - own * (queue.messages[-1] is newest), key)
+            for key, queue in self._queues.items()
+            if not queue.bounds.spared
         ]
         if not sizes:
             return 0
         largest, key = max(sizes)
-        flow = self._flows[key]
-        target = flow.size - largest // 2
+        queue = self._queues[key]
+        target = queue.size - largest // 2
         dropped = 0
-        while self._data_bytes > self._max_bytes and self._drop_oldest(flow, newest):
+        while self._data_bytes > self._max_bytes and self._drop_oldest(queue, newest):
             dropped += 1
-            if flow.size < target:
+            if queue.size < target:
                 break
-        if not flow.parcels:
-            self._forget(key, flow)
+        if not queue.messages:
+            self._remove_queue(key, queue)
         return dropped
 
-    def _expire(self, flow: _KeyQueue, key: int, now: float) -> None:
-        """Drop what has waited for too long: unless ``strict``, never the newest."""
-        terms = flow.terms
-        if terms.max_age is None:
+    def _expire(self, queue: _KeyQueue, key: int, now: float) -> None:
+        """Drop entries that waited for too long; never the newest, unless the key is ``strict``."""
+        bounds = queue.bounds
+        if bounds.max_age is None:
             return
-        kept = 0 if terms.strict else 1
-        while len(flow.parcels) > kept:
-            parcel = flow.parcels[0]
-            if parcel.sent or parcel.pinned or now - parcel.born <= terms.max_age:
+        kept = 0 if bounds.strict else 1
+        while len(queue.messages) > kept:
+            message = queue.messages[0]
+            if message.sent or message.pinned or now - message.born <= bounds.max_age:
                 return
-            flow.parcels.popleft()
-            self._release(flow, parcel)
-            parcel.dropped = True
+            queue.messages.popleft()
+            self._release(queue, message)
+            message.dropped = True
             self.expired[key] += 1

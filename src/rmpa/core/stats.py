@@ -1,4 +1,4 @@
-"""Figures from rings of fixed size: periods, latencies, rates. Plain Python; numpy would cost the agent 15 MB."""
+"""Statistics over rings of fixed size: periods, latencies, rates. Plain Python: numpy would cost the agent 15 MB."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class SampleSummary:
-    """What a set of samples says, in the samples' own unit; ``nan`` where there are too few samples to say it."""
+    """The statistics of a set of samples, in the samples' unit; ``nan`` where there are too few samples."""
 
     count: int
     mean: float
@@ -26,7 +26,7 @@ class SampleSummary:
 
     @classmethod
     def of(cls, samples: Iterable[float]) -> SampleSummary:
-        """Summarise; the standard deviation is the population's, as in ``rostopic hz``."""
+        """The summary of some samples; the standard deviation is the population's, as in ``rostopic hz``."""
         data = sorted(samples)
         if not data:
             return cls(0, *[math.nan] * 7)
@@ -56,7 +56,7 @@ def percentile(ordered: list[float], percent: float) -> float:
 
 
 class SampleRing:
-    """The last ``size`` samples; adding one costs the same however many there were.
+    """The last ``size`` samples; adding one takes constant time.
 
     Args:
         size: How many samples are kept, at least 1.
@@ -74,7 +74,7 @@ class SampleRing:
         """Samples ever added."""
 
     def add(self, sample: float) -> None:
-        """Add one sample; the oldest goes when the ring is full."""
+        """Add one sample; it replaces the oldest when the ring is full."""
         self._data[self._next] = sample
         self._next = (self._next + 1) % len(self._data)
         self.total += 1
@@ -94,7 +94,7 @@ class SampleRing:
         yield from self._data[: self._next]
 
     def summary(self) -> SampleSummary:
-        """Summarise what the ring holds."""
+        """The summary of the samples in the ring."""
         return SampleSummary.of(self)
 
 

@@ -1,4 +1,4 @@
-"""How often something may happen (a token bucket)."""
+"""A token bucket: limits the rate of an action."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ _ROUNDING: Final = 1e-9
 
 
 class TokenBucket:
-    """Lets something happen ``rate`` times a second, and ``burst`` times at once after a rest.
+    """Allows an action ``rate`` times a second, and ``burst`` times at once after a rest.
 
     Args:
-        rate: Times a second.
-        burst: At once, at least 1.
+        rate: Tokens a second.
+        burst: The capacity in tokens, at least 1.
     """
 
     def __init__(self, rate: float, burst: float) -> None:
@@ -22,7 +22,7 @@ class TokenBucket:
         self._at = float("-inf")
 
     def take(self, now: float) -> bool:
-        """Whether it may happen at ``now`` (monotonic seconds); if so it counts as done."""
+        """Take a token at ``now`` (monotonic seconds); return whether there was one."""
         self._fill(now)
         if self._level < 1 - _ROUNDING:
             return False
@@ -30,11 +30,11 @@ class TokenBucket:
         return True
 
     def put_back(self) -> None:
-        """One that was taken did not count after all."""
+        """Return a token that was taken but not used."""
         self._level = min(self._burst, self._level + 1)
 
     def next(self, now: float) -> float:
-        """When it may happen again, not before ``now``."""
+        """When there is a token again, not before ``now``."""
         self._fill(now)
         return now + max(0.0, 1 - self._level) / self._rate
 

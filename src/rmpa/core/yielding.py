@@ -1,4 +1,4 @@
-"""How long work in the pure rooms gives way without knowing to whom."""
+"""Lets long computations yield to pending data without importing the event loop."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ _T = TypeVar("_T")
 
 
 class Yielder(Protocol):
-    """Passes on what it is given, one after the other; between two of them something more urgent may be done.
+    """Iterates over items; between two of them data may be handled (``runtime.event_loop.yielding_to_data``).
 
-    ``iter`` is one that does nothing. What is iterated over must not change meanwhile: it is a copy, or shared by
-    nobody, and nothing of the caller's may be half done.
+    ``iter`` is a yielder that handles nothing. The items must not change meanwhile: pass a copy, or a collection that
+    nothing else changes. The caller's own data must be consistent during the iteration.
     """
 
     def __call__(self, items: Iterable[_T], /) -> Iterable[_T]:

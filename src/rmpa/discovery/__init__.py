@@ -1,1 +1,1 @@
-"""Who is there: beacons, the roster of peers, leases and heartbeats (paper, section 4.3)."""
+"""Discovery of peers: beacons, membership, leases and heartbeats (paper, section 4.3)."""

@@ -1,4 +1,4 @@
-"""The beacon: what a peer shouts so that others know it is there (docs/design/protocol.md, "Beacons").
+"""The beacon: the packet by which peers announce themselves (docs/design/protocol.md, "Beacons").
 
 Errors that ``Beacon.parse`` raises, all of them the sender's fault::
 
@@ -8,7 +8,7 @@ Errors that ``Beacon.parse`` raises, all of them the sender's fault::
     ├── BeaconOtherDomain    of another domain: several may share a network, so this is no fault at all
     └── BeaconOtherVersion   of another version of this protocol
 
-The first eight bytes are the same in every version, so the last two are told before the rest is looked at.
+The first eight bytes are the same in every version, so the last two errors are found before the rest is parsed.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from rmpa.core.identity import Identity
 from rmpa.core.sizes import UINT32_MAX
 from rmpa.discovery import limits
 
-Endpoint = tuple[str, int]
-"""A numeric address and a port."""
+Address = tuple[str, int]
+"""A numeric IPv4 address and a UDP port, as sockets have it."""
 
 MAGIC: Final = b"RMPA"
 VERSION: Final = 1
@@ -41,11 +41,11 @@ class BeaconKind(IntEnum):
     """Why a beacon was sent."""
 
     ANNOUNCE = 1
-    """The sender has just started, or greets an address that it was told of: answer, please."""
+    """The sender has just started, or contacts an address that it was told of; it asks for an answer."""
     HEARTBEAT = 2
     """The sender is still there."""
     ANSWER = 3
-    """By unicast, to somebody who announced itself; it is not answered."""
+    """By unicast, to a peer that announced itself; it is not answered."""
     GOODBYE = 4
     """The sender leaves."""
 
@@ -74,7 +74,7 @@ class BeaconOtherVersion(RemoteProtocolError):  # noqa: N818
 
 @dataclass
 class BeaconOtherDomain(RemoteProtocolError):  # noqa: N818
-    """A peer of another domain; counted, and nothing else."""
+    """A peer of another domain."""
 
     domain: int
 
@@ -93,7 +93,7 @@ class Beacon:
         lease_ms: Milliseconds after which the sender is gone if it is silent and has no link; 32 bits.
         sequence: Counts the beacons of this instance; 32 bits, wraps.
         gossip: Peers that the sender knows to be alive, at most ``limits.BEACON_GOSSIP_MAX``.
-        elsewhere: Where the sender hears some of these, if not at their GUIDs' own addresses; at most as many.
+        observed: Source addresses of gossiped peers, where they differ from the GUID's; at most as many.
 
     Raises:
         ValueError: A part is out of its range.
@@ -104,14 +104,14 @@ class Beacon:
     lease_ms: int
     sequence: int
     gossip: tuple[Guid, ...] = ()
-    elsewhere: tuple[Endpoint, ...] = ()
+    observed: tuple[Address, ...] = ()
 
     def __post_init__(self) -> None:
         if not (0 <= self.lease_ms <= UINT32_MAX and 0 <= self.sequence <= UINT32_MAX):
             raise ValueError("lease and sequence have 32 bits")
         if len(self.identity.addresses) > limits.BEACON_ADDRESSES_MAX:
             raise ValueError(f"a beacon carries at most {limits.BEACON_ADDRESSES_MAX} addresses")
-        if max(len(self.gossip), len(self.elsewhere)) > limits.BEACON_GOSSIP_MAX:
+        if max(len(self.gossip), len(self.observed)) > limits.BEACON_GOSSIP_MAX:
             raise ValueError(f"a beacon carries at most {limits.BEACON_GOSSIP_MAX} gossiped peers")
         port = self.identity.guid.port
         for address in (self.identity.guid.address, *self.identity.addresses):
@@ -120,7 +120,7 @@ class Beacon:
         for guid in self.gossip:
             if not guid.dialable:
                 raise ValueError(f"no gossiped peer can be reached at {guid}")
-        for host, at in self.elsewhere:
+        for host, at in self.observed:
             if not dialable(IPv4Address(host), at):
                 raise ValueError(f"no gossiped peer can be reached at {host}:{at}")
 
@@ -152,7 +152,7 @@ class Beacon:
         number = data[offset] if offset < len(data) else 0  # a beacon without it ends here
         if number > limits.BEACON_GOSSIP_MAX:
             raise BeaconMalformed(f"{number} further addresses of gossiped peers")
-        elsewhere, _ = _take(data, offset + 1, _ENDPOINT.size * number, "gossiped addresses") if number else (b"", 0)
+        observed, _ = _take(data, offset + 1, _ENDPOINT.size * number, "gossiped addresses") if number else (b"", 0)
         try:
             return cls(
                 BeaconKind(kind),
@@ -166,7 +166,7 @@ class Beacon:
                 lease,
                 sequence,
                 tuple(Guid(value) for (value,) in _GUID.iter_unpack(gossip)),
-                tuple((str(IPv4Address(host)), at) for host, at in _ENDPOINT.iter_unpack(elsewhere)),
+                tuple((str(IPv4Address(host)), at) for host, at in _ENDPOINT.iter_unpack(observed)),
             )
         except ValueError as error:
             raise BeaconMalformed(str(error)) from error
@@ -193,8 +193,8 @@ class Beacon:
                 *(address.packed for address in identity.addresses),
                 bytes((len(self.gossip),)),
                 *(_GUID.pack(guid.value) for guid in self.gossip),
-                bytes((len(self.elsewhere),)) if self.elsewhere else b"",
-                *(_ENDPOINT.pack(IPv4Address(host).packed, at) for host, at in self.elsewhere),
+                bytes((len(self.observed),)) if self.observed else b"",
+                *(_ENDPOINT.pack(IPv4Address(host).packed, at) for host, at in self.observed),
             )
         )
 
@@ -205,7 +205,7 @@ class Beacon:
 
 
 def sender_of(data: bytes, domain: int) -> tuple[Guid, bytes]:
-    """The GUID and the instance id that a packet begins with, without a look at the rest of it.
+    """The GUID and the instance id at the beginning of a packet; the rest is not parsed.
 
     Args:
         data: The whole packet.

@@ -1,4 +1,4 @@
-"""One (address, port): which of the runs that claim it is the live one (restart, ghost or conflict)."""
+"""One (address, port): which of the runs that claim it is the live one (restart, late packet or conflict)."""
 
 from __future__ import annotations
 
@@ -14,36 +14,50 @@ from rmpa.discovery.events import HeardBy
 
 if TYPE_CHECKING:
     from rmpa.core.identity import Identity
-    from rmpa.discovery.beacon import Beacon
-    from rmpa.discovery.events import Address
+    from rmpa.discovery.beacon import Address, Beacon
 
 _NEVER: Final = float("-inf")
 
 
 class EndpointChange(Enum):
-    """What a beacon, or the fate of a link, means for the seat."""
+    """The change of an endpoint by a beacon, or by a link that came or was lost."""
 
     NEW = auto()
-    """The seat was empty; it is taken now."""
+    """The endpoint had no current run; it has one now."""
     KNOWN = auto()
-    """The one who has the seat spoke."""
+    """The current run was heard."""
     CHANGED = auto()
-    """… and says something else of itself."""
+    """The current run was heard, and its identity has changed."""
     RESTARTED = auto()
-    """Another run has the seat now."""
+    """Another run is current now."""
     LEAVING = auto()
-    """The one who has the seat said goodbye."""
+    """The current run said goodbye."""
     STALE = auto()
-    """A late or doubled packet; ignored."""
+    """A late or repeated packet; ignored."""
     WAITING = auto()
-    """Another run spoke, which may be a late packet, or the next to have the seat."""
+    """Another run was heard: perhaps by a late packet, perhaps it is the next one."""
     CONFLICT = auto()
-    """Another run is alive beyond doubt, and so is the one who has the seat."""
+    """Another run is certainly alive, and so is the current one."""
 
 
 @dataclass(slots=True)
 class PeerInstance:
-    """One run of one peer, as heard here. Times in seconds of the roster's clock."""
+    """One run of a peer, as heard here. Times are seconds of the protocol's clock.
+
+    Args:
+        identity: As its last beacon or handshake said.
+        since: When it was first heard, or became a member.
+        heard: When it was last heard, or had a link.
+        lease: Seconds of silence after which it counts as gone.
+        found_by: How it was first heard.
+        heard_by: How it was last heard.
+        source: The source address of its last packet; ``None`` if only a link has shown it.
+        sequence: The number of its last beacon.
+        multicast_at: When it was last heard by multicast.
+        linked: Whether there is a link with it.
+        leaving: Whether it said goodbye.
+        superseded_at: When another run took its endpoint.
+    """
 
     identity: Identity
     since: float
@@ -56,22 +70,28 @@ class PeerInstance:
     multicast_at: float = _NEVER
     linked: bool = False
     leaving: bool = False
-    aside_at: float = _NEVER
+    superseded_at: float = _NEVER
 
     @property
     def deadline(self) -> float:
-        """When its silence has lasted for its lease."""
+        """When its lease is over, if it stays silent."""
         return self.heard + self.lease
+
+    @property
+    def addresses(self) -> tuple[Address, ...]:
+        """Where its unicasts go: its GUID's endpoint, and the source of its packets where that differs."""
+        endpoint = self.identity.guid.endpoint
+        return (endpoint,) if self.source is None or self.source == endpoint else (endpoint, self.source)
 
     def accepts(self, sequence: int) -> bool:
         """Whether a beacon is newer than the last one (serial numbers, RFC 1982: they wrap)."""
         return self.sequence is None or is_later(sequence, self.sequence)
 
-    def heed(self, beacon: Beacon, now: float, source: Address, *, multicast: bool) -> None:
-        """Take over what a newer beacon says."""
+    def update(self, beacon: Beacon, now: float, source: Address, *, multicast: bool) -> None:
+        """Take over the content of a newer beacon."""
         self.identity = beacon.identity
         self.sequence = beacon.sequence
-        self.lease = min(max(beacon.lease_ms / 1000, limits.ROSTER_LEASE_MIN), limits.ROSTER_LEASE_MAX)
+        self.lease = min(max(beacon.lease_ms / 1000, limits.LEASE_MIN), limits.LEASE_MAX)
         self.heard = now
         self.source = source
         self.heard_by = HeardBy.MULTICAST if multicast else HeardBy.UNICAST
@@ -83,11 +103,11 @@ class Endpoint:
     """The runs heard under one (address, port).
 
     Args:
-        current: Who has the seat.
-        others: By instance id: runs that had it, that left, or that claim it too.
-        conflict: Whether two live ones were seen.
-        present: Whether ``current`` was told as found and not yet as lost.
-        own: Whether this is our own seat, which we never give up.
+        current: The run that counts as the live one.
+        others: By instance id: runs that were current, that said goodbye, or that claim the endpoint too.
+        conflict: Whether two live runs were seen.
+        present: Whether ``current`` is a member: reported as found and not yet as lost.
+        own: Whether this is this agent's own endpoint, which no other run gets.
     """
 
     current: PeerInstance | None = None
@@ -96,45 +116,45 @@ class Endpoint:
     present: bool = False
     own: bool = False
 
-    def hear(self, beacon: Beacon, now: float, source: Address, *, multicast: bool) -> EndpointChange:
-        """Place one beacon; see ``EndpointChange``."""
+    def receive(self, beacon: Beacon, now: float, source: Address, *, multicast: bool) -> EndpointChange:
+        """Take in one beacon; return what it changes."""
         instance = beacon.identity.instance
-        voice = self._find(instance)
-        if voice is None:
+        peer = self._find(instance)
+        if peer is None:
             if beacon.kind is BeaconKind.GOODBYE:
                 return EndpointChange.STALE
-            return self._stranger(_voice(beacon, now, source, multicast=multicast), now)
+            return self._new_run(_peer_from(beacon, now, source, multicast=multicast), now)
         if multicast:
-            voice.multicast_at = now
-        if not voice.accepts(beacon.sequence):
+            peer.multicast_at = now
+        if not peer.accepts(beacon.sequence):
             return EndpointChange.STALE
-        previous, departed = voice.identity, voice.leaving
-        voice.heed(beacon, now, source, multicast=multicast)
-        if voice is not self.current:
-            return self._returned(voice, now, departed=departed)
-        if voice.leaving:
+        previous, departed = peer.identity, peer.leaving
+        peer.update(beacon, now, source, multicast=multicast)
+        if peer is not self.current:
+            return self._other_run(peer, now, departed=departed)
+        if peer.leaving:
             return EndpointChange.LEAVING
-        return EndpointChange.KNOWN if voice.identity == previous else EndpointChange.CHANGED
+        return EndpointChange.KNOWN if peer.identity == previous else EndpointChange.CHANGED
 
     def link_up(self, identity: Identity, now: float) -> EndpointChange:
-        """A link's handshake proves that this run is alive: it gets the seat."""
-        voice = self._find(identity.instance)
-        if voice is None:
-            voice = PeerInstance(identity, now, now, core_limits.ROSTER_LEASE, HeardBy.LINK, HeardBy.LINK)
-        previous = voice.identity
+        """A link's handshake proves that this run is alive: it becomes the current one."""
+        peer = self._find(identity.instance)
+        if peer is None:
+            peer = PeerInstance(identity, now, now, core_limits.PEER_LEASE, HeardBy.LINK, HeardBy.LINK)
+        previous = peer.identity
         # A handshake carries no further addresses; those of the beacons stay.
-        voice.identity = identity if identity.addresses else replace(identity, addresses=previous.addresses)
-        voice.linked = True
-        voice.leaving = False
-        voice.heard = now
-        if voice is self.current:
-            return EndpointChange.KNOWN if voice.identity == previous else EndpointChange.CHANGED
+        peer.identity = identity if identity.addresses else replace(identity, addresses=previous.addresses)
+        peer.linked = True
+        peer.leaving = False
+        peer.heard = now
+        if peer is self.current:
+            return EndpointChange.KNOWN if peer.identity == previous else EndpointChange.CHANGED
         if self.current is None:
-            return self._promote(voice, now, EndpointChange.NEW)
-        return self._promote(voice, now, EndpointChange.RESTARTED)
+            return self._promote(peer, now, EndpointChange.NEW)
+        return self._promote(peer, now, EndpointChange.RESTARTED)
 
     def link_down(self, now: float) -> EndpointChange:
-        """The link of the one who has the seat fell; a run that waited for just that gets it."""
+        """The link of the current run fell; a run that was heard meanwhile becomes current."""
         current = self.current
         if current is None or not current.linked:
             return EndpointChange.STALE
@@ -144,33 +164,33 @@ class Endpoint:
             return EndpointChange.LEAVING
         if self.conflict:
             return EndpointChange.CONFLICT
-        # A run that lives sends heartbeats; one beacon, perhaps forged, long ago gets nobody a seat.
+        # A live run sends heartbeats; a single beacon long ago, perhaps forged, is not enough.
         waiting = [v for v in self.rivals() if v.since > current.since and now - v.heard <= limits.HEARTBEAT_LATE]
         if not waiting:
             return EndpointChange.KNOWN
         return self._promote(max(waiting, key=lambda v: v.heard), now, EndpointChange.RESTARTED)
 
     def rivals(self) -> list[PeerInstance]:
-        """The others that have not said goodbye."""
+        """The other runs that have not said goodbye."""
         return [v for v in self.others.values() if not v.leaving]
 
-    def vacate(self) -> None:
-        """The one who has the seat is gone; in a conflict the loudest rival gets it."""
+    def remove_current(self) -> None:
+        """The current run is gone; in a conflict the rival that was heard last becomes current."""
         if self.current is not None and self.current.leaving:
-            self._put_aside(self.current, self.current.heard)
+            self._supersede(self.current, self.current.heard)
         self.current = None
         rivals = self.rivals()
         if self.conflict and rivals:
             self.current = max(rivals, key=lambda v: v.heard)
             del self.others[self.current.identity.instance]
 
-    def forget(self, now: float) -> None:
-        """Drop the others whose lease is over."""
+    def expire_others(self, now: float) -> None:
+        """Drop the other runs whose lease is over."""
         for instance in [i for i, v in self.others.items() if v.deadline <= now]:
             del self.others[instance]
 
     def next_timer(self) -> float | None:
-        """When somebody's lease is over."""
+        """When the first lease is over; that of a linked run never is."""
         times = [v.deadline for v in self.others.values()]
         if self.current is not None and not self.current.linked:
             times.append(self.current.deadline)
@@ -181,51 +201,52 @@ class Endpoint:
             return self.current
         return self.others.get(instance)
 
-    def _stranger(self, voice: PeerInstance, now: float) -> EndpointChange:
+    def _new_run(self, peer: PeerInstance, now: float) -> EndpointChange:
+        """A run that was not known, or had said goodbye, was heard."""
         if self.current is None:
-            self.current = voice
+            self.current = peer
             return EndpointChange.NEW
         if self.current.linked or self.conflict:
-            self._put_aside(voice, now)
+            self._supersede(peer, now)
             return EndpointChange.WAITING
-        return self._promote(voice, now, EndpointChange.RESTARTED)
+        return self._promote(peer, now, EndpointChange.RESTARTED)
 
-    def _returned(self, voice: PeerInstance, now: float, *, departed: bool) -> EndpointChange:
-        """One of the others spoke, with a packet that is not a late one by its number."""
-        if voice.leaving:
+    def _other_run(self, peer: PeerInstance, now: float, *, departed: bool) -> EndpointChange:
+        """A known run that is not current was heard, by a packet that is not a late one by its number."""
+        if peer.leaving:
             return EndpointChange.WAITING
         if departed:
-            del self.others[voice.identity.instance]
-            voice.since = now
-            return self._stranger(voice, now)
+            del self.others[peer.identity.instance]
+            peer.since = now
+            return self._new_run(peer, now)
         if self.current is None:
-            return self._promote(voice, now, EndpointChange.NEW)
-        if self.conflict or now - voice.aside_at < limits.CONFLICT_AFTER:
+            return self._promote(peer, now, EndpointChange.NEW)
+        if self.conflict or now - peer.superseded_at < limits.CONFLICT_AFTER:
             return EndpointChange.WAITING
         if self.current.linked or now - self.current.heard <= limits.HEARTBEAT_LATE:
             self.conflict = True
             return EndpointChange.CONFLICT
-        # Whoever has the seat missed its heartbeat: its packets were the late ones.
-        return self._promote(voice, now, EndpointChange.RESTARTED)
+        # The current run missed its heartbeat: its packets were the late ones.
+        return self._promote(peer, now, EndpointChange.RESTARTED)
 
-    def _promote(self, voice: PeerInstance, now: float, verdict: EndpointChange) -> EndpointChange:
-        self.others.pop(voice.identity.instance, None)
+    def _promote(self, peer: PeerInstance, now: float, change: EndpointChange) -> EndpointChange:
+        self.others.pop(peer.identity.instance, None)
         if self.current is not None:
             self.current.linked = False
-            self._put_aside(self.current, now)
-        self.current = voice
-        return verdict
+            self._supersede(self.current, now)
+        self.current = peer
+        return change
 
-    def _put_aside(self, voice: PeerInstance, now: float) -> None:
-        voice.aside_at = now
-        self.others[voice.identity.instance] = voice
-        while len(self.others) >= limits.SEAT_VOICES_MAX:
+    def _supersede(self, peer: PeerInstance, now: float) -> None:
+        peer.superseded_at = now
+        self.others[peer.identity.instance] = peer
+        while len(self.others) >= limits.ENDPOINT_RUNS_MAX:
             del self.others[min(self.others, key=lambda i: (self.others[i].heard, i))]
 
 
-def _voice(beacon: Beacon, now: float, source: Address, *, multicast: bool) -> PeerInstance:
+def _peer_from(beacon: Beacon, now: float, source: Address, *, multicast: bool) -> PeerInstance:
     how = HeardBy.MULTICAST if multicast else HeardBy.UNICAST
-    voice = PeerInstance(beacon.identity, now, now, core_limits.ROSTER_LEASE, how, how)
-    voice.heed(beacon, now, source, multicast=multicast)
-    voice.multicast_at = now if multicast else _NEVER
-    return voice
+    peer = PeerInstance(beacon.identity, now, now, core_limits.PEER_LEASE, how, how)
+    peer.update(beacon, now, source, multicast=multicast)
+    peer.multicast_at = now if multicast else _NEVER
+    return peer

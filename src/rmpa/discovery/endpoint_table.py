@@ -1,4 +1,4 @@
-"""All seats of a roster, and what is asked of all of them often: nothing here looks at each for one packet."""
+"""All endpoints of the membership protocol, with indexes: a packet never costs a look at every endpoint."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from bisect import bisect_left, insort
 from typing import TYPE_CHECKING
 
 from rmpa.core.timer_queue import TimerQueue
+from rmpa.discovery.events import ConflictKind, HeardBy, PeerConflict, PeerView
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -14,7 +15,10 @@ if TYPE_CHECKING:
 
 
 class EndpointTable:
-    """The seats by place, with their timers. Whoever changes a seat says so: ``heard`` or ``changed``."""
+    """The endpoints by place (``Guid.place``), with their timers.
+
+    After an endpoint was changed from outside, ``changed`` must be called; ``heard`` if only its peer was heard.
+    """
 
     def __init__(self) -> None:
         self._all: dict[int, Endpoint] = {}
@@ -34,68 +38,116 @@ class EndpointTable:
         return iter([self._all[place] for place in self._order])
 
     def get(self, place: int) -> Endpoint | None:
-        """The seat of a place."""
+        """The endpoint at a place, or ``None``."""
         return self._all.get(place)
 
-    def add(self, place: int, seat: Endpoint) -> Endpoint:
-        """Set up a seat at a place that has none."""
-        self._all[place] = seat
+    def add(self, place: int, endpoint: Endpoint) -> Endpoint:
+        """Add an endpoint at a place that has none; return it."""
+        self._all[place] = endpoint
         insort(self._order, place)
         self.changed(place)
-        return seat
+        return endpoint
 
-    def drop(self, place: int) -> None:
-        """Take a seat away."""
+    def remove(self, place: int) -> None:
+        """Remove the endpoint at a place."""
         del self._all[place]
         del self._order[bisect_left(self._order, place)]
         self._timers.set(place, None)
-        self._forget()
+        self._clear_indexes()
 
     def heard(self, place: int) -> None:
-        """The one who has a seat spoke, and nothing else has changed."""
-        seat = self._all.get(place)
-        if seat is not None:
-            self._timers.set(place, seat.next_timer())
+        """The endpoint's timer has changed, and nothing else of it."""
+        endpoint = self._all.get(place)
+        if endpoint is not None:
+            self._timers.set(place, endpoint.next_timer())
 
     def changed(self, place: int) -> None:
-        """Anything of a seat has changed: who has it, what it is called, whether it is present."""
+        """Anything of the endpoint has changed: its peer, its name, whether it is present."""
         self.heard(place)
-        self._forget()
+        self._clear_indexes()
 
-    def _forget(self) -> None:
+    def _clear_indexes(self) -> None:
         self._present = self._by_name = None
 
     def next_timer(self) -> float | None:
-        """When ``due`` has something."""
+        """When ``take_expired`` has something."""
         return self._timers.next()
 
-    def due(self, now: float) -> list[int]:
-        """The places at which somebody's lease is over, in order; each is to be dealt with, and ``changed``."""
+    def take_expired(self, now: float) -> list[int]:
+        """The places at which a lease is over, in order. The caller handles each, and calls ``changed``."""
         return sorted(self._timers.take(now))
 
     def present(self) -> list[PeerInstance]:
-        """Those that are in the roster, in the order of their GUIDs; not to be changed."""
+        """The peers that are members, in the order of their GUIDs; not to be changed by the caller."""
         if self._present is None:
-            self._present = [seat.current for seat in self if seat.present and seat.current is not None]
+            self._present = [e.current for e in self if e.present and e.current is not None]
         return self._present
 
-    def named(self, name: str) -> list[Endpoint]:
-        """The seats of those who have this name, in order, conflicts and ourselves included."""
+    def with_name(self, name: str) -> list[Endpoint]:
+        """The endpoints whose peer has this name, in order; peers in conflict and this agent itself included."""
         if self._by_name is None:
             self._by_name = {}
-            for seat in self:
-                if seat.current is not None:
-                    self._by_name.setdefault(seat.current.identity.name, []).append(seat)
+            for endpoint in self:
+                if endpoint.current is not None:
+                    self._by_name.setdefault(endpoint.current.identity.name, []).append(endpoint)
         return list(self._by_name.get(name, ()))
 
     def oldest_unlinked(self) -> tuple[float, int] | None:
-        """Of the seats without a linked peer the one that was heard the longest ago: when, and its place."""
+        """Of the endpoints without a linked peer the one that was heard the longest ago: when, and its place."""
         never = float("-inf")
         return min(
             (
-                (seat.current.heard if seat.current is not None else never, place)
-                for place, seat in self._all.items()
-                if seat.current is None or not seat.current.linked
+                (endpoint.current.heard if endpoint.current is not None else never, place)
+                for place, endpoint in self._all.items()
+                if endpoint.current is None or not endpoint.current.linked
             ),
             default=None,
+        )
+
+    def same_name(self, endpoint: Endpoint) -> list[tuple[PeerInstance, PeerInstance]]:
+        """This endpoint's peer with each other live peer of its name, the newer of both first."""
+        mine = endpoint.current
+        if mine is None:
+            return []
+        pairs = []
+        for other in self.with_name(mine.identity.name):
+            peer = other.current
+            if peer is None or other is endpoint or not (other.present or other.own):
+                continue
+            newer, older = (mine, peer) if (mine.since, other.own) >= (peer.since, endpoint.own) else (peer, mine)
+            alive = older.linked or older.heard >= newer.since or other.own or endpoint.own
+            if alive:
+                pairs.append((newer, older))
+        return pairs
+
+    def views(self) -> tuple[PeerView, ...]:
+        """All peers in GUID order, those included that a conflict keeps from being members; not this agent itself."""
+        return tuple(
+            self._view(endpoint, peer)
+            for endpoint in self
+            for peer in [endpoint.current, *(endpoint.rivals() if endpoint.conflict else [])]
+            if peer is not None and not (endpoint.own and peer is endpoint.current)
+        )
+
+    def _view(self, endpoint: Endpoint, peer: PeerInstance) -> PeerView:
+        conflicts = []
+        if endpoint.conflict and endpoint.current is not None:
+            rivals = endpoint.rivals()
+            other = endpoint.current if peer is not endpoint.current else rivals[0] if rivals else peer
+            kind = ConflictKind.OWN_GUID if endpoint.own else ConflictKind.GUID
+            conflicts.append(str(PeerConflict(kind, peer.identity, other.identity)))
+        conflicts += [
+            str(PeerConflict(ConflictKind.NAME, one.identity, other.identity))
+            for one, other in (self.same_name(endpoint) if peer is endpoint.current else ())
+        ]
+        return PeerView(
+            peer.identity,
+            peer.since,
+            peer.heard,
+            peer.found_by,
+            peer.heard_by if not peer.linked else HeardBy.LINK,
+            peer.source,
+            peer.linked,
+            tuple(conflicts),
+            endpoint.present and peer is endpoint.current,
         )

@@ -1,4 +1,4 @@
-"""What the roster tells (events) and what it wants sent (outputs)."""
+"""Events and outputs of the membership protocol, and the view of a peer."""
 
 from __future__ import annotations
 
@@ -9,10 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rmpa.core.guid import Guid
     from rmpa.core.identity import Identity
-    from rmpa.discovery.beacon import Beacon
-
-Address = tuple[str, int]
-"""A numeric IPv4 address and a UDP port, as sockets want it."""
+    from rmpa.discovery.beacon import Address, Beacon
 
 
 class HeardBy(Enum):
@@ -21,12 +18,12 @@ class HeardBy(Enum):
     MULTICAST = "multicast"
     UNICAST = "unicast"
     GOSSIP = "gossip"
-    """It answered a greeting to an address that another peer had passed on."""
+    """It answered an announcement to an address that another peer's gossip had."""
     LINK = "link"
 
 
 class LossReason(Enum):
-    """Why a peer left the roster."""
+    """Why a peer is no member any more."""
 
     SILENCE = "silent for its lease"
     GOODBYE = "said goodbye"
@@ -35,7 +32,7 @@ class LossReason(Enum):
 
 
 class ConflictKind(Enum):
-    """What two live peers have in common though they must not."""
+    """The property that two live peers share, though it must be unique."""
 
     GUID = "guid"
     OWN_GUID = "own guid"
@@ -44,10 +41,10 @@ class ConflictKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class PeerFound:
-    """A peer is in the roster now.
+    """A peer has become a member.
 
     Args:
-        identity: What it says of itself.
+        identity: As in its beacon or handshake.
         source: Where its first packet came from; ``None`` if a link brought it.
         heard: How it was found.
     """
@@ -64,7 +61,7 @@ class PeerFound:
 
 @dataclass(frozen=True, slots=True)
 class PeerChanged:
-    """The same run of a peer says something else of itself: addresses, name."""
+    """The same run of a peer has another identity: addresses or name have changed."""
 
     identity: Identity
     previous: Identity
@@ -77,7 +74,7 @@ class PeerChanged:
 
 @dataclass(frozen=True, slots=True)
 class PeerRestarted:
-    """Another run of an agent has the place of ``previous``, which is gone."""
+    """Another run of an agent is at the endpoint of ``previous``, which is gone."""
 
     identity: Identity
     previous: Identity
@@ -91,7 +88,7 @@ class PeerRestarted:
 
 @dataclass(frozen=True, slots=True)
 class PeerLost:
-    """A peer is no longer in the roster."""
+    """A peer is no member any more."""
 
     identity: Identity
     reason: LossReason
@@ -104,12 +101,12 @@ class PeerLost:
 
 @dataclass(frozen=True, slots=True)
 class PeerConflict:
-    """Two live peers claim one thing. ``str`` says what to do; told once until it clears.
+    """Two live peers claim the same GUID address or name. ``str`` says what to do. Reported once until it clears.
 
     Args:
         kind: What they share.
-        identity: The one heard now.
-        other: The one that was there; our own identity for ``OWN_GUID`` and perhaps for ``NAME``.
+        identity: The peer that was heard now.
+        other: The peer that was there; this agent itself for ``OWN_GUID`` and perhaps for ``NAME``.
     """
 
     kind: ConflictKind
@@ -162,18 +159,18 @@ Output = SendMulticast | SendUnicast
 
 @dataclass(frozen=True, slots=True)
 class PeerView:
-    """One line of the roster, for people.
+    """One peer, for display.
 
     Args:
-        identity: What the peer says of itself.
-        since: When it was found, in seconds of the roster's clock.
+        identity: As in its last beacon or handshake.
+        since: When it was found, in seconds of the protocol's clock.
         heard: When it was last heard by beacon or had a link, on the same clock.
         found_by: How it was found.
         heard_by: How it was last heard.
         source: Where its last packet came from, if there was one.
         linked: Whether it has a link.
-        conflicts: What it shares with others though it must not, ready to read.
-        present: ``False`` while a conflict keeps it out.
+        conflicts: Its conflicts, as texts for the user.
+        present: Whether it is a member; ``False`` while a conflict prevents it.
     """
 
     identity: Identity

@@ -1,48 +1,52 @@
-"""Whom a beacon passes on, and who gets one by unicast: so many of many, in turn."""
+"""Gossip: the GUIDs of known peers that beacons carry, and the addresses that were learnt from such beacons."""
 
 from __future__ import annotations
 
-from collections import deque
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from rmpa.core.backoff import Backoff
+from rmpa.core.timer_queue import TimerQueue
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.discovery import limits
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from rmpa.core.guid import Guid
+    from rmpa.discovery.beacon import Address
     from rmpa.discovery.endpoint import PeerInstance
 
 
 class GossipSelector:
-    """Chooses the peers that one beacon passes on."""
+    """Selects the peers that one beacon gossips about, within the room that a beacon has."""
 
     def __init__(self) -> None:
         self._turn = 0
 
     def choose(
-        self, voices: Sequence[PeerInstance], to: PeerInstance | None, now: float, *, near: bool
+        self, peers: Sequence[PeerInstance], to: PeerInstance | None, now: float, *, loopback: bool
     ) -> tuple[Guid, ...]:
-        """GUIDs to pass on, in order; where they are too many for one beacon, in turn.
+        """GUIDs for one beacon, in order; if they are too many, the next beacon goes on where this one ends.
 
-        Who has no link and was not heard of late is left out: others would greet it for as long as we speak of it.
+        Peers that have no link and were not heard lately are left out: receivers would send announcements to them for
+        as long as they are mentioned.
 
         Args:
-            voices: Who is known.
-            to: Who is told, if it is one alone.
+            peers: Those that are known.
+            to: The receiver, if the beacon is a unicast; it is not told of itself.
             now: Monotonic seconds.
-            near: Whether those who are told can reach loopback addresses.
+            loopback: Whether the receivers can reach loopback addresses.
         """
-        count = len(voices)
+        count = len(peers)
         start = self._turn % count if count > limits.BEACON_GOSSIP_MAX else 0
         guids: list[Guid] = []
         for number in range(start, start + count):
-            voice = voices[number % count]
-            if voice is to or not (voice.linked or now - voice.heard <= limits.MULTICAST_SILENCE):
+            peer = peers[number % count]
+            if peer is to or not (peer.linked or now - peer.heard <= limits.MULTICAST_SILENCE):
                 continue
-            guid = voice.identity.guid
-            if near or not guid.is_loopback:
+            guid = peer.identity.guid
+            if loopback or not guid.is_loopback:
                 guids.append(guid)
                 if len(guids) == limits.BEACON_GOSSIP_MAX:
                     self._turn = number + 1
@@ -50,41 +54,68 @@ class GossipSelector:
         return tuple(guids)
 
 
-class UnicastHeartbeats:
-    """Chooses who gets a heartbeat by unicast: all that are linked; of the others, who may be invented, a few."""
+@dataclass(slots=True)
+class _Candidate:
+    backoff: Backoff
+    gossiped_at: float
 
-    def __init__(self) -> None:
-        self._turn = 0
-        self._allowed = TokenBucket(
-            limits.WHISPERS_PER_SECOND, limits.WHISPERS_PER_SECOND * limits.HEARTBEAT_INTERVAL
-        )
-        self._waiting: deque[PeerInstance] = deque()
-        self.at: float | None = None
-        """When ``some`` has somebody."""
 
-    def choose(self, voices: Sequence[PeerInstance], now: float) -> tuple[list[PeerInstance], bool]:
-        """Those of ``voices`` who get one now, the others in turn from call to call; whether that is all of them."""
-        chosen = [voice for voice in voices if voice.linked]
-        others = [voice for voice in voices if not voice.linked]
-        start = self._turn % len(others) if others else 0
-        for voice in others[start:] + others[:start]:
-            if not self._allowed.take(now):
-                return chosen, False
-            chosen.append(voice)
-            self._turn = (self._turn + 1) % len(others)
-        return chosen, True
+class GossipCandidates:
+    """Addresses learnt from gossip. Each gets announcements, with back-off, until it answers or gossip about it ends.
 
-    def plan(self, voices: Sequence[PeerInstance], now: float) -> bool:
-        """Let those whom ``choose`` chooses have one; whether that is all of them."""
-        chosen, everybody = self.choose(voices, now)
-        waiting = set(map(id, self._waiting))
-        self._waiting += [voice for voice in chosen if id(voice) not in waiting]
-        self.at = now if self._waiting else None
-        return everybody
+    Gossip about a dead peer ends by itself: a beacon only mentions peers that its sender has heard.
 
-    def some(self) -> list[PeerInstance]:
-        """The next of them; so few that whoever else has something to do need not wait."""
-        few = [self._waiting.popleft() for _ in range(min(limits.WHISPERS_AT_ONCE, len(self._waiting)))]
-        if not self._waiting:
-            self.at = None
-        return few
+    Args:
+        rng: Uniform numbers in [0, 1).
+    """
+
+    def __init__(self, rng: Callable[[], float]) -> None:
+        self._rng = rng
+        self._all: dict[Address, _Candidate] = {}
+        self._due: TimerQueue[Address] = TimerQueue()
+        self._allowed = TokenBucket(limits.CANDIDATES_PER_SECOND, limits.CANDIDATES_MAX)
+        self._resume = float("-inf")
+
+    def __contains__(self, address: Address) -> bool:
+        return address in self._all
+
+    def __len__(self) -> int:
+        return len(self._all)
+
+    def add(self, address: Address, now: float) -> bool:
+        """Gossip mentions ``address``; return ``False`` if there is no room for it."""
+        candidate = self._all.get(address)
+        if candidate is not None:
+            candidate.gossiped_at = now
+            return True
+        if len(self._all) >= limits.CANDIDATES_MAX:
+            return False
+        backoff = Backoff(limits.CANDIDATE_RETRY_FIRST, limits.CANDIDATE_RETRY_MAX, self._rng)
+        self._all[address] = _Candidate(backoff, now)
+        self._due.set(address, now)
+        return True
+
+    def answered(self, address: Address) -> bool:
+        """A packet came from ``address``: it is no candidate any more. Return whether it was one."""
+        self._due.set(address, None)
+        return self._all.pop(address, None) is not None
+
+    def take_due(self, now: float) -> list[Address]:
+        """The addresses that get an announcement now, longest wait first; those beyond the rate go on waiting."""
+        due: list[Address] = []
+        while now >= self._resume and (address := self._due.pop(now)) is not None:
+            candidate = self._all[address]
+            if now - candidate.gossiped_at >= limits.CANDIDATE_LIFETIME:
+                del self._all[address]
+            elif self._allowed.take(now):
+                due.append(address)
+                self._due.set(address, now + candidate.backoff.delay())
+            else:
+                self._due.set(address, now)
+                self._resume = self._allowed.next(now)
+        return due
+
+    def next_timer(self) -> float | None:
+        """When ``take_due`` has something to do."""
+        due = self._due.next()
+        return None if due is None else max(due, self._resume)

@@ -16,7 +16,7 @@ BEACON_MAX_BYTES: Final = 1200
 BEACON_ADDRESSES_MAX: Final = 8
 """Addresses that a beacon carries: a robot with more interfaces announces the first eight."""
 BEACON_GOSSIP_MAX: Final = 64
-"""Peers that one beacon passes on; more are passed on in turn."""
+"""Peers that one beacon gossips about; if there are more they take turns."""
 BURST_OFFSETS: Final = (0.0, 0.1, 0.3, 0.7)
 """When a starting peer announces itself: Wi-Fi loses multicast, one beacon is not enough."""
 HEARTBEAT_INTERVAL: Final = 5.0
@@ -43,43 +43,43 @@ HEARTBEAT_LATE: Final = 6.0
 """A peer not heard for a heartbeat and a second has missed one: it may be the dead one of two instances."""
 MULTICAST_SILENCE: Final = 11.0
 """A peer not heard by multicast for two heartbeats and a second gets its heartbeats by unicast."""
-ROSTER_LEASE_MIN: Final = 2.0
+LEASE_MIN: Final = 2.0
 """A peer that asks for less would come and go with every lost packet."""
-ROSTER_LEASE_MAX: Final = 120.0
-"""A peer that asks for more would haunt the roster."""
-SEAT_VOICES_MAX: Final = 4
-"""Instances remembered for one (address, port): the present one, the last one and two rivals."""
+LEASE_MAX: Final = 120.0
+"""A peer that asks for more would be shown for long after its end."""
+ENDPOINT_RUNS_MAX: Final = 4
+"""Runs remembered for one (address, port): the present one, the last one and two rivals."""
 ANSWER_ADDRESSES_MAX: Final = 1024
 """Addresses remembered for ``ANSWER_INTERVAL``; the oldest is forgotten first."""
 ANSWERS_PER_SECOND: Final = 500
 """Over all addresses: forged beacons must not turn a peer into an amplifier; a start of 100 peers stays below."""
-GREETINGS_MAX: Final = 256
-"""Addresses known only by hearsay; further ones wait until there is room."""
-GREETING_FIRST: Final = 0.5
-"""Before the second greeting to an address known by hearsay; then it doubles."""
-GREETING_MAX: Final = 10.0
-"""Between two greetings at the most."""
-GREETING_FORGET: Final = 20.0
-"""An address of which nobody spoke for this long (four heartbeats) is greeted no more."""
-SPREAD_INTERVAL: Final = 0.5
-"""News of found peers are gathered this long for those that hear no multicast; the first goes out at once."""
-GREETINGS_PER_SECOND: Final = 25.0
-"""Over all such addresses, beyond one for each: who is passed on may be invented."""
-WHISPERS_PER_SECOND: Final = 10.0
-"""Heartbeats by unicast to peers without a link, over all of them: each takes 0.2 ms, and of a roster full of
-invented peers each still gets one a minute."""
-WHISPERS_AT_ONCE: Final = 8
-"""Of these and of those to linked peers, some 0.1 ms each, before anything else has a turn."""
-ROSTER_EVICTIONS_PER_SECOND: Final = 10.0
-"""In a full roster, peers without a link that missed a heartbeat and give way to new ones."""
+CANDIDATES_MAX: Final = 256
+"""Addresses known only from gossip; further ones wait until there is room."""
+CANDIDATE_RETRY_FIRST: Final = 0.5
+"""Before the second announcement to an address known from gossip; then it doubles."""
+CANDIDATE_RETRY_MAX: Final = 10.0
+"""Longest time between two such announcements."""
+CANDIDATE_LIFETIME: Final = 20.0
+"""An address that no gossip had for this long (four heartbeats) is given up."""
+DISSEMINATION_INTERVAL: Final = 0.5
+"""News of found peers are gathered this long for peers that hear no multicast; the first goes out at once."""
+CANDIDATES_PER_SECOND: Final = 25.0
+"""Announcements over all such addresses, beyond one for each: gossiped peers may be forged."""
+UNICAST_HEARTBEATS_PER_SECOND: Final = 10.0
+"""Heartbeats by unicast to peers without a link, over all of them: each takes 0.2 ms, and with as many forged
+peers as are accepted each still gets one a minute."""
+UNICAST_HEARTBEATS_AT_ONCE: Final = 8
+"""Of these and of those to linked peers, some 0.1 ms each, in one run of the timer."""
+EVICTIONS_PER_SECOND: Final = 10.0
+"""When ``PEERS_MAX`` is reached: peers without a link that missed a heartbeat and are removed for new ones."""
 BEACONS_PER_WAKE: Final = 64
-"""Packets handled, 100 microseconds each with data between them, before the loop gets its turn again."""
+"""Packets handled in one callback, 100 microseconds each, with pending data between them."""
 BEACONS_PER_SOURCE: Final = 200
 """Packets a second from one address; a host with twenty agents that all start at once stays below."""
 BEACONS_UNLINKED_PER_SECOND: Final = 200.0
 """Beacons a second of peers that we have no link with, over all addresses, which can be forged: 5 % of a core."""
 BEACONS_UNLINKED_BURST: Final = 1000
-"""The same at once: a hundred peers that start together send 400 and answer each other."""
+"""Such beacons at once: a hundred peers that start together send 400 and answer each other."""
 BEACON_SOURCES_MAX: Final = 1024
 """Source addresses counted for that; the oldest is forgotten first."""
 BEACON_REPEATS: Final = 128

@@ -5,7 +5,7 @@ each runs this machine, and ``mesh.io.link`` joins them.
 
 ::
 
-    HANDSHAKING ──welcome sent or received──► UP ──bye sent──► CLOSING ──drained, 1 s──► CLOSED
+    HANDSHAKING ──welcome sent or received──► UP ──bye sent──► CLOSING ──TCP end, 1 s──► CLOSED
          ├─ refuse or bye sent: CLOSING         └─ bye received, lease over, protocol error: CLOSED
          └─ refused, time out, error: CLOSED
 
@@ -352,20 +352,15 @@ class ConnectionProtocol:
         return Frame(FrameKind.CONTROL, payload, stamp_ns=self._wall_ns()).serialize()
 
     def close(self, reason: str, now: float) -> None:
-        """Say bye; ``ConnectionClosed`` comes from ``drained`` or the timer. Without effect once closing."""
+        """Say bye; ``ConnectionClosed`` comes from ``lost`` or the timer. Without effect once closing."""
         if self._state in (ConnectionState.CLOSING, ConnectionState.CLOSED):
             return
         if self._state is ConnectionState.UP:
             self._send(Frame(FrameKind.BYE, frames.text_payload(reason), stamp_ns=self._wall_ns()))
         self._close(_Step.LEAVING, reason, now)
 
-    def drained(self) -> None:
-        """The driver has sent all that was to be sent; the end of ``CLOSING``."""
-        if self._state is ConnectionState.CLOSING:
-            self._end(self._reason, orderly=True)
-
     def lost(self, reason: str) -> None:
-        """The TCP connection is gone; without effect once closed."""
+        """The TCP connection is gone, which is the orderly end of ``CLOSING``; without effect once closed."""
         if self._state is not ConnectionState.CLOSED:
             self._end(self._reason or reason, orderly=self._state is ConnectionState.CLOSING)
 

@@ -307,7 +307,7 @@ class Peering:
         peer.last_error = reason
         if silent or now - link.since >= limits.LINK_STABLE:
             peer.backoff.reset()
-        if not peer.announced and len(self._peers) > core_limits.ROSTER_PEERS_MAX:
+        if not peer.announced and len(self._peers) > core_limits.PEERS_MAX:
             peer.gone = True  # forged identities must not fill the memory, nor cause dials
         if peer.gone:
             self._forget_if_idle(peer)

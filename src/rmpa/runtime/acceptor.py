@@ -1,7 +1,7 @@
 """Accepts the connections of a listening socket, for every server of this process.
 
-A listening socket stays readable as long as a connection waits. A server that cannot accept it for want of a file
-descriptor would be called again at once, for ever: here it stops reading, and looks again after a pause.
+A listening socket stays readable as long as a connection waits. A server without a file descriptor for it would be
+called again at once, for ever: an ``Acceptor`` stops reading then, and tries again after a pause.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _GONE: Final = frozenset(
         errno.EPROTO,
     }
 )
-"""What became of one connection that waited (accept(2)); the next one may be well."""
+"""Errors of one waiting connection (accept(2)); the next connection may be fine."""
 
 
 class Acceptor:
@@ -46,10 +46,10 @@ class Acceptor:
         sock: Bound and listening; closed by ``close()``.
         on_accept: ``(connection, address)``, called from the loop. The connection is non-blocking and belongs to the
             callee, unless the call raises.
-        name: Who listens, for messages: ``XML-RPC of /talker``.
-        use: What the connections are for: it says whether they may take the last descriptors.
-        at_once: Connections that are accepted before the loop does something else.
-        descriptors: Those of the process.
+        name: The server, for log messages: ``XML-RPC of /talker``.
+        use: The purpose of the connections, which decides whether they may take the last descriptors.
+        at_once: Connections that are accepted in one callback of the loop.
+        descriptors: The process's.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Acceptor:
 
     @property
     def address(self) -> Any:
-        """Where the socket listens, as ``getsockname`` says it."""
+        """The address that the socket listens at, as ``getsockname`` returns it."""
         return self._sock.getsockname()
 
     @property
@@ -85,14 +85,14 @@ class Acceptor:
         return self._timer is not None
 
     def start(self) -> None:
-        """Accept from now on."""
+        """Begin to accept."""
         self._timer = None
         if not self._listening and not self._closed:
             asyncio.get_running_loop().add_reader(self._sock.fileno(), self._acceptable)
             self._listening = True
 
     def close(self) -> None:
-        """Accept nothing more, and close the listening socket; twice does no harm."""
+        """Stop accepting, and close the listening socket; may be called twice."""
         self._stop()
         if self._timer is not None:
             self._timer.cancel()
@@ -129,7 +129,7 @@ class Acceptor:
                 raise
 
     def _has_room(self) -> bool:
-        """Whether a descriptor is free that these connections may take; a duplicate has the lowest free number."""
+        """Whether these connections may take the lowest free descriptor, which is the number of a duplicate."""
         try:
             lowest = os.dup(self._sock.fileno())
         except OSError:
@@ -138,7 +138,7 @@ class Acceptor:
         return self._descriptors.has_room(self._use, lowest)
 
     def _has_connection(self) -> bool:
-        """Whether one waits: without a free descriptor accept(2) fails even when none does."""
+        """Whether a connection waits: without a free descriptor accept(2) fails even when none does."""
         look = select.poll()
         look.register(self._sock.fileno(), select.POLLIN)
         return bool(look.poll(0))

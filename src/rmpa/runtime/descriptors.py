@@ -1,10 +1,10 @@
-"""The file descriptors of this process: who may take the last ones, and what is told when they run out.
+"""The file descriptors of this process: which uses may take the last ones, and how a shortage is reported.
 
-A process without a free descriptor can neither accept nor dial. What carries data stops early, so that the ROS core,
-the control socket and the links to peers still work: a user has to be able to ask what is wrong.
+A process without a free descriptor can neither accept nor dial. Connections for data are refused early, so that the
+ROS core, the control socket and the links to peers still work: a user must be able to ask what is wrong.
 
 No count is kept. The kernel gives each new descriptor the lowest free number (POSIX, open(2)): a number near the
-limit says that all below it are taken.
+limit means that all lower ones are taken.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 OUT_OF_DESCRIPTORS: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
-"""The errors of accept(2) and socket(2) that say: not now, for want of descriptors or memory."""
+"""Errors of accept(2) and socket(2) about a lack of descriptors or memory, which may pass."""
 
 
 class Use(enum.Enum):
-    """What a descriptor is for; the value says how many reserves it has to leave free."""
+    """The purpose of a descriptor; the value is the number of reserves that it must leave free."""
 
     PROXY = 2.0
-    """The listening sockets of what stands for a remote node: they leave room for those who connect to them."""
+    """Listening sockets of proxies of remote nodes: they leave room for the connections to them."""
     DATA = 1.0
-    """Connections of topics and services, and to the slave APIs of nodes: nothing of the reserve is for them."""
+    """Connections of topics and services, and to the slave APIs of nodes: they must leave the whole reserve."""
     CORE = 0.5
     """The ROS core's XML-RPC."""
     LINK = 0.0
@@ -52,15 +52,15 @@ class Use(enum.Enum):
 
 @dataclass(slots=True)
 class DescriptorShortage:
-    """A time without descriptors.
+    """A period in which descriptors were refused.
 
     Attributes:
-        last: When something was refused last, by the loop's clock.
-        began: When it began.
-        least: Of what was refused, the use with the least right; when it has room again the shortage is over.
-        most: The one with the greatest right.
-        problem: What happened and what to do, ready to read.
-        told: Whether the log says so.
+        last: When the last one was refused, by the loop's clock.
+        began: When the first one was refused.
+        least: The refused use that must leave the largest reserve; the shortage is over when it has room again.
+        most: The refused use that must leave the smallest reserve.
+        problem: What happened and what to do, as a text for the user.
+        told: Whether it was logged.
     """
 
     last: float
@@ -72,9 +72,7 @@ class DescriptorShortage:
 
 
 class Descriptors:
-    """The descriptors of one process, shared by all that accepts and dials.
-
-    Not thread-safe: for the loop's thread.
+    """The descriptors of one process, shared by all servers and clients. Not thread-safe: for the loop's thread.
 
     Attributes:
         counters: ``descriptors.refused.data`` (and ``.proxy``, ``.core``, ``.link``): attempts to accept or to dial
@@ -93,24 +91,24 @@ class Descriptors:
 
     @property
     def limit(self) -> int:
-        """How many this process may have: the soft limit, which may be changed while it runs (prlimit(1))."""
+        """The soft limit, which may be changed while the process runs (prlimit(1))."""
         soft = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         return sys.maxsize if soft == resource.RLIM_INFINITY else soft
 
     @property
     def hard_limit(self) -> int:
-        """What the soft limit may be raised to without further rights."""
+        """The highest soft limit that needs no privileges."""
         hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
         return sys.maxsize if hard == resource.RLIM_INFINITY else hard
 
     @property
     def reserve(self) -> int:
-        """How many of them are kept for the core and the links."""
+        """The number of descriptors that are kept for the core and the links."""
         return _reserve(self.limit)
 
     @property
     def open(self) -> int:
-        """How many are open, counted a moment ago."""
+        """The number of open descriptors, as of the last second or so."""
         now = time.monotonic()
         if now >= self._count_until:
             self._count = _count_open(self.limit)
@@ -120,18 +118,18 @@ class Descriptors:
 
     @property
     def shortage(self) -> DescriptorShortage | None:
-        """The one that is not over yet; none is left when the loop ends that looked after it."""
+        """The present shortage, or ``None``; it ends with the loop in which it began."""
         if self._loop is not None and self._loop.is_closed():
             self._loop = self._shortage = None
         return self._shortage
 
     @property
     def short(self) -> bool:
-        """Whether something was refused, and the shortage is not over yet."""
+        """Whether there is a shortage."""
         return self.shortage is not None
 
     def has_room(self, use: Use, fd: int) -> bool:
-        """Whether ``use`` may keep a descriptor whose number, the lowest that was free, is ``fd``."""
+        """Whether ``use`` may keep the descriptor ``fd``, whose number was the lowest free one."""
         soft = self.limit
         return fd < soft - int(_reserve(soft) * use.value)
 
@@ -147,7 +145,7 @@ class Descriptors:
         """A new socket, non-blocking, if there is a descriptor left for ``use``.
 
         Raises:
-            OSError: There is none (``EMFILE``), or the system says no; the refusal is counted and told.
+            OSError: There is none (``EMFILE``), or another error; a refusal is counted and logged.
         """
         try:
             sock = socket.socket(family, kind | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
@@ -167,8 +165,8 @@ class Descriptors:
 
         Args:
             use: What the descriptor was for.
-            what: Who wanted it, for the log: ``node /talker``.
-            error: What the system said; none where the reserve was spared.
+            what: What needed it, for the log: ``node /talker``.
+            error: The system's error; ``None`` where the reserve was left free.
         """
         self.counters.add(f"descriptors.refused.{use.name.lower()}")
         loop = asyncio.get_running_loop()
@@ -208,7 +206,7 @@ class Descriptors:
         return f"{text}; {remedy(os.getpid())}"
 
     def _look(self) -> None:
-        """End the shortage when nothing was refused for a while and there is room; look again otherwise."""
+        """End the shortage when nothing was refused for a while and there is room; else check again later."""
         self._loop = None
         loop = asyncio.get_running_loop()
         short = self.shortage
@@ -229,13 +227,13 @@ class Descriptors:
         except OSError:
             return False
 
-    # --- giving up what is idle -------------------------------------------------------------------------------
+    # --- closing idle connections -----------------------------------------------------------------------------
 
     def offer(self, owner: object, close_one: Callable[[], bool] | None) -> None:
         """Let ``close_one`` be called when descriptors run out: it closes an idle connection, if ``owner`` has one.
 
         Args:
-            owner: Who offers; a later offer of the same one takes the place of the first.
+            owner: Identifies the offer; a later one of the same owner replaces it.
             close_one: Returns whether it closed one; ``None`` withdraws the offer.
         """
         if close_one is None:
@@ -244,9 +242,9 @@ class Descriptors:
             self._idle[owner] = close_one
 
     def make_room(self) -> bool:
-        """Close one connection that is idle, and return whether there was one.
+        """Close one idle connection, and return whether there was one.
 
-        Its descriptor is free in the loop's next round.
+        Its descriptor is free in the loop's next iteration.
         """
         for close_one in self._idle.values():
             if close_one():
@@ -256,7 +254,7 @@ class Descriptors:
 
 
 def is_shortage(error: BaseException | None) -> bool:
-    """Whether an error, or what caused it, says that no descriptor was left."""
+    """Whether an error, or its cause, is a lack of descriptors."""
     if error is None or isinstance(error, OutOfDescriptors):
         return error is not None
     return (isinstance(error, OSError) and error.errno in OUT_OF_DESCRIPTORS) or is_shortage(error.__cause__)
@@ -282,7 +280,7 @@ def _reserve(soft: int) -> int:
 
 
 def raise_file_limit() -> int:
-    """Raise the soft limit of open files to the hard one, or ``limits.OPEN_FILES``; return how many that are."""
+    """Raise the soft limit of open files to the hard one, or ``limits.OPEN_FILES``; return the new limit."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = limits.OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, limits.OPEN_FILES)
     if soft == resource.RLIM_INFINITY or soft >= wanted:
@@ -294,4 +292,4 @@ def raise_file_limit() -> int:
 
 
 DESCRIPTORS: Final = Descriptors()
-"""Those of this process."""
+"""The descriptors of this process."""

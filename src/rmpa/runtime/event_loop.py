@@ -1,15 +1,14 @@
-"""The event loop of an agent: asyncio's, with a short way for the sockets of the data path.
+"""The event loop of an agent: asyncio's, with direct callbacks for the sockets of the data path.
 
-asyncio takes an event from the selector, finds its handle, queues it, looks at its timers, and runs the handle in
-its context. For a message that is to be handed on at once this is a fifth of what the interpreter does. Here the
-selector itself calls the readers (and writers) of the data path as soon as ``epoll`` names them, and reports
-everything else to asyncio as usual.
+asyncio takes an event from the selector, finds its handle, queues it, checks its timers, and runs the handle in its
+context. For a message that is handed on at once this is a fifth of the interpreter's work. Here the selector itself
+calls the readers and writers of the data path as soon as ``epoll`` reports them (*direct* readers and writers), and
+returns all other events to asyncio as usual.
 
-Data also goes before control work that has begun: the loop looks at the data path's sockets before each ordinary
-callback, and work that takes long calls ``yield_to_data()`` between its slices. A look costs a quarter of a
-microsecond.
-What such a reader calls may therefore run in the middle of whatever breathes: at a breath nothing may be half done.
-docs/design/isolation.md says what was measured.
+Data also goes before control work that has begun: the loop polls the data path's sockets before each ordinary
+callback, and long work calls ``yield_to_data()`` between its slices. A poll costs a quarter of a microsecond.
+So a direct reader, and what it calls, may run in the middle of any code that yields: where code yields, its data must
+be consistent. docs/design/isolation.md has the measurements.
 """
 
 from __future__ import annotations
@@ -34,17 +33,17 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _EPOLL_RESOLUTION: Final = 1e-3
-_LOOK: Final = 64
-_BREATHS: Final = 8
-"""Breaths for one chore: a look at a counter is cheap, and yet not for each callback."""
-_ITEMS: Final = 64
-"""Steps of some work between two breaths, of a microsecond or less each."""
-_RUN: Final = 256
-"""Items that are sorted at once, some 50 microseconds."""
+_MAX_EVENTS: Final = 64
+_YIELDS_PER_HOOK: Final = 8
+"""Yields for one call of the hook: it is cheap, but too expensive for each callback."""
+_ITEMS_PER_YIELD: Final = 64
+"""Steps of long work between two yields, of a microsecond or less each."""
+_SORTED_RUN: Final = 256
+"""Items that are sorted without a yield, some 50 microseconds."""
 _T = TypeVar("_T")
 _Ts = TypeVarTuple("_Ts")
-_READ: Final = ~select.EPOLLOUT
-_WRITE: Final = ~select.EPOLLIN
+_NOT_WRITABLE: Final = ~select.EPOLLOUT
+_NOT_READABLE: Final = ~select.EPOLLIN
 
 
 class DirectSelector(selectors.BaseSelector):
@@ -52,36 +51,36 @@ class DirectSelector(selectors.BaseSelector):
 
     def __init__(self) -> None:
         self._epoll = select.epoll()
-        # The direct ones once more, so that a look at them alone costs the same however many others there are.
+        # The direct descriptors once more, so that polling them costs the same however many others there are.
         self._data = select.epoll()
-        self._look = self._data.poll
+        self._poll_direct = self._data.poll
         self._keys: dict[int, selectors.SelectorKey] = {}
         self._readers: dict[int, Callable[[], None]] = {}
         self._writers: dict[int, Callable[[], None]] = {}
-        self.calling = False
-        """Whether a direct reader or writer is at work."""
-        self.woke = self.woke_before = time.monotonic()
+        self.in_direct_call = False
+        """Whether a direct reader or writer is running."""
+        self.polled_at = self.previous_poll_at = time.monotonic()
 
     def call_directly(self, fd: int, reader: Callable[[], None] | None) -> None:
-        """Call ``reader`` when ``fd``, which is registered for reading, is readable; ``None``: as usual again."""
+        """Call ``reader`` when ``fd`` (registered for reading) is readable; ``None``: report it to asyncio."""
         if reader is None:
-            self._forget(fd)
+            self._remove_direct(fd)
             return
         if fd not in self._readers:
             self._data.register(fd, _epoll_events(self._keys[fd].events))
         self._readers[fd] = reader
 
     def write_directly(self, fd: int, writer: Callable[[], None] | None) -> None:
-        """Likewise when it is writable, as long as it has a direct reader too."""
+        """Call ``writer`` when ``fd`` is writable, as long as it has a direct reader too; ``None``: as above."""
         if writer is not None and fd in self._readers:
             self._writers[fd] = writer
         else:
             self._writers.pop(fd, None)
 
     def poll_data(self) -> None:
-        """Call the direct readers and writers that are ready now; does nothing when called by one of them."""
-        if not self.calling and (happened := self._look(0, _LOOK)):
-            self._call(happened)
+        """Call the direct readers and writers that are ready now; no effect from within one of them."""
+        if not self.in_direct_call and (events := self._poll_direct(0, _MAX_EVENTS)):
+            self._call(events)
 
     def register(
         self,
@@ -89,10 +88,10 @@ class DirectSelector(selectors.BaseSelector):
         events: int,
         data: Any = None,
     ) -> selectors.SelectorKey:
-        """Follow a file object.
+        """Watch a file object.
 
         Raises:
-            KeyError: It is followed already.
+            KeyError: It is watched already.
         """
         fd = _fd(fileobj)
         if fd in self._keys:
@@ -102,13 +101,13 @@ class DirectSelector(selectors.BaseSelector):
         return key
 
     def unregister(self, fileobj: FileDescriptorLike) -> selectors.SelectorKey:
-        """Follow a file object no longer.
+        """Stop watching a file object.
 
         Raises:
-            KeyError: It is not followed.
+            KeyError: It is not watched.
         """
         key = self._keys.pop(_fd(fileobj))
-        self._forget(key.fd)
+        self._remove_direct(key.fd)
         try:
             self._epoll.unregister(key.fd)
         except OSError:
@@ -121,54 +120,54 @@ class DirectSelector(selectors.BaseSelector):
         events: int,
         data: Any = None,
     ) -> selectors.SelectorKey:
-        """Follow a file object for other events.
+        """Watch a file object for other events.
 
         Raises:
-            KeyError: It is not followed.
+            KeyError: It is not watched.
         """
         key = self._keys[_fd(fileobj)]
         if events != key.events:
             self._epoll.modify(key.fd, _epoll_events(events))
             if not events & selectors.EVENT_READ:
-                self._forget(key.fd)
+                self._remove_direct(key.fd)
             elif key.fd in self._readers:
                 self._data.modify(key.fd, _epoll_events(events))
         key = self._keys[key.fd] = selectors.SelectorKey(fileobj, key.fd, events, data)
         return key
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        """Wait; call the direct readers and writers that are ready, and return the rest."""
+        """Wait; call the direct readers and writers that are ready, and return the other events."""
         if timeout is None:
             wait = -1.0
         elif timeout <= 0:
             wait = 0.0
         else:
-            # Rounded up, as asyncio's own does: a timer must not find itself early and spin.
+            # Rounded up, as asyncio's own selector does: else a timer would be early, and the loop would spin.
             wait = math.ceil(timeout / _EPOLL_RESOLUTION) * _EPOLL_RESOLUTION
         try:
             happened = self._epoll.poll(wait, max(len(self._keys), 1))
         except InterruptedError:
             return []
-        self.woke_before, self.woke = self.woke, time.monotonic()
+        self.previous_poll_at, self.polled_at = self.polled_at, time.monotonic()
         ready = []
         for fd, event in self._call(happened):
             key = self._keys.get(fd)
             if key is not None:
-                events = (selectors.EVENT_WRITE if event & _WRITE else 0) | (
-                    selectors.EVENT_READ if event & _READ else 0
+                events = (selectors.EVENT_WRITE if event & _NOT_READABLE else 0) | (
+                    selectors.EVENT_READ if event & _NOT_WRITABLE else 0
                 )
                 ready.append((key, events & key.events))
         return ready
 
-    def _call(self, happened: list[tuple[int, int]]) -> list[tuple[int, int]]:
-        """Call those that are direct; return what is left for asyncio."""
+    def _call(self, events: list[tuple[int, int]]) -> list[tuple[int, int]]:
+        """Call the direct readers and writers; return the events that are left for asyncio."""
         rest = []
-        self.calling = True
+        self.in_direct_call = True
         try:
-            for fd, event in happened:
-                if (reader := self._readers.get(fd)) is not None and event & _READ:
+            for fd, event in events:
+                if (reader := self._readers.get(fd)) is not None and event & _NOT_WRITABLE:
                     reader()
-                    event &= select.EPOLLOUT  # noqa: PLW2901 - what is left of it
+                    event &= select.EPOLLOUT  # noqa: PLW2901 - the rest of it
                     if not event:
                         continue
                 if (writer := self._writers.get(fd)) is not None and event & select.EPOLLOUT:
@@ -176,29 +175,29 @@ class DirectSelector(selectors.BaseSelector):
                     continue
                 rest.append((fd, event))
         finally:
-            self.calling = False
+            self.in_direct_call = False
         return rest
 
-    def _forget(self, fd: int) -> None:
+    def _remove_direct(self, fd: int) -> None:
         self._writers.pop(fd, None)
         if self._readers.pop(fd, None) is not None:
             with contextlib.suppress(OSError):  # closed before
                 self._data.unregister(fd)
 
     def get_map(self) -> Mapping[FileDescriptorLike, selectors.SelectorKey]:
-        """What is followed, by file descriptor."""
+        """The keys of all watched file objects, by file descriptor."""
         return cast("Mapping[FileDescriptorLike, selectors.SelectorKey]", self._keys)
 
     def get_key(self, fileobj: FileDescriptorLike) -> selectors.SelectorKey:
         """The key of a file object.
 
         Raises:
-            KeyError: It is not followed.
+            KeyError: It is not watched.
         """
         return self._keys[_fd(fileobj)]
 
     def close(self) -> None:
-        """Follow nothing any more."""
+        """Stop watching everything."""
         self._epoll.close()
         self._data.close()
         self._keys.clear()
@@ -207,58 +206,58 @@ class DirectSelector(selectors.BaseSelector):
 
 
 class AgentLoop(asyncio.SelectorEventLoop):
-    """asyncio's selector loop with ``add_direct_reader``; data goes before every ordinary callback."""
+    """asyncio's selector loop with ``add_direct_reader``; pending data is handled before every ordinary callback."""
 
     def __init__(self) -> None:
         self._direct_selector = DirectSelector()
         super().__init__(self._direct_selector)
         self._poll_data = self._direct_selector.poll_data
-        self._chore: Callable[[], None] | None = None
-        self._breaths = 0
-        # asyncio takes each callback of a round from here, and from nowhere else.
-        self._ready: deque[asyncio.Handle] = _Turnstile(self.breathe)
+        self._yield_hook: Callable[[], None] | None = None
+        self._yields = 0
+        # asyncio takes each ready callback from this queue, and only from it.
+        self._ready: deque[asyncio.Handle] = _ReadyQueue(self.yield_to_data)
 
     @property
-    def looked_before(self) -> float:
-        """When the sockets were last looked at before what is being read now came, in monotonic seconds.
+    def previous_poll_at(self) -> float:
+        """When the selector was polled before the poll that brought the present events, in monotonic seconds.
 
-        What was not there then came later: so long, and no longer, this process may have let it wait.
+        Data that was not there then has waited in this process since then at the longest.
         """
-        return self._direct_selector.woke_before
+        return self._direct_selector.previous_poll_at
 
-    def breathe(self) -> None:
-        """Let data that has arrived be handled now; code without a loop at hand calls ``yield_to_data``."""
+    def yield_to_data(self) -> None:
+        """Handle data that has arrived, now. Code that has no loop calls the function ``yield_to_data``."""
         self._poll_data()
-        if self._chore is not None and not self._direct_selector.calling:
-            self._breaths += 1
-            if self._breaths >= _BREATHS:
-                self._breaths = 0
-                self._chore()
+        if self._yield_hook is not None and not self._direct_selector.in_direct_call:
+            self._yields += 1
+            if self._yields >= _YIELDS_PER_HOOK:
+                self._yields = 0
+                self._yield_hook()
 
-    def between(self, chore: Callable[[], None] | None) -> None:
-        """Call ``chore`` at every few breaths, or nothing any more; it takes microseconds where it has nothing to do.
+    def set_yield_hook(self, hook: Callable[[], None] | None) -> None:
+        """Call ``hook`` at every few yields; ``None``: no longer. Without work to do it must return in microseconds.
 
-        For what control work must not put off until it ends, and data need not wait for.
+        For work that cannot wait until long control work ends, but that data need not wait for.
         """
-        self._chore = chore
+        self._yield_hook = hook
 
     def add_direct_reader(self, fd: int, callback: Callable[[], None]) -> None:
-        """Like ``add_reader``, on the short way; ``remove_reader`` ends it.
+        """Like ``add_reader``, but called by the selector itself; ``remove_reader`` ends it.
 
-        ``callback`` must be quick. It is called between the slices of any other work: see the module's text. What it
-        raises goes to the loop's exception handler. A writer that is added afterwards is called in the same way.
+        ``callback`` must be quick. It may run in the middle of any work that yields: see the module's docstring. Its
+        exceptions go to the loop's exception handler. A writer that is added afterwards is called in the same way.
         """
         self.add_reader(fd, callback)
         self._direct_selector.call_directly(fd, self._guarded(fd, "reader", callback))
 
     def add_writer(self, fd: FileDescriptorLike, callback: Callable[[*_Ts], Any], *args: *_Ts) -> None:
-        """As asyncio's; on the short way where ``fd`` has a direct reader."""
+        """Like asyncio's, but the selector itself calls the writer where ``fd`` has a direct reader."""
         super().add_writer(fd, callback, *args)
         number = _fd(fd)
         self._direct_selector.write_directly(number, self._guarded(number, "writer", lambda: callback(*args)))
 
     def remove_writer(self, fd: FileDescriptorLike) -> bool:
-        """As asyncio's."""
+        """Stop watching for writing, as in asyncio."""
         self._direct_selector.write_directly(_fd(fd), None)
         return super().remove_writer(fd)
 
@@ -273,43 +272,43 @@ class AgentLoop(asyncio.SelectorEventLoop):
 
 
 def yield_to_data() -> None:
-    """Between two slices of long work in a loop: let data that has come go first.
+    """Handle data that has arrived, now: for code on the event loop's thread, between two slices of long work.
 
-    Nothing happens on other loops than ``AgentLoop``, nor outside of one.
+    No effect on other loops than ``AgentLoop``, or without a running loop.
     """
     loop = asyncio._get_running_loop()  # noqa: SLF001 - the public one raises where there is none
     if isinstance(loop, AgentLoop):
-        loop.breathe()
+        loop.yield_to_data()
 
 
-def yielding_to_data(items: Iterable[_T], /, every: int = _ITEMS) -> Iterator[_T]:
-    """Pass on items one after the other, and breathe at each one out of ``every`` (``core.yielding.Breathing``)."""
+def yielding_to_data(items: Iterable[_T], /, every: int = _ITEMS_PER_YIELD) -> Iterator[_T]:
+    """The same items; data is handled before each one out of ``every`` (a ``core.yielding.Yielder``)."""
     for number, item in enumerate(items):
         if number % every == 0:
             yield_to_data()
         yield item
 
 
-def breathing_sorted(items: Iterable[str]) -> Iterator[str]:
-    """The same as ``sorted`` would give, without its milliseconds for thousands."""
+def sorted_yielding(items: Iterable[str]) -> Iterator[str]:
+    """The items as ``sorted`` gives them; data is handled in between, for thousands take milliseconds."""
     rest = iter(items)
     runs = []
-    while run := sorted(islice(rest, _RUN)):
+    while run := sorted(islice(rest, _SORTED_RUN)):
         runs.append(run)
         yield_to_data()
     return heapq.merge(*runs)
 
 
-class _Turnstile(deque[asyncio.Handle]):
-    """The callbacks that are ready; data goes before each of them."""
+class _ReadyQueue(deque[asyncio.Handle]):
+    """asyncio's ready callbacks; data is handled before each of them."""
 
-    def __init__(self, breathe: Callable[[], None]) -> None:
+    def __init__(self, yield_to_data: Callable[[], None]) -> None:
         super().__init__()
-        self._breathe = breathe
+        self._yield_to_data = yield_to_data
 
     def popleft(self) -> asyncio.Handle:
-        """The next one to run."""
-        self._breathe()
+        """The next callback to run."""
+        self._yield_to_data()
         return super().popleft()
 
 

@@ -1,16 +1,17 @@
-"""When cyclic garbage is collected: between messages and in small portions, never by the interpreter's own clock.
+"""Runs Python's cyclic garbage collector between messages and in small portions, instead of the interpreter.
 
-The interpreter collects where an allocation tips its balance: in the middle of a burst of messages, and once in a
-while over everything that lives. Here it is off from the end of the start on. What lives then is frozen. The data
-path makes no cycles, so in steady state nothing is ever collected. Control work does (each closed connection of
-asyncio is one), so a timer looks how many objects came to stay, and collects the young ones of them. Garbage of
-closed connections takes 0.3 µs an object, so that the pause is one of a tenth of a millisecond. To wait for a loop
-that rests was worse: what 1000 XML-RPC calls a second had gathered until then held it for 6 ms. Nor may much work
-wait for the timer: what a thousand topics that register at once leave in 20 ms took 10 ms, so work that breathes is
-looked at in its midst too.
+The interpreter collects when allocations exceed a threshold: in the middle of a burst of messages, and sometimes
+over all objects. Here automatic collection is off once the agent has started, and the objects of the start are frozen
+(``gc.freeze``). The data path makes no cycles, so in steady state nothing needs collecting. Control work does: each
+closed asyncio connection is a cycle. So a timer checks how many objects survived, and collects the young ones. At
+0.3 µs an object a pause is some 0.1 ms.
 
-What grew old before it became garbage is found by full collections only, which look at all that was made since the
-start. They wait until no data flows, for as long as the heap's growth allows.
+Two things were measured and rejected. Waiting until the loop is idle: 1000 XML-RPC calls a second left garbage for
+a pause of 6 ms. The timer alone: a thousand topics that register at once leave garbage for 10 ms within 20 ms, so the
+check also runs during work, at its yields.
+
+Objects that became garbage only when they were old are found by full collections, which scan all objects made since
+the start. They wait until no data flows, for as long as the growth of the heap allows.
 """
 
 from __future__ import annotations
@@ -34,114 +35,114 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
-class Due(Enum):
-    """What a look at the heap asks for."""
+class Collection(Enum):
+    """Which generations to collect."""
 
     NOTHING = auto()
     YOUNG = auto()
     FULL = auto()
 
 
-def what_is_due(young: int, grown: int, *, quiet: bool) -> Due:
-    """Decide.
+def choose_collection(young: int, grown: int, *, quiet: bool) -> Collection:
+    """Choose the collection that is due.
 
     Args:
-        young: Objects made since the last collection, less those that are gone: no more of them can be garbage. The
-            least of the last two looks: messages on their way are objects too, but soon gone.
+        young: Objects made and not freed since the last collection, which bounds the garbage among them. The smaller
+            number of the last two checks: messages that pass are objects too, but are soon freed.
         grown: Memory blocks by which the heap has grown since the last full collection.
-        quiet: Whether the links carried next to nothing since the last look.
+        quiet: Whether the links carried next to nothing since the last check.
     """
     if grown >= limits.COLLECT_GROWTH_MAX or (quiet and grown >= limits.COLLECT_GROWTH):
-        return Due.FULL
-    return Due.YOUNG if young >= limits.COLLECT_YOUNG else Due.NOTHING
+        return Collection.FULL
+    return Collection.YOUNG if young >= limits.COLLECT_YOUNG else Collection.NOTHING
 
 
 class GarbageCollector:
-    """Takes the interpreter's collector over, from ``start`` to ``close``.
+    """Replaces automatic garbage collection, from ``start`` to ``close``.
 
     Args:
-        carried: Bytes that the links have carried so far, in and out; less than before if one of them fell.
+        traffic: Returns the bytes that all links have carried, in and out; it shrinks when a link falls.
         counters: Gets ``collector.young`` and ``collector.full``.
     """
 
-    def __init__(self, carried: Callable[[], int], counters: Counters) -> None:
-        self._carried = carried
+    def __init__(self, traffic: Callable[[], int], counters: Counters) -> None:
+        self._traffic = traffic
         self._counters = counters
         self._timer: asyncio.TimerHandle | None = None
         self._enabled = False
-        self._heap = 0
+        self._heap_blocks = 0
         self._young = 0
-        self._seen = (0.0, 0)
+        self._last_check = (0.0, 0)
         self.longest_pause = 0.0
         """Seconds of the longest collection so far."""
 
     def start(self) -> None:
-        """Freeze what lives, and look from now on.
+        """Turn automatic collection off, freeze all objects, and check regularly from now on.
 
-        Nothing is collected first: that would cost 20 ms of the start and find next to nothing.
+        Nothing is collected first: that would take 20 ms of the start and find next to nothing.
         """
         self._enabled = gc.isenabled()
         gc.disable()
         gc.freeze()
-        self._heap = sys.getallocatedblocks()
-        self._seen = self._now()
+        self._heap_blocks = sys.getallocatedblocks()
+        self._last_check = self._now()
         self._loop = asyncio.get_running_loop()
         if isinstance(self._loop, AgentLoop):
-            self._loop.between(self._glance)
-        self._next(limits.COLLECT_LOOK)
+            self._loop.set_yield_hook(self._check_during_work)
+        self._schedule(limits.COLLECT_LOOK)
 
     def close(self) -> None:
-        """Leave it to the interpreter again, if it was before."""
+        """Turn automatic collection on again, if it was on before."""
         if self._timer is None:
             return
         self._timer.cancel()
         self._timer = None
         if isinstance(self._loop, AgentLoop):
-            self._loop.between(None)
+            self._loop.set_yield_hook(None)
         gc.unfreeze()
         if self._enabled:
             gc.enable()
 
-    def _next(self, delay: float) -> None:
-        self._timer = self._loop.call_later(delay, self._look)
+    def _schedule(self, delay: float) -> None:
+        self._timer = self._loop.call_later(delay, self._check)
 
     def _now(self) -> tuple[float, int]:
-        return time.monotonic(), self._carried()
+        return time.monotonic(), self._traffic()
 
-    def _look(self) -> None:
-        # The loop has served all that was ready before it called us, so nothing waits for what follows.
-        then, carried = self._seen
-        now, carries = self._seen = self._now()
+    def _check(self) -> None:
+        # The loop has handled all that was ready before it called this timer, so nothing waits for the collection.
+        checked_at, traffic = self._last_check
+        now, traffic_now = self._last_check = self._now()
         before, self._young = self._young, gc.get_count()[0]
-        due = what_is_due(
+        collection = choose_collection(
             min(before, self._young),
-            sys.getallocatedblocks() - self._heap,
-            quiet=0 <= carries - carried < limits.COLLECT_QUIET_BYTES * (now - then),
+            sys.getallocatedblocks() - self._heap_blocks,
+            quiet=0 <= traffic_now - traffic < limits.COLLECT_QUIET_BYTES * (now - checked_at),
         )
-        if due is not Due.NOTHING:
-            self._collect(due)
-        self._next(limits.COLLECT_LOOK if self._young < limits.COLLECT_YOUNG else limits.COLLECT_LOOK_AGAIN)
+        if collection is not Collection.NOTHING:
+            self._collect(collection)
+        self._schedule(limits.COLLECT_LOOK if self._young < limits.COLLECT_YOUNG else limits.COLLECT_LOOK_AGAIN)
 
-    def _glance(self) -> None:
-        """In the middle of work."""
+    def _check_during_work(self) -> None:
+        """Collect in the middle of long work, if it has made many objects."""
         if gc.get_count()[0] >= limits.COLLECT_BURST:
-            self._collect(Due.YOUNG)
+            self._collect(Collection.YOUNG)
 
-    def _collect(self, due: Due) -> None:
+    def _collect(self, collection: Collection) -> None:
         begin = time.perf_counter()
-        found = gc.collect(0 if due is Due.YOUNG else 2)
+        found = gc.collect(0 if collection is Collection.YOUNG else 2)
         pause = time.perf_counter() - begin
         self.longest_pause = max(self.longest_pause, pause)
-        if due is Due.YOUNG:
+        if collection is Collection.YOUNG:
             self._counters.add("collector.young")
             _log.debug("= collected %d young objects in %.3f ms", found, pause * 1e3)
             return
         self._counters.add("collector.full")
-        before, self._heap = self._heap, sys.getallocatedblocks()
+        before, self._heap_blocks = self._heap_blocks, sys.getallocatedblocks()
         _log.info(
             "= collected %d objects of all ages in %.1f ms; the heap has %d blocks, %+d since the last time",
             found,
             pause * 1e3,
-            self._heap,
-            self._heap - before,
+            self._heap_blocks,
+            self._heap_blocks - before,
         )

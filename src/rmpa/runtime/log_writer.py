@@ -1,4 +1,4 @@
-"""Where an agent's log lines go: to a thread, so that whoever does not read them holds up nobody but the log."""
+"""Writes an agent's log lines in a thread, so that a reader that stops does not block the agent."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ _log = logging.getLogger(__name__)
 class LogWriter:
     """The text stream of a log handler.
 
-    A pipe that nobody reads (a stopped pager, a hanging journal) blocks who writes to it. What then waits is bounded;
-    the newest lines are lost, and their number is said when the reader goes on.
+    A pipe that is not read (a stopped pager, a hanging journal) blocks its writer. The queue of lines is bounded: the
+    newest lines are lost, and their number is logged when the reader goes on.
 
     Args:
-        fd: Where the lines go; not closed here.
+        fd: The file descriptor for the lines; not closed here.
     """
 
     def __init__(self, fd: int) -> None:
         self._fd = fd
         self._waiting: deque[str] = deque()
-        self._news = threading.Event()
+        self._wake = threading.Event()
         self._closed = False
         self.lost = 0
-        """Lines that were lost and not yet said to be."""
+        """Lines that were lost and are not reported yet."""
         self._thread = threading.Thread(target=self._work, name="log", daemon=True)
         self._thread.start()
 
@@ -39,7 +39,7 @@ class LogWriter:
             self.lost += 1
         else:
             self._waiting.append(text)
-            self._news.set()
+            self._wake.set()
         return len(text)
 
     def flush(self) -> None:
@@ -48,15 +48,15 @@ class LogWriter:
     def close(self) -> None:
         """Wait until all is written, but no longer than ``limits.DRAIN_TIMEOUT``."""
         self._closed = True
-        self._news.set()
+        self._wake.set()
         self._thread.join(limits.DRAIN_TIMEOUT)
 
     def _work(self) -> None:
         while not self._closed or self._waiting:
-            self._news.wait()
+            self._wake.wait()
             if not self._closed:
                 time.sleep(limits.LOG_GATHER)  # one call for the lines of a burst
-            self._news.clear()
+            self._wake.clear()
             while self._waiting:
                 self._write()
             if self.lost:
@@ -70,6 +70,6 @@ class LogWriter:
             try:
                 rest = rest[os.write(self._fd, rest) :]
             except BlockingIOError:
-                time.sleep(limits.LOG_GATHER)  # somebody made it non-blocking
+                time.sleep(limits.LOG_GATHER)  # another process has made the pipe non-blocking
             except OSError:
-                return  # nobody will ever read it
+                return  # the pipe is closed

@@ -75,4 +75,4 @@ def _never() -> float | None:
 
 
 def _nothing(_now: float) -> None:
-    """What a timer that is closed does."""
+    """The ``on_due`` of a timer that is closed."""

@@ -1,12 +1,12 @@
-"""``--realtime``: what the agent asks the kernel for, and what to do about each wish that it does not get.
+"""``--realtime``: requests real-time scheduling and locked memory from the kernel, with a remedy for each refusal.
 
-The loop's thread gets SCHED_FIFO, the threads that it hands work to one priority less. They must not stay behind:
-whoever holds the interpreter's lock while a busy process keeps it from the CPU holds the loop up with it (measured
-beside two of those: 4 ms late at p99, and 0.2 ms with their own real-time priority). SCHED_RESET_ON_FORK keeps all
+The loop's thread gets SCHED_FIFO, worker threads one priority less. With the usual scheduling a worker thread that
+holds the interpreter's lock could be kept from the CPU by a busy process, and the loop would wait with it (measured
+beside two such processes: 4 ms late at p99, and 0.2 ms with a real-time priority). SCHED_RESET_ON_FORK keeps all
 other threads and every child process at the usual scheduling.
 
-All that is mapped at the start is read in and locked; what comes later is locked page by page as it is used
-(MCL_ONFAULT): without that, each thread's stack and heap would be filled with zeros, 10 MB apiece.
+Memory that is mapped at the start is read in and locked; later mappings are locked page by page as they are used
+(MCL_ONFAULT): otherwise each thread's stack and heap would be filled with zeros, 10 MB apiece.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ _RT_RUNTIME: Final = Path("/proc/sys/kernel/sched_rt_runtime_us")
 
 @dataclass(frozen=True, slots=True)
 class SchedulingRequest:
-    """One thing that was asked of the kernel.
+    """One request to the kernel, and its outcome.
 
     Args:
-        name: What, in a word or two.
-        granted: Whether we have it.
-        text: How much of it we have; or why we have it not.
-        remedy: What would grant it, or all of it, ready to read.
+        name: What was requested, in a word or two.
+        granted: Whether it was granted, at least in part.
+        text: How much was granted, or why it was refused.
+        remedy: What would grant (all of) it, as a text for the user; may be empty.
     """
 
     name: str
@@ -70,51 +70,51 @@ class SchedulingRequest:
 
 
 def apply(settings: RealtimeSettings) -> tuple[SchedulingRequest, ...]:
-    """Ask for everything that the settings wish, for the calling thread and the process; never fail.
+    """Request everything that the settings ask for, for the calling thread and the process; never raises.
 
-    What came of each wish is logged: at INFO if it was granted, else at WARNING with what would grant it. Call it
-    from the thread of the loop, before there are others: those inherit its CPUs.
+    Each outcome is logged: at INFO if granted, else at WARNING with what would grant it. To be called from the
+    loop's thread, before there are others: those inherit its CPU affinity.
 
     Returns:
-        One outcome a wish, none where real time is not enabled.
+        The outcomes; empty where real time is not enabled.
     """
     if not settings.enabled:
         return ()
-    wishes = [_schedule(settings.priority), _timer_slack()]
+    requests = [_schedule(settings.priority), _timer_slack()]
     if settings.lock_memory:
-        wishes.append(_lock_memory())
+        requests.append(_lock_memory())
     if settings.cpus:
-        wishes.append(_pin(settings.cpus))
+        requests.append(_pin(settings.cpus))
     if settings.keep_awake:
-        wishes.append(_keep_awake())
-    for wish in wishes:
-        level, mark = (logging.INFO, "=") if wish.granted else (logging.WARNING, "!")
-        remedy = f". For more: {wish.remedy}" if wish.granted else f". To have it: {wish.remedy}"
-        _log.log(level, "%s realtime: %s%s", mark, wish, remedy if wish.remedy else "")
-    return tuple(wishes)
+        requests.append(_keep_awake())
+    for request in requests:
+        level, mark = (logging.INFO, "=") if request.granted else (logging.WARNING, "!")
+        remedy = f". For more: {request.remedy}" if request.granted else f". To have it: {request.remedy}"
+        _log.log(level, "%s realtime: %s%s", mark, request, remedy if request.remedy else "")
+    return tuple(requests)
 
 
-def refused(wishes: Iterable[SchedulingRequest]) -> str:
+def refused(requests: Iterable[SchedulingRequest]) -> str:
     """One sentence about what was not granted, or an empty string."""
-    names = [wish.name for wish in wishes if not wish.granted]
+    names = [request.name for request in requests if not request.granted]
     return f"realtime: no {', no '.join(names)}; the agent's log says what would grant it" if names else ""
 
 
 def worker_pool() -> ThreadPoolExecutor:
-    """Threads for what must not hold the loop up, as urgent as the calling thread less one.
+    """Threads for blocking work, with one real-time priority less than the calling thread.
 
-    A thread that cannot be has the usual scheduling.
+    If that is refused, a thread has the usual scheduling.
     """
     policy = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
     if policy != os.SCHED_FIFO:
         return ThreadPoolExecutor(thread_name_prefix="worker")
     priority = max(1, os.sched_getparam(0).sched_priority - 1)
 
-    def join() -> None:
+    def initialize() -> None:
         with contextlib.suppress(OSError):
             _to_fifo(priority)
 
-    return ThreadPoolExecutor(thread_name_prefix="worker", initializer=join)
+    return ThreadPoolExecutor(thread_name_prefix="worker", initializer=initialize)
 
 
 # --- scheduling ------------------------------------------------------------------------------------------------
@@ -139,7 +139,7 @@ def _schedule(priority: int) -> SchedulingRequest:
 
 
 def _schedule_lower(name: str, priority: int, error: OSError) -> SchedulingRequest:
-    """Take what RLIMIT_RTPRIO allows, if that is anything."""
+    """Take the priority that RLIMIT_RTPRIO allows, if it allows any."""
     _, allowed = resource.getrlimit(resource.RLIMIT_RTPRIO)
     lower = priority if allowed == resource.RLIM_INFINITY else min(allowed, priority)
     if lower > 0:
@@ -157,7 +157,7 @@ def _schedule_lower(name: str, priority: int, error: OSError) -> SchedulingReque
 
 
 def _forbidden(name: str, error: OSError) -> SchedulingRequest:
-    """Explain a refusal to one who has the right: it is the whole kernel, the control group or a filter."""
+    """Explain a refusal despite the capability: the kernel's settings, the control group or a seccomp filter."""
     if _RT_RUNTIME.is_file() and _RT_RUNTIME.read_text(encoding="ascii").strip() == "0":
         remedy = "sudo sysctl kernel.sched_rt_runtime_us=950000"
         return SchedulingRequest(name, False, "this kernel has real time switched off", remedy)
@@ -171,7 +171,7 @@ def _forbidden(name: str, error: OSError) -> SchedulingRequest:
 
 
 def _killing_limit() -> int:
-    """Milliseconds after which the kernel ends a real-time thread that never rests, or 0 if it never does."""
+    """Milliseconds after which the kernel kills a real-time thread that never sleeps; 0: it does not."""
     soft, _ = resource.getrlimit(resource.RLIMIT_RTTIME)
     if soft == resource.RLIM_INFINITY:
         return 0
@@ -182,7 +182,7 @@ def _killing_limit() -> int:
 
 
 def _timer_slack() -> SchedulingRequest:
-    """Let the kernel not put timers off to gather them; a real-time thread's never are."""
+    """Ask the kernel not to delay timers in order to coalesce them; those of a real-time thread never are."""
     libc = _libc()
     libc.prctl(_PR_SET_TIMERSLACK, 1)
     slack = libc.prctl(_PR_GET_TIMERSLACK)
@@ -193,11 +193,11 @@ def _timer_slack() -> SchedulingRequest:
 
 
 def _lock_memory() -> SchedulingRequest:
-    """Lock what is mapped, and what will be.
+    """Lock present and future mappings.
 
-    Only without a limit, or above it by CAP_IPC_LOCK: an agent that came up to RLIMIT_MEMLOCK would be refused
-    memory, or killed when its stack grows. The limit counts address space, of which a process has ten times what it
-    uses. With a limit of 0, mlockall says whether we are above it.
+    Only without a limit, or with CAP_IPC_LOCK: an agent that reached RLIMIT_MEMLOCK would be refused memory, or
+    killed when its stack grows. The limit counts address space, which is ten times the memory that is used. A trial
+    with a limit of 0 shows whether the capability is there.
     """
     name = "memory lock"
     soft, hard = resource.getrlimit(resource.RLIMIT_MEMLOCK)
@@ -277,8 +277,8 @@ def _cpu_ways() -> str:
 def _keep_awake() -> SchedulingRequest:
     """Keep all CPUs in idle states that they leave at once, for as long as this process lives.
 
-    The kernel's PM QoS (Documentation/power/pm_qos_interface): the wish holds while the file is open, so it is never
-    closed. Between two processes on two CPUs of a virtual machine a wake-up took 11 µs with it, and 21 µs without.
+    The kernel's PM QoS (Documentation/power/pm_qos_interface): the request holds while the file is open, so it is
+    never closed. Between two processes on two CPUs of a virtual machine a wake-up took 11 µs with it, 21 µs without.
     """
     name = "wakefulness"
     try:
@@ -313,7 +313,7 @@ def _priority_ways(priority: int) -> str:
 
 
 def _ways(unit: str, *, login: str = "", container: str = "", capability: str = "") -> str:
-    """Name what grants a wish: in a container its own way first, for outside of it nothing else counts."""
+    """Name what would grant a request; in a container its options first, since nothing else has an effect there."""
     ways = [f"start the container with {container}"] if container and _in_container() else []
     ways.append(f"put {unit} into the systemd unit")
     if login:

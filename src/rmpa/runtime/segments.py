@@ -1,4 +1,4 @@
-"""A connected TCP socket that sends in small segments, whatever the kernel believes of the path."""
+"""A connected TCP socket that sends in small segments, whatever path MTU the kernel assumes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Buffer = bytes | bytearray | memoryview
 
 
 class SegmentedSocket:
-    """Cuts what is sent into pieces that the kernel neither joins nor sends as one large packet (MSG_EOR).
+    """Sends in pieces that the kernel neither joins nor sends as one large packet (MSG_EOR).
 
     TCP_MAXSEG cannot do this: it has no effect on a connected socket, and where the interface is to segment by itself
     (a virtual network never does) several segments still leave the machine as one packet. It costs a system call for
@@ -27,13 +27,13 @@ class SegmentedSocket:
         self._sock = sock
         self.size = size
         self._begun = 0
-        """Bytes of a piece that the socket took in part: the kernel appends to it what comes next."""
+        """Bytes of a piece that the socket took in part: the kernel appends the next bytes to that packet."""
 
     def sendmsg(self, parts: Sequence[Buffer]) -> int:
-        """Send as much as the socket takes now; return how many bytes that were.
+        """Send as much as the socket takes now; return the number of bytes.
 
         Raises:
-            BlockingIOError: It takes nothing.
+            BlockingIOError: The socket's buffer is full.
             OSError: The connection is gone.
         """
         sent = 0
@@ -52,7 +52,7 @@ class SegmentedSocket:
         return sent
 
     def _pieces(self, parts: Sequence[Buffer]) -> Iterator[tuple[list[Buffer], int]]:
-        """The bytes in pieces, as lists of views; the first one completes what was taken in part before."""
+        """The bytes in pieces, as lists of views; the first one completes the piece that was sent in part before."""
         if self._begun >= self.size:  # the size has shrunk below what was taken: no more is joined to that packet
             self._begun = 0
         room = self.size - self._begun
@@ -73,13 +73,13 @@ class SegmentedSocket:
             yield piece, filled
 
     def recv_into(self, buffer: memoryview) -> int:
-        """As a socket's."""
+        """Read into a buffer, as ``socket.recv_into``."""
         return self._sock.recv_into(buffer)
 
     def shutdown(self, how: int) -> None:
-        """As a socket's."""
+        """Close one direction, as ``socket.shutdown``."""
         self._sock.shutdown(how)
 
     def close(self) -> None:
-        """As a socket's."""
+        """Close the socket."""
         self._sock.close()

@@ -1,4 +1,4 @@
-"""Telling systemd how we are (sd_notify(3)): one datagram, if NOTIFY_SOCKET says where to."""
+"""Status notifications to systemd (sd_notify(3)): one datagram to NOTIFY_SOCKET, if it is set."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def notify_service_manager(state: str) -> bool:
     """Send ``READY=1``, ``STOPPING=1`` or ``STATUS=…``; a failure is logged and never fatal.
 
     Returns:
-        Whether somebody was told.
+        Whether it was sent.
     """
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:

@@ -1,4 +1,4 @@
-"""Where programs of ours keep what is to survive their end."""
+"""The directory of files that survive a program's end."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def state_dir(environ: Mapping[str, str], setting: str | None = None) -> Path | 
     ``rmpa`` below XDG_STATE_HOME, ``~/.local/state/rmpa``.
 
     Returns:
-        ``None`` if there is no such place: no home.
+        ``None`` if none of them is set and there is no home.
     """
     if setting or environ.get("RMPA_STATE_DIR"):
         return Path(setting or environ["RMPA_STATE_DIR"])
@@ -40,7 +40,7 @@ def core_file(environ: Mapping[str, str], port: int, module: str = "", setting: 
 
     Args:
         environ: As for ``state_dir``.
-        port: The core's; of a core whose port the system chooses nothing is kept, for nothing would find it again.
+        port: The core's; 0 (chosen by the system) keeps nothing, because the next run would have another port.
         module: Empty for a core without an agent.
         setting: As for ``state_dir``.
     """

@@ -1,8 +1,9 @@
 """A connected TCP socket on the data path: one growing read buffer, one ``sendmsg`` a write, a bounded outbox.
 
-asyncio's own transports join or copy what they cannot send at once and have no bound with a policy; this one
-keeps to ``core.outbox`` and costs one system call a message each way. A large message is sent in parts while it
-still arrives: ``open`` and ``extend``.
+asyncio's transports join or copy what cannot be sent at once, and have no bound with a drop policy. A ``Stream``
+queues in a ``core.outbox.Outbox``, and costs one system call a message each way. A large message can be sent in parts
+while it still arrives (``open`` and ``extend``); messages that one read brings leave in one write (*corking*, as
+TCP_CORK does).
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ OnBytes = Callable[[memoryview], tuple[int, int]]
 OnClose = Callable[[Exception | None], None]
 
 _corked: list[Stream] | None = None
-"""While a read is dealt with: the streams that keep messages for its end; see ``Stream.send``."""
+"""While the bytes of a read are handled: the streams that collect messages for one write; see ``Stream.send``."""
 
 
 class Stream:
@@ -51,16 +52,16 @@ class Stream:
     Args:
         sock: Connected, non-blocking; owned by the stream from here on.
         on_bytes: Called with all bytes not yet consumed; returns ``(consumed, wanted)``: how many it took, and
-            how many there must be in all behind those before it can take more (0 if it cannot say). The view is
-            only valid during the call. A ``RemoteProtocolError`` raised here closes the stream with it; any other
+            how many it needs behind those before it can take more (0: unknown). The view is only valid during the
+            call. A ``RemoteProtocolError`` raised here closes the stream with it; any other
             exception is a bug, is logged, and closes the stream too.
         on_close: Called once, from the loop and never from within a method, when the socket is gone: with
             ``None`` after an orderly end, with the error otherwise. Not called after ``close()``.
-        outbox: The bounds for what waits; what waits in it already is sent first.
-        frame: Makes the header of each fragment of an opened message; without it its bytes go out as they are.
-            The outbox has the same one.
-        keep: What waits when the socket is gone stays in the outbox, for the next one.
-        segment: Bytes that one packet may carry, ``None`` for as many as the kernel likes; see ``segments``.
+        outbox: The queue of what the socket does not take; entries that are in it already are sent first.
+        frame: Makes the header of each fragment of an opened message, the same as the outbox's; without it the bytes
+            are sent without headers.
+        keep: Whether entries stay in the outbox when the socket is gone, for the next stream.
+        segment: Bytes that one packet may carry; ``None``: the kernel decides; see ``segments``.
     """
 
     def __init__(
@@ -97,11 +98,11 @@ class Stream:
         self.last_in = self._loop.time()
         """When bytes last came (``loop.time()``), whether or not ``on_bytes`` was called for them."""
         self.resumed_at = -math.inf
-        """When this process last looked, and found nothing, before bytes ended a silence of more than
-        ``limits.STALE_AGE`` (``loop.time()``): what was on its way then was held up, what is younger may have been
-        kept waiting by ourselves."""
+        """When the socket was last polled without result, before bytes ended a silence of more than
+        ``limits.STALE_AGE`` (``loop.time()``): bytes sent before that were held up on the network, later ones may
+        have waited here."""
         self._fd = sock.fileno()
-        # An agent's loop has a short way for the data path; elsewhere (tools, tests) the usual one does.
+        # An agent's loop calls readers of the data path directly; other loops (tools, tests) have no such method.
         add_reader = getattr(self._loop, "add_direct_reader", self._loop.add_reader)
         add_reader(self._fd, self._readable)
         if outbox:
@@ -119,14 +120,14 @@ class Stream:
 
     @property
     def unacknowledged(self) -> int:
-        """Bytes in the kernel that the other side has not acknowledged, those that have not left included."""
+        """Bytes in the kernel's send queue: not sent yet, or not acknowledged by the other side."""
         if self._closed:
             return 0
         return int.from_bytes(fcntl.ioctl(self._fd, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
 
     @property
     def outbox(self) -> Outbox:
-        """What waits, and what was dropped."""
+        """The queue of what waits, with counts of what was dropped."""
         return self._outbox
 
     def segment(self, size: int) -> None:
@@ -137,7 +138,7 @@ class Stream:
             self._sock = SegmentedSocket(self._sock, size)
 
     def feed(self, data: Buffer) -> None:
-        """Take bytes that somebody else read from the socket before the stream had it."""
+        """Take bytes that were read from the socket before the stream existed."""
         if self._closed:
             return
         self._reserve(self._filled + len(data))
@@ -151,9 +152,9 @@ class Stream:
 
         Args:
             parts: In order, views of single bytes. From within ``on_bytes`` they may be views of what was read:
-                messages that one read brings for one stream are sent in one call when it is done with. Elsewhere
-                they are not kept after the call.
-            key: Which flow it belongs to, for the overflow policy; ``URGENT`` is never dropped.
+                the messages of one read for one stream are sent together when all of the read is handled. Outside of
+                ``on_bytes`` they are not referenced after the call.
+            key: The flow that it belongs to, for the overflow policy; ``URGENT`` is never dropped.
 
         Returns:
             How many older messages, of any key, were dropped to make room.
@@ -168,7 +169,7 @@ class Stream:
         return self._send_now(parts, key)
 
     def send_mark(self, data: bytes, key: int) -> None:
-        """Send a mark behind the messages of a key; unlike those it is never dropped."""
+        """Send a mark behind the messages of a key; unlike a message, a mark is never dropped."""
         if self._closed or self._finishing:
             return
         if self._kept:
@@ -179,7 +180,7 @@ class Stream:
             self._send_now((data,), key)
 
     def adopt(self, outbox: Outbox, frame: Framer | None) -> None:
-        """Send from another outbox from now on, first what waits in it already; it outlives the stream."""
+        """Send from another outbox from now on, its present entries first; it is kept when the socket is gone."""
         self._uncork()
         rest = b"".join(self._outbox.head(1 << 20))
         self._outbox.clear()
@@ -204,7 +205,7 @@ class Stream:
         if sent == size:
             return 0
         if sent:
-            sent = self._press(parts, sent, size)
+            sent = self._send_rest(parts, sent, size)
             if sent == size or self._closed:
                 return 0
         self._wait_for_room()
@@ -213,11 +214,11 @@ class Stream:
         self._outbox.push_rest(_behind(parts, sent), key)
         return 0
 
-    def _press(self, parts: Sequence[Buffer], sent: int, size: int) -> int:
-        """Go on with what the socket took in part: it often has room again at once, and to queue is to copy.
+    def _send_rest(self, parts: Sequence[Buffer], sent: int, size: int) -> int:
+        """Send the rest of what the socket took in part: it often has room again at once, and queueing means copying.
 
         Returns:
-            How many bytes have gone in all.
+            How many bytes were sent in all.
         """
         while sent < size:
             try:
@@ -238,7 +239,7 @@ class Stream:
     # --- messages in parts ----------------------------------------------------------------------------------
 
     def open(self, key: int, size: int, sequence: int = 0, stamp_ns: int = 0) -> QueuedMessage:
-        """Begin a message of ``size`` bytes whose bytes follow by ``extend``, before the next one of its key."""
+        """Begin a message of ``size`` bytes; ``extend`` gives its bytes, before another message of its key begins."""
         return QueuedMessage(key, size, sequence, stamp_ns, self._loop.time())
 
     def extend(self, parcel: QueuedMessage, data: Buffer) -> int:
@@ -293,7 +294,7 @@ class Stream:
         return torn
 
     def pump(self) -> None:
-        """Send what was put into the outbox from elsewhere."""
+        """Send entries that other code has put into the outbox."""
         if self._kept:
             self._uncork()
         if self._outbox and not self._writing and not self._closed:
@@ -311,10 +312,10 @@ class Stream:
             parts += (frame(parcel, len(part), first | last), part)
         return parts
 
-    # --- the end --------------------------------------------------------------------------------------------
+    # --- corking --------------------------------------------------------------------------------------------
 
     def _cork(self, parts: Sequence[Buffer], key: int, *, part: bool = False) -> None:
-        """Keep a message until the read that it came from is done with; what is kept is sent in one call."""
+        """Keep a message until the read that it came from is handled; all kept messages are sent in one call."""
         cast("list[Stream]", _corked).append(self)
         self._kept.append((parts, key, part))
         for buffer in parts:
@@ -328,7 +329,7 @@ class Stream:
         if self._closed or not kept:
             return
         if self._writing or self._outbox:
-            self._keep_rest(kept, 0)  # it must not get into the middle of what the outbox sends
+            self._keep_rest(kept, 0)  # behind what the outbox is sending
             return
         if len(kept) == 1:
             self._send_now(*kept[0])
@@ -342,14 +343,14 @@ class Stream:
             return
         self.bytes_out += sent
         if 0 < sent < size:
-            sent = self._press([buffer for parts, _, _ in kept for buffer in parts], sent, size)
+            sent = self._send_rest([buffer for parts, _, _ in kept for buffer in parts], sent, size)
         if sent < size and not self._closed:
             self._keep_rest(kept, sent)
 
     def _keep_rest(self, kept: list[tuple[Sequence[Buffer], int, bool]], sent: int) -> None:
-        """Queue what a batch's ``sendmsg`` did not take: the rest of one message perhaps, then whole ones.
+        """Queue what ``sendmsg`` did not take of a batch: perhaps the rest of one message, then whole ones.
 
-        What is in front of a part of a message stays in front of it: a part has its header and no other turn.
+        Entries in front of a part of a message are committed too: the part has its header and cannot take turns.
         """
         self._wait_for_room()
         last_part = max((index for index, (_, _, part) in enumerate(kept) if part), default=-1)
@@ -366,7 +367,7 @@ class Stream:
                 self._queue(b"".join(parts), key)
 
     def close(self) -> None:
-        """Close at once; what still waits is lost. ``on_close`` is not called."""
+        """Close at once; entries that wait are lost. ``on_close`` is not called."""
         self._uncork()
         if self._report is not None:
             self._report.cancel()
@@ -374,7 +375,7 @@ class Stream:
         self._shut()
 
     def finish(self) -> None:
-        """Send no more: when all that waits has left, the other side reads an end; ours goes on reading.
+        """Send no more: half-close when all that waits has been sent. Reading goes on.
 
         Not for ROS connections: rospy and roscpp take a half-closed socket for dead.
         """
@@ -385,7 +386,7 @@ class Stream:
                 self._shut_write()
 
     async def drained(self, within: float = limits.DRAIN_TIMEOUT) -> None:
-        """Wait until all that was sent has left, the stream is closed, or ``within`` seconds are over."""
+        """Wait until nothing waits any more, the stream is closed, or ``within`` seconds are over."""
         if self._closed or not self._writing:
             return
         if self._drained is None or self._drained.done():
@@ -406,7 +407,7 @@ class Stream:
         if self._writing:
             self._loop.remove_writer(self._fd)
         self._sock.close()
-        # Nobody is called any more: who holds the stream would stay with it as a cycle until the collector looks.
+        # No callback is called any more; dropping them breaks the reference cycle between the stream and its owner.
         self._on_bytes, self._on_close = _no_bytes, _no_close
         self._view = memoryview(b"")
         self._buffer = bytearray()
@@ -427,7 +428,7 @@ class Stream:
         if not self._closed:
             on_close = self._on_close
             self._shut()
-            # Not from here: this may be a ``send`` in the middle of the owner's loop over its streams.
+            # Not now: this may be a ``send`` in the middle of the owner's loop over its streams.
             self._report = self._loop.call_soon(self._report_end, on_close, error)
 
     def _report_end(self, on_close: OnClose, error: Exception | None) -> None:
@@ -454,10 +455,10 @@ class Stream:
             return
         now = self._loop.time()
         if now - self.last_in > limits.STALE_AGE:
-            # Only a silence in which we looked counts: not that this process got no CPU.
-            looked = getattr(self._loop, "looked_before", now)
-            if looked - self.last_in > limits.STALE_AGE:
-                self.resumed_at = looked
+            # Only a silence during which the socket was polled counts: not one in which this process got no CPU.
+            polled = getattr(self._loop, "previous_poll_at", now)
+            if polled - self.last_in > limits.STALE_AGE:
+                self.resumed_at = polled
         self.last_in = now
         self.bytes_in += count
         self._filled += count
@@ -467,9 +468,9 @@ class Stream:
             self._deliver()
 
     def _deliver(self) -> None:
-        global _corked  # noqa: PLW0603 - one loop, one thread: whoever reads holds the cork
+        global _corked  # noqa: PLW0603 - one loop, one thread: one read at a time
         outer = _corked
-        # A few bytes are one message, or two, and are handed on at once; not past what an outer read keeps.
+        # A few bytes are one or two messages, which are sent at once, unless an outer read has corked.
         corked: list[Stream] = []
         _corked = corked if self._filled > _CORK_ABOVE or outer is not None else None
         try:
@@ -477,7 +478,7 @@ class Stream:
         except RemoteProtocolError as error:
             self._lost(error)
             return
-        except Exception as error:  # noqa: BLE001 - a callback's top: the same bytes must not be offered for ever
+        except Exception as error:  # noqa: BLE001 - a callback's top: else the same bytes would be offered for ever
             _log.error("! a reader of bytes failed; its connection is closed", exc_info=error)
             self._lost(error)
             return
@@ -495,7 +496,7 @@ class Stream:
         self._filled = rest
         self._wanted = wanted
         if rest == len(self._buffer) or wanted > len(self._buffer):
-            # What a peer only claims is not allocated: the buffer grows with what has really come.
+            # A size that a peer claims is not allocated at once: the buffer grows with what has really arrived.
             self._reserve(min(max(wanted, 2 * rest), max(4 * rest, _FIRST_BUFFER)))
         elif rest <= _FIRST_BUFFER // 2 and wanted <= _FIRST_BUFFER and len(self._buffer) > _KEPT_BUFFER:
             view = self._view
@@ -504,9 +505,9 @@ class Stream:
             self._view[:rest] = view[:rest]
 
     def _writable(self) -> None:
-        """Send what waits until the socket takes no more; but let others have their turn too."""
+        """Send queued entries until the socket takes no more, or ``_WRITES`` writes were made."""
         for _ in range(_WRITES):
-            # All that waited may have been too old; then there are no parts.
+            # No parts: all entries were too old, and were dropped.
             parts = self._outbox.head(_IOV, self._loop.time())
             try:
                 sent = self._sock.sendmsg(parts) if parts else 0
@@ -532,7 +533,7 @@ class Stream:
 
 
 def _rest(parts: Sequence[Buffer], sent: int) -> list[memoryview]:
-    """What is left of ``parts`` behind the first ``sent`` bytes."""
+    """The parts without their first ``sent`` bytes."""
     left: list[memoryview] = []
     for part in parts:
         if sent < len(part):
@@ -542,14 +543,14 @@ def _rest(parts: Sequence[Buffer], sent: int) -> list[memoryview]:
 
 
 def _no_bytes(view: memoryview) -> tuple[int, int]:
-    """Of a closed stream."""
+    """``on_bytes`` of a closed stream."""
     return len(view), 0
 
 
 def _no_close(_error: Exception | None) -> None:
-    """The same."""
+    """``on_close`` of a closed stream."""
 
 
 def _behind(parts: Sequence[Buffer], sent: int) -> bytes:
-    """The same, copied once."""
+    """The parts without their first ``sent`` bytes, joined."""
     return b"".join(_rest(parts, sent))

@@ -1,4 +1,4 @@
-"""Runs a function of somebody else's in a thread of its own, which may hang for ever without harm to anybody."""
+"""Runs a user's function in a thread of its own, where it may hang for ever without blocking anything else."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _T = TypeVar("_T")
 
 
 async def in_thread(function: Callable[[], _T], name: str) -> _T:
-    """Call it, and wait for what it returns; who is cancelled meanwhile leaves it behind.
+    """Call ``function`` in a new daemon thread, and return its result. If cancelled, the thread goes on by itself.
 
-    Unlike ``asyncio.to_thread`` it takes no place in a pool: let a few hang there, and nothing runs in threads any
-    more. And being a daemon, it does not keep the process from its end.
+    ``asyncio.to_thread`` would take a place in a pool: with a few hanging functions the pool would be exhausted. And
+    a daemon thread does not keep the process from ending.
 
     Args:
-        function: What it raises is raised here; ``SystemExit`` and its like as a ``RuntimeError``.
-        name: Of the thread.
+        function: Its exceptions are raised here; ``SystemExit`` and the like as ``RuntimeError``.
+        name: The thread's name.
     """
     loop = asyncio.get_running_loop()
     result: asyncio.Future[_T] = loop.create_future()
@@ -38,7 +38,7 @@ async def in_thread(function: Callable[[], _T], name: str) -> _T:
             end(value, None)
 
     def end(value: _T | None, error: Exception | None) -> None:
-        def told() -> None:
+        def settle() -> None:
             if not result.done():
                 if error is not None:
                     result.set_exception(error)
@@ -46,7 +46,7 @@ async def in_thread(function: Callable[[], _T], name: str) -> _T:
                     result.set_result(value)  # type: ignore[arg-type] # a value, for there is no error
 
         with contextlib.suppress(RuntimeError):  # the loop has ended before us
-            loop.call_soon_threadsafe(told)
+            loop.call_soon_threadsafe(settle)
 
     context = contextvars.copy_context()
     threading.Thread(target=context.run, args=(run,), name=name, daemon=True).start()

@@ -28,7 +28,7 @@ class TimerFd:
     """One timer.
 
     Args:
-        blocking: Whether ``wait`` sleeps, for a thread of its own; else ``fileno`` is for a loop's ``add_reader``.
+        blocking: Whether ``wait`` sleeps until the timer is due, for a thread; else ``fileno`` is for a loop.
 
     Raises:
         OSError: No file descriptor is left.
@@ -42,11 +42,11 @@ class TimerFd:
             self._fd = _check(_libc().timerfd_create(_CLOCK_MONOTONIC, flags))
 
     def fileno(self) -> int:
-        """Readable from when it is due until ``wait`` or ``set``; -1 once it is closed."""
+        """The descriptor, readable from when the timer is due until ``wait`` or ``set``; -1 once closed."""
         return self._fd
 
     def set(self, due: float) -> None:
-        """Become due at this time of the monotonic clock, in seconds; one that is past is due now.
+        """Let the timer be due at this time of the monotonic clock, in seconds; a time that is past is due now.
 
         Raises:
             OSError: It is closed.
@@ -59,10 +59,10 @@ class TimerFd:
             _check(_libc().timerfd_settime(self._fd, _ABSTIME, spec, None))
 
     def wait(self) -> bool:
-        """Take that it was due; sleep until then if it is a blocking one.
+        """Reset a timer that is due; a blocking one sleeps until then.
 
         Returns:
-            Whether it was; never false for a blocking one.
+            Whether it was due; always true for a blocking one.
         """
         try:
             os.read(self._fd, 8)
@@ -71,7 +71,7 @@ class TimerFd:
         return True
 
     def close(self) -> None:
-        """Give the descriptor back; may be called twice. No thread may wait at that time."""
+        """Close the descriptor; may be called twice. No thread may be in ``wait`` at that time."""
         fd, self._fd = self._fd, -1
         if fd >= 0:
             os.close(fd)
@@ -87,7 +87,7 @@ class TimerFd:
 
 @functools.cache
 def _libc() -> ctypes.CDLL:
-    import ctypes  # noqa: PLC0415 - only who has timers pays for it
+    import ctypes  # noqa: PLC0415 - only programs with timers load it
 
     return ctypes.CDLL(None, use_errno=True)
 

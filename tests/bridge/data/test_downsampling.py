@@ -1,4 +1,4 @@
-"""Down-sampling: the rate is kept over every window, and the beat is steady."""
+"""Down-sampling: the rate is kept over every window, and the period is steady."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_no_window_has_more_than_its_rate(rate: float, gaps: list[float]) -> Non
 
 @settings(deadline=None)
 @given(RATES, st.lists(st.floats(0.001, 0.2), min_size=200, max_size=200))
-def test_many_messages_make_a_steady_beat_at_the_full_rate(rate: float, gaps: list[float]) -> None:
+def test_fast_source_is_sent_at_the_full_rate(rate: float, gaps: list[float]) -> None:
     now, times = 5.0, []
     for gap in gaps:
         now += gap / rate
@@ -60,7 +60,7 @@ def test_a_source_at_the_same_rate_loses_nothing(rate: float, jitter: float) -> 
     assert len(admitted(Downsampler(rate), times)) == len(times)
 
 
-def test_after_a_pause_the_beat_begins_anew_and_nothing_is_saved_up() -> None:
+def test_period_begins_anew_after_a_pause() -> None:
     throttle = Downsampler(10.0)
     assert throttle.admit(0.0)
     assert throttle.due == pytest.approx(0.1)
@@ -69,7 +69,7 @@ def test_after_a_pause_the_beat_begins_anew_and_nothing_is_saved_up() -> None:
     assert admitted(throttle, [100.0 + n / 100 for n in range(31)]) == pytest.approx([100.09, 100.19, 100.29])
 
 
-def test_whoever_waits_until_it_is_due_goes() -> None:
+def test_message_is_admitted_when_due() -> None:
     throttle = Downsampler(3.0)
     assert throttle.admit(0.123)
     for _ in range(10_000):

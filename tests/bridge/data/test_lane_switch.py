@@ -46,7 +46,7 @@ def test_a_route_begins_behind_the_word_that_opens_it(priority: Priority, large:
 
 
 @pytest.mark.parametrize("priority", [Priority.HIGH, Priority.LOW])
-def test_a_contract_that_says_the_lane_outweighs_every_size(priority: Priority) -> None:
+def test_priority_outweighs_message_size(priority: Priority) -> None:
     switch = LaneSwitch(Contract(priority=priority))
     if priority is Priority.LOW:
         assert switch.fenced(switch.fence())
@@ -55,7 +55,7 @@ def test_a_contract_that_says_the_lane_outweighs_every_size(priority: Priority) 
     assert switch.lane is (EXPRESS if priority is Priority.HIGH else BULK)
 
 
-def test_the_first_large_message_itself_must_wait_for_the_fence() -> None:
+def test_first_large_message_waits_for_the_fence() -> None:
     switch = LaneSwitch(Contract())
     assert not switch.judge(SMALL, 0.0)
     assert switch.judge(LARGE, 1.0)
@@ -68,7 +68,7 @@ def test_the_first_large_message_itself_must_wait_for_the_fence() -> None:
     assert not switch.judge(SMALL, 2.0)
 
 
-def test_back_only_behind_a_row_of_small_ones_that_is_long_in_number_and_in_time() -> None:
+def test_return_needs_many_small_messages_for_long() -> None:
     many_at_once = on_bulk()
     assert not any(many_at_once.judge(SMALL, REST - 0.001) for _ in range(5 * ROW))
     assert many_at_once.judge(SMALL, REST)
@@ -104,7 +104,7 @@ def test_only_the_answer_to_the_present_fence_counts() -> None:
     assert switch.lane is BULK
 
 
-def test_the_loss_of_bulk_answers_a_fence_on_it_and_none_on_express() -> None:
+def test_bulk_loss_answers_only_a_bulk_fence() -> None:
     there = LaneSwitch(Contract(), large=True)
     assert not there.lane_lost()
     number = there.fence()
@@ -120,7 +120,7 @@ def test_the_loss_of_bulk_answers_a_fence_on_it_and_none_on_express() -> None:
     assert not back.fenced(number), "an answer that came too late"
 
 
-def test_a_new_link_begins_on_the_express_lane_and_keeps_its_target() -> None:
+def test_new_link_begins_on_the_express_lane() -> None:
     switch = on_bulk()
     switch.restart()
     assert (switch.lane, switch.target, switch.fencing) == (EXPRESS, BULK, False)
@@ -130,7 +130,7 @@ def test_a_new_link_begins_on_the_express_lane_and_keeps_its_target() -> None:
 
 
 class TwoLanes(RuleBasedStateMachine):
-    """A sender as ``judge`` says, over two queues of which each may be as slow as it likes."""
+    """A sender that follows ``judge``, over two queues that are independently slow."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -215,7 +215,7 @@ TestTwoLanes.settings = settings(max_examples=150, stateful_step_count=40, deadl
 
 @settings(deadline=None)
 @given(st.lists(st.tuples(st.booleans(), st.floats(0, 1)), min_size=1, max_size=300))
-def test_it_wants_bulk_exactly_while_a_large_message_is_not_long_ago(run: list[tuple[bool, float]]) -> None:
+def test_bulk_lane_is_used_while_large_messages_are_recent(run: list[tuple[bool, float]]) -> None:
     """The target against the words of its docstring, counted by hand."""
     switch = LaneSwitch(Contract())
     now, large_at, row, wanted = 100.0, None, 0, EXPRESS

@@ -1,4 +1,4 @@
-"""What another machine's clock was."""
+"""The history of a peer's clock."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from rmpa.mesh import limits as mesh_limits
 def test_estimates_are_kept_in_order() -> None:
     clock = PeerClock()
     for second in range(3):
-        clock.told(1.0, 0.01, float(second))
+        clock.add(1.0, 0.01, float(second))
     assert list(clock) == [ClockEstimate(float(second), 1.0, 0.01) for second in range(3)]
 
 
 def test_a_clock_that_was_set_makes_all_before_void() -> None:
     clock = PeerClock()
-    clock.told(1.0, 0.01, 0.0)
-    clock.told(1.019, 0.01, 1.0)  # within both bounds
+    clock.add(1.0, 0.01, 0.0)
+    clock.add(1.019, 0.01, 1.0)  # within both bounds
     assert clock.trusted_from < 0
-    clock.told(1.5, 0.01, 2.0)
+    clock.add(1.5, 0.01, 2.0)
     assert list(clock) == [ClockEstimate(2.0, 1.5, 0.01)]
     assert clock.trusted_from == 2.0
 
 
 def test_drift_is_no_setting() -> None:
     clock = PeerClock()
-    clock.told(0.0, 0.0, 0.0)
-    clock.told(3600 * mesh_limits.CLOCK_DRIFT, 0.0, 3600.0)
+    clock.add(0.0, 0.0, 0.0)
+    clock.add(3600 * mesh_limits.CLOCK_DRIFT, 0.0, 3600.0)
     assert len(list(clock)) == 2
 
 
-def test_of_estimates_that_come_at_once_the_better_is_kept() -> None:
+def test_better_of_two_near_estimates_is_kept() -> None:
     clock = PeerClock()
     for now, error in ((0.0, 0.01), (0.1, 0.002), (0.2, 0.01), (0.3, 0.001), (1.5, 0.01)):
-        clock.told(1.0, error, now)
+        clock.add(1.0, error, now)
     assert [estimate.now for estimate in clock] == [0.0, 0.3, 1.5]
 
 
@@ -46,7 +46,7 @@ def test_a_minute_is_remembered_however_often_it_is_told(steps: list[float]) -> 
     clock, now = PeerClock(), 0.0
     for step in steps:
         now += step
-        clock.told(0.0, 0.001, now)
+        clock.add(0.0, 0.001, now)
     times = [estimate.now for estimate in clock]
     assert times == sorted(times)
     assert len(times) <= limits.QUALITY_CLOCKS

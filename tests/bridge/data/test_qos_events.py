@@ -49,7 +49,7 @@ def test_nothing_to_watch() -> None:
     assert watch.next_timer() is None
 
 
-def test_a_deadline_is_missed_by_the_timer_and_once_a_period() -> None:
+def test_deadline_is_missed_once_a_period() -> None:
     watch = QosWatch(Contract(deadline=0.25), 10.0)
     assert watch.next_timer() == 10.25
     watch.last = 10.125
@@ -89,9 +89,7 @@ def test_every_period_without_a_message_is_one_miss(arrivals: list[float], deadl
 
 
 @given(TICKS, EIGHTHS, st.data())
-def test_late_timers_invent_no_miss_and_tell_all_that_still_last(
-    arrivals: list[float], deadline: float, data: st.DataObject
-) -> None:
+def test_late_timers_report_only_real_misses(arrivals: list[float], deadline: float, data: st.DataObject) -> None:
     watch = QosWatch(Contract(deadline=deadline), 0.0)
     at_most = 0
     for before, after in pairwise([0.0, *arrivals]):
@@ -129,7 +127,7 @@ def test_rounding_neither_stops_nor_spins_the_timer(deadline: float, start: floa
     assert abs(watch.counts[QosEventKind.DEADLINE_MISSED] - elapsed) <= 1 + elapsed * 1e-6 + 1
 
 
-def test_a_period_that_rounding_hides_is_told_next() -> None:
+def test_miss_hidden_by_rounding_is_reported_next() -> None:
     watch = QosWatch(Contract(deadline=0.1), 1e6)
     now = 1e6 + 2 * 0.1  # less 1e6, this is less than twice 0.1
     assert [event.count for event in watch.handle_timer(now)] == [1]
@@ -177,7 +175,7 @@ def test_a_silent_source_is_lost_and_comes_back() -> None:
 
 
 @given(TICKS, st.integers(4, 16).map(lambda eighths: eighths / 8))
-def test_each_silence_beyond_the_lease_is_lost_and_restored_once(arrivals: list[float], lease: float) -> None:
+def test_silence_is_reported_lost_and_restored_once(arrivals: list[float], lease: float) -> None:
     watch = QosWatch(Contract(liveliness=Liveliness.MANUAL_BY_TOPIC, liveliness_lease=lease), 0.0)
     timer = Timer(watch)
     for now in arrivals:
@@ -226,7 +224,7 @@ def test_a_link_that_comes_and_goes_before_the_timer() -> None:
     assert watch.next_timer() is None
 
 
-def test_one_call_tells_each_kind_once() -> None:
+def test_one_call_reports_each_kind_once() -> None:
     watch = QosWatch(
         Contract(deadline=0.5, liveliness=Liveliness.MANUAL_BY_TOPIC, liveliness_lease=1.0),
         0.0,
@@ -261,7 +259,7 @@ def test_a_lifespan_that_the_sender_alone_has() -> None:
 @given(
     st.lists(st.tuples(st.sampled_from(["lost", "expired", "down", "up", "arrive", "timer"]), EIGHTHS), max_size=80)
 )
-def test_whatever_happens_memory_is_bounded_and_counts_hold(steps: list[tuple[str, float]]) -> None:
+def test_memory_is_bounded_and_counts_hold(steps: list[tuple[str, float]]) -> None:
     watch = QosWatch(Contract(deadline=0.5, lifespan=1.0, liveliness_lease=1.0), 0.0)
     now, told = 0.0, Counter[QosEventKind]()
     for step, pause in steps:

@@ -157,12 +157,12 @@ class LinkEnd:
         elif frame.kind is FrameKind.FENCE:
             self.mark(FrameKind.FENCED, frame.route, frame.sequence)
         elif frame.kind is not FrameKind.DATA:
-            bridge.mark(link, frame.kind, frame.route, frame.sequence)
+            bridge.receiver.mark(link, frame.kind, frame.route, frame.sequence)
         elif frame.flags == FIRST | LAST:
-            bridge.data(link, frame.route, frame.sequence, frame.stamp_ns, memoryview(frame.payload))
+            bridge.receiver.data(link, frame.route, frame.sequence, frame.stamp_ns, memoryview(frame.payload))
         else:
             part = memoryview(frame.payload)
-            bridge.part(link, frame.route, frame.sequence, frame.stamp_ns, frame.flags, part)
+            bridge.receiver.part(link, frame.route, frame.sequence, frame.stamp_ns, frame.flags, part)
 
     def end(self, *, silent: bool) -> None:
         """This end notices that the link is gone."""
@@ -170,4 +170,4 @@ class LinkEnd:
             self.gone, self.silent = True, silent
             self.express.end()
             self.bulk.end()
-            self.side.bridge.link_down(cast("PeerLink", self))
+            self.side.bridge.sessions.link_down(cast("PeerLink", self))

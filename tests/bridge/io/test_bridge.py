@@ -1,29 +1,26 @@
-"""How a bridge works off what it has to do; whole bridges are tested with their agents."""
+"""What the bridge does with control messages; whole bridges are tested with their agents."""
 
 from __future__ import annotations
 
-import asyncio
-from typing import TYPE_CHECKING, cast
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.actions import Describe, Disconnect, Warn
 from rmpa.bridge.io.bridge import Bridge
-from rmpa.bridge.messages import Advertise, Description, Source, TopicOffer, encode
+from rmpa.bridge.messages import Advertise, AdvertiseServices, TopicOffer, encode, op_of
 from rmpa.bridge.policy import Policy
+from rmpa.bridge.session.part import Part
 from rmpa.config import limits as config_limits
 from rmpa.config.settings import PolicySettings
-from rmpa.core.contract import Contract
-from rmpa.core.errors import LimitExceeded
+from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 
 if TYPE_CHECKING:
-    from rmpa.bridge.actions import Action
-    from rmpa.bridge.io.bridge import PeerSession
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.core.embedded import RosCore
 
-ABOUT = Description("a/B", "5a9ea5f83505693b71e785041e67a8bb", "", False)
+LINK = cast("PeerLink", object())
 
 
 class Core:
@@ -34,46 +31,11 @@ class Core:
 
 
 @pytest.fixture
-async def bridge() -> Bridge:
+async def bridge(monkeypatch: pytest.MonkeyPatch) -> Bridge:
     made = Bridge(cast("RosCore", Core()), Policy(PolicySettings()), rng=lambda: 0.5)
-    made._loop = asyncio.get_running_loop()
+    session = SimpleNamespace(peer=1)
+    monkeypatch.setattr(made.sessions, "of", lambda link: session if link is LINK else None)
     return made
-
-
-async def test_what_comes_while_others_are_done_waits_but_for_descriptions(
-    bridge: Bridge, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A reader of data may bring more to do at any breath between two actions."""
-    one, two, three = (Disconnect(Source("/t", f"/{name}")) for name in ("a", "b", "c"))
-    describe = Describe(1, Source("/t", "/d"), 7, ABOUT, Contract())
-    done: list[Action] = []
-
-    def do(action: Action) -> None:
-        done.append(action)
-        if action is one:
-            bridge._act([three, describe])
-
-    monkeypatch.setattr(bridge, "_do", do)
-    bridge._act([one, two])
-    assert done == [one, describe, two, three]
-
-
-async def test_an_action_that_fails_does_not_hold_up_the_next_ones(
-    bridge: Bridge, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    done: list[Action] = []
-
-    def do(action: Action) -> None:
-        done.append(action)
-        if len(done) == 1:
-            raise RuntimeError("once")
-
-    monkeypatch.setattr(bridge, "_do", do)
-    warnings = [Warn("kind", "who", str(number)) for number in range(3)]
-    with pytest.raises(RuntimeError):
-        bridge._act(list(warnings))
-    bridge._act([])
-    assert done == warnings
 
 
 def test_the_longest_advertisement_of_ours_is_within_the_limit_of_one() -> None:
@@ -83,10 +45,44 @@ def test_the_longest_advertisement_of_ours_is_within_the_limit_of_one() -> None:
     assert len(encode(Advertise(added=offers, full=True, more=True))) < limits.ADVERTISEMENT_MAX
 
 
-async def test_a_longer_one_ends_the_link_before_it_is_read(bridge: Bridge) -> None:
-    link = cast("PeerLink", object())
-    bridge._by_link[link] = cast("PeerSession", object())
+async def test_a_longer_one_ends_the_link_unparsed(bridge: Bridge) -> None:
     payload = encode(Advertise()).replace(b"[]", b" " * limits.ADVERTISEMENT_MAX + b"[]", 1)
-    assert payload.startswith(b'{"op":"advertise"')
     with pytest.raises(LimitExceeded):
-        bridge.control(link, payload)
+        bridge.control(LINK, payload)
+    bridge.control(cast("PeerLink", object()), payload)  # of a link that is gone
+
+
+@pytest.mark.parametrize(
+    ("payload", "op"),
+    [
+        (encode(Advertise()), "advertise"),
+        (encode(AdvertiseServices()), "services"),
+        (b'{"op":"close","route":1}', "close"),
+        (b'{"route":1,"op":"close"}', ""),
+        (b'{"op":"', ""),
+        (b"", ""),
+    ],
+)
+def test_the_kind_of_a_message_is_known_without_parsing(payload: bytes, op: str) -> None:
+    assert op_of(memoryview(payload)) == op
+
+
+async def test_advertisements_go_to_their_part_unparsed(bridge: Bridge) -> None:
+    taken: list[bytes] = []
+
+    class Services(Part):
+        advertisement = "services"
+
+        def advertised(self, session: Any, payload: bytes) -> None:
+            assert session.peer == 1
+            taken.append(payload)
+
+    bridge.add(Services())
+    bridge.control(LINK, memoryview(encode(AdvertiseServices())))
+    assert taken == [encode(AdvertiseServices())]
+
+
+async def test_a_message_that_no_part_takes_ends_the_link(bridge: Bridge) -> None:
+    reordered = b'{"added":[],"op":"services"}'  # no part for services was added
+    with pytest.raises(RemoteProtocolError, match="AdvertiseServices"):
+        bridge.control(LINK, reordered)

@@ -43,23 +43,24 @@ def play(seed: int, scene: Callable[[World], Coroutine[object, object, None]], *
 def lost_at_receiver(side: Side) -> int:
     """What the receiving module says is lost."""
     (attached,) = side.attached
-    entry = side.bridge.imports.get(attached.peer, SURE)
-    flow = attached.inbound.flow(SURE, entry.route if entry is not None else 0)
-    past = attached.inbound.past(SURE)
+    entry = side.bridge.topics.imports.get(attached.peer, SURE)
+    topics = side.bridge.topics.of(attached)
+    flow = topics.flow(SURE, entry.route if entry is not None else 0)
+    past = topics.past(SURE)
     return flow.lost if flow is not None else past.lost if past is not None else 0
 
 
 def unknown_at_receiver(side: Side) -> int:
     """How often it says that nobody knows how many."""
     (attached,) = side.attached
-    flow = attached.inbound.flow(SURE, 0)
+    flow = side.bridge.topics.of(attached).flow(SURE, 0)
     return flow.watch.counts[QosEventKind.LOSS_UNKNOWN] if flow is not None else 0
 
 
 def lost_at_sender(side: Side) -> int:
     """What the sending module says is lost to its peer."""
     (attached,) = side.attached
-    return side.bridge.outbound.lost(SURE, attached.peer)
+    return side.bridge.topics.outbound.lost(SURE, attached.peer)
 
 
 async def talk(world: World, speaker: Speaker, seconds: float, *, linked: bool = True) -> None:
@@ -82,7 +83,7 @@ async def begin(world: World) -> tuple[Speaker, Listener]:
 def told(side: Side) -> list[TopicOffer]:
     """What the other side was told since its link is up."""
     (attached,) = side.attached
-    exports = side.bridge.exports
+    exports = side.bridge.topics.exports
     return [offer for source in exports.offered if (offer := exports.offer(attached.peer, source)) is not None]
 
 
@@ -90,7 +91,7 @@ async def settled(world: World) -> None:
     """Let all come that is kept: a few messages for each acknowledgement."""
     await world.rest(5.0)
     for side in world.sides:
-        while any(leg.reliable and leg.sender.pending for leg in side.bridge.outbound._legs.values()):  # type: ignore[attr-defined] # reliable
+        while any(leg.reliable and leg.sender.pending for leg in side.bridge.topics.outbound._senders.values()):  # type: ignore[attr-defined] # reliable
             await world.rest(1.0)
 
 
@@ -278,7 +279,7 @@ async def back_on_a_busy_lane(world: World, speaker: Speaker) -> None:
 def waits(side: Side) -> bool:
     """Whether a reliable route waits for the other side to ask for it again."""
     (attached,) = side.attached
-    return side.bridge.exports.waits_for(attached.peer)
+    return side.bridge.topics.exports.waits_for(attached.peer)
 
 
 def test_what_is_kept_waits_until_the_peer_was_told_of_its_topic() -> None:
@@ -334,11 +335,11 @@ def test_the_links_end_ends_the_waiting_for_its_claims(monkeypatch: pytest.Monke
         monkeypatch.setattr(limits, "TELL_PATIENCE", 1e9)
         await back_on_a_busy_lane(world, speaker)
         (attached,) = a.attached
-        timer = attached.back
-        assert timer is not None
+        claims = a.bridge.topics._claims
+        assert claims.untold == {attached.peer}
         for index in (0, 1):
             world.notice(index, silent=True)
-        assert timer.cancelled()
+        assert claims.next_timer() is None
         await asyncio.sleep(2 * mesh_limits.RESUME_CLAIM_MAX)
         assert waits(a), "its outage goes on"
 
@@ -457,7 +458,7 @@ def test_peers_that_never_come_back_are_forgotten_beyond_their_bound(monkeypatch
             world.notice(index, silent=True)
         await talk(world, speaker, 20.0, linked=False)
         assert not speaker.connections
-        assert not a.bridge.outbound.losses
+        assert not a.bridge.topics.outbound.losses
         world.link()
         await world.rest(5.0)
         assert (lost_at_receiver(b), lost_at_sender(a)) == (0, 0)

@@ -21,8 +21,9 @@ BIG = Source("/big", "/one")
 
 def there(world: World) -> ImportFlow:
     """The flow at the receiver."""
-    (attached,) = world.sides[1].attached
-    flow = attached.inbound.flow(BIG, 0)
+    side = world.sides[1]
+    (attached,) = side.attached
+    flow = side.bridge.topics.of(attached).flow(BIG, 0)
     assert flow is not None
     return flow
 
@@ -41,7 +42,7 @@ def test_both_ends_say_it_and_smaller_ones_go_on(
             speaker.say(size)
             await world.rest(0.2)
         assert [number for _, number in listener.got[speaker.number]] == [1, 3, 5]
-        flow = a.bridge.outbound.flows[BIG]
+        flow = a.bridge.topics.outbound.flows[BIG]
         assert (flow.messages, flow.oversized, flow.oversized_bytes) == (3, 2, 1001)
         assert (there(world).oversized, there(world).oversized_bytes, there(world).lost) == (2, 1001, 0)
         assert a.bridge.counters["message.oversized"] == b.bridge.counters["message.oversized_there"] == 2

@@ -24,7 +24,7 @@ from tests.bridge.io.nodes import Core, Listener, Node, PublisherConnection, Spe
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from rmpa.bridge.io.bridge import PeerSession
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.core.contract import ContractRule
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.core.embedded import RosCore
@@ -44,7 +44,7 @@ SMALL_LIMITS: Final = MappingProxyType(
         "ACK_MESSAGES": 4,
         "ACK_BYTES": 1500,
         "ADVERTISED_AT_ONCE": 2,
-        "LEARNT_AT_ONCE": 2,
+        "APPLIED_AT_ONCE": 2,
     }
 )
 """What makes a message of some hundred bytes a large one, and a few of them many."""
@@ -82,14 +82,14 @@ class Side:
     @property
     def attached(self) -> Iterator[PeerSession]:
         """The other side, as far as this one knows it."""
-        return self.bridge.everyone()
+        return iter(self.bridge.sessions)
 
     def publications(self, topic: str) -> Iterator[Publication]:
         """What local nodes can connect to."""
         for attached in self.attached:
-            for _, proxy in attached.inbound:
-                if topic in proxy.publications and self.core.publishers(topic).get(proxy.node.name):
-                    yield proxy.publications[topic]
+            for published in self.bridge.topics.of(attached)._published.values():
+                if published.publication.topic == topic and self.core.publishers(topic).get(published.node.name):
+                    yield published.publication
 
     def named(self, topic: str) -> None:
         """The master has named a topic's publishers."""
@@ -165,8 +165,8 @@ class World:
                 end.clock_offset, end.clock_error = 0.0, 0.001
             end.side.link = end
         for end in self.rng.sample(self._ends, 2):
-            end.side.bridge.link_up(cast("PeerLink", end))
-            end.side.bridge.clock(cast("PeerLink", end))
+            end.side.bridge.sessions.link_up(cast("PeerLink", end))
+            end.side.bridge.sessions.clock(cast("PeerLink", end))
 
     def cut(self) -> None:
         """The cable is out: nothing arrives any more; nobody has noticed yet."""
@@ -212,7 +212,7 @@ class World:
         if end is not None and end in self._bulk_lost and not end.gone:
             self._bulk_lost.remove(end)
             end.bulk.disconnect()
-            end.side.bridge.lane_lost(cast("PeerLink", end))
+            end.side.bridge.sessions.lane_lost(cast("PeerLink", end))
 
     def mend_bulk(self) -> None:
         """There is a new bulk connection; who had not noticed the end of the last one does so now."""
@@ -296,20 +296,22 @@ class World:
         """Nobody listens: nothing is connected, nothing flows, nothing is remembered of it."""
         for side in self.sides:
             bridge = side.bridge
-            assert not bridge.exports._flows
-            assert not bridge.outbound.flows
-            assert not bridge.outbound._connections
-            assert not bridge.outbound._legs
-            assert not bridge.outbound._parked
+            assert not bridge.topics.exports._flows
+            assert not bridge.topics.outbound.flows
+            assert not bridge.topics.outbound._connections
+            assert not bridge.topics.outbound._senders
+            assert not bridge.topics.outbound._parked
             for attached in side.attached:
-                assert not attached.inbound.flows
-                assert not attached.inbound._latest
-                assert not attached.inbound._watches
+                topics = bridge.topics.of(attached)
+                assert not topics.flows
+                assert not topics._latest
+                assert not topics._watches
+                assert not attached.handlers
         for end in self._ends:
             for lane in (end.express, end.bulk):
                 assert lane.outbox.pending_bytes == 0
                 assert not lane._open
-                assert not lane.outbox._special
+                assert not lane.outbox._own_bounds
 
 
 @contextmanager

@@ -26,7 +26,7 @@ from rmpa.bridge.services.exports import (
 from rmpa.config import limits as config_limits
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings
 from rmpa.core.errors import RemoteProtocolError
-from tests.bridge.services.test_rules import obey, rules
+from tests.bridge.services.test_rules import apply_rules, rules
 
 ADD = LocalService("/adder", "rosrpc://127.0.0.1:5")
 ABOUT = ServiceAbout("a/Add", "6a2e34150c00229791cc89ff309fff21")
@@ -35,8 +35,8 @@ ROUTE = limits.SERVICE_ROUTES + 1
 
 def told(exports: ServiceExports, peer: int = 1) -> list[AdvertiseServices]:
     found = []
-    while exports.untold:
-        sent = [action.message for action in exports.tell() if isinstance(action, Send) and action.peer == peer]
+    while exports.pending:
+        sent = [action.message for action in exports.advertise() if isinstance(action, Send) and action.peer == peer]
         found += [message for message in sent if isinstance(message, AdvertiseServices)]
     return found
 
@@ -186,9 +186,9 @@ def test_other_rules_touch_only_what_they_change(exports: ServiceExports) -> Non
     exports.graph("/sub", ADD)
     told(exports)
     requests = opened(exports)
-    assert obey(exports, rules(ServiceSettings(deny=("/sub",)))) == [ServerGone("/sub")]
+    assert apply_rules(exports, rules(ServiceSettings(deny=("/sub",)))) == [ServerGone("/sub")]
     assert told(exports) == [AdvertiseServices(removed=("/sub",))]
     assert exports.callers("/add") == (1,)
-    gone = obey(exports, rules(ServiceSettings(deny=("/add",))))
+    gone = apply_rules(exports, rules(ServiceSettings(deny=("/add",))))
     assert EndRoute(1, ROUTE, requests) in gone
     assert told(exports) == [AdvertiseServices((ServiceOffer("/sub", "/adder"),), ("/add",))]

@@ -26,7 +26,7 @@ from rmpa.bridge.services.imports import (
 )
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
-from tests.bridge.services.test_rules import obey, rules
+from tests.bridge.services.test_rules import apply_rules, rules
 
 MD5 = "6a2e34150c00229791cc89ff309fff21"
 ROUTE = limits.SERVICE_ROUTES + 1
@@ -157,9 +157,9 @@ def test_what_a_returning_peer_no_longer_has_goes_when_it_has_said_all(imports: 
     imports.link_down(1)
     imports.link_up(1, "base", 10)
     assert imports.advertised(1, offer("/sub", full=True, more=True)) == [ForgetAbout(1, "/sub")]
-    gone = imports.advertised(1, offer("/div"))
-    assert gone[0] == Provide(1, "/div", "/n")
-    assert {a.service for a in gone[1:] if isinstance(a, Withdraw)} == {"/add", "/mul"}
+    *gone, new = imports.advertised(1, offer("/div"))
+    assert new == Provide(1, "/div", "/n")
+    assert {a.service for a in gone if isinstance(a, Withdraw)} == {"/add", "/mul"}
 
 
 def test_another_node_in_its_place_is_another_service(imports: ServiceImports) -> None:
@@ -189,7 +189,7 @@ def test_names_here_are_made_by_the_peers_rules() -> None:
     assert made.advertised(1, offer("/go", full=True)) == [Provide(1, "/robot1/go", "/n")]
     assert made.want(1, "/robot1/go", 0.0) == [Send(1, OpenService(ROUTE, "/go"))]
     made.closed(1, ServiceClosed(ROUTE, "no"))
-    changed = obey(made, rules(peers=(PeerRule("robot", prefix="/r"),)))
+    changed = apply_rules(made, rules(peers=(PeerRule("robot", prefix="/r"),)))
     assert [type(action) for action in changed] == [Withdraw, Provide]
     assert made.get(1, "/r/go") is not None
     assert made.get(1, "/robot1/go") is None
@@ -208,9 +208,9 @@ def test_two_of_one_peer_that_would_have_one_name_here() -> None:
 def test_other_rules_touch_only_what_they_change(imports: ServiceImports) -> None:
     imports.advertised(1, offer("/sub"))
     opened(imports)
-    (gone,) = obey(imports, rules(ServiceSettings(deny=("/sub",))))
+    (gone,) = apply_rules(imports, rules(ServiceSettings(deny=("/sub",))))
     assert gone == Withdraw(1, "/sub", "/n", "policy: services.deny has '/sub'")
     remote = imports.get(1, "/add")
     assert remote is not None
     assert remote.state is SessionState.OPEN
-    assert obey(imports, rules()) == [Provide(1, "/sub", "/n")]
+    assert apply_rules(imports, rules()) == [Provide(1, "/sub", "/n")]

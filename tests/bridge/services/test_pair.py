@@ -43,7 +43,7 @@ from rmpa.bridge.services.imports import (
 )
 from rmpa.config.settings import ServiceSettings
 from rmpa.core.errors import RemoteProtocolError
-from tests.bridge.services.test_rules import obey, rules
+from tests.bridge.services.test_rules import apply_rules, rules
 
 SERVICES = ["/a", "/b", "/c"]
 ABOUT = ServiceAbout("a/Add", "6a2e34150c00229791cc89ff309fff21")
@@ -141,8 +141,8 @@ class World:
 
     def change_rules(self, _service: str) -> None:
         self.rules = STRICT if self.rules is OPEN else OPEN
-        self.act(obey(self.exports, self.rules))
-        self.act(obey(self.imports, self.rules))
+        self.act(apply_rules(self.exports, self.rules))
+        self.act(apply_rules(self.imports, self.rules))
 
     def link(self, _service: str = "") -> None:
         if not self.linked:
@@ -175,7 +175,7 @@ class World:
                 self.act(self.exports.refused(probe.service, "no answer"))
 
     def deliver(self, _service: str = "") -> bool:
-        self.act(self.exports.tell())
+        self.act(self.exports.advertise())
         if self.to_caller:
             self._to_caller(decode(self.to_caller.popleft()))
         elif self.to_server:

@@ -20,9 +20,9 @@ def rules(settings: ServiceSettings | None = None, peers: tuple[PeerRule, ...] =
     return ServiceRules(settings or ServiceSettings(), Policy(PolicySettings(), peers), Names(peers))
 
 
-def obey(plan: ServiceExports | ServiceImports, changed: ServiceRules) -> list[Any]:
+def apply_rules(plan: ServiceExports | ServiceImports, changed: ServiceRules) -> list[Any]:
     """Everything that other rules bring."""
-    return [action for portion in plan.obey(changed) for action in portion]
+    return [action for portion in plan.apply_rules(changed) for action in portion]
 
 
 @pytest.mark.parametrize(

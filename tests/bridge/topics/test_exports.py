@@ -4,7 +4,7 @@ import msgspec
 import pytest
 
 from rmpa.bridge.actions import Action, AddRoute, Connect, Disconnect, RemoveRoute, Send, SuspendRoute, Warn
-from rmpa.bridge.bounds import Beyond
+from rmpa.bridge.catalogue.bounds import Beyond
 from rmpa.bridge.messages import (
     Advertise,
     CloseRoute,
@@ -30,8 +30,8 @@ def graph(exports: Exports, sources: dict[Source, LocalSource]) -> list[Action]:
     actions = []
     for topic in sorted({*exports.topics, *(source.topic for source in sources)}):
         actions += exports.graph(topic, {s.node: local for s, local in sources.items() if s.topic == topic})
-    while exports.untold:
-        actions += exports.tell()
+    while exports.pending:
+        actions += exports.advertise()
     return actions
 
 
@@ -211,8 +211,8 @@ def test_a_large_graph_is_told_a_part_at_a_time(exports: Exports) -> None:
     graph(exports, many(200))
     actions = exports.link_up(1)
     exports.link_up(2)
-    while exports.untold:
-        told = exports.tell()
+    while exports.pending:
+        told = exports.advertise()
         assert len(told) <= 2
         actions += told
     messages = [action.message for action in actions if isinstance(action, Send) and action.peer == 1]
@@ -228,14 +228,14 @@ def test_what_came_and_went_before_it_was_told_is_not_told(exports: Exports) -> 
     exports.link_up(1)
     exports.graph("/cmd", {"/joy": JOY})
     exports.graph("/cmd", {})
-    assert exports.tell() == []
+    assert exports.advertise() == []
     graph(exports, {CMD: JOY})
     exports.graph("/cmd", {})
     exports.graph("/cmd", {"/joy": JOY})
-    assert [exports.untold, exports.tell(), exports.untold] == [True, [], False]
+    assert [exports.pending, exports.advertise(), exports.pending] == [True, [], False]
     exports.graph("/cmd", {})
     exports.graph("/cmd", {"/joy": LocalSource("std_msgs/Empty", JOY.uri)})
-    assert exports.tell() == [Send(1, Advertise(added=(TopicOffer("/cmd", "/joy", "std_msgs/Empty"),)))]
+    assert exports.advertise() == [Send(1, Advertise(added=(TopicOffer("/cmd", "/joy", "std_msgs/Empty"),)))]
 
 
 def test_room_is_given_to_a_source_that_there_were_too_many_for() -> None:
@@ -246,7 +246,7 @@ def test_room_is_given_to_a_source_that_there_were_too_many_for() -> None:
     exports.graph("/t0003", {})
     exports.graph("/t0000", {})
     assert [source.topic for source in exports.offered] == ["/t0001", "/t0002"]
-    assert exports.tell() == [
+    assert exports.advertise() == [
         Send(1, Advertise(added=(TopicOffer("/t0002", "/n", JOY.type),), removed=(Source("/t0000", "/n"),)))
     ]
     exports.graph("/t0001", {})
@@ -269,7 +269,7 @@ def test_a_change_costs_what_changed_and_not_what_there_is(exports: Exports) -> 
     assert exports.graph("/t0001", {"/n": JOY}) == []
     assert exports.graph("/t0001", {}) == []
     assert exports.graph("/t0001", {"/m": JOY}) == []
-    assert exports.tell() == [
+    assert exports.advertise() == [
         Send(1, Advertise(added=(TopicOffer("/t0001", "/m", JOY.type),), removed=(Source("/t0001", "/n"),)))
     ]
     assert asked == ["/t0001"]

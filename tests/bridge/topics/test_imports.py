@@ -18,7 +18,8 @@ from rmpa.bridge.messages import (
     TopicOffer,
 )
 from rmpa.bridge.policy import Policy
-from rmpa.bridge.topics.imports import TRANSITIONS, Imports, RouteState
+from rmpa.bridge.topics.imports import Imports
+from rmpa.bridge.topics.remote_topic import TRANSITIONS, RouteState
 from rmpa.config.settings import PolicySettings
 from rmpa.core.contract import Contract, ContractRule, Contracts, Reliability
 
@@ -195,7 +196,7 @@ def test_a_long_advertisement_comes_to_the_same_in_portions(imports: Imports) ->
     whole = imports.advertised(1, change)
     portions = list(imports.portions(2, change))
     assert max(len(portion.added) + len(portion.removed) for portion in portions) <= 16
-    parts = [action for portion in portions for action in imports.advertised(2, portion)]
+    parts = [action for portion in portions for action in imports.take_in(2, portion, 0.0)]
     assert [replace(action, peer=1) for action in parts if isinstance(action, Publish | Retract)] == whole
     assert set(imports.offered_by(1)) == set(imports.offered_by(2)) == {offer.topic for offer in many(100)[20:]}
 
@@ -369,10 +370,10 @@ def test_what_is_offered_no_more_goes_when_the_whole_offer_is_there(flowing: Imp
     flowing.link_away(1)
     flowing.link_up(1)
     [portion] = flowing.portions(1, Advertise(added=(ODOM,), full=True, more=True))
-    assert flowing.advertised(1, portion, 10.0) == [Publish(1, ODOM.source, "a/B")]
+    assert flowing.take_in(1, portion, 10.0) == [Publish(1, ODOM.source, "a/B")]
     assert state(flowing) is RouteState.WAITING
     portions = flowing.portions(1, Advertise())
-    actions = [action for portion in portions for action in flowing.advertised(1, portion, 10.0)]
+    actions = [action for portion in portions for action in flowing.take_in(1, portion, 10.0)]
     assert actions == [Detach(1, CMD, 0), Retract(1, CMD)]
 
 

@@ -7,12 +7,13 @@ import contextlib
 import logging
 import os
 import socket
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.config.settings import HostPort, Settings
+from rmpa.config.settings import HostPort, Multicast, Settings
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.discovery import limits
@@ -66,7 +67,7 @@ class Agent:
 
 @pytest.fixture
 def settings() -> Settings:
-    return Settings(group="239.255.82.78", group_port=free_port(), interfaces=("lo",))
+    return Settings(multicast=Multicast(group="239.255.82.78", port=free_port()), interfaces=("lo",))
 
 
 @pytest.fixture
@@ -112,7 +113,7 @@ async def test_a_restart_on_the_same_port_is_told(agents: list[Agent], settings:
     await start(agents, base)
     await start([], pc)
     await until(base.names)
-    pc.discovery._roster._closed = True  # killed: no goodbye
+    pc.discovery._membership._closed = True  # killed: no goodbye
     await pc.end()
     again = Agent("pc", settings, port=pc.port)
     await start(agents, again)
@@ -168,7 +169,10 @@ async def test_other_domains_do_not_meet(agents: list[Agent], settings: Settings
     base = Agent("base", settings)
     # The port moves with the domain; a wrong setting could still bring both to one port.
     other = Agent(
-        "other", Settings(group=settings.group, group_port=settings.group_port - 1, domain=1, interfaces=("lo",))
+        "other",
+        Settings(
+            multicast=replace(settings.multicast, port=settings.multicast.port - 1), domain=1, interfaces=("lo",)
+        ),
     )
     await start(agents, base, other)
     await until(lambda: base.discovery.counters["beacon.other_domain"] >= 2)
@@ -176,10 +180,10 @@ async def test_other_domains_do_not_meet(agents: list[Agent], settings: Settings
 
 
 async def test_seeds_without_multicast_and_gossip(agents: list[Agent], settings: Settings) -> None:
-    quiet = {"group": settings.group, "group_port": settings.group_port, "multicast": False}
-    hub = Agent("hub", Settings(**quiet))  # type: ignore[arg-type]
+    quiet = replace(settings.multicast, enabled=False)
+    hub = Agent("hub", Settings(multicast=quiet))
     seeds = (HostPort("127.0.0.1", hub.port),)
-    left, right = (Agent(n, Settings(**quiet, seeds=seeds)) for n in ("left", "right"))  # type: ignore[arg-type]
+    left, right = (Agent(n, Settings(multicast=quiet, seeds=seeds)) for n in ("left", "right"))
     await start(agents, hub, left, right)
     await until(lambda: left.names() == {"hub", "right"} and right.names() == {"hub", "left"})
     assert hub.discovery.counters["beacon.out_multicast"] == 0
@@ -187,7 +191,7 @@ async def test_seeds_without_multicast_and_gossip(agents: list[Agent], settings:
 
 
 async def test_a_seed_by_name_and_without_a_port(agents: list[Agent], settings: Settings) -> None:
-    quiet = {"group": settings.group, "group_port": settings.group_port, "multicast": False}
+    quiet = replace(settings.multicast, enabled=False)
     tries: list[str] = []
 
     def resolve(host: str) -> list[str]:
@@ -196,11 +200,11 @@ async def test_a_seed_by_name_and_without_a_port(agents: list[Agent], settings: 
             raise OSError("no name server yet")
         return ["127.0.0.1"]
 
-    hub = Agent("hub", Settings(**quiet))  # type: ignore[arg-type]
+    hub = Agent("hub", Settings(multicast=quiet))
     await start(agents, hub)
     # On one machine the last that opened the discovery port gets its unicasts; keep that one the hub.
-    left = Agent("left", Settings(**quiet, seeds=(HostPort("robot.local"),)), resolve=resolve)  # type: ignore[arg-type]
-    left.discovery._open_door = lambda: None  # type: ignore[method-assign]
+    left = Agent("left", Settings(multicast=quiet, seeds=(HostPort("robot.local"),)), resolve=resolve)
+    left.discovery._open_seed_port = lambda: None  # type: ignore[method-assign]
     await start(agents, left)
     await until(lambda: left.names() == {"hub"} and hub.names() == {"left"})
     assert tries == ["robot.local"] * 2
@@ -212,7 +216,7 @@ async def test_a_seed_that_never_resolves_does_not_hold_up_the_end(settings: Set
     stuck = threading.Event()
     agent = Agent(
         "base",
-        Settings(multicast=False, group_port=settings.group_port, seeds=(HostPort("nowhere"),)),
+        Settings(multicast=replace(settings.multicast, enabled=False), seeds=(HostPort("nowhere"),)),
         resolve=lambda _: (stuck.wait(DEADLINE) and []) or [],
     )
     await agent.discovery.start()
@@ -258,7 +262,7 @@ async def test_an_unknown_interface_is_said_and_used_when_it_comes(
     there = list_interfaces()
     (loopback,) = (i for i in there if i.name == "lo")
     now_there: list[Interface] = [i for i in there if i.name != "lo"]
-    odd = Settings(group=settings.group, group_port=settings.group_port, interfaces=("lo", "wlan7"))
+    odd = Settings(multicast=settings.multicast, interfaces=("lo", "wlan7"))
     base = Agent("base", odd, look=lambda: tuple(now_there))
     pc = Agent("pc", settings)
     await start(agents, base, pc)
@@ -278,7 +282,7 @@ async def test_an_interface_that_refuses_is_said_once(
 ) -> None:
     (loopback,) = (i for i in list_interfaces() if i.name == "lo")
     gone = Interface("gone0", 4242, loopback.addresses, up=True, multicast=True, loopback=False)
-    both = Settings(group=settings.group, group_port=settings.group_port)
+    both = Settings(multicast=settings.multicast)
     base, pc = Agent("base", both, look=lambda: (loopback, gone)), Agent("pc", settings)
     await start(agents, base, pc)
     await until(lambda: pc.names() == {"base"} and base.discovery.counters["beacon.send_failed"] >= 3)
@@ -292,7 +296,7 @@ async def test_a_discovery_port_that_somebody_keeps_is_said(
     agents: list[Agent], settings: Settings, caplog: pytest.LogCaptureFixture
 ) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as keeper:
-        keeper.bind(("", settings.group_port))
+        keeper.bind(("", settings.multicast.port))
         base = Agent("base", settings)
         await start(agents, base)
         assert "cannot listen at" in caplog.text
@@ -348,24 +352,24 @@ async def test_an_identity_that_no_longer_fits_is_announced_no_more(agents: list
 
     base = Agent("base", settings, look=lambda: tuple(now_there), on_interfaces=fits)
     await start(agents, base)
-    await until(lambda: not base.discovery._roster._burst)
+    await until(lambda: not base.discovery._membership._burst)
     for times in (1, 2):
         now_there.append(Interface(f"new{times}", 4242 + times, (), up=False, multicast=False, loopback=False))
         base.discovery._watcher._compare()
         assert len(asked) == times
-        assert bool(base.discovery._roster._burst) == (times == 2)
+        assert bool(base.discovery._membership._burst) == (times == 2)
 
 
 async def test_seeds_that_do_not_answer_and_another_domain_are_told(
     agents: list[Agent], settings: Settings, caplog: pytest.LogCaptureFixture
 ) -> None:
-    quiet = {"group": settings.group, "group_port": settings.group_port, "multicast": False}
-    hub = Agent("hub", Settings(**quiet, domain=1))  # type: ignore[arg-type]
+    quiet = replace(settings.multicast, enabled=False)
+    hub = Agent("hub", Settings(multicast=quiet, domain=1))
     seed = (HostPort("127.0.0.1", hub.port),)
-    left = Agent("left", Settings(**quiet, domain=2, seeds=seed))  # type: ignore[arg-type]
+    left = Agent("left", Settings(multicast=quiet, domain=2, seeds=seed))
     await start(agents, hub, left)
     await until(lambda: "is of domain 2, we are of domain 1: start both with the same --domain" in caplog.text)
     assert f"seed 127.0.0.1:{hub.port}: no answer" in left.discovery.notes()[0]
-    right = Agent("right", Settings(**quiet, domain=1, seeds=seed))  # type: ignore[arg-type]
+    right = Agent("right", Settings(multicast=quiet, domain=1, seeds=seed))
     await start(agents, right)
     await until(lambda: right.discovery.notes() == ())

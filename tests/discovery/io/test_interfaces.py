@@ -25,7 +25,7 @@ BARE = interface("eth1")
 ODD = interface("usb0", "169.254.3.4")
 
 
-def test_usable_are_those_that_are_up_have_an_address_and_carry_multicast() -> None:
+def test_usable_interface_is_up_has_an_address_and_multicast() -> None:
     assert choose((LO, ETH, DOWN, TUN, BARE, ODD)) == (LO, ETH, ODD)
 
 

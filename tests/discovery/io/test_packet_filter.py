@@ -39,7 +39,7 @@ class Door:
     def flood(self, count: int, now: float, *, interface: int = 1) -> int:
         """So many forged beacons, each from an address of its own; return how many got in."""
         found = (
-            self.intake.take(forged(n), source(n), now, multicast=True, interface=interface) for n in range(count)
+            self.intake.parse(forged(n), source(n), now, multicast=True, interface=interface) for n in range(count)
         )
         return sum(beacon is not None for beacon in found)
 
@@ -55,27 +55,28 @@ def test_peers_without_a_link_share_what_an_interface_takes() -> None:
 def test_a_linked_peer_is_heard_through_a_flood() -> None:
     door = Door()
     door.flood(3000, 10.0)
-    heard = door.intake.take(packet(FRIEND, 7), ("10.0.0.2", 4000), 10.0, multicast=True, interface=1)
+    heard = door.intake.parse(packet(FRIEND, 7), ("10.0.0.2", 4000), 10.0, multicast=True, interface=1)
     assert heard is not None
     assert heard.identity == FRIEND
     again = Identity(FRIEND.guid, b"g" * 16, "friend")
-    assert door.intake.take(packet(again, 8), ("10.0.0.2", 4000), 10.0, multicast=True, interface=1) is None
+    assert door.intake.parse(packet(again, 8), ("10.0.0.2", 4000), 10.0, multicast=True, interface=1) is None
 
 
-def test_what_is_no_beacon_of_ours_is_counted_as_what_it_is_during_a_flood() -> None:
+def test_malformed_packets_are_counted_by_kind_during_a_flood() -> None:
     door = Door()
     door.flood(3000, 10.0)
     good = packet(FRIEND, 9)
     for data in (b"garbage", good[:30], good[:4] + b"\x09" + good[5:], good[:6] + b"\0\1" + good[8:]):
-        assert door.intake.take(data, ("10.3.0.1", 1), 10.0, multicast=True, interface=1) is None
+        assert door.intake.parse(data, ("10.3.0.1", 1), 10.0, multicast=True, interface=1) is None
     counted = [door.counters[f"beacon.{name}"] for name in ("malformed", "version", "other_domain")]
     assert counted == [2, 1, 1]
 
 
-def test_one_address_that_sends_too_much_is_ignored_for_the_rest_of_the_second() -> None:
+def test_flooding_address_is_ignored_for_the_rest_of_the_second() -> None:
     door = Door()
     taken = [
-        door.intake.take(packet(FRIEND, n), ("10.0.0.2", 4000), 10.0, multicast=True, interface=1) for n in range(500)
+        door.intake.parse(packet(FRIEND, n), ("10.0.0.2", 4000), 10.0, multicast=True, interface=1)
+        for n in range(500)
     ]
     assert sum(beacon is not None for beacon in taken) == limits.BEACONS_PER_SOURCE
-    assert door.intake.take(packet(FRIEND, 501), ("10.0.0.2", 4000), 11.0, multicast=True, interface=1) is not None
+    assert door.intake.parse(packet(FRIEND, 501), ("10.0.0.2", 4000), 11.0, multicast=True, interface=1) is not None

@@ -14,6 +14,7 @@ using node::hints;
 using node::init;
 using node::Options;
 using node::say;
+using node::wall_ns;
 
 constexpr size_t kHeader = 20;
 constexpr size_t kPeriod = 251;
@@ -22,11 +23,6 @@ inline uint32_t crc32(const uint8_t* data, size_t size) {
   boost::crc_32_type crc;
   crc.process_bytes(data, size);
   return static_cast<uint32_t>(crc.checksum());
-}
-
-inline uint64_t wall_ns() {
-  using namespace std::chrono;
-  return duration_cast<nanoseconds>(system_clock::now().time_since_epoch()).count();
 }
 
 // Bodies of one size: the same bytes as payload.py makes.

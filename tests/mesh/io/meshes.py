@@ -35,7 +35,7 @@ async def until(condition: Callable[[], bool], what: str) -> None:
 
 
 class Peer:
-    """A mesh and what it was told."""
+    """A mesh, and what it passed to its callbacks."""
 
     def __init__(
         self,
@@ -118,7 +118,7 @@ class Peer:
         return self.linked(*others) and all(self.link(other).bulk_connection is not None for other in others)
 
     def kill(self) -> None:
-        """As kill -9: the kernel closes the sockets, nobody says bye."""
+        """As kill -9: the kernel closes the sockets, and no bye is sent."""
         self.mesh._running = False
         self.mesh._acceptor.close()
         self.mesh._timer.close()
@@ -161,7 +161,7 @@ async def linked_pair() -> AsyncIterator[tuple[Peer, Peer]]:
 async def raw(
     peer: Peer, identity: Identity, *, lease: float = 1.0, lane: int = Lane.EXPRESS
 ) -> tuple[socket.socket, Frame]:
-    """A hand-made dialler: its socket, and the first frame that it is answered."""
+    """A hand-made dialler: its socket, and the first frame of the answer."""
     loop = asyncio.get_running_loop()
     sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
     peer.hand_made.append(sock)

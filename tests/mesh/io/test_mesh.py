@@ -60,7 +60,7 @@ async def test_one_side_alone_knows_the_other() -> None:
 
 
 async def test_of_several_addresses_whichever_answers_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody answers at the GUID's own address; at the next one nobody listens, and at the third a stranger does."""
+    """The GUID's own address does not answer, the next one refuses, at the third another program answers."""
     one, other = sorted((Peer(1, host="127.0.0.4"), Peer(2, host="127.0.0.4")), key=lambda p: p.identity.guid)
     connect = one.mesh.dialler.connect  # where packets are swallowed
 
@@ -88,10 +88,10 @@ async def test_of_several_addresses_whichever_answers_is_used(monkeypatch: pytes
         await other.mesh.close()
 
 
-async def test_a_link_that_ends_during_its_redial_leaves_no_socket(
+async def test_link_that_ends_during_its_redial_leaks_no_socket(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The race of addresses ends when the silent link, and its socket, are closed already."""
+    """The race of addresses ends after the silent link and its socket were closed."""
     async with peers(2) as made:
         one, other = sorted(made, key=lambda peer: peer.identity.guid)
         await until(lambda: one.linked(other) and other.linked(one), "a link")
@@ -123,7 +123,7 @@ async def test_a_link_that_ends_during_its_redial_leaves_no_socket(
         await until(lambda: one.linked(other) and other.linked(one), "the peers' machine dials again")
 
 
-async def test_a_link_that_ends_while_its_bulk_lane_is_dialled_leaves_no_socket(
+async def test_link_that_ends_during_a_bulk_dial_leaks_no_socket(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     async with peers(2, found=False) as made:
@@ -174,7 +174,7 @@ async def test_a_dial_that_fails_of_a_bug_is_logged(
         assert not one.mesh._dials
 
 
-async def test_small_and_large_messages_in_order_and_byte_exact() -> None:
+async def test_messages_arrive_in_order_and_byte_exact() -> None:
     async with peers(2) as (one, other):
         await until(lambda: one.linked(other) and other.linked(one), "a link")
         link = one.link(other)
@@ -196,7 +196,7 @@ async def test_small_and_large_messages_in_order_and_byte_exact() -> None:
         assert not link.dropped
 
 
-async def test_a_killed_peer_comes_back_with_a_new_instance_on_the_same_port() -> None:
+async def test_killed_peer_comes_back_as_a_new_instance() -> None:
     async with peers(3) as (one, two, three):
         await until(lambda: one.linked(two, three) and two.linked(one, three) and three.linked(one, two), "a mesh")
         one.kill()
@@ -252,7 +252,7 @@ async def test_another_domain_is_refused_with_what_to_do(caplog: pytest.LogCaptu
         ]
 
 
-async def test_a_stopped_peer_is_down_after_its_lease_and_its_memory_is_bounded(
+async def test_stopped_peer_is_down_after_its_lease(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(limits, "LINK_QUEUE_BYTES", 4 * MIB)
@@ -278,7 +278,7 @@ async def test_a_stopped_peer_is_down_after_its_lease_and_its_memory_is_bounded(
         sock.close()
 
 
-async def test_control_that_nobody_reads_closes_the_link_with_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_unread_control_frames_close_the_link(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "LINK_URGENT_BYTES", MIB)
     async with peers(1) as (one,):
         sock, _ = await raw(one, Identity(Guid.of("127.0.0.1", 9), b"s" * 16, "deaf"), lease=60.0)
@@ -290,8 +290,8 @@ async def test_control_that_nobody_reads_closes_the_link_with_a_reason(monkeypat
         sock.close()
 
 
-def test_little_waits_in_the_kernel_for_a_peer_that_is_slow() -> None:
-    """What waits in our own queue can be overtaken and dropped; a pong behind megabytes of data was 5 s late."""
+def test_kernel_queue_stays_short_for_a_slow_peer() -> None:
+    """Messages in the agent's own queue can be overtaken; a pong behind megabytes of data was 5 s late."""
     counters = Counters()
     with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as sock:
         tune_express(sock, LaneSettings(), counters)
@@ -332,7 +332,7 @@ async def test_what_waits_for_a_link_that_ends_is_counted() -> None:
         assert waiting - 2 <= one.mesh.counters["link.discarded"] <= waiting, "but for what was on its way"
 
 
-async def test_a_peer_that_is_not_there_says_why_it_is_not_linked() -> None:
+async def test_status_of_an_unreachable_peer_says_why() -> None:
     async with peers(1) as (one,):
         free = socket.socket()
         free.bind(("127.0.0.1", 0))

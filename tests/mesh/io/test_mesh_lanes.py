@@ -30,7 +30,7 @@ HAND_MADE = Identity(Guid.of("127.0.0.1", 9), b"h" * 16, "hand_made")
 
 
 def large(number: int, size: int) -> bytes:
-    """Bytes of which no piece is like another."""
+    """Bytes without repetitions."""
     block = hashlib.sha256(number.to_bytes(4, "big")).digest()
     return b"".join(hashlib.sha256(block + n.to_bytes(4, "big")).digest() for n in range(size // 32 + 1))[:size]
 
@@ -45,7 +45,7 @@ def bulk_of(link: PeerLink) -> Connection:
 
 
 @pytest.mark.parametrize("count", [2, 4])
-async def test_each_link_has_a_bulk_lane_that_the_same_side_dialled(count: int) -> None:
+async def test_same_side_dials_both_lanes(count: int) -> None:
     async with peers(count) as made:
         others = {p.number: [o for o in made if o is not p] for p in made}
         await until(lambda: all(p.both_lanes(*others[p.number]) for p in made), "both lanes everywhere")
@@ -83,7 +83,7 @@ async def test_the_sockets_of_both_lanes_have_their_options() -> None:
             assert not peer.mesh.counters["link.option_refused"]
 
 
-async def test_by_default_commands_go_first_in_every_queue_and_wifi_class() -> None:
+async def test_express_lane_has_priority_by_default() -> None:
     async with linked_pair() as (one, other):
         link = one.link(other)
         for connection, tos, priority in ((link.connection, 0xC0, 6), (bulk_of(link), 0, 0)):
@@ -94,9 +94,7 @@ async def test_by_default_commands_go_first_in_every_queue_and_wifi_class() -> N
 @pytest.mark.parametrize(
     ("lane", "code"), [(Lane.BULK, Refusal.NO_EXPRESS), (0, Refusal.LANE), (3, Refusal.LANE), (255, Refusal.LANE)]
 )
-async def test_a_lane_without_an_express_one_and_one_that_does_not_exist_are_refused(
-    lane: int, code: Refusal
-) -> None:
+async def test_unknown_lane_and_lone_bulk_lane_are_refused(lane: int, code: Refusal) -> None:
     async with peers(1) as (one,):
         sock, answer = await raw(one, HAND_MADE, lane=lane)
         assert answer.kind is FrameKind.REFUSE
@@ -107,7 +105,7 @@ async def test_a_lane_without_an_express_one_and_one_that_does_not_exist_are_ref
         assert not one.ups
 
 
-async def test_another_instance_gets_no_bulk_lane_beside_a_link_that_is_not_its_own() -> None:
+async def test_other_instance_gets_no_bulk_lane() -> None:
     async with peers(1) as (one,):
         express, answer = await raw(one, HAND_MADE)
         assert answer.kind is FrameKind.WELCOME
@@ -125,7 +123,7 @@ async def test_both_sides_promise_the_bulk_lanes_lease() -> None:
             assert leases == [limits.LINK_LEASE, limits.BULK_LEASE]
 
 
-async def test_whoever_takes_what_comes_takes_it_from_both_lanes() -> None:
+async def test_handlers_receive_from_both_lanes() -> None:
     async with linked_pair() as (one, other):
         got: list[int] = []
         link = other.link(one)
@@ -136,7 +134,7 @@ async def test_whoever_takes_what_comes_takes_it_from_both_lanes() -> None:
         await until(lambda: sorted(got) == [1, 2], "both")
 
 
-async def test_a_bulk_lane_that_cannot_be_reached_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_failed_dial_of_a_bulk_lane_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
     async with peers(2, found=False) as made:
         one, other = sorted(made, key=lambda peer: peer.identity.guid)
         hold_bulk(one, fails=3)
@@ -180,7 +178,7 @@ async def test_messages_of_all_sizes_arrive_byte_for_byte(lane: str) -> None:
             assert receiver.data == sent
 
 
-async def test_a_message_that_is_sent_while_it_comes_arrives_as_one() -> None:
+async def test_message_sent_in_parts_arrives_as_one() -> None:
     async with linked_pair() as (one, other):
         lane = one.link(other).bulk
         payload = large(1, 300_000)
@@ -194,7 +192,7 @@ async def test_a_message_that_is_sent_while_it_comes_arrives_as_one() -> None:
         assert len(other.messages(8)) == 5
 
 
-async def test_an_abandoned_message_is_nobodys_and_the_next_one_comes() -> None:
+async def test_abandoned_message_is_not_delivered() -> None:
     async with linked_pair() as (one, other):
         lane = one.link(other).bulk
         parcel = lane.open(7, 300_000, 1, 0)
@@ -207,7 +205,7 @@ async def test_an_abandoned_message_is_nobodys_and_the_next_one_comes() -> None:
         assert not other._begun
 
 
-async def test_small_messages_of_the_same_lane_go_between_the_parts_of_large_ones() -> None:
+async def test_small_messages_go_between_parts_of_large_ones() -> None:
     async with linked_pair() as (one, other):
         lane = one.link(other).bulk
         lane.send(7, 1, 0, bytes(32 << 20))
@@ -233,7 +231,7 @@ async def test_each_route_has_its_own_bound_and_drops_its_own() -> None:
         assert [link.dropped for link in one.mesh.links()] == [3]
 
 
-async def test_a_closed_route_lets_go_of_what_waits() -> None:
+async def test_closed_route_drops_what_waits() -> None:
     async with linked_pair() as (one, other):
         link = one.link(other)
         link.bulk.send(7, 0, 0, bytes(32 << 20))
@@ -252,7 +250,7 @@ async def test_a_closed_route_lets_go_of_what_waits() -> None:
 
 
 @pytest.mark.parametrize("by_dialler", [True, False])
-async def test_the_bulk_lane_falls_and_comes_back_while_small_messages_go_on(by_dialler: bool) -> None:
+async def test_small_messages_go_on_while_the_bulk_lane_is_gone(by_dialler: bool) -> None:
     async with linked_pair() as (one, other):
         held = asyncio.Event()
         hold_bulk(one, until_set=held)
@@ -288,7 +286,7 @@ async def test_the_bulk_lane_falls_and_comes_back_while_small_messages_go_on(by_
             assert link.bytes_out >= was_out + 300_000
 
 
-async def test_cut_in_the_middle_of_large_messages_none_arrives_by_half_and_those_that_waited_do() -> None:
+async def test_cut_bulk_lane_delivers_no_half_message() -> None:
     async with linked_pair() as (one, other):
         lane = one.link(other).bulk
         for cut in range(5):
@@ -319,7 +317,7 @@ async def test_cut_in_the_middle_of_large_messages_none_arrives_by_half_and_thos
         assert not other.downs
 
 
-async def test_the_rest_of_a_message_whose_beginning_went_down_with_the_lane_is_not_sent() -> None:
+async def test_rest_of_a_torn_message_is_not_sent() -> None:
     async with linked_pair() as (one, other):
         lane = one.link(other).bulk
         parcel = lane.open(7, 200_000, 1, 0)
@@ -370,8 +368,8 @@ async def test_a_killed_peer_leaves_no_lane_behind() -> None:
 # --- a bulk lane in place of another ------------------------------------------------------------------------------
 
 
-async def test_a_new_bulk_lane_replaces_one_that_is_stuck_and_carries_what_waited() -> None:
-    """The peer gave its connection up, and we have not heard of it: a router forgot it, perhaps."""
+async def test_new_bulk_lane_replaces_a_stuck_one() -> None:
+    """The peer gave its connection up without this side noticing: perhaps a router forgot it."""
     async with peers(1) as (one,):
         express, _ = await raw(one, HAND_MADE, lease=60.0)
         stuck, answer = await raw(one, HAND_MADE, lease=60.0, lane=Lane.BULK)
@@ -430,7 +428,7 @@ async def read_messages(
 
 
 @pytest.mark.parametrize("way", ["express", "bulk"])
-async def test_a_fence_is_answered_when_all_before_it_has_arrived(way: str) -> None:
+async def test_fence_is_answered_after_all_messages_before_it(way: str) -> None:
     async with linked_pair() as (one, other):
         lane: LaneSender = getattr(one.link(other), way)
         seen: list[list[int]] = []
@@ -453,7 +451,7 @@ async def test_a_fence_is_answered_when_all_before_it_has_arrived(way: str) -> N
         assert not other.marks, "a fence is answered, and told to nobody"
 
 
-async def test_a_route_that_changes_lanes_behind_fences_keeps_its_order() -> None:
+async def test_route_keeps_its_order_when_lanes_change() -> None:
     async with linked_pair() as (one, other):
         link = one.link(other)
         number = 0
@@ -468,7 +466,7 @@ async def test_a_route_that_changes_lanes_behind_fences_keeps_its_order() -> Non
         assert [sequence for _, sequence, _, _ in other.data] == list(range(number))
 
 
-async def test_a_fence_that_waits_for_the_lanes_connection_is_answered_when_it_is_back() -> None:
+async def test_fence_waits_for_the_lanes_connection() -> None:
     async with linked_pair() as (one, other):
         held = asyncio.Event()
         hold_bulk(one, until_set=held)
@@ -486,8 +484,8 @@ async def test_a_fence_that_waits_for_the_lanes_connection_is_answered_when_it_i
         assert other.messages(7) == [(2, b"kept")]
 
 
-async def test_a_fence_on_a_link_whose_messages_nobody_takes_is_not_answered() -> None:
-    """The answer would say that they were taken."""
+async def test_fence_on_an_unused_link_is_not_answered() -> None:
+    """An answer would mean that the messages were delivered."""
     async with peers(1) as (one,):
         sock, _ = await raw(one, HAND_MADE, lease=60.0)
         await until(lambda: bool(one.ups), "a link")
@@ -512,7 +510,7 @@ async def test_a_fence_on_a_link_whose_messages_nobody_takes_is_not_answered() -
         await until(lambda: not one.mesh.connections(), "closed")
 
 
-async def test_acknowledgements_go_in_front_and_by_the_express_lane() -> None:
+async def test_acknowledgements_overtake_data() -> None:
     async with linked_pair() as (one, other):
         link = one.link(other)
         link.express.send(7, 1, 0, bytes(32 << 20))

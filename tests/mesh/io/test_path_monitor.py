@@ -1,4 +1,4 @@
-"""Links on a path that drops large packets: what the kernel tells is made up, all else is real."""
+"""Links on a path that drops large packets: the kernel's statistics are made up, all else is real."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FIRST, LEAST = limits.SEGMENT_BYTES
 
 
 class Hole:
-    """Lets connections stand still that send segments larger than ``passes`` bytes."""
+    """Stalls connections that send segments larger than ``passes`` bytes."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, *peers: Peer) -> None:
         self.passes = 0
@@ -60,7 +60,7 @@ def segment(one: Peer, other: Peer) -> int | None:
 
 
 @pytest.mark.parametrize("dialler", [True, False])
-async def test_a_bulk_lane_that_stands_still_is_dialled_anew_with_small_packets(
+async def test_stalled_bulk_lane_is_redialled_with_small_packets(
     dialler: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with linked_pair() as made:
@@ -87,7 +87,7 @@ async def test_a_bulk_lane_that_stands_still_is_dialled_anew_with_small_packets(
         assert other.mesh.paths.problem(other.link(one)) is None
 
 
-async def test_where_small_packets_do_not_help_it_is_said_and_left(
+async def test_useless_small_packets_are_reported(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with linked_pair() as (one, other):
@@ -114,9 +114,7 @@ async def test_an_express_lane_that_stands_still_begins_anew(monkeypatch: pytest
 
 
 @pytest.mark.parametrize("dialler", [True, False])
-async def test_where_both_lanes_stand_still_a_new_connection_is_the_small_packet(
-    dialler: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_new_connection_probes_when_both_lanes_stall(dialler: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     async with linked_pair() as made:
         one, other = made if dialler else made[::-1]
         hole = Hole(monkeypatch, one)
@@ -150,7 +148,7 @@ async def test_a_peer_that_answers_nothing_is_no_black_hole(monkeypatch: pytest.
         assert not one.mesh.counters["link.black_hole"]
 
 
-def test_what_the_kernel_tells_of_a_connection() -> None:
+def test_kernel_statistics_of_a_connection() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server, socket.socket() as sock:
         limit_segments(sock, FIRST, Counters())
         sock.connect(server.getsockname())

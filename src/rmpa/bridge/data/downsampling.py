@@ -1,4 +1,4 @@
-"""Down-sampling to a contract's ``max_rate``: on a steady beat, and the newest message is the one that is kept."""
+"""Down-sampling to a contract's ``max_rate``, at a steady period."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ class Downsampler:
         rate: Messages a second.
     """
 
-    __slots__ = ("_due", "_interval", "skipped")
+    __slots__ = ("_due", "_period", "skipped")
 
     def __init__(self, rate: float) -> None:
-        self._interval = 1 / rate
+        self._period = 1 / rate
         self._due = 0.0
         self.skipped = 0
-        """Messages that gave way to newer ones."""
+        """Messages left out for newer ones; counted by the sender."""
 
     @property
     def due(self) -> float:
-        """When the next one may go, monotonic seconds."""
+        """When the next message may be sent, monotonic seconds."""
         return self._due
 
     def admit(self, now: float) -> bool:
-        """Whether a message may go now; then the next one may an interval later."""
-        # A tenth of the interval early is on time: two clocks at the same rate must not lose every other message.
-        if now < self._due - self._interval / 10:
+        """Whether a message may be sent now; if so, the next one may a period later."""
+        # A tenth of the period early is on time: two clocks at the same rate must not lose every other message.
+        if now < self._due - self._period / 10:
             return False
-        # Keep to the beat where messages come faster than it; begin anew after a pause.
-        self._due = max(self._due + self._interval, now)
-        if self._due < now + self._interval / 2:
-            self._due = now + self._interval
+        # Keep the phase where messages come faster than the rate; begin anew after a pause.
+        self._due = max(self._due + self._period, now)
+        if self._due < now + self._period / 2:
+            self._due = now + self._period
         return True

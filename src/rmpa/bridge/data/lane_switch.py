@@ -1,15 +1,15 @@
-"""Which lane a route's messages take, so that their order is kept when it changes.
+"""Chooses the lane of a route's messages, and keeps their order when it changes.
 
 Sans-I/O. A contract's priority decides, else the size of the messages: one large message moves a topic to the bulk
-lane, a long row of small ones brings it back. Two connections have no common order; so before the first message on
-the other lane a *fence* is sent behind the last one on the present lane, and what comes meanwhile is held until the
-peer has answered it::
+lane, a long series of small ones brings it back. Two connections have no common order. Therefore a *fence* is sent
+behind the last message on the present lane, and messages are held until the peer has answered it; then the other lane
+is used::
 
     ON(express) ──large──► FENCING(express → bulk) ──fenced──► ON(bulk)
          ▲                                                        │ small, for long
          └────fenced──── FENCING(bulk → express) ◄────────────────┘
 
-A new route begins on the express lane, behind the word that opens it.
+A new route begins on the express lane, behind the control frame that opens it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class LaneSwitch:
     """The lane of one route.
 
     Args:
-        contract: Its priority counts.
+        contract: What holds for the route; only its priority is used.
         large: Whether the source is known to have large messages.
     """
 
@@ -44,9 +44,9 @@ class LaneSwitch:
         self._numbers = 0
         self._fence = 0
         self.lane = EXPRESS
-        """Where messages go now; while fencing, where the last ones went."""
+        """The lane of messages now; while fencing, that of the last ones."""
         self.target = BULK if self._fixed is BULK or (large and self._fixed is None) else EXPRESS
-        """Where they shall go."""
+        """The lane that they shall use."""
 
     @property
     def fencing(self) -> bool:
@@ -54,7 +54,7 @@ class LaneSwitch:
         return bool(self._fence)
 
     def judge(self, size: int, now: float) -> bool:
-        """Look at a message of ``size`` bytes; whether it, and what follows, must not go by the present lane."""
+        """Consider the size of the next message; return whether the lane must change before it is sent."""
         if self._fixed is None:
             if size > limits.EXPRESS_MESSAGE_MAX:
                 self._small = 0
@@ -68,13 +68,13 @@ class LaneSwitch:
         return self.target is not self.lane
 
     def fence(self) -> int:
-        """The number of the fence to be sent on the present lane."""
+        """Begin to change the lane; return the number of the fence to be sent on the present lane."""
         self._numbers += 1
         self._fence = self._numbers
         return self._fence
 
     def fenced(self, number: int) -> bool:
-        """The peer has answered a fence; whether it was the one, and the held messages may go by the target."""
+        """The peer has answered a fence; return whether it was the last one, so that the target lane is used now."""
         if number != self._fence or not number:
             return False
         self._fence = 0
@@ -82,15 +82,15 @@ class LaneSwitch:
         return True
 
     def lane_lost(self) -> bool:
-        """The bulk lane's connection is gone; whether that leaves nothing to wait for.
+        """The bulk lane's connection is gone; return whether the target lane is used now.
 
-        What was on it does not come any more, so nothing can be overtaken.
+        What was on that connection does not arrive any more, so it cannot be overtaken.
         """
         if self._fence and self.lane is BULK:
             return self.fenced(self._fence)
         return False
 
     def restart(self) -> None:
-        """A new link: its routes begin on the express lane."""
+        """A new link is used: its routes begin on the express lane."""
         self._fence = 0
         self.lane = EXPRESS

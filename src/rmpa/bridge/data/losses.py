@@ -1,7 +1,7 @@
-"""What the receivers of reliable sources have missed: counted at the sender, told to the receiver.
+"""How many messages the receivers of reliable sources have missed: counted at the sender, reported to the receiver.
 
-Pure. ``LossRecords`` are the sender's, asked by the exports as ``KeptMessages``; ``ReceptionHistory`` is what a
-receiver remembers.
+Pure. ``LossRecords`` belong to the sender, whose exports query them as ``KeptMessages``; ``ReceptionHistory`` is what
+a receiver remembers.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Missed:
-    """What a peer has missed of a reliable source before a new numbering, and does not know of.
+    """Messages of a reliable source that a peer missed before a new numbering, and does not know of.
 
     Args:
-        count: Messages.
+        count: How many.
         at_least: Whether there may be more.
     """
 
@@ -36,26 +36,26 @@ class Missed:
 
 
 class KeptMessages(Protocol):
-    """What the exports ask of those who keep reliable messages."""
+    """What the exports need of the part that keeps reliable messages."""
 
     def following(self, source: Source, peer: int, after: int) -> int | None:
-        """The sequence of the next message of a suspended route, if its peer has all up to ``after``."""
+        """The sequence of the next message of a suspended route whose peer has all up to ``after``; or ``None``."""
         ...
 
     def settle(self, source: Source, peer: int, epoch: int, after: int) -> Missed | None:
-        """A peer asks for a source anew: count what it missed until now, once; ``None``: that is not known.
+        """A peer opens a route of a source again: what it missed until now, reported once; ``None`` if unknown.
 
         Args:
-            source: Which.
-            peer: Who.
-            epoch: The last numbering that it has a part of; 0 if it has none.
-            after: The last message of that which it has.
+            source: The source.
+            peer: The peer's number.
+            epoch: The last numbering of which it has messages; 0 if it has none.
+            after: The last message of that numbering that it has.
         """
         ...
 
 
 class NothingKept:
-    """No messages are kept: for exports alone."""
+    """A ``KeptMessages`` that keeps none."""
 
     def following(self, source: Source, peer: int, after: int) -> int | None:  # noqa: ARG002 - as Kept has it
         """Not known."""
@@ -70,12 +70,12 @@ NOTHING_KEPT: Final = NothingKept()
 
 
 def going_on(opened: RouteOpened, following: int | None) -> RouteOpened:
-    """Say in an ``opened`` which message comes next of a numbering that goes on, if that is known."""
+    """Add to an ``opened`` which message comes next of a numbering that goes on, if that is known."""
     return opened if following is None else msgspec.structs.replace(opened, following=following)
 
 
 def beginning_anew(opened: RouteOpened, missed: Missed | None) -> RouteOpened:
-    """Say in an ``opened`` what was missed before its numbering, if that is known."""
+    """Add to an ``opened`` what was missed before its numbering, if that is known."""
     if missed is None:
         return opened
     lost, at_least = min(missed.count, limits.LOST_TOLD_MAX), missed.at_least or msgspec.UNSET
@@ -87,10 +87,10 @@ class _Record:
     """What one peer has missed of one source.
 
     Args:
-        settled: Messages of numberings that are over and accounted for.
-        ended: The last numbering that ended without that, if one did.
+        settled: Missed messages of numberings that are accounted for.
+        ended: The last numbering that ended, if it is not accounted for yet.
         wished: Whether the peer itself ended it.
-        at_least: Whether messages were published since that nobody counts.
+        at_least: Whether messages were published since that no agent counts.
     """
 
     settled: int = 0
@@ -100,16 +100,16 @@ class _Record:
 
     @property
     def provisional(self) -> int:
-        """Messages of the ended numbering, as far as is known."""
+        """Missed messages of the ended numbering, as far as is known."""
         if self.ended is None:
             return 0
         return self.ended.seen_as_gaps if self.wished else self.ended.lost()
 
 
 class LossRecords:
-    """What peers have missed of this module's reliable sources, for as long as is remembered.
+    """How many messages of this module's reliable sources each peer has missed.
 
-    At most ``limits.LOSSES_REMEMBERED`` of them; the one that was changed first is forgotten first.
+    At most ``limits.LOSSES_REMEMBERED`` records are kept; the one whose last change is oldest is forgotten first.
     """
 
     def __init__(self) -> None:
@@ -119,7 +119,7 @@ class LossRecords:
         return len(self._records)
 
     def count(self, source: Source, peer: int) -> int:
-        """Messages that a peer has missed of a source, those of a numbering that goes on left out."""
+        """Messages of a source that a peer has missed, those of a numbering that goes on not included."""
         record = self._records.get((peer, source))
         return record.settled + record.provisional if record is not None else 0
 
@@ -127,11 +127,11 @@ class LossRecords:
         """A numbering has ended.
 
         Args:
-            source: Of what.
-            peer: To whom.
-            ended: What is left of it.
+            source: The source.
+            peer: The peer's number.
+            ended: What is known of it.
             wished: Whether the peer ended it.
-            at_least: Whether its publisher goes on, and nobody counts.
+            at_least: Whether its publisher goes on and its messages are not counted.
         """
         record = self._records.pop((peer, source), None) or _Record()
         record.settled += record.provisional
@@ -139,13 +139,13 @@ class LossRecords:
         self._put(peer, source, record)
 
     def settle(self, source: Source, peer: int, epoch: int, after: int, *, inherited: bool = False) -> Missed | None:
-        """A peer asks for a source anew; see ``KeptMessages``.
+        """A peer opens a route of a source again; see ``KeptMessages``.
 
         Args:
-            source: Which.
-            peer: Who.
-            epoch: The last numbering that it has a part of; 0 if it has none.
-            after: The last message of that which it has.
+            source: The source.
+            peer: The peer's number.
+            epoch: The last numbering of which it has messages; 0 if it has none.
+            after: The last message of that numbering that it has.
             inherited: Whether it follows another run of its module, which may have missed something.
         """
         record = self._records.get((peer, source))
@@ -158,19 +158,19 @@ class LossRecords:
         if inherited and not epoch and not record.wished:
             record.settled += ended.lost()
             return Missed(ended.unseen(), record.at_least)
-        # It did not want what it has not got, or it has forgotten what it had.
+        # The peer did not want what it misses, or it has forgotten what it had.
         record.settled += ended.seen_as_gaps if record.wished or not epoch else ended.lost()
         if not record.settled:
             del self._records[peer, source]
         return None
 
     def inherit(self, old: int, new: int) -> None:
-        """A module has another run: what the old one missed is that one's matter from now on."""
+        """A module has another run: count for it what the old run missed."""
         for peer, source in [key for key in self._records if key[0] == old]:
             self._put(new, source, self._records.pop((peer, source)))
 
     def unclaimed(self, peer: int) -> None:
-        """A peer that was away has not asked for what it missed: nobody there wants that."""
+        """A peer that was away has not asked for what it missed: no subscriber there needs it."""
         for (owner, source), record in list(self._records.items()):
             if owner == peer and record.ended is not None:
                 record.settled += record.ended.seen_as_gaps
@@ -179,7 +179,7 @@ class LossRecords:
                     del self._records[owner, source]
 
     def forget(self, peer: int) -> None:
-        """A peer will not come back."""
+        """A peer will not come back: drop its records."""
         for key in [key for key in self._records if key[0] == peer]:
             del self._records[key]
 
@@ -195,11 +195,11 @@ class ReceptionHistory:
 
     Args:
         topic: Its topic here.
-        receiver: Where its numbering stands; ``None``: nothing goes on from there.
-        missed: Whether somebody listened when the route ended, so that what came since is missed.
+        receiver: Its position in the numbering; ``None``: a new route cannot go on from there.
+        missed: Whether there were subscribers when the route ended, so that later messages are missed.
         lost: Messages that never came.
-        counts: What happened to its contract, by kind.
-        recent: The last of that.
+        counts: Events of its contract, by kind.
+        recent: The last events.
     """
 
     topic: str
@@ -210,6 +210,6 @@ class ReceptionHistory:
     recent: tuple[QosEvent, ...]
 
     def forget_position(self, *, missed: bool) -> None:
-        """The numbering means nothing any more."""
+        """A new route cannot go on from the last position any more."""
         self.receiver = None
         self.missed = missed

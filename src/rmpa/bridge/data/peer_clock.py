@@ -1,4 +1,4 @@
-"""What another machine's clock was, second by second: latencies are corrected by what was known at their time."""
+"""The offset of a peer's clock over the last minute: latencies are corrected by what was known at their time."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ClockEstimate:
-    """What was known of the other clock at one moment.
+    """What was known of the peer's clock at one moment.
 
     Args:
-        now: When, in monotonic seconds.
-        offset: The other side's wall clock less ours, seconds.
-        error: Its bound, ± seconds.
+        now: The moment, monotonic seconds.
+        offset: The peer's wall clock less the local one, seconds.
+        error: The offset is true within ± this many seconds.
     """
 
     now: float
@@ -30,23 +30,23 @@ class ClockEstimate:
 
 
 class PeerClock:
-    """The estimates of one link's clock over the last minute, to be told every second or so.
+    """The estimates of one peer's clock over the last minute; ``add`` one about every second.
 
-    An estimate that contradicts the one before shows that a clock was set: what was known before is void, and so is
-    every latency from before.
+    An estimate that contradicts the one before shows that a clock was set: earlier estimates are void, and so are
+    earlier latencies.
     """
 
     def __init__(self) -> None:
         self._estimates: deque[ClockEstimate] = deque(maxlen=limits.QUALITY_CLOCKS)
         self.trusted_from = -math.inf
-        """Stamps from before this time (monotonic seconds) tell nothing."""
+        """Latencies of messages from before this time (monotonic seconds) are not known."""
 
     def __iter__(self) -> Iterator[ClockEstimate]:
         """Oldest first."""
         return iter(self._estimates)
 
-    def told(self, offset: float, error: float, now: float) -> None:
-        """Remember what the other side's clock is now; see ``ClockEstimate``."""
+    def add(self, offset: float, error: float, now: float) -> None:
+        """Add the present estimate; see ``ClockEstimate``."""
         estimate = ClockEstimate(now, offset, error)
         if self._estimates:
             last = self._estimates[-1]
@@ -55,7 +55,7 @@ class PeerClock:
                 self._estimates.clear()
                 self.trusted_from = now
             elif len(self._estimates) > 1 and now - self._estimates[-2].now < limits.QUALITY_CLOCK_STEP:
-                # Told more often: the better one is kept, or a minute would not fit.
+                # Added more often than needed: keep the better one, or the ring would not last for a minute.
                 self._estimates.pop()
                 estimate = min(last, estimate, key=lambda each: each.error)
         self._estimates.append(estimate)

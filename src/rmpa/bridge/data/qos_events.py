@@ -1,7 +1,8 @@
 """Watches whether the messages of one remote source keep their contract: deadline, lifespan, liveliness, loss.
 
-The data path only leaves the time of the last message in ``QosWatch.last``; all else happens when the timer is due.
-It is due one deadline after the last message that it knew of, so whatever came in between came in time: no gap hides.
+The data path only assigns the time of the last message to ``QosWatch.last``; all else happens when the timer is due.
+It is due one deadline after the last message that it knew of, so a message that came since was in time, and no gap
+is overlooked.
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ class QosEvent:
     Args:
         kind: What happened.
         count: How often, or to how many messages.
-        text: Ready to show.
-        now: When, and of several when the last time (monotonic seconds).
+        text: The event for people.
+        now: When it happened, of several when the last one did; monotonic seconds.
     """
 
     kind: QosEventKind
@@ -76,11 +77,11 @@ class QosWatch:
     def __init__(self, contract: Contract, now: float) -> None:
         self._contract = contract
         self.last = now
-        """When the last message came, before the first one the start; the data path assigns it, and no more."""
+        """When the last message came, before the first one the start; assigned by the data path."""
         self.counts: Counter[QosEventKind] = Counter()
         """How often each kind of event came since the start."""
         self.recent: deque[QosEvent] = deque(maxlen=limits.WATCH_RECENT)
-        """The last events, oldest first; what repeats at once stands there once, with the sum of its counts."""
+        """The last events, oldest first; an event that repeats is kept once, with the sum of its counts."""
         self._seen = now  # the message from which the present deadline counts
         self._missed = 0  # deadlines since then
         self._due = now + (contract.deadline or 0)
@@ -91,11 +92,11 @@ class QosWatch:
 
     @property
     def alive(self) -> bool:
-        """Whether the source lives, as far as the last timer saw."""
+        """Whether the source was alive at the last timer."""
         return self._lost_since is None
 
     def lost(self, count: int, now: float) -> QosEvent:
-        """``count`` messages (at least one) never came, as the gap in their numbers shows."""
+        """``count`` messages (at least one) never came, as the gap in the sequence shows."""
         return self._happened(QosEventKind.MESSAGES_LOST, count, lambda sum_: f"{_messages(sum_)} lost", now)
 
     def lost_unknown(self, why: str, now: float) -> QosEvent:
@@ -111,17 +112,17 @@ class QosWatch:
         return self._happened(QosEventKind.LIFESPAN_EXPIRED, count, lambda sum_: f"{_messages(sum_)} {beyond}", now)
 
     def link_down(self, now: float) -> None:
-        """No link leads to the source's peer, or ``now`` is when it was last heard; changes ``next_timer``."""
+        """The source's peer has no link; ``now`` is when, or when it was last heard. Changes ``next_timer``."""
         if self._down_since is None:
             self._down_since = now
 
     def link_up(self, now: float) -> None:
-        """A link leads there again; changes ``next_timer``."""
+        """The source's peer has a link again; changes ``next_timer``."""
         self._down_since = None
         self._look = now
 
     def link_gone(self, now: float) -> list[QosEvent]:
-        """The source leaves the graph: if its link is down, it is lost now and not only after the lease."""
+        """The source leaves the graph: if its link is down, its liveliness is lost now, before the lease is over."""
         lease = self._contract.liveliness_lease
         if self._down_since is None or lease is None:
             return []
@@ -129,15 +130,15 @@ class QosWatch:
         return [] if occurred is None else [occurred]
 
     def next_timer(self) -> float | None:
-        """When ``handle_timer`` has something to do; ``None``: the contract has nothing to watch.
+        """When ``handle_timer`` is due; ``None``: the contract has nothing to watch.
 
-        Messages only put it off: a timer that is set after each ``handle_timer`` alone is never too late.
+        Messages only postpone it, so a timer that is armed after each ``handle_timer`` is never too late.
         """
         due = [time for time in (self._deadline_due(), self._liveliness_due()) if time is not None]
         return min(due) if due else None
 
     def handle_timer(self, now: float) -> list[QosEvent]:
-        """What the clock shows: at most one event of a kind, with all deadlines that passed since the last call."""
+        """Return what has happened: at most one event of a kind, with all deadlines missed since the last call."""
         found = [self._miss(now), self._judge_life(now)]
         return [event for event in found if event is not None]
 
@@ -201,7 +202,10 @@ class QosWatch:
     def _happened(
         self, kind: QosEventKind, count: int, text: Callable[[int], str], now: float, *, goes_on: bool | None = None
     ) -> QosEvent:
-        """Count an event and remember it; with the one before, if it ``goes_on`` (``None``: if that was just now)."""
+        """Count an event and remember it, joined with the event before if it ``goes_on``.
+
+        ``None`` joins events of one kind that are no more than ``limits.WATCH_RUN`` apart.
+        """
         self.counts[kind] += count
         before = self.recent[-1] if self.recent else None
         whole = count
@@ -220,7 +224,7 @@ def _messages(count: int) -> str:
 
 
 def shown_seconds(seconds: float) -> str:
-    """A duration to read: ``200 ms``, ``12.5 s``."""
+    """A duration for people: ``200 ms``, ``12.5 s``."""
     if seconds < 1:
         return f"{round(seconds * 1e3, 1):g} ms"
     return f"{round(seconds, 2):.10g} s"

@@ -1,8 +1,8 @@
-"""How well one remote source arrives: periods, one-way latency and sizes, from rings of fixed size.
+"""How the messages of one remote source arrive: periods, one-way latencies and sizes, from rings of fixed size.
 
-The data path only notes three numbers a message; everything else is worked out when somebody asks. At thousands of
-messages a second the ring holds some milliseconds, which tell the rate of one burst and not of the source; so each
-turn of the ring leaves a mark (time, messages, bytes), and rate and bandwidth are counted from a mark a second ago.
+The data path only stores three numbers a message; everything else is computed on request. At thousands of messages a
+second a ring holds some milliseconds, which show the rate of one burst and not of the source. Therefore each turn of
+the ring leaves a mark (time, messages, bytes), and rate and bandwidth are counted from a mark a second ago.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 _NS: Final = 1e-9
 _MARKS: Final = 16
-"""Marks in the time that a rate is counted over."""
+"""Marks in ``limits.QUALITY_RATE_SPAN``."""
 _Number = TypeVar("_Number", int, float)
 
 
@@ -38,12 +38,12 @@ class _Mark(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class QualitySummary:
-    """What arrived of one source lately; seconds, messages and bytes.
+    """The recent arrivals of one source; seconds, messages and bytes.
 
     Args:
-        latency: From the publisher's agent taking a message to it being handed on here; ``None`` where the other
-            side's clock is unknown, or nothing came.
-        latency_last: The last message's.
+        latency: From the arrival of a message at the publisher's agent to its delivery here; ``None`` where the
+            peer's clock is unknown, or nothing came.
+        latency_last: That of the last message.
         latency_error: The true latencies lie within ± this.
         period: Between messages.
         jitter: The period's 99th percentile less its median; ``nan`` before the third message.
@@ -51,8 +51,8 @@ class QualitySummary:
             every period counts, so the rate of a dead source falls.
         bandwidth: Bytes a second, over the same time.
         age: Since the last message; ``None`` if none came.
-        messages: Ever.
-        bytes: Ever.
+        messages: Since the route was opened.
+        bytes: Since then.
     """
 
     latency: SampleSummary | None
@@ -68,10 +68,10 @@ class QualitySummary:
 
 
 class Quality:
-    """The last arrivals of one route; noting one costs the same however many there were.
+    """The last arrivals of one route; storing one takes the same time however many there were.
 
     Args:
-        window: How many messages are remembered: a power of two.
+        window: How many messages the rings hold: a power of two.
 
     Raises:
         ValueError: ``window`` is not one.
@@ -90,26 +90,26 @@ class Quality:
         self._delays = array("d", bytes(8 * window))
         self._sizes = array("I", bytes(4 * window))
         self.bytes = 0
-        """In all messages that ever arrived."""
+        """Bytes of all messages that arrived."""
 
     @property
     def messages(self) -> int:
-        """Ever arrived."""
+        """Messages that arrived."""
         return self._before + self._slot
 
     def arrived(self, now: float, wall_ns: int, stamp_ns: int, size: int) -> None:
-        """Note one message.
+        """Store the arrival of one message.
 
         Args:
             now: Monotonic seconds.
-            wall_ns: Our wall clock.
-            stamp_ns: The other agent's wall clock when the message came from its publisher.
+            wall_ns: The local wall clock.
+            stamp_ns: The wall clock of the publisher's agent when the message came from its publisher.
             size: Bytes, below 4 GiB.
         """
         slot = self._slot
         try:
             self._times[slot] = now
-        except IndexError:  # costs nothing until it happens, once a turn
+        except IndexError:  # once a turn; a comparison would cost time for each message
             slot = self._turn(now)
         self._delays[slot] = wall_ns - stamp_ns
         self._sizes[slot] = size
@@ -117,7 +117,7 @@ class Quality:
         self.bytes += size
 
     def _turn(self, now: float) -> int:
-        """Go round: note where the count stands, and begin at the first slot again."""
+        """Mark where the counts stand, and begin at the first slot of the rings again."""
         window = len(self._times)
         if not self._marks:
             self._marks.append(_Mark(self._times[0], 1, self._sizes[0]))  # the very first message
@@ -135,12 +135,12 @@ class Quality:
         return self._times[self._slot - 1] if self.messages else None
 
     def summary(self, clock: PeerClock | None, now: float, *, latching: bool = False) -> QualitySummary:
-        """What the messages of the last ``limits.QUALITY_SPAN`` say, as far as the ring remembers them.
+        """Summarize the messages of the last ``limits.QUALITY_SPAN``, as far as the rings hold them.
 
         Args:
-            clock: What is known of the other side's clock, if anything.
+            clock: The peer's clock, if it is known.
             now: Monotonic seconds.
-            latching: Whether the route's first message was a stored one, whose age is no latency.
+            latching: Whether the route's first message was a kept one, whose age is no latency.
         """
         times = self._recent(now)
         periods = list(map(sub, times[1:], times))
@@ -164,7 +164,7 @@ class Quality:
         )
 
     def _counted(self, times: array[float], now: float) -> tuple[int, int, float]:
-        """Messages, bytes and seconds that rate and bandwidth are made of; the first message begins the time."""
+        """Messages, bytes and seconds for rate and bandwidth; the time begins with a message that is not counted."""
         if len(times) < 2:
             return 0, 0, 0.0
         last, span = times[-1], limits.QUALITY_RATE_SPAN
@@ -176,7 +176,7 @@ class Quality:
         return len(times) - 1, sum(self._latest(self._sizes, len(times) - 1)), last - times[0]
 
     def _recent(self, now: float) -> array[float]:
-        """When the messages of the span came, oldest first; the last one in any case."""
+        """Arrival times of the messages of the span, oldest first; the last one is always included."""
         times = self._latest(self._times, self.messages)
         since = now - limits.QUALITY_SPAN
         if times and times[0] < since:
@@ -185,9 +185,9 @@ class Quality:
         return times
 
     def _latencies(self, times: array[float], clock: PeerClock, *, latching: bool) -> tuple[list[float], float]:
-        """The latencies that can be told, oldest first, and the bound of their errors.
+        """The known latencies, oldest first, and the bound of their errors.
 
-        Each by the first estimate of the other clock from its arrival on; the newest ones by the last.
+        Each is corrected by the first estimate of the peer's clock after its arrival; the newest ones by the last.
         """
         delays = self._latest(self._delays, len(times))
         begin = bisect_left(times, clock.trusted_from)

@@ -1,4 +1,4 @@
-"""What becomes of ``rosnode kill`` of a proxy: the agent of the node's module is asked to end the node itself."""
+"""Answers ``rosnode kill`` of a proxy: asks the agent of the node's module to end the node itself."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from rmpa.ros.core.notifier import MASTER_ID
 from rmpa.ros.wire.xmlrpc import RosReply
 
 if TYPE_CHECKING:
-    from rmpa.bridge.io.bridge import PeerSession
     from rmpa.bridge.session.peer_rpc import PeerRpc
+    from rmpa.bridge.session.peer_session import PeerSession
 
 _log = logging.getLogger(__name__)
 
@@ -31,11 +31,11 @@ class RemoteKills:
     proxies. It ends the nodes of this module, and those of other modules live on: a module stands alone.
 
     Args:
-        asks: Carries the question.
+        rpc: Carries the question.
     """
 
-    def __init__(self, asks: PeerRpc) -> None:
-        self._asks = asks
+    def __init__(self, rpc: PeerRpc) -> None:
+        self._rpc = rpc
         self._all: dict[str, float] = {}
         self._under_way = 0
 
@@ -48,41 +48,41 @@ class RemoteKills:
         _log.info("= %s asks the agent's own node to end (%s): it stays, end the agent instead", caller, reason)
         return RosReply(_REFUSED, "this node is the agent; it ends with `rmpa up`", 0)
 
-    async def proxy(self, attached: PeerSession, node: str, caller: str, reason: str) -> RosReply:
+    async def proxy(self, session: PeerSession, node: str, caller: str, reason: str) -> RosReply:
         """A proxy was asked to end: let the node that it stands for do so.
 
         Args:
-            attached: The peer whose node it is.
+            session: The peer whose node it is.
             node: Its name in the peer's graph.
             caller: The caller's node.
             reason: What it says.
         """
-        whose = f"{attached.link.name}:{node}"
+        whose = f"{session.link.name}:{node}"
         if caller == MASTER_ID:
             # Another node took the proxy's name here. That is nothing to the node over there.
             _log.warning("! another node has the name of the proxy of %s", whose)
             return RosReply(1, "shutdown", 0)
-        problem = await self._ask(attached, node, caller, reason)
+        problem = await self._ask(session, node, caller, reason)
         if problem:
             _log.warning("! %s, which %s asks to end, lives on: %s", whose, caller, problem)
             return RosReply(_REFUSED, problem, 0)
         _log.info("= %s was ended for %s (%s)", whose, caller, reason)
         return RosReply(1, "shutdown", 0)
 
-    async def _ask(self, attached: PeerSession, node: str, caller: str, reason: str) -> str:
+    async def _ask(self, session: PeerSession, node: str, caller: str, reason: str) -> str:
         """Have it ended; why it is not, or empty."""
         loop = asyncio.get_running_loop()
         if self._all.get(caller, 0.0) > loop.time():
             self._all[caller] = loop.time() + limits.NODE_KILL_ALL
             return "kill -a ends the nodes of this module only; name a node of another module to end it"
-        if attached.away is not None:
-            return f"{attached.link.name} is not linked"
+        if not session.linked:
+            return f"{session.link.name} is not linked"
         if self._under_way >= limits.NODE_KILLS_AT_ONCE:
             return f"{self._under_way} other nodes are being ended; try again"
         self._under_way += 1
         try:
             args = {"node": node, "by": caller, "reason": reason[: limits.ASK_NAME_MAX]}
-            answer = await self._asks.ask(attached, KILL, args, limits.NODE_KILL_TIMEOUT)
+            answer = await self._rpc.request(session, KILL, args, limits.NODE_KILL_TIMEOUT)
         except RmpaError as error:
             return str(error)
         finally:

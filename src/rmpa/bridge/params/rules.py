@@ -88,7 +88,7 @@ class ParamPolicy:
             return "" if self._time.share else "this module does not share its time; set share = true in its [time]"
         for rule in self._params.follow:
             if overlap(rule.to, key):
-                # Whoever follows what is followed could be followed back, and two values would chase each other.
+                # A follower could be followed back, and two values would chase each other.
                 return f"{rule.to} is followed from {rule.owner}:{rule.key} here; follow that one"
         return self.why_not_get(key)
 
@@ -111,7 +111,7 @@ class Followed:
         had: Whether this run of the owner has had a value; where it never had one, what is here stays.
         ask: Whether the value has to be asked for: it is larger than a portion.
         due: Whether the local core has to be looked at, or set.
-        doubted: Whether somebody here has changed it since.
+        doubted: Whether a local node has changed it since.
         problem: What is wrong with it, or empty.
     """
 
@@ -135,7 +135,7 @@ class Followed:
 
 
 class Following:
-    """Whose parameters are followed over which link: one owner each.
+    """Which parameters are followed over which link: each has one owner.
 
     Args:
         rules: What is followed.
@@ -200,7 +200,7 @@ class Following:
         return found
 
     def touched(self, key: str) -> list[Followed]:
-        """Somebody here has changed a parameter: those that it may concern."""
+        """A local node has changed a parameter: those that it may concern."""
         return [entry for entry in self._entries.values() if overlap(entry.rule.to, key)]
 
     @property

@@ -11,14 +11,12 @@ what a server said of itself; it gets back actions. A peer opens a service once,
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import dataclass, field
-from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.actions import Send, Warn
-from rmpa.bridge.bounds import Beyond
+from rmpa.bridge.catalogue.offers import CataloguePeer, OfferCatalogue
 from rmpa.bridge.messages import (
     AdvertiseServices,
     CloseService,
@@ -35,13 +33,14 @@ from rmpa.core.errors import RemoteProtocolError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
+    from rmpa.bridge.catalogue.bounds import Beyond
     from rmpa.bridge.messages import Origin
     from rmpa.bridge.services.rules import ServiceRules
 
 
 @dataclass(frozen=True, slots=True)
 class LocalService:
-    """Who provides a service in the local graph: the node, its ``rosrpc://`` address, and whose it is if we relay."""
+    """A service's server in the local graph: its node, its ``rosrpc://`` address, and its origin if relayed."""
 
     node: str
     uri: str
@@ -75,7 +74,7 @@ class ServeRoute:
         route: The caller's id.
         requests: Ours.
         service: The service's local name.
-        server: Who provides it.
+        server: The node that provides it.
         timeout: Seconds that the caller waits for each.
     """
 
@@ -89,7 +88,7 @@ class ServeRoute:
 
 @dataclass(frozen=True, slots=True)
 class EndRoute:
-    """No more calls come on a route, and nobody waits for replies."""
+    """No more calls come on a route, and no replies are waited for."""
 
     peer: int
     route: int
@@ -122,35 +121,20 @@ class _ServiceSession:
 
 
 @dataclass(slots=True)
-class _ServiceExportPeer:
-    """One link.
+class _Callers:
+    """What one linked peer calls.
 
     Args:
-        name: The peer's name, for the rules.
-        news: Services that it is to hear of.
-        told: What it knows: local name to the name that it was told and the server.
-        wires: The other way: names that it was told.
         sessions: What it has open, by its own route.
         routes: Counts our routes: even ones, the odd ones are for our own calls.
-        beginning: Whether it has not heard everything once yet.
-        instance: The peer's run.
     """
 
-    name: str
-    news: dict[str, None]
-    told: dict[str, tuple[str, LocalService]] = field(default_factory=dict)
-    wires: dict[str, str] = field(default_factory=dict)
     sessions: dict[int, _ServiceSession] = field(default_factory=dict)
     routes: int = 0
-    beginning: bool = True
-    instance: str = ""
 
 
+_Peer = CataloguePeer[str, LocalService, ServiceOffer, str]
 _DEFAULT_LIMITS: Final = LimitSettings()
-
-
-def _always(_peer: int) -> bool:
-    return True
 
 
 class ServiceExports:
@@ -163,12 +147,17 @@ class ServiceExports:
 
     def __init__(self, rules: ServiceRules, most: LimitSettings = _DEFAULT_LIMITS) -> None:
         self._rules = rules
-        self._most = most
-        self._too_many: OrderedDict[str, None] = OrderedDict()
+        self._catalogue: OfferCatalogue[str, LocalService, ServiceOffer, str] = OfferCatalogue(
+            "services",
+            most.services,
+            offer=self._offer,
+            wire=lambda offer: offer.service,
+            # Another server behind the same name: what peers know of it may no longer be true.
+            renewed=lambda before, now: before != now,
+        )
         self._seen: dict[str, LocalService] = {}
-        self._crossing: dict[str, LocalService] = {}
         self._about: dict[str, ServiceAbout] = {}
-        self._peers: dict[int, _ServiceExportPeer] = {}
+        self._peers: dict[int, _Callers] = {}
 
     @property
     def seen(self) -> Mapping[str, LocalService]:
@@ -178,12 +167,12 @@ class ServiceExports:
     @property
     def offered(self) -> Mapping[str, LocalService]:
         """What peers are told of."""
-        return self._crossing
+        return self._catalogue.offered
 
     @property
     def beyond(self) -> Beyond:
         """What is offered to no peer because there is too much (``limits.services``)."""
-        return Beyond("services", self._most.services, len(self._too_many))
+        return self._catalogue.beyond
 
     def about(self, service: str) -> ServiceAbout | None:
         """What is known of a service of ours."""
@@ -198,14 +187,14 @@ class ServiceExports:
         )
 
     @property
-    def untold(self) -> bool:
-        """Whether there is something to ``tell``."""
-        return any(peer.news or peer.beginning for peer in self._peers.values())
+    def pending(self) -> bool:
+        """Whether there is something to ``advertise``."""
+        return self._catalogue.pending
 
     # --- the local graph ---------------------------------------------------------------------------------------
 
     def graph(self, service: str, server: LocalService | None) -> list[ExportAction]:
-        """Say who provides a service in the local graph now, proxies left out; peers hear it by ``tell``."""
+        """Set the server that a service has now, proxies left out; peers are told by ``advertise``."""
         if self._seen.get(service) == server:
             return []
         if server is None:
@@ -214,45 +203,36 @@ class ServiceExports:
             self._seen[service] = server
         return self._judge(service)
 
-    def obey(self, rules: ServiceRules, most: LimitSettings = _DEFAULT_LIMITS) -> Iterator[list[ExportAction]]:
+    def apply_rules(self, rules: ServiceRules, most: LimitSettings = _DEFAULT_LIMITS) -> Iterator[list[ExportAction]]:
         """Other rules hold from now on; what they do not touch goes on.
 
         Returns:
             What is to be done for one service after the other, looked at when it is asked for.
         """
-        self._rules, self._most = rules, most
-        for peer in self._peers.values():
-            peer.news |= dict.fromkeys(self._crossing)
+        self._rules, self._catalogue.limit = rules, most.services
+        for known in self._catalogue.peers():
+            self._catalogue.note_all(known)
         return (self._judge(service) for service in tuple(self._seen))
 
     def _judge(self, service: str) -> list[ExportAction]:
-        server, before = self._seen.get(service), self._crossing.get(service)
-        self._too_many.pop(service, None)
+        server, before = self._seen.get(service), self.offered.get(service)
         reason = "its server has gone"
         if server is not None and not self._crosses(service, server):
             server, reason = None, "a rule keeps it home now"
+        if server is None:
+            if not self._catalogue.remove(service):
+                return []
+            self._catalogue.note(service)
+            actions = self._end(service, reason)
+            if (waiting := self._catalogue.next_beyond()) is not None:
+                actions += self._judge(waiting[0])
+            return actions
         if server == before:
             return []
-        actions: list[ExportAction] = []
-        if server is None:
-            del self._crossing[service]
-            actions = self._end(service, reason)
-            if self._too_many:
-                actions += self._judge(next(iter(self._too_many)))
-        elif before is None and len(self._crossing) >= self._most.services:
-            self._too_many[service] = None
-            text = (
-                f"this module has more services than limits.services = {self._most.services}; the rest is offered to "
-                "no peer: raise it in rmpa.toml and `rmpa reload`, or deny some"
-            )
-            return [Warn("services.too_many", "local", text)]
-        else:
-            self._crossing[service] = server
-            if before is not None:
-                actions = self._end(service, "its server has restarted")
-        for peer in self._peers.values():
-            peer.news[service] = None
-        return actions
+        if not self._catalogue.put(service, server):
+            return [self._catalogue.warning("services.too_many")]
+        self._catalogue.note(service)
+        return self._end(service, "its server has restarted") if before is not None else []
 
     def _crosses(self, service: str, server: LocalService) -> bool:
         named = is_crossing_name(service) and is_crossing_name(server.node)
@@ -272,55 +252,34 @@ class ServiceExports:
     # --- telling -----------------------------------------------------------------------------------------------
 
     def link_up(self, peer: int, name: str, instance: str = "") -> list[ExportAction]:
-        """A link is up: ``tell`` begins with all we have, but for what came from that very run of the peer."""
-        self._peers[peer] = _ServiceExportPeer(name, dict.fromkeys(self._crossing), instance=instance)
-        return [Send(peer, self._next(self._peers[peer], full=True))]
+        """A link is up: ``advertise`` begins with all we have, but for what came from that very run of the peer."""
+        self._peers[peer] = _Callers()
+        first = self._catalogue.link_up(peer, name, instance, judged=False)
+        return [Send(peer, AdvertiseServices(tuple(first.added), tuple(first.removed), full=True, more=first.more))]
 
     def link_down(self, peer: int) -> list[ExportAction]:
         """A link is gone, and all its routes."""
+        self._catalogue.link_down(peer)
         gone = self._peers.pop(peer, None)
         sessions = gone.sessions.items() if gone is not None else ()
         return [EndRoute(peer, route, s.requests) for route, s in sessions if s.requests]
 
-    def tell(self, ready: Callable[[int], bool] = _always) -> list[ExportAction]:
-        """One message for each peer that has not heard everything and is ready; call again while ``untold``."""
-        actions: list[ExportAction] = []
-        for number, peer in self._peers.items():
-            if (peer.news or peer.beginning) and ready(number):
-                begins = peer.beginning
-                message = self._next(peer)
-                if message.added or message.removed or begins:
-                    actions.append(Send(number, message))
-        return actions
+    def advertise(self, ready: Callable[[int], bool] = lambda _: True) -> list[ExportAction]:
+        """One message for each peer that has not heard everything and is ready; call again while ``pending``."""
+        return [
+            Send(peer, AdvertiseServices(tuple(portion.added), tuple(portion.removed), more=portion.more))
+            for peer, portion in self._catalogue.portions(ready)
+            if portion.is_news
+        ]
 
-    def _next(self, peer: _ServiceExportPeer, *, full: bool = False) -> AdvertiseServices:
-        added: list[ServiceOffer] = []
-        removed: list[str] = []
-        for service in tuple(islice(peer.news, limits.ADVERTISED_AT_ONCE)):
-            del peer.news[service]
-            server = self._crossing.get(service)
-            wire = self._wire(peer, service, server) if server is not None else None
-            known = peer.told.get(service)
-            if known is not None and (wire is None or known[0] != wire):
-                removed.append(known[0])
-                del peer.told[service]
-                del peer.wires[known[0]]
-            if wire is not None and server is not None and known != (wire, server):
-                added.append(ServiceOffer(wire, server.node, server.origin))
-                peer.told[service] = (wire, server)
-                peer.wires[wire] = service
-        peer.beginning = peer.beginning and bool(peer.news)
-        return AdvertiseServices(added=tuple(added), removed=tuple(removed), full=full, more=peer.beginning)
-
-    def _wire(self, peer: _ServiceExportPeer, service: str, server: LocalService) -> str | None:
-        """What a peer is to know a service by, if it may at all."""
-        if server.origin is not None and not may_have(peer.instance, server.origin):
+    def _offer(self, known: _Peer, service: str, server: LocalService) -> ServiceOffer | None:
+        """What a peer is to know of a service, if it may at all."""
+        if server.origin is not None and not may_have(known.instance, server.origin):
             return None
-        wire = self._rules.wire_name(peer.name, service)
-        if not is_crossing_name(wire) or not self._rules.judge_for(peer.name, service, wire).allowed:
+        wire = self._rules.wire_name(known.name, service)
+        if not is_crossing_name(wire) or not self._rules.judge_for(known.name, service, wire).allowed:
             return None
-        # Where two of ours would be one over there, the first one stays.
-        return wire if peer.wires.get(wire, service) == service else None
+        return ServiceOffer(wire, server.node, server.origin)
 
     # --- their calls -------------------------------------------------------------------------------------------
 
@@ -333,11 +292,12 @@ class ServiceExports:
         peer = self._peers[number]
         if message.route in peer.sessions:
             raise RemoteProtocolError(f"route {message.route} is opened twice, for {message.service} now")
-        if len(peer.sessions) >= self._most.services:
-            text = f"more services are open on one link than limits.services = {self._most.services} over there"
+        if len(peer.sessions) >= self._catalogue.limit:
+            text = f"more services are open on one link than limits.services = {self._catalogue.limit} over there"
             return [Send(number, ServiceClosed(message.route, text))]
-        service = peer.wires.get(message.service)
-        server = self._crossing.get(service) if service is not None else None
+        known = self._catalogue.peer(number)
+        service = known.by_wire.get(message.service) if known is not None else None
+        server = self.offered.get(service) if service is not None else None
         if service is None or server is None:
             text = f"{message.service} is not provided here, or policy keeps it home"
             return [Send(number, ServiceClosed(message.route, text))]
@@ -358,13 +318,13 @@ class ServiceExports:
 
     def described(self, service: str, server: LocalService, about: ServiceAbout) -> list[ExportAction]:
         """A server has said what its service is."""
-        if self._crossing.get(service) != server:
+        if self.offered.get(service) != server:
             return []  # it is another one by now
         self._about[service] = about
         return self._start(service)
 
     def refused(self, service: str, reason: str) -> list[ExportAction]:
-        """A server does not answer, or says no: those who wait for it are told."""
+        """A server does not answer, or refuses: the peers that wait for it are told."""
         actions: list[ExportAction] = []
         for number, peer in self._peers.items():
             for route, session in list(peer.sessions.items()):
@@ -373,7 +333,7 @@ class ServiceExports:
         return actions
 
     def _start(self, service: str) -> list[ExportAction]:
-        about, server = self._about[service], self._crossing[service]
+        about, server = self._about[service], self.offered[service]
         actions: list[ExportAction] = []
         for number, peer in self._peers.items():
             for route, session in peer.sessions.items():
@@ -392,7 +352,7 @@ class ServiceExports:
                 ]
         return actions
 
-    def _drop(self, number: int, peer: _ServiceExportPeer, route: int, reason: str) -> list[ExportAction]:
+    def _drop(self, number: int, peer: _Callers, route: int, reason: str) -> list[ExportAction]:
         session = peer.sessions.pop(route)
         closed = Send(number, ServiceClosed(route, reason[: limits.CONTROL_TEXT_MAX]))
         return [EndRoute(number, route, session.requests), closed] if session.requests else [closed]

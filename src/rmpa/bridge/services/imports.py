@@ -2,7 +2,7 @@
 
 Sans-I/O, like ``bridge.topics.imports`` for topics: the driver tells what peers say, what the local graph provides
 itself
-and what somebody local wants to call; it gets back actions. A graph has one provider for each service, so of several
+and what local nodes want to call; it gets back actions. A graph has one provider for each service, so of several
 one is shown: a local one always, else that of the peer with the lowest GUID; the others are hidden, with the reason,
 and come when it goes. Each service of each peer is in one state of this table::
 
@@ -21,8 +21,11 @@ from enum import Enum, auto
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Final
 
-from rmpa.bridge import bounds, limits
+from rmpa.bridge import limits
 from rmpa.bridge.actions import Send, Warn
+from rmpa.bridge.catalogue import bounds
+from rmpa.bridge.catalogue.bounds import Beyond, NodePlaces
+from rmpa.bridge.catalogue.peer_offers import PeerOffers
 from rmpa.bridge.messages import (
     AdvertiseServices,
     CloseService,
@@ -41,6 +44,7 @@ from rmpa.core.guid import Guid
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
 
+    from rmpa.bridge.catalogue.peer_offers import Change
     from rmpa.bridge.messages import Origin
     from rmpa.bridge.services.rules import ServiceRules
 
@@ -49,7 +53,7 @@ class SessionState(Enum):
     """Where a remote service stands."""
 
     IDLE = auto()
-    """Nobody calls it."""
+    """It is not called."""
     OPENING = auto()
     """Asked for, not answered."""
     OPEN = auto()
@@ -69,7 +73,7 @@ class Provide:
     """Let a peer's service appear in the local graph, as one of its node's proxy.
 
     Args:
-        peer: Whose.
+        peer: The peer's number.
         service: Its name here.
         node: Its node, in the peer's graph.
     """
@@ -81,7 +85,7 @@ class Provide:
 
 @dataclass(frozen=True, slots=True)
 class Withdraw:
-    """Let it disappear; who is just calling it is told the reason."""
+    """Let it disappear; calls under way fail with the reason."""
 
     peer: int
     service: str
@@ -102,7 +106,7 @@ class OpenedService:
 
 @dataclass(frozen=True, slots=True)
 class EndedService:
-    """It cannot be called (``route`` is its reply route, if it had one open): whoever waits is told the reason."""
+    """It cannot be called (``route`` is its reply route, if it had one): waiting calls fail with the reason."""
 
     peer: int
     service: str
@@ -138,7 +142,7 @@ class RemoteService:
         due: While it is asked for: when that has taken too long, monotonic seconds.
         about: What it is, once known.
         problem: Why it could not be opened last, or empty.
-        origin: Whose it is, if its peer only passes it on.
+        origin: Its module and node, if its peer only passes it on.
     """
 
     wire: str
@@ -155,31 +159,19 @@ class RemoteService:
     origin: Origin | None = None
 
 
-@dataclass(slots=True)
-class _ServiceImportPeer:
-    """What one run of a peer offers.
+@dataclass(slots=True, kw_only=True)
+class _ServiceImportPeer(PeerOffers[str, RemoteService, ServiceOffer]):
+    """What one run of a peer offers; its nodes' places are for the services' names here.
 
     Args:
-        name: The peer's name.
         rank: The lower one is shown.
-        nodes: Which of its nodes stand here, and what waits for a place.
-        surplus: What it offers beyond ``limits.services``.
-        services: What it offers, by the name on the way.
         routes: What is asked for or open, by our route.
         serial: Counts our routes: odd ones, the even ones are for its calls.
-        away: Whether it has no link, and may come back.
-        doubtful: What it offered over its last link and has not offered again since.
     """
 
-    name: str
     rank: int
-    nodes: bounds.NodePlaces[str]
-    surplus: bounds.Surplus[ServiceOffer]
-    services: dict[str, RemoteService] = field(default_factory=dict)
     routes: dict[int, RemoteService] = field(default_factory=dict)
     serial: int = -1
-    away: bool = False
-    doubtful: set[str] = field(default_factory=set)
 
 
 _DEFAULT_LIMITS: Final = LimitSettings()
@@ -198,16 +190,16 @@ class ServiceImports:
         self._most = most
         self._peers: dict[int, _ServiceImportPeer] = {}
         self.ways = RelayPaths()
-        """By which of its ways each module is reached whose services relays offer."""
+        """The path by which each relayed module is reached."""
         self._local: dict[str, str] = {}
-        # By the name here: who offers it.
+        # By the name here: the peers that offer it.
         self._claims: dict[str, dict[int, RemoteService]] = {}
         self._opening: dict[tuple[int, int], RemoteService] = {}
 
     def __iter__(self) -> Iterator[tuple[int, RemoteService]]:
         """Each service of each peer."""
         for number, peer in self._peers.items():
-            for remote in peer.services.values():
+            for remote in peer.entries.values():
                 yield number, remote
 
     def get(self, peer: int, service: str) -> RemoteService | None:
@@ -226,8 +218,8 @@ class ServiceImports:
 
     def beyond(self, peer: int) -> bounds.Beyond:
         """What a peer offers beyond ``limits.services``."""
-        known = self._peers.get(peer)
-        return bounds.Beyond("services", self._most.services, len(known.surplus) if known is not None else 0)
+        known, limit = self._peers.get(peer), self._most.services
+        return known.beyond("services", limit) if known is not None else Beyond("services", limit, 0)
 
     def crowded(self, peer: int) -> Mapping[str, Collection[str]]:
         """The nodes of a peer whose services have no place here (``limits.nodes``), and these."""
@@ -239,8 +231,7 @@ class ServiceImports:
         """A link is up, of a new peer or of one that was away."""
         known = self._peers.get(peer)
         if known is None:
-            places: bounds.NodePlaces[str] = bounds.NodePlaces(self._most.nodes)
-            self._peers[peer] = _ServiceImportPeer(name, rank, places, bounds.Surplus(limits.SURPLUS_MAX))
+            self._peers[peer] = _ServiceImportPeer(name=name, nodes=NodePlaces(self._most.nodes), rank=rank)
         else:
             known.away = False
             known.serial = -1
@@ -277,49 +268,47 @@ class ServiceImports:
         if known is None:
             return []
         actions = self.link_down(peer)
-        known.nodes.give_up()
-        known.surplus.clear()
-        for wire in list(known.services):
+        known.give_up()
+        for wire in list(known.entries):
             actions += self._remove(peer, wire, f"{known.name} is gone")
         del self._peers[peer]
         return actions
 
     # --- what peers offer --------------------------------------------------------------------------------------
 
-    def advertised(self, peer: int, message: AdvertiseServices) -> list[ImportAction]:
-        """A peer says what it provides, all or what changed."""
+    def portions(self, peer: int, message: AdvertiseServices) -> Iterator[Change[ServiceOffer, str]]:
+        """Split an advertisement into portions that ``take_in`` deals with in a moment."""
+        known, full, more = self._peers.get(peer), message.full, message.more
+        if known is None:
+            return iter(())
+        return known.changes(message.added, message.removed, lambda offer: offer.service, full=full, more=more)
+
+    def take_in(self, peer: int, change: Change[ServiceOffer, str]) -> list[ImportAction]:
+        """A peer provides more, or less."""
         known = self._peers.get(peer)
         if known is None:
             return []
-        if message.full:
-            known.doubtful = set(known.services)
-            known.surplus.clear()
         actions: list[ImportAction] = []
-        for wire in message.removed:
-            if wire not in known.services:
+        for wire in change.removed:
+            if wire not in known.entries:
                 known.surplus.discard(wire)
             actions += self._remove(peer, wire, f"its server at {known.name} has gone")
-        for offer in message.added:
+        for offer in change.added:
             actions += self._offer(peer, known, offer)
-        if message.full or known.doubtful:
-            known.doubtful -= {offer.service for offer in message.added}
-            if not message.more:
-                for wire in known.doubtful:
-                    actions += self._remove(peer, wire, f"its server at {known.name} has gone")
-                known.doubtful = set()
-        for admitted in islice(self._admit(peer), limits.LEARNT_AT_ONCE):
-            actions += admitted
-        return actions
+        admitted = islice(self._admit(peer), limits.APPLIED_AT_ONCE)
+        return actions + [action for one in admitted for action in one]
+
+    def advertised(self, peer: int, message: AdvertiseServices) -> list[ImportAction]:
+        """A peer says what it provides: all portions at once."""
+        return [action for change in self.portions(peer, message) for action in self.take_in(peer, change)]
 
     def _admit(self, peer: int) -> Iterator[list[ImportAction]]:
         """Take in what was beyond ``limits.services`` while there is room, one after the other."""
-        while (known := self._peers.get(peer)) is not None and len(known.services) < self._most.services:
-            if (offer := known.surplus.pop()) is None:
-                return
+        while (known := self._peers.get(peer)) and (offer := known.admitted(self._most.services)):
             yield self._offer(peer, known, offer)
 
     def _offer(self, peer: int, known: _ServiceImportPeer, offer: ServiceOffer) -> list[ImportAction]:
-        before = known.services.get(offer.service)
+        before = known.entries.get(offer.service)
         actions: list[ImportAction] = []
         if before is not None and (before.node, before.origin) == (offer.node, offer.origin):
             # The same once more: another server behind it, or a new link; what it is may have changed.
@@ -327,13 +316,13 @@ class ServiceImports:
             return [ForgetAbout(peer, before.name)] if before.shown else []
         if before is not None:
             actions += self._remove(peer, offer.service, f"another node of {known.name} provides it now")
-        elif len(known.services) >= self._most.services:
+        elif len(known.entries) >= self._most.services:
             known.surplus.add(offer.service, offer)
             text = bounds.warning(known.name, "services", self._most.services)
             return [Warn("services.too_many", known.name, text)]
         name = self._rules.local_name(offer.origin.name if offer.origin else known.name, offer.service)
-        remote = known.services[offer.service] = RemoteService(offer.service, offer.node, name, origin=offer.origin)
-        if offer.origin is not None and self.ways.learn(peer, offer.origin):
+        remote = known.entries[offer.service] = RemoteService(offer.service, offer.node, name, origin=offer.origin)
+        if offer.origin is not None and self.ways.add(peer, offer.origin):
             actions += self._choose_of({offer.origin.instance})
         if not is_crossing_name(name):
             remote.hidden = f"the rules of names make {name!r} of it"
@@ -347,13 +336,13 @@ class ServiceImports:
 
     def _remove(self, peer: int, wire: str, reason: str) -> list[ImportAction]:
         known = self._peers[peer]
-        remote = known.services.pop(wire, None)
+        remote = known.entries.pop(wire, None)
         if remote is None:
             return []
         known.nodes.leave(remote.node, remote.name)
         # Our words may have crossed: what we asked for last is open over there, for another server perhaps.
         actions = self._release(peer, remote, reason)
-        another_way = remote.origin is not None and self.ways.forget(peer, remote.origin)
+        another_way = remote.origin is not None and self.ways.remove(peer, remote.origin)
         if remote.shown:
             remote.shown = False
             actions.append(Withdraw(peer, remote.name, remote.node, reason))
@@ -378,7 +367,7 @@ class ServiceImports:
                     actions += self._choose(name)
         return actions
 
-    # --- who is shown ------------------------------------------------------------------------------------------
+    # --- which is shown ----------------------------------------------------------------------------------------
 
     def local(self, service: str, node: str | None) -> list[ImportAction]:
         """Say which node of this module provides a service now, if any."""
@@ -388,7 +377,7 @@ class ServiceImports:
             self._local[service] = node
         return self._choose(service) if service in self._claims else []
 
-    def obey(self, rules: ServiceRules, most: LimitSettings = _DEFAULT_LIMITS) -> Iterator[list[ImportAction]]:
+    def apply_rules(self, rules: ServiceRules, most: LimitSettings = _DEFAULT_LIMITS) -> Iterator[list[ImportAction]]:
         """Other rules hold from now on; what they do not touch goes on.
 
         Returns:
@@ -397,14 +386,14 @@ class ServiceImports:
         self._rules, self._most = rules, most
         for known in self._peers.values():
             known.nodes.bound(most.nodes)
-        offers = [(number, wire) for number, known in self._peers.items() for wire in known.services]
+        offers = [(number, wire) for number, known in self._peers.items() for wire in known.entries]
         # A second time, for those whose new name was still another one's old one.
         judged = (self._rejudge(number, wire, again=again) for again in (False, True) for number, wire in offers)
         return chain(judged, (actions for number in list(self._peers) for actions in self._admit(number)))
 
     def _rejudge(self, number: int, wire: str, *, again: bool) -> list[ImportAction]:
         known = self._peers.get(number)
-        remote = known.services.get(wire) if known is not None else None
+        remote = known.entries.get(wire) if known is not None else None
         if known is None or remote is None:
             return []
         name = self._rules.local_name(remote.origin.name if remote.origin else known.name, wire)
@@ -415,7 +404,7 @@ class ServiceImports:
         return [] if again or claimed is not remote else self._choose(name)
 
     def _choose(self, service: str) -> list[ImportAction]:
-        """Show one of those who offer a service, and hide the others."""
+        """Show the service of one peer, and hide those of the others."""
         claims = self._claims[service]
         local = self._local.get(service)
         seen: str | None = f"{local} of this module provides it itself" if local is not None else None
@@ -467,7 +456,7 @@ class ServiceImports:
     # --- calling -----------------------------------------------------------------------------------------------
 
     def want(self, peer: int, service: str, now: float) -> list[ImportAction]:
-        """Somebody local wants to call, or to know what it is: ``OpenedService`` or ``EndedService`` will follow.
+        """A local node wants to call it, or to know its type: ``OpenedService`` or ``EndedService`` will follow.
 
         Raises:
             LocalProtocolError: It is not shown, or its peer has no link: ask before.
@@ -512,7 +501,7 @@ class ServiceImports:
         return self._end(peer, message.route, message.reason)
 
     def release(self, peer: int, service: str, reason: str = "nobody calls it") -> list[ImportAction]:
-        """Nobody here has called it for a while."""
+        """It was not called for a while."""
         remote = self.get(peer, service)
         return self._release(peer, remote, reason) if remote is not None else []
 

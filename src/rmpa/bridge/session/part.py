@@ -1,38 +1,69 @@
-"""What the bridge is made of beside topics: each part hears of links, of their messages and of the local graph.
-
-A part is an object of its own (services, questions, followed parameters …), so that the bridge only hands on.
-"""
+"""What the bridge is made of: topics, services, parameters and others are parts alike."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rmpa.bridge.io.bridge import PeerSession
     from rmpa.bridge.messages import Message
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import Settings
+    from rmpa.core.identity import Identity
     from rmpa.ros.master.effects import GraphChange
 
 
 class Part:
-    """Hears of everything and does nothing; parts override what they care for. All calls come from the loop."""
+    """Gets every event of the bridge and does nothing with it; parts override what they need.
+
+    All methods are called from the event loop.
+    """
+
+    advertisement = ""
+    """The kind of control message that ``advertised`` takes before it is parsed; empty: none."""
 
     def start(self) -> None:
         """The bridge has started: the local core answers."""
 
     async def close(self) -> None:
-        """The bridge ends: links are gone, the local core is still there."""
+        """The bridge ends: all sessions have ended, the local core is still there."""
 
-    def link_up(self, attached: PeerSession) -> None:
-        """A link is up, of a new peer or of one that was away for a moment (then ``link_down`` came before)."""
+    # --- sessions ----------------------------------------------------------------------------------------------
 
-    def link_down(self, attached: PeerSession) -> None:
-        """A link is gone; the peer may come back within ``limits.AWAY_GRACE`` (``gone`` is not called then)."""
+    def remembered(self, identity: Identity) -> int | None:  # noqa: ARG002 - for those that override it
+        """The number of an ended session of this run of a peer, if the part still knows something under it."""
+        return None
 
-    def gone(self, attached: PeerSession) -> None:
-        """A peer is gone for good: what came from it leaves the local graph."""
+    def link_up(self, session: PeerSession) -> None:
+        """A link is up, of a new peer or of one whose session waited (then ``link_down`` came before)."""
 
-    def message(self, attached: PeerSession, message: Message) -> bool:  # noqa: ARG002 - for those that override it
+    def link_down(self, session: PeerSession) -> None:
+        """A link is gone; the peer may come back."""
+
+    def grace_over(self, session: PeerSession) -> bool:  # noqa: ARG002 - for those that override it
+        """The peer did not come back within ``mesh.limits.AWAY_GRACE``, or its link did not end by silence.
+
+        Returns:
+            Whether the part keeps something for the peer: then the session waits.
+        """
+        return False
+
+    def outlasted(self, session: PeerSession, seconds: float) -> float | None:  # noqa: ARG002 - likewise
+        """The peer has been away for ``seconds``: what is not kept for longer goes.
+
+        Returns:
+            For how many seconds the next thing is kept, more than ``seconds``; ``None``: nothing is kept any more.
+        """
+        return None
+
+    def gone(self, session: PeerSession) -> None:
+        """The session ends for good: what came from the peer leaves the local graph."""
+
+    def lane_lost(self, session: PeerSession) -> None:
+        """The bulk lane of a link is gone, and perhaps half a message in either direction."""
+
+    # --- messages ----------------------------------------------------------------------------------------------
+
+    def message(self, session: PeerSession, message: Message) -> bool:  # noqa: ARG002 - for those that override it
         """A control message came.
 
         Returns:
@@ -42,6 +73,15 @@ class Part:
             RemoteProtocolError: It is not one that can come now; the link is closed.
         """
         return False
+
+    def advertised(self, session: PeerSession, payload: bytes) -> None:
+        """A control message of the kind ``advertisement`` came, not parsed yet.
+
+        Raises:
+            LimitExceeded: It is longer than ``limits.ADVERTISEMENT_MAX``; the link is closed.
+        """
+
+    # --- the local graph ---------------------------------------------------------------------------------------
 
     def graph_changed(self, change: GraphChange) -> None:
         """A registration in the local graph came, changed or went."""
@@ -61,19 +101,4 @@ class Part:
         """The settings were read again; of those that a running agent can take, others may hold from now on."""
 
     def reconcile(self) -> None:
-        """Each ``limits.RECONCILE_INTERVAL``: compare what is with what should be, and mend it."""
-
-    def lane_lost(self, attached: PeerSession) -> None:
-        """The bulk lane of a link is gone, and half a message perhaps."""
-
-
-class DataHandler(Protocol):
-    """Takes what comes on a route that is not a topic's (``limits.SERVICE_ROUTES`` and above)."""
-
-    def message(self, sequence: int, stamp_ns: int, framed: memoryview) -> None:
-        """A whole message, its 4-byte length in front; only valid during the call."""
-        ...
-
-    def part(self, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
-        """A part of a large one (``core.outbox`` FIRST, LAST, ABORT); only valid during the call."""
-        ...
+        """Compare what is with what should be, and mend it; called each ``limits.RECONCILE_INTERVAL``."""

@@ -24,8 +24,8 @@ from rmpa.core.sizes import UINT32_MAX
 from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
-    from rmpa.bridge.io.bridge import PeerSession
     from rmpa.bridge.messages import Message
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.core.counters import Counters
 
 _log = logging.getLogger(__name__)
@@ -49,21 +49,21 @@ class PeerRpc(Part):
         self._listeners: dict[str, Listener] = {}
         self._answering: dict[int, set[asyncio.Task[None]]] = {}
 
-    def on(self, what: str, handler: Handler) -> None:
+    def on_request(self, what: str, handler: Handler) -> None:
         """Answer a question from now on."""
         self._handlers[what] = handler
 
-    def on_tell(self, what: str, listener: Listener) -> None:
+    def on_notification(self, what: str, listener: Listener) -> None:
         """Take news of this name from now on."""
         self._listeners[what] = listener
 
-    def tell(self, attached: PeerSession, what: str, args: dict[str, Any]) -> None:
+    def notify(self, session: PeerSession, what: str, args: dict[str, Any]) -> None:
         """Send news to a linked peer."""
-        attached.link.send_control(encode(Notification(what, args)))
+        session.link.send_control(encode(Notification(what, args)))
 
-    async def ask(
+    async def request(
         self,
-        attached: PeerSession,
+        session: PeerSession,
         what: str,
         args: dict[str, Any],
         timeout: float = limits.ASK_TIMEOUT,  # noqa: ASYNC109 - the message names it
@@ -76,32 +76,32 @@ class PeerRpc(Part):
         """
         number = next(self._numbers)
         future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
-        self._waiting[attached.peer, number] = (future, attached.link.name)
+        self._waiting[session.peer, number] = (future, session.link.name)
         try:
-            attached.link.send_control(encode(Request(number, what, args)))
+            session.link.send_control(encode(Request(number, what, args)))
             async with asyncio.timeout(timeout):
                 return await future
         except TimeoutError:
             remedy = "is its agent stopped, or its version older?"
-            raise UnreachableError("agent", f"{attached.link.name} ({what}, {timeout:g} s)", remedy) from None
+            raise UnreachableError("agent", f"{session.link.name} ({what}, {timeout:g} s)", remedy) from None
         finally:
-            self._waiting.pop((attached.peer, number), None)
+            self._waiting.pop((session.peer, number), None)
 
-    def link_down(self, attached: PeerSession) -> None:
-        """Nobody answers any more, and nobody waits for our answers."""
+    def link_down(self, session: PeerSession) -> None:
+        """The link is gone: requests over it fail, and answers to the peer are not worked out any more."""
         for (peer, _), (future, name) in list(self._waiting.items()):
-            if peer == attached.peer and not future.done():
+            if peer == session.peer and not future.done():
                 future.set_exception(UnreachableError("agent", name, "its link has just ended; try again"))
-        for task in self._answering.pop(attached.peer, ()):
+        for task in self._answering.pop(session.peer, ()):
             task.cancel()
 
-    def message(self, attached: PeerSession, message: Message) -> bool:
+    def message(self, session: PeerSession, message: Message) -> bool:
         """Take a question or an answer."""
         match message:
             case Request():
-                self._answer(attached, message)
+                self._answer(session, message)
             case Response():
-                future, name = self._waiting.get((attached.peer, message.number), (None, ""))
+                future, name = self._waiting.get((session.peer, message.number), (None, ""))
                 if future is not None and not future.done():
                     if message.ok:
                         future.set_result(message.value)
@@ -109,28 +109,28 @@ class PeerRpc(Part):
                         future.set_exception(PeerRefused(name, message.error, message.remedy))
             case Notification():
                 if (listener := self._listeners.get(message.what)) is not None:
-                    listener(attached, message.args)
+                    listener(session, message.args)
             case _:
                 return False
         return True
 
     async def close(self) -> None:
-        """Answer nobody any more."""
+        """Answer no more requests."""
         tasks = [task for tasks in self._answering.values() for task in tasks]
         self._answering.clear()
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
-    def _answer(self, attached: PeerSession, ask: Request) -> None:
-        tasks = self._answering.setdefault(attached.peer, set())
+    def _answer(self, session: PeerSession, ask: Request) -> None:
+        tasks = self._answering.setdefault(session.peer, set())
         if len(tasks) >= limits.ASKS_AT_ONCE:
             self._counters.add("ask.refused")
-            self._send(attached, Response(ask.number, ok=False, error="too many questions at once"))
+            self._send(session, Response(ask.number, ok=False, error="too many questions at once"))
             return
-        task = asyncio.create_task(self._respond(attached, ask), name=f"answer {ask.what} of {attached.link.name}")
+        task = asyncio.create_task(self._respond(session, ask), name=f"answer {ask.what} of {session.link.name}")
         tasks.add(task)
-        task.add_done_callback(functools.partial(self._answered, attached.peer))
+        task.add_done_callback(functools.partial(self._answered, session.peer))
 
     def _answered(self, peer: int, task: asyncio.Task[None]) -> None:
         tasks = self._answering.get(peer, set())
@@ -138,16 +138,14 @@ class PeerRpc(Part):
         if not tasks:
             self._answering.pop(peer, None)
 
-    async def _respond(self, attached: PeerSession, ask: Request) -> None:
+    async def _respond(self, session: PeerSession, ask: Request) -> None:
         handler = self._handlers.get(ask.what)
         if handler is None:
             text = f"this agent does not know the question {ask.what!r}"
-            self._send(
-                attached, Response(ask.number, ok=False, error=text, remedy="install the same release on both")
-            )
+            self._send(session, Response(ask.number, ok=False, error=text, remedy="install the same release on both"))
             return
         try:
-            value = handler(attached, ask.args)
+            value = handler(session, ask.args)
             if inspect.isawaitable(value):
                 value = await value
             answer = Response(ask.number, ok=True, value=msgspec.to_builtins(value))
@@ -155,15 +153,15 @@ class PeerRpc(Part):
             answer = Response(ask.number, ok=False, error=str(error)[: limits.CONTROL_TEXT_MAX])
         except Exception:  # noqa: BLE001 - a task's top: one question must not end the link
             self._counters.add("ask.failed")
-            _log.exception("! a question of %s failed: %s", attached.link.name, ask.what[: limits.ASK_NAME_MAX])
+            _log.exception("! a question of %s failed: %s", session.link.name, ask.what[: limits.ASK_NAME_MAX])
             answer = Response(
                 ask.number, ok=False, error=f"the agent failed at {ask.what}", remedy="its log says why"
             )
-        self._send(attached, answer)
+        self._send(session, answer)
 
-    def _send(self, attached: PeerSession, answer: Response) -> None:
+    def _send(self, session: PeerSession, answer: Response) -> None:
         payload = encode(answer)
         if len(payload) > mesh_limits.CONTROL_PAYLOAD_MAX:
             text = f"the answer has {len(payload)} bytes, more than {mesh_limits.CONTROL_PAYLOAD_MAX}"
             payload = encode(Response(answer.number, ok=False, error=text))
-        attached.link.send_control(payload)
+        session.link.send_control(payload)

@@ -80,7 +80,7 @@ class ProxyNodes:
         """
         if self._listener is None:
             with DESCRIPTORS.open_socket(Use.PROXY, what=f"the proxy {name}"):
-                pass  # there is room for its sockets, and for those who connect to them
+                pass  # there is room for its sockets, and for connections to them
         return SlaveNode(
             name,
             self._core.node_host,

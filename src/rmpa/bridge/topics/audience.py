@@ -1,4 +1,4 @@
-"""Topics whose publisher looks at who listens, not only at whether somebody does.
+"""Topics whose publisher looks at the names of its listeners, not only at whether there are any.
 
 An actionlib client believes in a server once the node that publishes the status listens to the client's goals and
 cancellations, too (``wait_for_server``, ``waitForServer``): it compares the caller ids of the connections. Over the
@@ -22,7 +22,7 @@ _CANCEL: Final = "actionlib_msgs/GoalID"
 
 
 def is_watched(type_name: str) -> bool:
-    """Whether publishers of this type look at who listens; by the type, for a topic can be remapped."""
+    """Whether publishers of this type look at their listeners' names; by the type, for a topic can be remapped."""
     return type_name.endswith(_GOAL) or type_name == _CANCEL
 
 

@@ -9,7 +9,7 @@ A source is connected while at least one peer wants it::
       ▲               │ refused, lost          │ lost, restarted, gone
       └───────────────┴────────────────────────┘  every route of it: Closed(reason)
 
-Who lost a route asks again: the one that wants the data is the one that retries. A reliable route outlives its
+A peer that lost a route asks again: the side that wants the data retries. A reliable route outlives its
 link: it is suspended, its source stays connected, and the peer's next ``OpenRoute`` goes on where it was
 (``link_away``).
 
@@ -22,16 +22,13 @@ told a bounded number of sources at a time.
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import dataclass, field
-from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from rmpa.bridge import limits
 from rmpa.bridge.actions import Action, AddRoute, Connect, Disconnect, RemoveRoute, Send, SuspendRoute, Warn
-from rmpa.bridge.bounds import Beyond
+from rmpa.bridge.catalogue.offers import CataloguePeer, OfferCatalogue
 from rmpa.bridge.data.losses import NOTHING_KEPT, beginning_anew, going_on
 from rmpa.bridge.messages import (
     Advertise,
@@ -45,7 +42,7 @@ from rmpa.bridge.messages import (
     is_crossing_name,
     is_crossing_type,
 )
-from rmpa.bridge.naming import Names, PeerNames
+from rmpa.bridge.naming import Names
 from rmpa.bridge.relay import may_have
 from rmpa.config.settings import LimitSettings
 from rmpa.core.contract import Contract, Contracts, Durability, Reliability, combine
@@ -53,6 +50,8 @@ from rmpa.core.contract import Contract, Contracts, Durability, Reliability, com
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
 
+    from rmpa.bridge.catalogue.bounds import Beyond
+    from rmpa.bridge.catalogue.offers import Portion
     from rmpa.bridge.data.losses import KeptMessages
     from rmpa.bridge.messages import Origin
     from rmpa.bridge.policy import Policy
@@ -60,7 +59,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class LocalSource:
-    """A source of the local graph: its message type, its node's slave API, and whose it is if we relay it."""
+    """A source of the local graph: its message type, its node's slave API, and its origin where it is relayed."""
 
     type: str
     uri: str
@@ -119,42 +118,10 @@ class _Topic:
     rules: int = 0
 
 
-@dataclass(slots=True)
-class _ExportPeer:
-    """One link.
-
-    Args:
-        name: The peer's.
-        names: How our names read over there.
-        ruled: Whether it may know less than others, or by other names.
-        news: Sources that it is perhaps to hear of (a dict, for its order).
-        told: Those that it knows, as it was told.
-        by_wire: The same by the names that it knows them by.
-        behind: Sources whose wire name another one has, by that name.
-        routes: What it has open.
-        beginning: Whether it has not heard everything once yet.
-        instance: The peer's run.
-    """
-
-    name: str
-    names: PeerNames
-    ruled: bool
-    news: dict[Source, None]
-    told: dict[Source, TopicOffer] = field(default_factory=dict)
-    by_wire: dict[Source, Source] = field(default_factory=dict)
-    behind: dict[Source, list[Source]] = field(default_factory=dict)
-    routes: dict[int, Source] = field(default_factory=dict)
-    beginning: bool = True
-    instance: str = ""
-
-
+_Peer = CataloguePeer[Source, LocalSource, TopicOffer, Source]
 _NOTHING: Final = _Topic({})
 _NO_NAMES: Final = Names()
 _DEFAULT_LIMITS: Final = LimitSettings()
-
-
-def _always(_peer: int) -> bool:
-    return True
 
 
 class Exports:
@@ -165,7 +132,7 @@ class Exports:
         contracts: What our side promises.
         names: How our names read at the peers.
         most: How much is offered.
-        kept: Who keeps the messages of reliable routes.
+        kept: Keeps the messages of reliable routes.
     """
 
     def __init__(
@@ -179,53 +146,56 @@ class Exports:
         self._kept = kept
         self._policy = policy
         self._most = most
+        self._catalogue: OfferCatalogue[Source, LocalSource, TopicOffer, Source] = OfferCatalogue(
+            "topics", most.topics, offer=self._offer, wire=lambda offer: offer.source
+        )
         self._contracts = contracts if contracts is not None else Contracts()
         self._names = names
         self._rules = 0
         self._epochs = 0
         self._topics: dict[str, _Topic] = {}
-        self._local: dict[Source, LocalSource] = {}
-        self._too_many: OrderedDict[Source, LocalSource] = OrderedDict()
-        self._peers: dict[int, _ExportPeer] = {}
+        self._routes: dict[int, dict[int, Source]] = {}
+        """What each linked peer has open, by its route."""
         self._flows: dict[Source, _ExportedFlow] = {}
 
     @property
     def offered(self) -> Mapping[Source, LocalSource]:
         """What peers are told of."""
-        return self._local
+        return self._catalogue.offered
 
     @property
     def beyond(self) -> Beyond:
         """What is offered to no peer because there is too much (``limits.topics``)."""
-        return Beyond("topics", self._most.topics, len(self._too_many))
+        return self._catalogue.beyond
 
     def is_beyond(self, source: Source) -> bool:
         """Whether a source is one of these."""
-        return source in self._too_many
+        return self._catalogue.is_beyond(source)
 
     def offer(self, peer: int, source: Source) -> TopicOffer | None:
         """What a peer was told of a source, by the name that it has over there."""
-        return known.told.get(source) if (known := self._peers.get(peer)) is not None else None
+        return self._catalogue.told(peer, source)
 
     def topics_for(self, peer: int) -> int:
         """How many topics a peer may have."""
-        known = self._peers.get(peer)
-        sources = known.told if known is not None and known.ruled else self._local
+        known = self._catalogue.peer(peer)
+        sources = known.told if known is not None and known.judged else self.offered
         return len({source.topic for source in sources})
 
     def local(self, peer: int, wire: Source) -> Source | None:
         """The source that a peer knows by a name, or ``None`` if it may know none by it."""
-        known = self._peers.get(peer)
+        known = self._catalogue.peer(peer)
         if known is None:
             return None
         source = known.by_wire.get(wire)
-        if source is None and not known.ruled and wire in self._local and self._offer(known, wire) is not None:
+        local = self.offered.get(wire if source is None else source)
+        if source is None and local is not None and not known.judged and self._offer(known, wire, local) is not None:
             return wire  # it is about to be told
-        return source if source in self._local else None
+        return source if local is not None else None
 
     def source(self, peer: int, route: int) -> Source | None:
         """What a peer has open on a route."""
-        return known.routes.get(route) if (known := self._peers.get(peer)) is not None else None
+        return self._routes.get(peer, {}).get(route)
 
     def flowing(self, source: Source) -> tuple[int, ...]:
         """The peers that a source goes to now."""
@@ -248,38 +218,38 @@ class Exports:
         return self._topics.keys()
 
     @property
-    def untold(self) -> bool:
-        """Whether there is something to ``tell``."""
-        return any(peer.news for peer in self._peers.values())
+    def pending(self) -> bool:
+        """Whether there is something to ``advertise``."""
+        return self._catalogue.pending
 
     def beginning(self, peer: int) -> bool:
         """Whether a peer has not been told everything once since its link is up."""
-        return known.beginning if (known := self._peers.get(peer)) is not None else False
+        return self._catalogue.beginning(peer)
 
-    def rules(
+    def apply_rules(
         self, policy: Policy, contracts: Contracts, names: Names, most: LimitSettings = _DEFAULT_LIMITS
     ) -> list[Action]:
         """Other rules hold from now on; what they leave as it is goes on untouched.
 
-        The topics are judged by them when ``graph`` tells of each next, and the peers hear of it by ``tell``.
+        The topics are judged by them when ``graph`` tells of each next, and the peers hear of it by ``advertise``.
         """
         self._policy, self._contracts, self._names, self._most = policy, contracts, names, most
         self._rules += 1
-        for peer in self._peers.values():
-            before = peer.ruled
-            peer.names, peer.ruled = self._rules_of(peer.name)
-            if before or peer.ruled:
-                peer.news.update(dict.fromkeys(self._local))
+        self._catalogue.limit = most.topics
+        for known in self._catalogue.peers():
+            before, known.judged = known.judged, self._is_judged(known.name)
+            if before or known.judged:
+                self._catalogue.note_all(known)
         actions: list[Action] = []
         for source, flow in list(self._flows.items()):
-            offered = contracts.of(source.topic, self._local[source].type)
+            offered = contracts.of(source.topic, self.offered[source].type)
             for (peer_number, _), route in list(flow.routes.items()):
                 if combine(offered, route.asked) != route.contract:
                     actions += self._end_for(source, peer_number, "its contract has changed here")
         return actions
 
     def graph(self, topic: str, publishers: Mapping[str, LocalSource]) -> list[Action]:
-        """Say who publishes a topic in the local graph now, by node, proxies left out; peers hear it by ``tell``."""
+        """Set a topic's publishers now, by node, proxies left out; peers are told by ``advertise``."""
         before = self._topics.get(topic, _NOTHING)
         if before.seen == publishers and (before.rules == self._rules or not publishers):
             return []
@@ -309,120 +279,80 @@ class Exports:
 
     def _came(self, source: Source, local: LocalSource) -> list[Action]:
         """A source is there: new, as it was, with another type, or at another address."""
-        before = self._local.get(source)
-        if before is None and len(self._local) >= self._most.topics:
-            self._too_many[source] = local
-            text = (
-                f"this module has more topics than limits.topics = {self._most.topics}; the rest is offered to no "
-                "peer: raise it in rmpa.toml and `rmpa reload`, or deny some"
-            )
-            return [Warn("sources.too_many", "local", text)]
-        self._too_many.pop(source, None)
-        self._local[source] = local
+        before = self.offered.get(source)
+        if not self._catalogue.put(source, local):
+            return [self._catalogue.warning("sources.too_many")]
         if before is None or (before.type, before.origin) != (local.type, local.origin):
-            self._note(source)
-        # A new address is nobody's business but ours.
+            self._catalogue.note(source)
+        # Peers need not know of a new address.
         flow = self._flows.get(source)
         return self._end(source, "the node has restarted") if flow is not None and flow.uri != local.uri else []
 
     def _went(self, source: Source) -> list[Action]:
-        before = self._local.pop(source, None)
-        if before is None:
-            del self._too_many[source]
+        if not self._catalogue.remove(source):
             return []
-        self._note(source)
+        self._catalogue.note(source)
         actions = self._end(source, "the node has gone")
-        if self._too_many:
-            actions += self._came(*self._too_many.popitem(last=False))
+        if (waiting := self._catalogue.next_beyond()) is not None:
+            actions += self._came(*waiting)
         return actions
 
-    def _note(self, source: Source) -> None:
-        for peer in self._peers.values():
-            peer.news.setdefault(source)
+    def advertise(self, ready: Callable[[int], bool] = lambda _: True) -> list[Action]:
+        """One message for each peer that has not heard everything and is ready; call again while ``pending``."""
+        return [
+            action
+            for peer, portion in self._catalogue.portions(ready)
+            for action in self._told_portion(peer, portion, full=False)
+        ]
 
-    def tell(self, ready: Callable[[int], bool] = _always) -> list[Action]:
-        """One message for each peer that has not heard everything and is ready; call again while ``untold``.
-
-        Of those that have rules of their own only one is told at a time, in turn: each source is judged for it.
-        """
+    def _told_portion(self, peer: int, portion: Portion[Source, TopicOffer, Source], *, full: bool) -> list[Action]:
+        """A portion as a message; routes of sources that the peer may not have any more end."""
         actions: list[Action] = []
-        judged = False
-        for number, peer in list(self._peers.items()):
-            begins = peer.beginning
-            if not peer.news or (peer.ruled and judged) or not ready(number):
-                continue
-            if peer.ruled:
-                judged = True
-                self._peers[number] = self._peers.pop(number)
-            message, ends = self._next(number, peer)
-            actions += ends
-            if message.added or message.removed or begins is not message.more:
-                actions.append(Send(number, message))
+        for source in portion.ended:
+            actions += self._end_for(source, peer, "it is not offered here any more, or by another name")
+        known = self._catalogue.peer(peer)
+        for source, offer, holder in portion.taken:
+            name = known.name if known is not None else ""
+            text = f"{source} would be {offer.topic} at {name}, as {holder.topic} is already: rename one"
+            actions.append(Warn("names.taken", f"{peer} {source}", text))
+        if full or portion.is_news:
+            message = Advertise(tuple(portion.added), tuple(portion.removed), full, portion.more)
+            actions.append(Send(peer, message))
         return actions
 
-    def _next(self, number: int, peer: _ExportPeer, *, full: bool = False) -> tuple[Advertise, list[Action]]:
-        """The next portion of news, and what becomes of routes whose sources the peer may not have any more."""
-        added: list[TopicOffer] = []
-        removed: list[Source] = []
-        actions: list[Action] = []
-        for source in tuple(islice(peer.news, limits.ADVERTISED_AT_ONCE)):
-            del peer.news[source]
-            before, now = peer.told.get(source), self._offer(peer, source)
-            if before is not None and (now is None or now.source != before.source):
-                del peer.told[source], peer.by_wire[before.source]
-                removed.append(before.source)
-                peer.news.update(dict.fromkeys(peer.behind.pop(before.source, ())))
-                actions += self._end_for(source, number, "it is not offered here any more, or by another name")
-            if now is not None and now != before:
-                holder = peer.by_wire.setdefault(now.source, source)
-                if holder != source:
-                    peer.behind.setdefault(now.source, []).append(source)
-                    text = f"{source} would be {now.topic} at {peer.name}, as {holder.topic} is already: rename one"
-                    actions.append(Warn("names.taken", f"{number} {source}", text))
-                    continue
-                peer.told[source] = now
-                added.append(now)
-        peer.beginning = peer.beginning and bool(peer.news)
-        return Advertise(added=tuple(added), removed=tuple(removed), full=full, more=peer.beginning), actions
-
-    def _offer(self, peer: _ExportPeer, source: Source) -> TopicOffer | None:
+    def _offer(self, known: _Peer, source: Source, local: LocalSource) -> TopicOffer | None:
         """What a peer is to know of a source now."""
-        local = self._local.get(source)
-        if local is None:
+        if local.origin is not None and not may_have(known.instance, local.origin):
             return None
-        if local.origin is not None and not may_have(peer.instance, local.origin):
-            return None
-        if not peer.ruled:
+        if not known.judged:
             return TopicOffer(source.topic, source.node, local.type, local.origin)
-        wire = peer.names.wire_name(source.topic, local.type)
+        wire = self._names.wire_name(known.name, source.topic, local.type)
         if not is_crossing_name(wire):
             return None
-        if not self._policy.judge_for(peer.name, source.topic, local.type, wire).allowed:
+        if not self._policy.judge_for(known.name, source.topic, local.type, wire).allowed:
             return None
         return TopicOffer(wire, source.node, local.type, local.origin)
 
     def link_up(self, peer: int, name: str = "", instance: str = "") -> list[Action]:
-        """A link is up: begin to tell all we have; ``tell`` goes on with it.
+        """A link is up: begin to tell all we have; ``advertise`` goes on with it.
 
         Args:
-            peer: Whose.
+            peer: The peer's number.
             name: The peer's name, which its rules go by.
             instance: Its run, as 32 hexadecimal digits; nothing that came from there is relayed back to it.
         """
-        new = _ExportPeer(name, *self._rules_of(name), dict.fromkeys(self._local), instance=instance)
-        self._peers[peer] = new
-        message, actions = self._next(peer, new, full=True)
-        return [*actions, Send(peer, message)]
+        self._routes[peer] = {}
+        first = self._catalogue.link_up(peer, name, instance, judged=self._is_judged(name))
+        return self._told_portion(peer, first, full=True)
 
-    def _rules_of(self, name: str) -> tuple[PeerNames, bool]:
-        names = self._names.of(name)
-        return names, not names.plain or self._policy.has_rules_for(name)
+    def _is_judged(self, name: str) -> bool:
+        return not self._names.of(name).plain or self._policy.has_rules_for(name)
 
     def link_down(self, peer: int, *, counting: bool = False) -> list[Action]:
         """A peer is gone, and all its routes; ``counting``: suspended ones stay, for what it misses is counted."""
         actions: list[Action] = []
-        gone = self._peers.pop(peer, None)
-        for route, source in gone.routes.items() if gone is not None else ():
+        self._catalogue.link_down(peer)
+        for route, source in self._routes.pop(peer, {}).items():
             actions += self._remove(source, peer, route)
         return actions if counting else actions + self.unclaimed(peer)
 
@@ -443,8 +373,8 @@ class Exports:
         # What the peer had not asked for again yet waits anew.
         again = [(one, flow.away[peer].contract) for one, flow in self._flows.items() if peer in flow.away]
         actions: list[Action] = [SuspendRoute(one, peer, contract.outage) for one, contract in again]
-        gone = self._peers.pop(peer, None)
-        for number, source in gone.routes.items() if gone is not None else ():
+        self._catalogue.link_down(peer)
+        for number, source in self._routes.pop(peer, {}).items():
             flow = self._flows.get(source)
             route = flow.routes.get((peer, number)) if flow is not None else None
             if flow is None or route is None or not (route.live and route.epoch):
@@ -484,7 +414,7 @@ class Exports:
 
     def opened(self, peer: int, message: OpenRoute) -> list[Action]:
         """A peer asks for a source."""
-        routes = self._peers[peer].routes
+        routes = self._routes[peer]
         if message.route in routes:
             return [
                 Warn("route.doubled", str(peer), f"a peer opens route {message.route} twice; the second is ignored")
@@ -496,7 +426,7 @@ class Exports:
         if source is None:
             text = f"{message.source}: not published here, or policy keeps it home"
             return [Send(peer, RouteClosed(message.route, text))]
-        local = self._local[source]
+        local = self.offered[source]
         flow = self._flows.get(source)
         if flow is not None and any(other == peer for other, _ in flow.routes):
             # One copy a peer: more would let it multiply what we send at will.
@@ -526,7 +456,7 @@ class Exports:
 
     def closed(self, peer: int, message: CloseRoute) -> list[Action]:
         """A peer wants no more of a route; one that is not open is none of our worry (it crossed ours)."""
-        source = self._peers[peer].routes.pop(message.route, None)
+        source = self._routes[peer].pop(message.route, None)
         return self._remove(source, peer, message.route, wished=True) if source is not None else []
 
     def described(self, source: Source, description: Description) -> list[Action]:
@@ -571,7 +501,7 @@ class Exports:
         return actions + self._disconnect(source, flow)
 
     def _disconnect(self, source: Source, flow: _ExportedFlow) -> list[Action]:
-        """Leave a source that nobody wants any more."""
+        """Leave a source that no peer wants any more."""
         if flow.wanted:
             return []
         del self._flows[source]
@@ -584,7 +514,7 @@ class Exports:
             return []
         actions: list[Action] = []
         for number in [number for owner, number in flow.routes if owner == peer]:
-            self._peers[peer].routes.pop(number, None)
+            self._routes[peer].pop(number, None)
             actions += [*self._remove(source, peer, number), Send(peer, RouteClosed(number, reason))]
         if flow.away.pop(peer, None) is not None:
             actions += [RemoveRoute(source, peer, 0), *self._disconnect(source, flow)]
@@ -597,7 +527,7 @@ class Exports:
         actions: list[Action] = []
         actions += [RemoveRoute(source, peer, 0, over=True) for peer in flow.away]
         for (peer, number), route in flow.routes.items():
-            self._peers[peer].routes.pop(number, None)
+            self._routes[peer].pop(number, None)
             if route.live:
                 actions.append(RemoveRoute(source, peer, number, over=True))
             actions.append(Send(peer, RouteClosed(number, reason)))

@@ -1,16 +1,10 @@
 """Which sources of the peers appear in the local graph, and which routes are open for them.
 
-Sans-I/O: the driver tells what peers say and whether somebody local listens; it gets back actions. Each source
-of each peer is in one state of this table::
+Sans-I/O: the driver says what peers advertise and whether local nodes listen; it gets back actions. The states of
+each source's route are in ``topics.remote_topic``.
 
-    idle ──wanted──► opening ──opened──► open ──unwanted──► lingering ──time──► idle
-      ▲                 │ closed, time      │ closed             │ wanted
-      │ unwanted        ▼                   ▼                    ▼
-      └────────────── waiting ◄────────────────                 open
-                        │ time ──► opening
-
-What each method costs depends on what it is told, not on how many peers and sources there are; only who takes a long
-advertisement in one piece waits long (``portions``).
+What each method costs depends on what it is told, not on how many peers and sources there are; only a long
+advertisement in one piece takes long (``portions``).
 
 A source is known by its wire name, as its peer has it; under which topic it stands here is ``RemoteTopic.topic``
 (``bridge.naming``), and what the local graph says of topics is about those.
@@ -19,20 +13,17 @@ A source is known by its wire name, as its peer has it; under which topic it sta
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import Enum, auto
-from heapq import heappop, heappush
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Final
 
-from msgspec import UnsetType
-
-from rmpa.bridge import bounds, limits
-from rmpa.bridge.actions import Action, Describe, Detach, Publish, Retract, Send, Warn
+from rmpa.bridge import limits
+from rmpa.bridge.actions import Action, Detach, Publish, Retract, Send, Warn
+from rmpa.bridge.catalogue import bounds
+from rmpa.bridge.catalogue.bounds import Beyond, NodePlaces
+from rmpa.bridge.catalogue.peer_offers import PeerOffers
 from rmpa.bridge.messages import (
     Advertise,
-    CloseRoute,
     Mismatch,
-    OpenRoute,
     RouteClosed,
     RouteOpened,
     Source,
@@ -41,88 +32,20 @@ from rmpa.bridge.messages import (
 )
 from rmpa.bridge.naming import Names, PeerNames
 from rmpa.bridge.relay import LinkedPeer, RelayPaths
+from rmpa.bridge.topics.import_routes import ImportRoutes
+from rmpa.bridge.topics.remote_topic import RemoteTopic, RouteState
 from rmpa.config.param_rules import CLOCK
 from rmpa.config.settings import LimitSettings
-from rmpa.core import limits as core_limits
 from rmpa.core.backoff import Backoff
-from rmpa.core.contract import Contract, Contracts, Reliability
-from rmpa.core.errors import LocalProtocolError
+from rmpa.core.contract import Contracts
 from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping
 
-    from rmpa.bridge.messages import Description, Origin
+    from rmpa.bridge.catalogue.peer_offers import Change
+    from rmpa.bridge.messages import Origin
     from rmpa.bridge.policy import Policy
-
-
-class RouteState(Enum):
-    """Where a remote source's route stands."""
-
-    IDLE = auto()
-    """Visible in the local graph, nobody listens."""
-    OPENING = auto()
-    """Asked for, not answered."""
-    OPEN = auto()
-    """Data flows."""
-    LINGERING = auto()
-    """Data flows, though nobody listens; perhaps somebody comes back."""
-    WAITING = auto()
-    """It was closed although somebody listens; it will be asked for again."""
-
-
-_S = RouteState
-TRANSITIONS: Final[Mapping[RouteState, frozenset[RouteState]]] = {
-    _S.IDLE: frozenset({_S.OPENING}),
-    _S.OPENING: frozenset({_S.OPEN, _S.WAITING, _S.IDLE}),
-    _S.OPEN: frozenset({_S.LINGERING, _S.WAITING}),
-    _S.LINGERING: frozenset({_S.OPEN, _S.IDLE}),
-    _S.WAITING: frozenset({_S.OPENING, _S.IDLE}),
-}
-
-
-@dataclass(slots=True)
-class RemoteTopic:
-    """One source of one peer, as we see it.
-
-    Args:
-        type: Its message type.
-        topic: The topic that it is here.
-        backoff: Delays between attempts.
-        shown: Whether it is in the local graph.
-        hidden: Why it is not, or empty.
-        conflict: Whether that is because a local node publishes the topic with another type, or time has come from
-            elsewhere before.
-        state: Where its route stands.
-        route: The route's id while it is asked for or open, else 0.
-        timer: When the state is looked at again, monotonic seconds.
-        description: What its messages are, once known.
-        problem: Why the last attempt failed, or empty.
-        wanted: Whether somebody local listens.
-        contract: What holds for its route, once it was open.
-        asked: What was last asked for.
-        serial: Of the timer.
-        origin: Whose it is, if its peer only passes it on.
-        crowded: Whether it is hidden because its node has no place here (``limits.nodes``).
-    """
-
-    type: str
-    topic: str
-    backoff: Backoff
-    shown: bool = False
-    hidden: str = ""
-    conflict: bool = False
-    state: RouteState = RouteState.IDLE
-    route: int = 0
-    timer: float | None = None
-    description: Description | None = None
-    problem: str = ""
-    wanted: bool = False
-    contract: Contract | None = None
-    asked: Contract | None = None
-    serial: int = 0
-    origin: Origin | None = None
-    crowded: bool = False
 
 
 def _nothing(_peer: int, _source: Source) -> None:
@@ -131,41 +54,24 @@ def _nothing(_peer: int, _source: Source) -> None:
 
 _NO_NAMES: Final = Names()
 _DEFAULT_LIMITS: Final = LimitSettings()
-_LISTENED: Final = frozenset({RouteState.OPENING, RouteState.OPEN, RouteState.WAITING})
 
 
-@dataclass(slots=True)
-class _ImportPeer:
+@dataclass(slots=True, kw_only=True)
+class _ImportPeer(PeerOffers[Source, RemoteTopic, TopicOffer]):
     """What came over one link, or over the links of one instance.
 
     Args:
-        name: The peer's.
-        names: How its names read here.
-        nodes: Which of its nodes stand here, and what waits for a place.
-        surplus: What it offers beyond ``limits.topics``.
-        sources: What it offers.
-        topics: The same by the topic here (dicts, for their order).
+        names: How the peer's names read here.
+        topics: What it offers by the topic here (dicts, for their order).
         places: What is in the local graph, by its topic and node there.
-        routes: Those that were asked for or are open.
-        next_route: The next one's id.
-        away: Whether it has no link, and may come back.
-        silent: Whether its link fell silent before, for nobody closed it.
-        doubtful: What it offered over its last link and has not offered again since.
+        silent: Whether its link fell silent before it ended.
         relayed: What it only passes on, by the instance of the module whose it is (dicts, for their order).
     """
 
-    name: str
     names: PeerNames
-    nodes: bounds.NodePlaces[Source]
-    surplus: bounds.Surplus[TopicOffer]
-    sources: dict[Source, RemoteTopic] = field(default_factory=dict)
     topics: dict[str, dict[Source, None]] = field(default_factory=dict)
     places: dict[tuple[str, str], Source] = field(default_factory=dict)
-    routes: dict[int, Source] = field(default_factory=dict)
-    next_route: int = 1
-    away: bool = False
     silent: bool = False
-    doubtful: set[Source] = field(default_factory=set)
     relayed: dict[str, dict[Source, None]] = field(default_factory=dict)
 
 
@@ -195,28 +101,25 @@ class Imports:
         self._names = names
         self._rng = rng
         self._contracts = contracts if contracts is not None else Contracts()
-        self._position = position
+        self._routes = ImportRoutes(self.get, self._contracts, position)
         self._peers: dict[int, _ImportPeer] = {}
         self.ways = RelayPaths()
         """By which of its ways each module is reached that relays offer."""
         self._local_types: dict[str, str] = {}
-        # (when, serial, peer, source); what no longer is an entry's timer is passed over.
-        self._timers: list[tuple[float, int, int, Source]] = []
-        self._serial = 0
 
     def __iter__(self) -> Iterator[tuple[int, Source, RemoteTopic]]:
         """Every known source, with its peer; what changes meanwhile may or may not be seen."""
         for peer, known in list(self._peers.items()):
-            for source, entry in list(known.sources.items()):
+            for source, entry in list(known.entries.items()):
                 yield peer, source, entry
 
     def get(self, peer: int, source: Source) -> RemoteTopic | None:
         """One known source."""
-        return known.sources.get(source) if (known := self._peers.get(peer)) is not None else None
+        return known.entries.get(source) if (known := self._peers.get(peer)) is not None else None
 
     def knows(self, source: Source) -> bool:
         """Whether any peer offers a source."""
-        return any(source in known.sources for known in self._peers.values())
+        return any(source in known.entries for known in self._peers.values())
 
     def at(self, topic: str) -> Iterator[tuple[int, Source]]:
         """What peers offer for a topic, by its name here: each source with its peer."""
@@ -229,10 +132,10 @@ class Imports:
     def relayed_topics(self, instance: str) -> set[str]:
         """The topics of a module that relays pass on, as they are here."""
         return {
-            known.sources[source].topic
+            known.entries[source].topic
             for known in self._peers.values()
             for source in known.relayed.get(instance, ())
-            if known.sources[source].shown
+            if known.entries[source].shown
         }
 
     def local_type(self, topic: str, type_name: str | None) -> list[Action]:
@@ -249,7 +152,7 @@ class Imports:
         actions: list[Action] = []
         for peer, known in self._peers.items():
             for source in known.topics.get(topic, ()):
-                entry = known.sources[source]
+                entry = known.entries[source]
                 shown, conflict = entry.shown, entry.conflict
                 actions += self._show_or_hide(peer, source, entry)
                 if shown and not entry.shown:
@@ -260,8 +163,8 @@ class Imports:
 
     def beyond(self, peer: int) -> bounds.Beyond:
         """What a peer offers beyond ``limits.topics``."""
-        known = self._peers.get(peer)
-        return bounds.Beyond("topics", self._most.topics, len(known.surplus) if known is not None else 0)
+        known, limit = self._peers.get(peer), self._most.topics
+        return known.beyond("topics", limit) if known is not None else Beyond("topics", limit, 0)
 
     def crowded(self, peer: int) -> Mapping[str, Collection[Source]]:
         """The nodes of a peer that have no place here (``limits.nodes``), and their sources."""
@@ -273,7 +176,7 @@ class Imports:
             for offer in list(known.surplus):
                 yield peer, self._names_of(known, offer.origin).local_name(offer.topic, offer.type), offer
 
-    def rules(
+    def apply_rules(
         self, policy: Policy, contracts: Contracts, names: Names, now: float, most: LimitSettings = _DEFAULT_LIMITS
     ) -> Iterator[list[Action]]:
         """Other rules hold from now on; what they leave as it is goes on untouched.
@@ -282,6 +185,7 @@ class Imports:
             What to do, source by source, as it is taken.
         """
         self._policy, self._contracts, self._names, self._most = policy, contracts, names, most
+        self._routes.contracts = contracts
         for known in self._peers.values():
             known.names = names.of(known.name)
             known.nodes.bound(most.nodes)
@@ -292,10 +196,8 @@ class Imports:
 
     def _admit(self, peer: int, now: float) -> Iterator[list[Action]]:
         """Take in what was beyond ``limits.topics`` while there is room, one after the other."""
-        while (known := self._peers.get(peer)) is not None and len(known.sources) < self._most.topics:
-            if (offer := known.surplus.pop()) is None:
-                return
-            yield self._learn(peer, offer, now)
+        while (known := self._peers.get(peer)) and (offer := known.admitted(self._most.topics)):
+            yield self._add(peer, offer, now)
 
     def _rejudge(self, peer: int, source: Source, now: float) -> list[Action]:
         entry = self.get(peer, source)
@@ -311,31 +213,29 @@ class Imports:
             known.topics.setdefault(topic, {})[source] = None
         actions += self._show_or_hide(peer, source, entry)
         if entry.route and entry.asked != self._contracts.of(entry.topic, entry.type):
-            actions += self._close(peer, source, entry, missed=entry.wanted)
-            actions += self._open(peer, source, entry, now) if entry.wanted else []
+            actions += self._routes.close(peer, source, entry, missed=entry.wanted)
+            actions += self._routes.open(peer, source, entry, now) if entry.wanted else []
         return actions
 
     def link_up(self, peer: int, name: str = "", who: LinkedPeer | None = None) -> list[Action]:
         """A link is up, perhaps of a peer that was away; its first message begins a full advertisement.
 
         Args:
-            peer: Whose.
+            peer: The peer's number.
             name: The peer's name, which its rules go by.
-            who: Whose link it is: what relays offer of that module is not needed any more.
+            who: The module that has the link: what relays offer of it is not needed any more.
         """
-        places: bounds.NodePlaces[Source] = bounds.NodePlaces(self._most.nodes)
-        new = _ImportPeer(name, self._names.of(name), places, bounds.Surplus(limits.SURPLUS_MAX))
+        new = _ImportPeer(name=name, nodes=NodePlaces(self._most.nodes), names=self._names.of(name))
         known = self._peers.setdefault(peer, new)
         known.away = known.silent = False
-        known.routes = {}
-        known.next_route = 1
+        self._routes.link_up(peer)
         return self._ways_changed(self.ways.linked(peer, who)) if who is not None else []
 
     def link_away(self, peer: int, *, briefly: bool = False) -> tuple[list[Action], bool]:
         """A link is gone, but its peer may come back: what does not need a reliable route leaves the local graph.
 
         Args:
-            peer: Whose.
+            peer: The peer's number.
             briefly: Nothing leaves yet: the link fell silent, and most of those are back at once. Called again
                 without this when the time is over.
 
@@ -346,61 +246,50 @@ class Imports:
         known = self._peers[peer]
         known.away = True
         known.silent = known.silent or briefly
-        known.routes = {}
+        self._routes.link_down(peer)
         if not briefly:
-            known.nodes.give_up()
-            known.surplus.clear()
-        for source, entry in list(known.sources.items()):
-            keep = briefly or _outlives(entry, silent=known.silent)
+            known.give_up()
+        for source, entry in list(known.entries.items()):
+            keep = briefly or entry.outlives(silent=known.silent)
             if entry.route:
-                # Where nobody listens any more, nothing is to go on.
+                # Without a listener, nothing is to go on.
                 goes_on = keep and entry.state is not RouteState.LINGERING
                 missed = entry.wanted and entry.state is not RouteState.LINGERING
                 actions.append(Detach(peer, source, entry.route, keep=goes_on, missed=missed and not goes_on))
             entry.route = 0
             if keep:
-                self._suspend(peer, source, entry)
+                self._routes.suspend(entry)
             else:
                 actions += self._drop(peer, source, entry)
-        return actions, bool(known.sources)
+        return actions, bool(known.entries)
 
     def waits_for(self, peer: int) -> bool:
-        """Whether something of a peer stays for a while: what somebody local listens to, reliable or latched."""
+        """Whether something of a peer stays for a while: what local nodes listen to, reliable or latched."""
         known = self._peers[peer]
-        return any(_outlives(entry, silent=known.silent) for entry in known.sources.values())
+        return any(entry.outlives(silent=known.silent) for entry in known.entries.values())
 
     def outages(self, peer: int) -> set[float]:
         """For how many seconds each source waits that stays when its peer is away."""
-        return {_outage(entry) for entry in self._peers[peer].sources.values()}
+        return {entry.outage for entry in self._peers[peer].entries.values()}
 
     def outlasted(self, peer: int, seconds: float) -> list[Action]:
         """A peer has been away for so long: what does not wait for longer leaves the local graph."""
-        gone = [one for one in self._peers[peer].sources.items() if _outage(one[1]) <= seconds]
+        gone = [one for one in self._peers[peer].entries.items() if one[1].outage <= seconds]
         return [action for source, entry in gone for action in self._drop(peer, source, entry)]
 
     def detached(self, peer: int) -> list[Action]:
         """A link is gone, and nothing waits for its peer: ``link_down`` follows. Costs what was open."""
-        known = self._peers[peer]
-        gone = [(source, entry) for source in known.routes.values() if (entry := known.sources[source]).route]
-        known.routes = {}
-        return [Detach(peer, source, entry.route, missed=entry.wanted) for source, entry in gone]
-
-    def _suspend(self, peer: int, source: Source, entry: RemoteTopic) -> None:
-        """Bring an entry into a state without a link."""
-        entry.problem = "its peer is away"
-        if entry.state is RouteState.LINGERING:
-            self._move(peer, source, entry, RouteState.IDLE)
-        elif entry.state in {RouteState.OPEN, RouteState.OPENING}:
-            self._move(peer, source, entry, RouteState.WAITING)
-        entry.timer = None
+        gone = [(source, entry) for source in self._routes.link_down(peer) if (entry := self.get(peer, source))]
+        return [Detach(peer, source, entry.route, missed=entry.wanted) for source, entry in gone if entry.route]
 
     def link_down(self, peer: int) -> Iterator[Action]:
         """A peer is gone for good: all that came from it leaves the local graph.
 
         It is forgotten at once; to take the actions frees what it was made of, which takes long for thousands.
         """
+        self._routes.link_down(peer)
         known = self._peers.pop(peer, None)
-        return _gone(peer, known.sources) if known is not None else iter(())
+        return _gone(peer, known.entries) if known is not None else iter(())
 
     def unlinked(self, peer: int) -> list[Action]:
         """Behind ``link_down``: relays may bring on what the peer brought, and what it passed on."""
@@ -413,7 +302,7 @@ class Imports:
             for instance in instances
             for peer, known in self._peers.items()
             for source in known.relayed.get(instance, ())
-            if (entry := known.sources.get(source)) is not None
+            if (entry := known.entries.get(source)) is not None
         ]
         return [
             action
@@ -423,94 +312,55 @@ class Imports:
         ]
 
     def _names_of(self, known: _ImportPeer, origin: Origin | None) -> PeerNames:
-        """The rules that a source's name goes by: those for its own module, not for who passes it on."""
+        """The rules that a source's name goes by: those for its own module, not for the relay."""
         return known.names if origin is None else self._names.of(origin.name)
 
-    def portions(self, peer: int, message: Advertise) -> Iterator[Advertise]:
-        """The same as an advertisement says, in portions that ``advertised`` deals with in a moment."""
-        known = self._peers[peer]
-        removed = message.removed
-        if message.full:
-            known.doubtful = set(known.sources)
-            known.surplus.clear()
-        known.doubtful.difference_update(offer.source for offer in message.added)
-        if known.doubtful and not message.more:
-            removed += tuple(sorted(known.doubtful))
-            known.doubtful = set()
-        for begin in range(0, len(removed), limits.LEARNT_AT_ONCE):
-            yield Advertise(removed=removed[begin : begin + limits.LEARNT_AT_ONCE])
-        for begin in range(0, len(message.added), limits.LEARNT_AT_ONCE):
-            yield Advertise(added=message.added[begin : begin + limits.LEARNT_AT_ONCE])
+    def portions(self, peer: int, message: Advertise) -> Iterator[Change[TopicOffer, Source]]:
+        """Split an advertisement into portions that ``take_in`` deals with in a moment."""
+        full, more = message.full, message.more
+        return self._peers[peer].changes(
+            message.added, message.removed, lambda offer: offer.source, full=full, more=more
+        )
 
-    def advertised(self, peer: int, message: Advertise, now: float = 0.0) -> list[Action]:
-        """A peer says what it publishes."""
-        known = self._peers[peer].sources
-        removed = list(message.removed)
-        if message.full:
-            offered = {offer.source for offer in message.added}
-            removed += [source for source in known if source not in offered]
-            self._peers[peer].surplus.clear()
+    def take_in(self, peer: int, change: Change[TopicOffer, Source], now: float) -> list[Action]:
+        """A peer publishes more, or less."""
+        known = self._peers[peer]
         actions: list[Action] = []
-        for source in removed:
-            if source not in known:
-                self._peers[peer].surplus.discard(source)
+        for source in change.removed:
+            if source not in known.entries:
+                known.surplus.discard(source)
             actions += self._forget(peer, source)
-        for offer in message.added:
-            actions += self._learn(peer, offer, now)
-        admitted = islice(self._admit(peer, now), limits.LEARNT_AT_ONCE)
+        for offer in change.added:
+            actions += self._add(peer, offer, now)
+        admitted = islice(self._admit(peer, now), limits.APPLIED_AT_ONCE)
         return actions + [action for one in admitted for action in one]
 
+    def advertised(self, peer: int, message: Advertise, now: float = 0.0) -> list[Action]:
+        """A peer says what it publishes: all portions at once."""
+        return [action for change in self.portions(peer, message) for action in self.take_in(peer, change, now)]
+
+    # --- routes ------------------------------------------------------------------------------------------------
+
     def opened(self, peer: int, message: RouteOpened, now: float) -> list[Action]:
-        """A route that we asked for is open; one that we closed meanwhile is ignored."""
-        source = self._peers[peer].routes.get(message.route)
-        entry = self._peers[peer].sources.get(source) if source is not None else None
-        if source is None or entry is None or entry.state is not RouteState.OPENING:
-            return []
-        if message.description.type != entry.type:
-            self._peers[peer].routes.pop(message.route)
-            why = f"it is offered as {entry.type}, but its publisher sends {message.description.type}"
-            fail = self._fail(peer, source, entry, why, now)
-            return [
-                Send(peer, CloseRoute(message.route)),
-                Warn("mismatch.type", str(source), f"{source}: {why}"),
-                *fail,
-            ]
-        self._move(peer, source, entry, RouteState.OPEN)
-        entry.problem = ""
-        entry.backoff.reset()
-        entry.description = message.description
-        entry.contract = message.contract
-        terms = (message.contract, message.epoch, message.first)
-        following, lost = (None if isinstance(n, UnsetType) else n for n in (message.following, message.lost))
-        at_least = message.at_least is True
-        return [Describe(peer, source, message.route, message.description, *terms, following, lost, at_least)]
+        """A route that this module asked for is open; one that it closed meanwhile is ignored."""
+        return self._routes.opened(peer, message, now)
 
     def closed(self, peer: int, message: RouteClosed, now: float) -> list[Action]:
         """The other side has no such route, or no longer."""
-        source = self._peers[peer].routes.pop(message.route, None)
-        entry = self._peers[peer].sources.get(source) if source is not None else None
-        if source is None or entry is None:
-            return []
-        return self._fail(peer, source, entry, message.reason, now)
+        return self._routes.closed(peer, message, now)
 
     def demand(self, peer: int, source: Source, now: float, *, wanted: bool) -> list[Action]:
-        """Somebody local listens to a source, or nobody does any more."""
+        """A local node listens to a source, or none does any more."""
         entry = self.get(peer, source)
-        if entry is None:
-            return []
-        entry.wanted = wanted
-        if wanted:
-            if entry.state is RouteState.IDLE:
-                return self._open(peer, source, entry, now)
-            if entry.state is RouteState.LINGERING:
-                self._move(peer, source, entry, RouteState.OPEN)
-            return []
-        if entry.state is RouteState.OPEN:
-            self._move(peer, source, entry, RouteState.LINGERING, now + limits.ROUTE_LINGER)
-            return []
-        if entry.state in {RouteState.OPENING, RouteState.WAITING}:
-            return self._close(peer, source, entry)
-        return []
+        return self._routes.demand(peer, source, entry, now, wanted=wanted) if entry is not None else []
+
+    def next_timer(self) -> float | None:
+        """When ``handle_timer`` is due."""
+        return self._routes.next_timer()
+
+    def handle_timer(self, now: float) -> list[Action]:
+        """Do what is due, or a part of it: then ``next_timer`` is due again at once."""
+        return self._routes.handle_timer(now)
 
     def mismatched(self, peer: int, source: Source, subscriber: str, text: str) -> list[Action]:
         """A local node was refused because its definition is another one: say so here and over there."""
@@ -519,38 +369,8 @@ class Imports:
             Send(peer, Mismatch(source.topic, source.node, subscriber, text)),
         ]
 
-    def next_timer(self) -> float | None:
-        """When ``handle_timer`` is due."""
-        while self._timers and not self._is_due(self._timers[0]):
-            heappop(self._timers)
-        return self._timers[0][0] if self._timers else None
-
-    def handle_timer(self, now: float) -> list[Action]:
-        """Do what is due, or a part of it: then ``next_timer`` is due again at once."""
-        actions: list[Action] = []
-        for _ in range(limits.LEARNT_AT_ONCE):
-            if (due := self.next_timer()) is None or due > now:
-                break
-            _, _, peer, source = heappop(self._timers)
-            entry = self._peers[peer].sources[source]
-            if entry.state is RouteState.LINGERING:
-                actions += self._close(peer, source, entry)
-            elif entry.state is RouteState.OPENING:
-                self._peers[peer].routes.pop(entry.route, None)
-                actions.append(Send(peer, CloseRoute(entry.route)))
-                actions += self._fail(peer, source, entry, "the peer has not answered", now)
-            elif entry.state is RouteState.WAITING:
-                actions += self._open(peer, source, entry, now)
-        return actions
-
-    def _is_due(self, timer: tuple[float, int, int, Source]) -> bool:
-        """Whether this is still its source's timer."""
-        when, serial, peer, source = timer
-        entry = self.get(peer, source)
-        return entry is not None and entry.timer == when and entry.serial == serial
-
-    def _learn(self, peer: int, offer: TopicOffer, now: float) -> list[Action]:
-        known = self._peers[peer].sources
+    def _add(self, peer: int, offer: TopicOffer, now: float) -> list[Action]:
+        known = self._peers[peer].entries
         source = offer.source
         actions: list[Action] = []
         if source in known:
@@ -558,7 +378,7 @@ class Imports:
             if (entry.type, entry.origin) == (offer.type, offer.origin):
                 # It was offered over a link before this one: ask again for what that took away.
                 waits = entry.state is RouteState.WAITING and entry.timer is None
-                return self._open(peer, source, entry, now) if waits else []
+                return self._routes.open(peer, source, entry, now) if waits else []
             actions += self._forget(peer, source)
         elif len(known) >= self._most.topics:
             name = self._peers[peer].name
@@ -570,7 +390,7 @@ class Imports:
         self._peers[peer].topics.setdefault(topic, {})[source] = None
         if offer.origin is not None:
             self._peers[peer].relayed.setdefault(offer.origin.instance, {})[source] = None
-            if self.ways.learn(peer, offer.origin):
+            if self.ways.add(peer, offer.origin):
                 actions += self._ways_changed({offer.origin.instance})
         actions += self._show_or_hide(peer, source, entry)
         if entry.crowded:
@@ -600,7 +420,11 @@ class Imports:
     def _hide(self, peer: int, source: Source, entry: RemoteTopic) -> list[Action]:
         entry.shown = False
         entry.wanted = False
-        return [*self._close(peer, source, entry), Retract(peer, source), *self._yield_place(peer, source, entry)]
+        return [
+            *self._routes.close(peer, source, entry),
+            Retract(peer, source),
+            *self._yield_place(peer, source, entry),
+        ]
 
     def _yield_place(self, peer: int, source: Source, entry: RemoteTopic) -> list[Action]:
         """A source has left the local graph: another one may have stood behind it."""
@@ -609,7 +433,7 @@ class Imports:
         known.nodes.hide(source.node)
         actions = self._behind(peer, source, entry)
         for sources in known.nodes.next_in():
-            actions += [a for s in sources for a in self._show_or_hide(peer, s, known.sources[s])]
+            actions += [a for s in sources for a in self._show_or_hide(peer, s, known.entries[s])]
         return actions
 
     def _behind(self, peer: int, source: Source, entry: RemoteTopic) -> list[Action]:
@@ -618,11 +442,11 @@ class Imports:
         if entry.topic == CLOCK:
             entry.shown = False
             waiting = [(p, s) for p, k in self._peers.items() for s in k.topics.get(CLOCK, ()) if s != source]
-            return [a for p, s in waiting for a in self._show_or_hide(p, s, self._peers[p].sources[s])]
+            return [a for p, s in waiting for a in self._show_or_hide(p, s, self._peers[p].entries[s])]
         if self._names_of(known, entry.origin).plain:
             return []
         behind = [s for s in known.topics.get(entry.topic, ()) if s.node == source.node and s != source]
-        return [action for s in behind for action in self._show_or_hide(peer, s, known.sources[s])]
+        return [action for s in behind for action in self._show_or_hide(peer, s, known.entries[s])]
 
     @staticmethod
     def _unlist(known: _ImportPeer, source: Source, entry: RemoteTopic) -> None:
@@ -673,15 +497,15 @@ class Imports:
             return "a node of this module publishes /clock, and time has one source: end that one", True
         for other, known in self._peers.items():
             for one in known.topics.get(CLOCK, ()):
-                if known.sources[one].shown and (other, one) != (peer, source):
+                if known.entries[one].shown and (other, one) != (peer, source):
                     return f"time comes from {one.node} of {known.name} already, and has one source", True
         return "", False
 
     def _forget(self, peer: int, source: Source) -> list[Action]:
-        entry = self._peers[peer].sources.get(source)
+        entry = self._peers[peer].entries.get(source)
         if entry is None:
             return []
-        return self._close(peer, source, entry) + self._drop(peer, source, entry)
+        return self._routes.close(peer, source, entry) + self._drop(peer, source, entry)
 
     def _drop(self, peer: int, source: Source, entry: RemoteTopic) -> list[Action]:
         known = self._peers[peer]
@@ -689,7 +513,7 @@ class Imports:
         known.nodes.leave(source.node, source)
         if entry.shown:
             actions += [Retract(peer, source), *self._yield_place(peer, source, entry)]
-        del known.sources[source]
+        del known.entries[source]
         known.doubtful.discard(source)
         self._unlist(known, source, entry)
         if entry.origin is not None:
@@ -697,85 +521,9 @@ class Imports:
             del known.relayed[instance][source]
             if not known.relayed[instance]:
                 del known.relayed[instance]
-            if self.ways.forget(peer, entry.origin):
+            if self.ways.remove(peer, entry.origin):
                 actions += self._ways_changed({instance})
         return actions
-
-    def _move(
-        self, peer: int, source: Source, entry: RemoteTopic, state: RouteState, timer: float | None = None
-    ) -> None:
-        """Change a state as the table allows."""
-        if state not in TRANSITIONS[entry.state]:
-            raise LocalProtocolError(f"{entry.state.name} does not lead to {state.name}")
-        entry.state = state
-        entry.timer = timer
-        if timer is not None:
-            self._serial += 1
-            entry.serial = self._serial
-            heappush(self._timers, (timer, self._serial, peer, source))
-
-    def _open(self, peer: int, source: Source, entry: RemoteTopic, now: float) -> list[Action]:
-        known = self._peers[peer]
-        if known.away:
-            self._move(peer, source, entry, RouteState.OPENING)
-            self._move(peer, source, entry, RouteState.WAITING)
-            return []
-        route = known.next_route
-        known.next_route += 1
-        known.routes[route] = source
-        entry.route = route
-        self._move(peer, source, entry, RouteState.OPENING, now + limits.ROUTE_OPEN_TIMEOUT)
-        contract = entry.asked = self._contracts.of(entry.topic, entry.type)
-        epoch, after = self._position(peer, source) or (0, 0)
-        return [Send(peer, OpenRoute(route, source.topic, source.node, contract, epoch, after))]
-
-    def _close(self, peer: int, source: Source, entry: RemoteTopic, *, missed: bool = False) -> list[Action]:
-        """Leave a source alone, whatever its state."""
-        actions: list[Action] = []
-        if entry.route:
-            self._peers[peer].routes.pop(entry.route, None)
-            actions += [Send(peer, CloseRoute(entry.route)), Detach(peer, source, entry.route, missed=missed)]
-        elif entry.state is RouteState.WAITING and entry.timer is None:
-            actions.append(Detach(peer, source, 0))  # what waited for a new link to go on
-        entry.route = 0
-        entry.backoff.reset()
-        if entry.state is RouteState.OPEN:
-            self._move(peer, source, entry, RouteState.LINGERING)
-        if entry.state is not RouteState.IDLE:
-            self._move(peer, source, entry, RouteState.IDLE)
-        return actions
-
-    def _fail(self, peer: int, source: Source, entry: RemoteTopic, reason: str, now: float) -> list[Action]:
-        missed = entry.wanted and entry.state is not RouteState.LINGERING
-        actions: list[Action] = [Detach(peer, source, entry.route, missed=missed)]
-        entry.route = 0
-        entry.problem = reason
-        if entry.state is RouteState.LINGERING:
-            self._move(peer, source, entry, RouteState.IDLE)
-        else:
-            self._move(peer, source, entry, RouteState.WAITING, now + entry.backoff.delay())
-        return actions
-
-
-def _outlives(entry: RemoteTopic, *, silent: bool) -> bool:
-    """Whether an entry stays when its peer's link is gone.
-
-    A reliable one does, so that nothing is lost. A latched one does if the link fell silent: its subscribers stay
-    connected, and are not told again what they know when the peer is back; late ones are told meanwhile. One that is
-    relayed does not: another relay may bring it on.
-    """
-    if not entry.wanted or entry.origin is not None or entry.state not in _LISTENED:
-        return False
-    if silent and entry.description is not None and entry.description.latching:
-        return True
-    return entry.contract is not None and entry.contract.reliability is Reliability.RELIABLE
-
-
-def _outage(entry: RemoteTopic) -> float:
-    """For how many seconds a source stays that outlives its link: latched ones wait as by default."""
-    if entry.contract is not None and entry.contract.reliability is Reliability.RELIABLE:
-        return entry.contract.outage
-    return core_limits.RESUME_WINDOW
 
 
 def _gone(peer: int, sources: dict[Source, RemoteTopic]) -> Iterator[Action]:

@@ -1,4 +1,4 @@
-"""Who does not fit which source, here and at the peers: what ``rmpa topic info`` and the diagnostics show."""
+"""Subscribers that do not fit a source, here and at the peers: what ``rmpa topic info`` and the diagnostics show."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 
 
 class Mismatches:
-    """Texts by source and by whom they are about.
+    """Texts by source and subscriber.
 
-    Whom: a local subscriber's name (``/viewer``), or one at a peer behind the peer's name (``base/viewer``).
+    Subscriber: a local one's name (``/viewer``), or one at a peer behind the peer's name (``base/viewer``).
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Discovery at work: sockets, interfaces and one timer around the roster machine."""
+"""Runs the membership protocol: its UDP sockets, its timer, the interfaces and the seeds."""
 
 from __future__ import annotations
 
@@ -22,8 +22,9 @@ from rmpa.discovery.io.interfaces import (
 )
 from rmpa.discovery.io.packet_filter import PacketFilter
 from rmpa.discovery.io.seeds import SeedResolver, resolve_ipv4
-from rmpa.discovery.roster import Roster
+from rmpa.discovery.membership import MembershipProtocol
 from rmpa.runtime.event_loop import yield_to_data
+from rmpa.runtime.machine_timer import MachineTimer
 from rmpa.runtime.system_clock import SystemClock
 
 if TYPE_CHECKING:
@@ -35,7 +36,8 @@ if TYPE_CHECKING:
     from rmpa.core.clock import Clock
     from rmpa.core.guid import Guid
     from rmpa.core.identity import Identity
-    from rmpa.discovery.events import Address, Event, Output, PeerView
+    from rmpa.discovery.beacon import Address
+    from rmpa.discovery.events import Event, Output, PeerView
 
 _log = logging.getLogger(__name__)
 
@@ -44,18 +46,18 @@ _ALONE: Final = "no interface that can carry multicast is up: other machines are
 
 
 class Discovery:
-    """Finds the other agents and is found by them.
+    """Finds the other agents of the domain, and makes this one known to them.
 
     Args:
-        identity: Our own.
+        identity: This agent's own.
         settings: Group, port, domain, interfaces, seeds, and whether to use multicast.
         udp_socket: Bound to the mesh's port, non-blocking; lent, not closed here.
-        on_event: Called in the loop with each event of the roster, in order.
-        on_interfaces: Called in the loop with all interfaces, used or not, after they changed; says whether our
-            identity still fits them. If not we are about to be closed, and announce nothing more.
-        clock: Tells monotonic seconds.
-        look: How interfaces are listed.
-        resolve: How the host name of a seed is looked up; runs in a thread.
+        on_event: Called in the loop with each event of the membership protocol, in order.
+        on_interfaces: Called in the loop with all interfaces, used or not, after a change. Returns whether the
+            identity still fits them; if not, ``close`` is about to be called, and nothing more is announced.
+        clock: The source of monotonic seconds.
+        look: Lists the interfaces.
+        resolve: Looks up the host name of a seed; runs in a thread.
     """
 
     def __init__(
@@ -77,50 +79,50 @@ class Discovery:
         self._on_event = on_event
         self._on_interfaces = on_interfaces
         self._clock: Clock = clock if clock is not None else SystemClock()
-        self._roster = Roster(identity, rng=random.random, multicast=settings.multicast, counters=self.counters)
-        self._intake = PacketFilter(settings.domain, self.counters, is_linked=self._roster.is_linked)
+        self._membership = MembershipProtocol(
+            identity, rng=random.random, multicast=settings.multicast.enabled, counters=self.counters
+        )
+        self._filter = PacketFilter(settings.domain, self.counters, is_linked=self._membership.is_linked)
         self._refusals = RefusalLog(_log, self.counters)
-        self._group: Address = (settings.group, settings.discovery_port)
+        self._group: Address = (settings.multicast.group, settings.discovery_port)
         self._sender = sockets.Sender(udp_socket, self._group, self.counters)
         self._watcher = InterfaceWatcher(self._interfaces_changed, look=look)
         self._seeds = SeedResolver(settings.seeds, settings.discovery_port, self._seeds_changed, resolve=resolve)
         self._interfaces: tuple[Interface, ...] = ()
         self._receivers: list[socket.socket] = []
-        self._membership: sockets.Membership | None = None
+        self._joined: sockets.GroupMembership | None = None
         self._warned: set[str] = set()
-        self._timer: asyncio.TimerHandle | None = None
+        self._timer = MachineTimer(self._membership.next_timer, self._timer_due, now=self._clock.now)
         self._started = False
         self._flushing = False
 
     # --- life -------------------------------------------------------------------------------------------------
 
     async def start(self) -> None:
-        """Listen, and announce ourselves. What cannot be had is said once, and the rest works."""
+        """Listen, and announce this agent. A socket that cannot be opened is logged; the rest works without it."""
         self._started = True
         loop = asyncio.get_running_loop()
         loop.add_reader(self._udp.fileno(), partial(self._readable, self._udp, multicast=False))
-        self._open_door()
-        if self._settings.multicast:
+        self._open_seed_port()
+        if self._settings.multicast.enabled:
             self._open_group()
         everything = self._watcher.start()
         self._use(everything)
         now = self._clock.now()
-        self._roster.interfaces_changed(now, self._further_addresses(everything))
-        self._roster.start(now)
+        self._membership.interfaces_changed(now, self._other_addresses(everything))
+        self._membership.start(now)
         self._flush()
         self._seeds.start()
 
     async def close(self) -> None:
-        """Say goodbye and stop."""
+        """Send a goodbye and stop."""
         if not self._started:
             return
         self._started = False
         self._watcher.close()
         await self._seeds.close()
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-        self._roster.goodbye(self._clock.now())
+        self._timer.close()
+        self._membership.goodbye(self._clock.now())
         self._flush()
         loop = asyncio.get_running_loop()
         loop.remove_reader(self._udp.fileno())
@@ -128,50 +130,50 @@ class Discovery:
             loop.remove_reader(sock.fileno())
             sock.close()
         self._receivers.clear()
-        self._membership = None
+        self._joined = None
 
-    # --- what others tell it ----------------------------------------------------------------------------------
+    # --- links ------------------------------------------------------------------------------------------------
 
     def link_up(self, identity: Identity, endpoint: Address | None = None) -> None:
-        """A link to this peer is up; while it is, the peer is in the roster.
+        """A link to this peer is up; for as long as it is, the peer is a member.
 
         Args:
             identity: As the link's handshake said.
             endpoint: Where the peer's beacons can be sent to, if that is known: its address and its mesh port
                 (not the port of a connection that it dialled).
         """
-        self._roster.link_up(identity, self._clock.now(), endpoint)
+        self._membership.link_up(identity, self._clock.now(), endpoint)
         self._flush()
 
     def link_down(self, guid: Guid, instance: bytes | None = None) -> None:
         """The link to this peer (to this run of it, if ``instance`` is given) fell."""
-        self._roster.link_down(guid, self._clock.now(), instance)
+        self._membership.link_down(guid, self._clock.now(), instance)
         self._flush()
 
     def peers(self) -> tuple[PeerView, ...]:
-        """The roster as it is now, in GUID order."""
-        return self._roster.peers()
+        """All known peers, in GUID order."""
+        return self._membership.peers()
 
     @property
     def interfaces(self) -> tuple[Interface, ...]:
-        """Those in use."""
+        """The interfaces in use."""
         return self._interfaces
 
     @property
     def identity(self) -> Identity:
-        """Our own, with the addresses that we have now."""
-        return self._roster.identity
+        """This agent's own, with its present addresses."""
+        return self._membership.identity
 
     # --- sockets ----------------------------------------------------------------------------------------------
 
-    def _open_door(self) -> None:
-        """Unicasts to the discovery port, for seeds without a port; one agent of a machine gets them."""
+    def _open_seed_port(self) -> None:
+        """Receive unicasts to the discovery port: seeds without a port name it. One agent of a machine gets them."""
         self._receiver(_ALL_NETWORKS, multicast=False, lost="seeds of others must name our port")
 
     def _open_group(self) -> None:
         sock = self._receiver(self._group[0], multicast=True, lost="no multicast is heard; use --seed")
         if sock is not None:
-            self._membership = sockets.Membership(sock, self._group[0])
+            self._joined = sockets.GroupMembership(sock, self._group[0])
 
     def _receiver(self, host: str, *, multicast: bool, lost: str) -> socket.socket | None:
         port = self._group[1]
@@ -187,7 +189,7 @@ class Discovery:
         return sock
 
     def _readable(self, sock: socket.socket, *, multicast: bool) -> None:
-        """Take a bounded number of packets, with data between them: a flood must not delay it."""
+        """Handle a bounded number of packets, with pending data between them: a flood must not delay data."""
         now = self._clock.now()
         for _ in range(limits.BEACONS_PER_WAKE):
             yield_to_data()
@@ -198,10 +200,10 @@ class Discovery:
             except OSError as error:  # an ICMP error that some earlier packet of ours caused
                 _log.debug("< %s", error)
                 continue
-            beacon = self._intake.take(data, source, now, multicast=multicast, interface=index)
+            beacon = self._filter.parse(data, source, now, multicast=multicast, interface=index)
             if beacon is not None:
                 _log.debug("< %s:%d (interface %d): %s", *source, index, beacon)
-                self._roster.receive(beacon, source, now, multicast=multicast)
+                self._membership.receive(beacon, source, now, multicast=multicast)
         self._flush()
 
     # --- interfaces and seeds ---------------------------------------------------------------------------------
@@ -210,31 +212,31 @@ class Discovery:
         self._use(everything)
         if not self._on_interfaces(everything):
             return
-        self._roster.interfaces_changed(self._clock.now(), self._further_addresses(everything))
+        self._membership.interfaces_changed(self._clock.now(), self._other_addresses(everything))
         self._flush()
 
     def notes(self) -> tuple[str, ...]:
-        """What the user should know of the network, ready to read."""
+        """Problems of the network, as texts for the user."""
         silent = [
             f"seed {host}:{port}: no answer; is `rmpa up` running there, in domain {self._settings.domain} too, "
             "and its UDP port open?"
-            for host, port in self._roster.silent_seeds()
+            for host, port in self._membership.silent_seeds()
         ]
         return (*sorted(self._warned), *silent)
 
-    def _further_addresses(self, everything: tuple[Interface, ...]) -> tuple[IPv4Address, ...]:
+    def _other_addresses(self, everything: tuple[Interface, ...]) -> tuple[IPv4Address, ...]:
         wanted = self._settings.interfaces
         mine = [i for i in everything if i.up and (not wanted or i.name in wanted)]
         return further_addresses(mine, self._identity.guid.address)
 
     def _use(self, everything: tuple[Interface, ...]) -> None:
-        """Join on what is there now."""
+        """Choose the usable interfaces, and join the group on them."""
         wanted = self._settings.interfaces
         before = self._interfaces
         self._interfaces = choose(everything, wanted)
         if problem := unknown_names(everything, wanted):
             self._warn(problem)
-        if not self._settings.multicast:
+        if not self._settings.multicast.enabled:
             return
         if self._interfaces != before:
             _log.info("= multicast %s:%d on %s", *self._group, ", ".join(map(str, self._interfaces)) or "nothing")
@@ -242,12 +244,12 @@ class Discovery:
             self._warned.discard(_ALONE)
         else:
             self._warn(_ALONE)
-        if self._membership is not None:
-            for name, error in self._membership.update(self._interfaces).items():
+        if self._joined is not None:
+            for name, error in self._joined.update(self._interfaces).items():
                 self._warn(f"{name}: the group cannot be joined ({error.strerror}); tried again when it changes")
 
     def _seeds_changed(self, addresses: tuple[Address, ...]) -> None:
-        self._roster.set_seeds(addresses)
+        self._membership.set_seeds(addresses)
         self._flush()
 
     def _warn(self, text: str) -> None:
@@ -255,24 +257,25 @@ class Discovery:
             self._warned.add(text)
             _log.warning("! %s", text)
 
-    # --- the roster's wishes ----------------------------------------------------------------------------------
+    # --- outputs and events -----------------------------------------------------------------------------------
 
     def _flush(self) -> None:
-        """Send, tell, and set the timer; a handler of an event may call us again meanwhile."""
+        """Send the outputs, deliver the events, set the timer. A handler of an event may call this again."""
         if self._flushing:
             return
         self._flushing = True
         try:
-            while (outputs := self._roster.outputs()) or (events := self._roster.events()):
+            while (outputs := self._membership.outputs()) or (events := self._membership.events()):
                 if outputs:
                     self._send(outputs)
                     continue
                 for event in events:
                     yield_to_data()
-                    self._tell(event)
+                    self._deliver(event)
         finally:
             self._flushing = False
-            self._arm()
+            if self._started:
+                self._timer.arm()
 
     def _send(self, outputs: list[Output]) -> None:
         for output in outputs:
@@ -285,24 +288,12 @@ class Discovery:
                 _log.debug("> %s:%d: %s", *output.address, output.beacon)
                 self._sender.unicast(data, output.address)
 
-    def _tell(self, event: Event) -> None:
+    def _deliver(self, event: Event) -> None:
         if isinstance(event, PeerConflict):
-            who = str(event.identity.guid.address)
-            self._refusals.refuse(self._clock.now(), f"conflict.{event.kind.name.lower()}", who, str(event))
+            host = str(event.identity.guid.address)
+            self._refusals.refuse(self._clock.now(), f"conflict.{event.kind.name.lower()}", host, str(event))
         self._on_event(event)
 
-    def _arm(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-        if not self._started:
-            return
-        when = self._roster.next_timer()
-        if when is not None:
-            delay = max(0.0, when - self._clock.now())
-            self._timer = asyncio.get_running_loop().call_later(delay, self._timer_due)
-
-    def _timer_due(self) -> None:
-        self._timer = None
-        self._roster.handle_timer(self._clock.now())
+    def _timer_due(self, now: float) -> None:
+        self._membership.handle_timer(now)
         self._flush()

@@ -74,12 +74,12 @@ def list_interfaces() -> tuple[Interface, ...]:
 
 
 def choose(interfaces: Iterable[Interface], wanted: tuple[str, ...] = ()) -> tuple[Interface, ...]:
-    """The usable ones among those that the user named; among all if none was named."""
+    """The usable interfaces among those that the user named; among all if none was named."""
     return tuple(i for i in interfaces if i.usable and (not wanted or i.name in wanted))
 
 
 def unknown_names(interfaces: Iterable[Interface], wanted: tuple[str, ...]) -> str | None:
-    """Say which of the user's names no interface has, and what there is; ``None`` if all exist."""
+    """The error text about names in the settings that no interface has; ``None`` if all exist."""
     there = {i.name for i in interfaces}
     missing = [name for name in wanted if name not in there]
     if not missing:
@@ -89,14 +89,14 @@ def unknown_names(interfaces: Iterable[Interface], wanted: tuple[str, ...]) -> s
 
 
 def pick_address(interfaces: Iterable[Interface]) -> IPv4Address:
-    """The address for our GUID: the first that is not 127.x, or else 127.0.0.1."""
+    """The address for this agent's GUID: the first that is not 127.x, or else 127.0.0.1."""
     addresses = [a for i in interfaces if i.up for a in i.addresses if not a.is_loopback]
     # A link-local address (169.254.x) only when nothing better is there: it changes from boot to boot.
     return min(addresses, key=lambda a: a.is_link_local, default=_LOOPBACK)
 
 
 def further_addresses(interfaces: Iterable[Interface], guid_address: IPv4Address) -> tuple[IPv4Address, ...]:
-    """Our other addresses, best first, as many as a beacon carries; loopback is none for others."""
+    """The addresses besides the GUID's, best first, as many as a beacon carries; loopback is of no use to others."""
     addresses = [a for i in interfaces for a in i.addresses if not a.is_loopback and a != guid_address]
     return tuple(sorted(dict.fromkeys(addresses), key=lambda a: a.is_link_local))[: limits.BEACON_ADDRESSES_MAX]
 
@@ -104,12 +104,12 @@ def further_addresses(interfaces: Iterable[Interface], guid_address: IPv4Address
 class InterfaceWatcher:
     """Calls back when interfaces or their addresses change.
 
-    The kernel says so through a netlink socket (``rtnetlink(7)``); where that is refused, a look every
-    ``limits.INTERFACE_LOOK`` seconds does.
+    The kernel reports changes through a netlink socket (``rtnetlink(7)``); where that is refused, the interfaces are
+    listed every ``limits.INTERFACE_LOOK`` seconds.
 
     Args:
-        on_change: Called in the loop with all interfaces, after they settled.
-        look: How to list them.
+        on_change: Called in the loop with all interfaces, ``INTERFACE_SETTLE`` seconds after a change.
+        look: Lists them.
     """
 
     def __init__(
@@ -125,17 +125,17 @@ class InterfaceWatcher:
         self._timer: asyncio.TimerHandle | None = None
 
     def start(self) -> tuple[Interface, ...]:
-        """Watch from now on; return what there is now."""
+        """Begin to watch; return the present interfaces."""
         self._netlink = _open_netlink()
         self._known = self._look()
         if self._netlink is not None:
-            asyncio.get_running_loop().add_reader(self._netlink.fileno(), self._news)
+            asyncio.get_running_loop().add_reader(self._netlink.fileno(), self._netlink_readable)
         else:
-            self._look_in(limits.INTERFACE_LOOK)
+            self._compare_in(limits.INTERFACE_LOOK)
         return self._known
 
     def close(self) -> None:
-        """Watch no more."""
+        """Stop watching."""
         if self._timer is not None:
             self._timer.cancel()
         if self._netlink is not None:
@@ -143,27 +143,27 @@ class InterfaceWatcher:
             self._netlink.close()
             self._netlink = None
 
-    def _news(self) -> None:
-        # What they say does not matter; an ENOBUFS says that some were lost: all the more reason to look.
+    def _netlink_readable(self) -> None:
+        # The messages only mean that something changed; ENOBUFS means that some were lost, which is the same.
         with contextlib.suppress(OSError):
             while self._netlink is not None:
                 self._netlink.recv(64 * KIB)
         if self._timer is None:
-            self._look_in(limits.INTERFACE_SETTLE)
+            self._compare_in(limits.INTERFACE_SETTLE)
 
-    def _look_in(self, delay: float) -> None:
+    def _compare_in(self, delay: float) -> None:
         self._timer = asyncio.get_running_loop().call_later(delay, self._compare)
 
     def _compare(self) -> None:
         self._timer = None
         if self._netlink is None:
-            self._look_in(limits.INTERFACE_LOOK)
+            self._compare_in(limits.INTERFACE_LOOK)
         try:
             now = self._look()
-        except OSError as error:  # no file descriptor is left to ask the kernel; what changed is looked at later
+        except OSError as error:  # no file descriptor is left to ask the kernel: tried again later
             _log.debug("! interfaces cannot be listed: %s", error)
             if self._timer is None:
-                self._look_in(limits.INTERFACE_LOOK)
+                self._compare_in(limits.INTERFACE_LOOK)
             return
         if now != self._known:
             self._known = now

@@ -1,4 +1,4 @@
-"""What stands between the sockets and the parser: repeats, floods and malformed packets end here."""
+"""Filters the packets of the discovery sockets: drops repeats, floods and malformed packets, and parses the rest."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from rmpa.core.counters import Counters
     from rmpa.core.guid import Guid
-    from rmpa.discovery.events import Address
+    from rmpa.discovery.beacon import Address
 
 _log = logging.getLogger(__name__)
 
@@ -25,13 +25,14 @@ _INTERFACES: Final = 256
 
 
 class PacketFilter:
-    """Turns packets into beacons, or into counts.
+    """Parses packets; those that are dropped are counted.
 
     Args:
-        domain: Ours.
+        domain: This agent's domain id.
         counters: ``beacon.in``, ``beacon.repeated``, ``beacon.flood``, ``beacon.unlinked_limited``,
             ``beacon.other_domain``, ``beacon.version``, ``beacon.malformed``.
-        is_linked: Whether there is a link with a run of a peer; its beacons, and our own echoes, are never too many.
+        is_linked: Whether there is a link with a run of a peer: beacons of linked peers, and echoes of
+            this agent's own, are not limited in rate.
     """
 
     def __init__(
@@ -45,21 +46,23 @@ class PacketFilter:
         self._recent: OrderedDict[bytes, None] = OrderedDict()
         self._sources: OrderedDict[str, tuple[float, int]] = OrderedDict()
 
-    def take(self, data: bytes, source: Address, now: float, *, multicast: bool, interface: int = 0) -> Beacon | None:
-        """The beacon in a packet; ``None`` if there is none, which is counted and, where it helps, logged.
+    def parse(
+        self, data: bytes, source: Address, now: float, *, multicast: bool, interface: int = 0
+    ) -> Beacon | None:
+        """The beacon in a packet; ``None`` if it is dropped, which is counted and, where it helps, logged.
 
-        Other domains have ports of their own, and are none of our business. But one that speaks to us alone was
-        given our address, and waits for an answer.
+        Other domains have other ports, so their multicasts are ignored silently. A unicast of another domain is
+        logged: its sender was given this address by a user, and waits for an answer.
 
         Args:
             data: The packet.
             source: The address and port it came from.
             now: Monotonic seconds.
             multicast: Whether it came to the group.
-            interface: The index of the interface it came by: a flood on one leaves the others alone.
+            interface: The index of the interface it came in by: each has a limit of its own.
         """
         host, _ = source
-        if self._floods(host, now):
+        if self._is_flood(host, now):
             self._refusals.refuse(
                 now, "beacon.flood", host, f"{host} sends too many packets to the discovery port; the rest is ignored"
             )
@@ -72,7 +75,7 @@ class PacketFilter:
             if len(self._recent) > limits.BEACON_REPEATS:
                 self._recent.popitem(last=False)
         try:
-            if not self._is_linked(*sender_of(data, self._domain)) and not self._may_be_new(interface, now):
+            if not self._is_linked(*sender_of(data, self._domain)) and not self._within_limit(interface, now):
                 self._counters.add("beacon.unlinked_limited")
                 return None
             beacon = Beacon.parse(data, self._domain)
@@ -91,18 +94,18 @@ class PacketFilter:
             return beacon
         return None
 
-    def _may_be_new(self, interface: int, now: float) -> bool:
-        """Whether one more of a peer without a link is dealt with."""
+    def _within_limit(self, interface: int, now: float) -> bool:
+        """Whether one more beacon of an unlinked peer is within the limit of this interface."""
         bucket = self._unlinked.get(interface)
         if bucket is None:
             if len(self._unlinked) >= _INTERFACES:
-                self._unlinked.clear()  # those of containers come and go, each with an index of its own
+                self._unlinked.clear()  # interfaces of containers come and go, each with a new index
             bucket = self._unlinked[interface] = TokenBucket(
                 limits.BEACONS_UNLINKED_PER_SECOND, limits.BEACONS_UNLINKED_BURST
             )
         return bucket.take(now)
 
-    def _floods(self, host: str, now: float) -> bool:
+    def _is_flood(self, host: str, now: float) -> bool:
         since, count = self._sources.get(host, (now, 0))
         if now - since >= 1.0:
             since, count = now, 0

@@ -1,4 +1,4 @@
-"""Seeds: where users say that other agents are. Names are resolved off the loop, again and again."""
+"""Seeds: addresses of other agents in the settings. Host names are looked up in threads, again and again."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from rmpa.discovery import limits
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.config.settings import HostPort
-    from rmpa.discovery.events import Address
+    from rmpa.config.values import HostPort
+    from rmpa.discovery.beacon import Address
 
 _log = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ class SeedResolver:
         seeds: As the user wrote them.
         default_port: For seeds without a port.
         on_change: Called in the loop with all addresses known so far, when they change.
-        resolve: How a name is looked up; runs in a thread.
+        resolve: Looks up a host name; runs in a thread.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class SeedResolver:
         self._tasks: list[asyncio.Task[None]] = []
 
     def start(self) -> None:
-        """Tell the numeric ones at once; look the names up."""
+        """Report the numeric addresses at once; start to look up the names."""
         names = []
         for host in dict.fromkeys(seed.host for seed in self._seeds):
             try:
@@ -67,16 +67,16 @@ class SeedResolver:
             except AddressValueError:
                 names.append(host)
         if self._hosts:
-            self._tell()
+            self._report()
         self._tasks = [asyncio.get_running_loop().create_task(self._follow(host)) for host in names]
 
     async def close(self) -> None:
-        """Look nothing up any more; a look-up under way ends by itself, in its thread."""
+        """Stop. A look-up that is under way ends by itself, in its thread."""
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         self._on_change(
             tuple((a, s.port or self._default_port) for s in self._seeds for a in self._hosts.get(s.host, ()))
         )
@@ -98,11 +98,11 @@ class SeedResolver:
             if addresses != self._hosts.get(host):
                 _log.info("= seed %s is %s", host, ", ".join(addresses))
                 self._hosts[host] = addresses
-                self._tell()
+                self._report()
             await asyncio.sleep(limits.SEED_RESOLVE_INTERVAL)
 
     async def _look_up(self, host: str) -> list[str]:
-        """In a daemon thread of its own: a name server that never answers must not hold up the agent's end."""
+        """Look up a name in a daemon thread: a name server that never answers must not delay the end."""
         loop = asyncio.get_running_loop()
         done: asyncio.Future[list[str]] = loop.create_future()
 

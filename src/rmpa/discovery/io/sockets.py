@@ -1,4 +1,4 @@
-"""The UDP sockets of discovery: joined and sent to interface by interface, by index."""
+"""The UDP sockets of discovery. The group is joined, and sent to, on each interface by its index."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from rmpa.core.counters import Counters
-    from rmpa.discovery.events import Address
+    from rmpa.discovery.beacon import Address
     from rmpa.discovery.io.interfaces import Interface
 
 _log = logging.getLogger(__name__)
@@ -28,14 +28,14 @@ _IP_MULTICAST_ALL: Final = 49
 
 
 def open_receiver(host: str, port: int) -> socket.socket:
-    """A socket that several agents of one machine may hold at once, and that hears only what it joined.
+    """Open a socket that several agents of one machine may bind at once, and that receives only from joined groups.
 
     Args:
-        host: The group for its multicasts; an empty string for unicasts to this port.
+        host: The group, to receive its multicasts; an empty string: unicasts to this port.
         port: The domain's discovery port.
 
     Raises:
-        OSError: The port is held by somebody who does not share it.
+        OSError: Another program has bound the port without SO_REUSEADDR.
     """
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
     try:
@@ -66,7 +66,7 @@ def receive(sock: socket.socket) -> tuple[bytes, Address, int]:
     return data, (source[0], source[1]), index
 
 
-class Membership:
+class GroupMembership:
     """The interfaces on which a receiving socket has joined the group.
 
     Args:
@@ -80,7 +80,7 @@ class Membership:
         self._joined: set[int] = set()
 
     def update(self, interfaces: Iterable[Interface]) -> dict[str, OSError]:
-        """Join on these and leave all others; return the names of those that refused, and how."""
+        """Join on these interfaces and leave all others; return the errors by the name of the interface."""
         refused = {}
         wanted = {i.index: i for i in interfaces}
         for index in self._joined - wanted.keys():
@@ -104,10 +104,10 @@ class Membership:
 
 
 class Sender:
-    """Sends beacons through the mesh's UDP socket; says once what does not work, and once that it works again.
+    """Sends beacons through the mesh's UDP socket; a failure is logged once, and once more when it is over.
 
     Args:
-        sock: Bound to the mesh's port; lent, not owned.
+        sock: Bound to the mesh's port; not closed here.
         group: Group and port of the multicasts.
         counters: Where failures are counted.
     """
@@ -121,7 +121,7 @@ class Sender:
         sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
 
     def multicast(self, data: bytes, interfaces: Iterable[Interface]) -> int:
-        """Send to the group on each of these; return on how many it worked."""
+        """Send to the group on each interface; return the number of interfaces without an error."""
         sent = 0
         for interface in interfaces:
             # Left alone, Linux takes an address of another interface for what leaves by loopback: its own has only

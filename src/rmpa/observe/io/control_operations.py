@@ -24,8 +24,9 @@ from rmpa.ros.node_info import NodeLine, PeerNodes
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Collection
 
-    from rmpa.bridge.io.bridge import Bridge, PeerSession
+    from rmpa.bridge.io.bridge import Bridge
     from rmpa.bridge.params.io.part import Params
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.observe.io.control_server import Handler
     from rmpa.observe.io.snapshot_builder import SnapshotBuilder
     from rmpa.observe.why.io.why import WhyService
@@ -96,7 +97,7 @@ class ControlOperations:
         if not isinstance(inner, dict):
             raise ConfigError("args", f"{inner!r} is no table")
         session = self._session(args.get("peer", ""))
-        return await self._bridge.asks.ask(session, what, inner, bridge_limits.PARAM_ASK_TIMEOUT)
+        return await self._bridge.rpc.request(session, what, inner, bridge_limits.PARAM_ASK_TIMEOUT)
 
     def followed(self, _args: Args) -> tuple[FollowedInfo, ...]:
         """The parameters of other modules that this one follows."""
@@ -116,21 +117,23 @@ class ControlOperations:
         """Pass a request about a node on to a peer: ``peer``, ``what``, ``node``; without a peer, list all nodes."""
         what, peer = _request(args, node_requests.REPLIES), args.get("peer")
         if peer is None:
-            return await asyncio.gather(*(self._nodes_of(session) for session in list(self._bridge.attached())))
+            return await asyncio.gather(
+                *(self._nodes_of(session) for session in list(self._bridge.sessions.linked()))
+            )
         session = self._session(peer)
         if what == node_requests.LIST:
             return [await self._nodes_of(session)]
         request = {"node": str(args.get("node", "")), "by": OWN_NODE, "reason": "user request"}
-        return await self._bridge.asks.ask(session, what, request, bridge_limits.NODE_KILL_TIMEOUT)
+        return await self._bridge.rpc.request(session, what, request, bridge_limits.NODE_KILL_TIMEOUT)
 
     async def _nodes_of(self, session: PeerSession) -> PeerNodes:
         """The nodes of a peer; where it does not answer, those of which this module has proxies."""
         peer = session.link.name
         try:
-            value = await self._bridge.asks.ask(session, node_requests.LIST, {})
+            value = await self._bridge.rpc.request(session, node_requests.LIST, {})
             return PeerNodes(peer=peer, nodes=msgspec.convert(value, tuple[NodeLine, ...]))
         except (RmpaError, msgspec.ValidationError) as error:
-            nodes = tuple(NodeLine(name=node) for node, _ in session.inbound)
+            nodes = tuple(NodeLine(name=node) for node, _ in session.proxies)
             return PeerNodes(peer=peer, nodes=nodes, problem=str(error))
 
     def _session(self, name: object) -> PeerSession:
@@ -141,7 +144,7 @@ class ControlOperations:
             UnreachableError: No linked peer has it.
         """
         peer = str(name)
-        sessions = list(self._bridge.attached())
+        sessions = list(self._bridge.sessions.linked())
         fitting = [s for s in sessions if peer in {s.link.name, str(s.link.guid), str(s.link.guid).partition("#")[0]}]
         if len(fitting) == 1:
             return fitting[0]

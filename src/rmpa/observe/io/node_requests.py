@@ -20,8 +20,8 @@ from rmpa.ros.node_info import NodeEnd, NodeFacts, NodeLine, NodePing, describe_
 from rmpa.runtime.event_loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from rmpa.bridge.io.bridge import PeerSession
     from rmpa.bridge.session.peer_rpc import PeerRpc
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.ros.core.api import Core
 
@@ -49,10 +49,10 @@ class NodeRequests:
     def __init__(self, settings: Settings, core: Core, asks: PeerRpc) -> None:
         self._settings = settings
         self._core = core
-        asks.on(LIST, self._list)
-        asks.on(INFO, self._info)
-        asks.on(PING, self._ping)
-        asks.on(KILL, self._kill)
+        asks.on_request(LIST, self._list)
+        asks.on_request(INFO, self._info)
+        asks.on_request(PING, self._ping)
+        asks.on_request(KILL, self._kill)
 
     def reload(self, settings: Settings) -> None:
         """Other settings hold from now on."""

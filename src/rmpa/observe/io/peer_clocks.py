@@ -28,8 +28,8 @@ class PeerClocks:
     def follow(self, now: float) -> None:
         """Record the present estimates; forget peers that are gone. ``now`` is monotonic seconds."""
         before, self._clocks = self._clocks, {}
-        for session in self._bridge.everyone():
+        for session in self._bridge.sessions:
             clock = self._clocks[session.peer] = before.get(session.peer) or PeerClock()
             offset, error = session.link.clock_offset, session.link.clock_error
-            if offset is not None and error is not None and session.away is None:
-                clock.told(offset, error, now)
+            if offset is not None and error is not None and session.linked:
+                clock.add(offset, error, now)

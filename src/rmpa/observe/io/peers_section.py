@@ -14,9 +14,10 @@ from rmpa.runtime.system_clock import SystemClock
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rmpa.bridge.bounds import Beyond
+    from rmpa.bridge.catalogue.bounds import Beyond
     from rmpa.bridge.io.bounds import Bounds
-    from rmpa.bridge.io.bridge import Bridge, PeerSession
+    from rmpa.bridge.io.bridge import Bridge
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.core.identity import Identity
     from rmpa.discovery.events import PeerView
     from rmpa.discovery.io.discovery import Discovery
@@ -53,7 +54,7 @@ class PeersSection:
     def infos(self, endpoint: EndpointView) -> tuple[PeerInfo, ...]:
         """Every peer that is known, by name."""
         now = self._clock.now()
-        links = {session.link.guid: session for session in self._bridge.attached()}
+        links = {session.link.guid: session for session in self._bridge.sessions.linked()}
         yield_to_data()  # a millisecond each with a full roster
         roster = {view.identity.guid: view for view in endpoint.discovery.peers()}
         yield_to_data()
@@ -65,8 +66,8 @@ class PeersSection:
             info = self._peer(roster.get(guid), statuses.get(guid), session, now)
             if session is not None:
                 info = msgspec.structs.replace(info, link=self._link(session.link, endpoint.mesh.paths, now))
-                theirs = len(self._bridge.imports.offered_by(session.peer))
-                ours = self._bridge.exports.topics_for(session.peer)
+                theirs = len(self._bridge.topics.imports.offered_by(session.peer))
+                ours = self._bridge.topics.exports.topics_for(session.peer)
                 yield_to_data()
                 beyond = self._beyond(session)
                 info = msgspec.structs.replace(info, topics_in=theirs, topics_out=ours, beyond=beyond)
@@ -84,10 +85,10 @@ class PeersSection:
     def _relayed(self, known: Mapping[str, PeerInfo]) -> list[PeerInfo]:
         """Modules without a link whose topics a relay passes on. The roster may know them all the same."""
         infos = []
-        for origin, via in self._bridge.imports.ways:
+        for origin, via in self._bridge.topics.imports.ways:
             blank = PeerInfo(name=origin.name, guid=origin.guid, instance=origin.instance, state="", since_ago=0.0)
             info = known.get(origin.instance, blank)
-            topics = self._bridge.imports.relayed_topics(origin.instance)
+            topics = self._bridge.topics.imports.relayed_topics(origin.instance)
             infos.append(msgspec.structs.replace(info, state="relayed", via=via, topics_in=len(topics)))
         return infos
 

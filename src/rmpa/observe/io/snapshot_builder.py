@@ -138,7 +138,7 @@ class SnapshotBuilder:
     def _agent(self, endpoint: EndpointView | None) -> AgentInfo:
         identity = endpoint.identity if endpoint is not None else None
         bridge, core = self._sources.bridge, self._sources.core
-        proxies = sum(session.inbound.count for session in bridge.everyone())
+        proxies = sum(len(session.proxies) for session in bridge.sessions)
         return AgentInfo(
             name=self._settings.name,
             guid=str(identity.guid) if identity else "",

@@ -12,13 +12,13 @@ from rmpa.bridge.data.io.route_sender import ReliableRouteSender
 from rmpa.bridge.data.qos_events import shown_seconds
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import Policy, PolicyDecision, is_own
-from rmpa.bridge.topics.imports import RouteState
+from rmpa.bridge.topics.remote_topic import RouteState
 from rmpa.config.param_rules import CLOCK
 from rmpa.core import limits
 from rmpa.core.contract import KEYS, Contract, Contracts
 from rmpa.observe.snapshot import EventInfo, LatencyInfo, RouteInfo, SampleSpread, TopicInfo, UnreachableInfo
 from rmpa.ros.wire.tcpros import LENGTH
-from rmpa.runtime.event_loop import breathing_sorted, yield_to_data, yielding_to_data
+from rmpa.runtime.event_loop import sorted_yielding, yield_to_data, yielding_to_data
 from rmpa.runtime.system_clock import SystemClock
 
 if TYPE_CHECKING:
@@ -28,9 +28,10 @@ if TYPE_CHECKING:
     from rmpa.bridge.data.peer_clock import PeerClock
     from rmpa.bridge.data.qos_events import QosWatch
     from rmpa.bridge.data.quality import QualitySummary
-    from rmpa.bridge.io.bridge import Bridge, PeerSession
+    from rmpa.bridge.io.bridge import Bridge
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.bridge.topics.exports import LocalSource
-    from rmpa.bridge.topics.imports import RemoteTopic
+    from rmpa.bridge.topics.remote_topic import RemoteTopic
     from rmpa.config.settings import Settings
     from rmpa.observe.io.peer_clocks import PeerClocks
     from rmpa.ros.core.api import Core
@@ -92,7 +93,7 @@ class TopicsSection:
         known = {name for name in yielding_to_data(names) if any(name in table for table in tables)}
         unreachable = {info.node: str(info) for info in unreachable_infos(self._core, self._clock.now())}
         found = []
-        for name in breathing_sorted(known):
+        for name in sorted_yielding(known):
             yield_to_data()
             nodes, type_name = tuple(state.publishers.get(name, ())), state.types.get(name, "")
             own, crossing = tuple(node for node in nodes if not is_own(node)), tuple(routes.get(name, ()))
@@ -122,26 +123,26 @@ class TopicsSection:
 
     def _inbound(self, wanted: Collection[str] | None) -> Iterator[tuple[Source, RouteInfo, list[str]]]:
         """Each source of a peer with its route, and its mismatches."""
-        sessions = {at.peer: at for at in self._bridge.everyone()}
+        sessions = {at.peer: at for at in self._bridge.sessions}
         self._clocks.follow(self._clock.now())
         clocks = {peer: self._clocks[peer] for peer in sessions}
-        for peer, source, entry in yielding_to_data(list(self._bridge.imports)):
+        for peer, source, entry in yielding_to_data(list(self._bridge.topics.imports)):
             if wanted is not None and entry.topic not in wanted:
                 continue
             yield_to_data()
             at = sessions[peer]
             texts = [f"{at.link.name}: {entry.hidden}"] if entry.conflict else []
-            texts += self._bridge.mismatches(source)
+            texts += self._bridge.topics.mismatches(source)
             yield Source(entry.topic, source.node), self._import(at, source, entry, clocks[peer]), texts
 
     def _left_out(self, wanted: Collection[str] | None) -> Iterator[tuple[Source, RouteInfo, list[str]]]:
         """The topics of peers beyond ``limits.topics``, which are hidden."""
-        names = {at.peer: at.link.name for at in self._bridge.everyone()}
-        for peer, topic, offer in self._bridge.imports.left_out():
+        names = {at.peer: at.link.name for at in self._bridge.sessions}
+        for peer, topic, offer in self._bridge.topics.imports.left_out():
             if wanted is not None and topic not in wanted:
                 continue
             yield_to_data()
-            limit = self._bridge.imports.beyond(peer).limit
+            limit = self._bridge.topics.imports.beyond(peer).limit
             problem = f"{names[peer]} has more topics than limits.topics = {limit} of this module"
             yield (
                 Source(topic, offer.node),
@@ -159,12 +160,13 @@ class TopicsSection:
             )
 
     def _import(self, at: PeerSession, source: Source, entry: RemoteTopic, clock: PeerClock) -> RouteInfo:
-        flow = at.inbound.flow(source, entry.route)
-        publication = at.inbound.publication(source)
-        past = at.inbound.past(source) if flow is None else None
+        topics = self._bridge.topics.of(at)
+        flow = topics.flow(source, entry.route)
+        publication = topics.publication(source)
+        past = topics.past(source) if flow is None else None
         about, now = entry.description, self._clock.now()
         latched = about.latching if about is not None else False
-        problem = at.inbound.problems.get(source.node, "")
+        problem = at.proxies.problems.get(source.node, "")
         if not problem and entry.state is not RouteState.OPEN:
             problem = entry.problem
         info = RouteInfo(
@@ -198,22 +200,22 @@ class TopicsSection:
 
     def _outbound(self, wanted: Collection[str] | None) -> Iterator[tuple[Source, RouteInfo | None, list[str]]]:
         """Each source of this module with its mismatches, and then with its route to each peer that wants it."""
-        names = {session.peer: session.link.name for session in self._bridge.attached()}
-        for source, local in yielding_to_data(list(self._bridge.exports.offered.items())):
+        names = {session.peer: session.link.name for session in self._bridge.sessions.linked()}
+        for source, local in yielding_to_data(list(self._bridge.topics.exports.offered.items())):
             if wanted is not None and source.topic not in wanted:
                 continue
             yield_to_data()
-            yield source, None, list(self._bridge.mismatches(source))
-            for peer in list(self._bridge.exports.flowing(source)):
-                contract = self._bridge.exports.contract(source, peer)
+            yield source, None, list(self._bridge.topics.mismatches(source))
+            for peer in list(self._bridge.topics.exports.flowing(source)):
+                contract = self._bridge.topics.exports.contract(source, peer)
                 yield source, self._export(source, local, peer, names.get(peer, ""), contract), []
-            for peer, away in self._bridge.exports.absent(source).items():
-                if peer not in names or self._bridge.exports.contract(source, peer) is None:
+            for peer, away in self._bridge.topics.exports.absent(source).items():
+                if peer not in names or self._bridge.topics.exports.contract(source, peer) is None:
                     yield source, self._away(self._export(source, local, peer, "", away), peer), []
 
     def _away(self, route: RouteInfo, peer: int) -> RouteInfo:
         """A reliable route whose peer has no link, or has not opened it again."""
-        name, seconds = self._bridge.losses.away(peer)
+        name, seconds = self._bridge.topics.losses.away(peer)
         keeps = float(route.contract.get("outage") or limits.RESUME_WINDOW)
         if seconds < keeps:
             text = f"{name} is away for {shown_seconds(seconds)}; messages are kept for {shown_seconds(keeps)}"
@@ -225,10 +227,10 @@ class TopicsSection:
     def _export(
         self, source: Source, local: LocalSource, peer: int, name: str, contract: Contract | None
     ) -> RouteInfo:
-        about = self._bridge.exports.description(source)
-        flow = self._bridge.outbound.flows.get(source)
+        about = self._bridge.topics.exports.description(source)
+        flow = self._bridge.topics.outbound.flows.get(source)
         sender = flow.by_peer.get(peer) if flow is not None else None
-        offer = self._bridge.exports.offer(peer, source)
+        offer = self._bridge.topics.exports.offer(peer, source)
         info = RouteInfo(
             peer=name,
             node=source.node,
@@ -236,7 +238,7 @@ class TopicsSection:
             state="open",
             type=local.type,
             md5=about.md5 if about is not None else "",
-            lost=self._bridge.outbound.lost(source, peer),
+            lost=self._bridge.topics.outbound.lost(source, peer),
             kept=sender.sender.pending if isinstance(sender, ReliableRouteSender) else 0,
             latched=about.latching if about is not None else False,
             wire=offer.topic if offer is not None and offer.topic != source.topic else "",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from typing import TYPE_CHECKING, Any
 
-from rmpa.config.contract_rules import read_contracts
+from rmpa.config.contract_rules import CONTRACT_RULES
 from rmpa.config.file import LISTS
 from rmpa.config.values import BadValue, did_you_mean
 from rmpa.core.contract import Contract
@@ -46,7 +46,7 @@ def read_contract(where: str, terms: Mapping[str, object]) -> Contract:
     if not terms:
         return Contract()
     try:
-        rules = read_contracts([{"topics": ["/**"], **terms}]).rules
+        rules = CONTRACT_RULES.read([{"topics": ["/**"], **terms}])
     except BadValue as error:
         key = error.at[-1] if error.at else ""
         remedy = error.remedy or (f"did you mean {error.better}?" if error.better else "")

@@ -1,4 +1,4 @@
-"""What happens to each message on its way through the bridge, with a clock that is told the time."""
+"""What happens to each message on its way through the bridge, under a simulated clock."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_a_peer_has_one_leg_and_the_newer_one_counts() -> None:
     assert flow.by_peer == {}
 
 
-def test_a_late_peer_gets_the_latched_message_once_and_before_later_ones() -> None:
+def test_late_peer_gets_the_latched_message_first() -> None:
     flow, one, two = ExportFlow(), Link(), Link()
     flow.latch()
     flow.add(1, one, 7, BEST, 0)
@@ -121,7 +121,7 @@ def test_a_source_that_is_left_keeps_nothing() -> None:
     assert late.sent == []
 
 
-def test_what_is_not_latched_is_not_replayed() -> None:
+def test_unlatched_messages_are_not_replayed() -> None:
     flow, link = ExportFlow(), Link()
     flow.add(9, Link(), 7, BEST, 0)
     flow.message(memoryview(b"old"))
@@ -129,7 +129,7 @@ def test_what_is_not_latched_is_not_replayed() -> None:
     assert link.sent == []
 
 
-def test_each_peer_gets_as_many_kept_messages_as_its_contract_says() -> None:
+def test_contract_says_how_many_kept_messages_a_peer_gets() -> None:
     flow = ExportFlow()
     flow.add(1, Link(), 7, KEPT, 0)
     for n in range(3):
@@ -171,7 +171,7 @@ def test_drops_are_counted() -> None:
     assert flow.dropped == 5
 
 
-def test_parts_go_to_whom_can_take_them_and_the_whole_to_the_others() -> None:
+def test_parts_or_the_whole_go_to_each_sender() -> None:
     flow, streams, whole, slow = ExportFlow(), Link(), Link(), Link()
     flow.add(1, streams, 7, BULKY, 0)
     flow.add(2, whole, 7, RELIABLE, 4)
@@ -184,8 +184,8 @@ def test_parts_go_to_whom_can_take_them_and_the_whole_to_the_others() -> None:
     flow.part(memoryview(payload)[100:])
     assert got(streams) == [(1, b"small"), (2, payload)]
     assert got(whole) == [(1, b"small")]
-    leg = flow.by_peer[2]
-    leg.fenced(whole.fences.popleft()[1])
+    sender = flow.by_peer[2]
+    sender.fenced(whole.fences.popleft()[1])
     assert got(whole) == [(1, b"small"), (2, payload)]
     assert got(slow) == [(1, b"small")]
     assert (flow.messages, flow.bytes) == (2, len(payload) + 5)
@@ -201,7 +201,7 @@ def test_where_all_take_parts_nothing_is_copied_together() -> None:
 
 
 @pytest.mark.parametrize("latching", [False, True])
-def test_a_peer_that_comes_in_the_middle_gets_the_whole_of_what_is_kept_and_half_of_nothing(latching: bool) -> None:
+def test_peer_added_in_the_middle_gets_no_half_message(latching: bool) -> None:
     flow, early, late = ExportFlow(), Link(), Link()
     if latching:
         flow.latch()
@@ -216,7 +216,7 @@ def test_a_peer_that_comes_in_the_middle_gets_the_whole_of_what_is_kept_and_half
     assert got(late)[-1][1] == b"n" * BIG
 
 
-def test_a_peer_that_leaves_in_the_middle_gets_no_more_of_it() -> None:
+def test_peer_removed_in_the_middle_gets_no_more_parts() -> None:
     flow, stays, leaves, whole = ExportFlow(), Link(), Link(), Link()
     flow.add(1, stays, 7, BULKY, 0)
     flow.add(2, leaves, 7, BULKY, 0)
@@ -232,7 +232,7 @@ def test_a_peer_that_leaves_in_the_middle_gets_no_more_of_it() -> None:
 
 
 @pytest.mark.parametrize("latching", [False, True])
-def test_a_publisher_that_dies_in_the_middle_leaves_nothing_whole_behind(latching: bool) -> None:
+def test_dead_publisher_leaves_no_partial_message(latching: bool) -> None:
     flow, streams, whole, late = ExportFlow(), Link(), Link(), Link()
     if latching:
         flow.latch()
@@ -250,20 +250,20 @@ def test_a_publisher_that_dies_in_the_middle_leaves_nothing_whole_behind(latchin
     assert got(late) == [(1, b"n" * BIG)]
 
 
-def test_a_suspended_peer_misses_nothing_and_only_a_reliable_one_can_be() -> None:
+def test_only_reliable_routes_are_suspended() -> None:
     flow, old, new, other = ExportFlow(), Link(), Link(), Link()
-    leg = flow.add(1, old, 7, RELIABLE, 3)
+    sender = flow.add(1, old, 7, RELIABLE, 3)
     flow.add(2, other, 7, BEST, 0)
     flow.message(memoryview(b"a"))
     for peer in (1, 2, 3):
         flow.suspend(peer)
     flow.message(memoryview(b"b"))
     give(flow, bytes(BIG))
-    assert leg.reliable
-    leg.resume(new, 8, 1)  # type: ignore[attr-defined]
+    assert sender.reliable
+    sender.resume(new, 8, 1)  # type: ignore[attr-defined]
     assert got(old) == [(1, b"a")]
     assert got(new) == [(2, b"b")]
-    leg.fenced(new.fences.popleft()[1])
+    sender.fenced(new.fences.popleft()[1])
     assert got(new) == [(2, b"b"), (3, bytes(BIG))]
     assert [payload for _, _, payload in other.sent] == [b"a", b"b"]
 
@@ -272,7 +272,7 @@ def test_a_suspended_peer_misses_nothing_and_only_a_reliable_one_can_be() -> Non
 
 
 class Inlet:
-    """A flow from a peer, and what came of it.
+    """A flow from a peer, and what it delivered.
 
     Args:
         contract: Of the route.
@@ -329,7 +329,7 @@ class Inlet:
         return self.flow.lost, self.flow.late, self.flow.stale, self.flow.expired
 
 
-def test_an_import_counts_what_came_and_what_is_missing(clock: Clock) -> None:
+def test_import_counts_received_and_missing_messages(clock: Clock) -> None:
     inlet = Inlet()
     for sequence, payload in [(1, b"a"), (2, b"b"), (5, b"e"), (6, b"f")]:
         clock.advance(1.0)
@@ -343,7 +343,7 @@ def test_an_import_counts_what_came_and_what_is_missing(clock: Clock) -> None:
     assert flow.position is None
 
 
-def test_what_is_missing_before_the_first_is_known_too() -> None:
+def test_gap_before_the_first_message_counts() -> None:
     inlet = Inlet()
     inlet.message(4)
     assert inlet.counts == (3, 0, 0, 0)
@@ -361,7 +361,7 @@ def test_a_sequence_that_wraps_loses_nothing() -> None:
     assert inlet.counts == (1, 0, 0, 0)
 
 
-def test_what_comes_behind_newer_ones_or_again_is_left_out() -> None:
+def test_late_and_repeated_messages_are_dropped() -> None:
     inlet = Inlet()
     for sequence in (1, 2, 5, 3, 5, 4, 1, 6):
         inlet.message(sequence, bytes([sequence]))
@@ -374,7 +374,7 @@ def test_what_comes_behind_newer_ones_or_again_is_left_out() -> None:
 @given(
     st.lists(st.tuples(st.sampled_from([5, 5000, BIG]), st.sets(st.integers(4, 2 * BIG), max_size=4)), max_size=12)
 )
-def test_messages_whole_and_in_any_parts_come_out_as_they_were(run: list[tuple[int, set[int]]]) -> None:
+def test_messages_in_any_parts_are_delivered_unchanged(run: list[tuple[int, set[int]]]) -> None:
     with running(Clock()):
         inlet, sent = Inlet(), []
         for sequence, (size, cuts) in enumerate(run, 1):
@@ -439,7 +439,7 @@ def test_a_claimed_size_is_not_stored() -> None:
         inlet.flow.part(1, 0, FIRST, memoryview(b"\xff\xff\xff\xff"))
 
 
-def test_the_rest_of_what_is_left_out_is_left_out_too() -> None:
+def test_rest_of_a_dropped_message_is_dropped() -> None:
     inlet = Inlet()
     inlet.flow.part(1, 0, LAST, memoryview(b"c"))
     inlet.flow.part(1, 0, ABORT | LAST, memoryview(b""))
@@ -450,7 +450,7 @@ def test_the_rest_of_what_is_left_out_is_left_out_too() -> None:
 
 
 @pytest.mark.parametrize("cut", [4, 100])
-def test_a_publisher_that_dies_in_the_middle_hangs_up_on_who_has_half_and_nothing_is_lost(cut: int) -> None:
+def test_aborted_message_disconnects_its_subscribers(cut: int) -> None:
     inlet = Inlet()
     inlet.parts(1, bytes(BIG), cut, end=1)
     inlet.flow.part(1, 0, LAST | ABORT, memoryview(b""))
@@ -461,7 +461,7 @@ def test_a_publisher_that_dies_in_the_middle_hangs_up_on_who_has_half_and_nothin
     assert inlet.counts == (0, 0, 0, 0)
 
 
-def test_a_lane_that_falls_in_the_middle_has_lost_that_message() -> None:
+def test_lost_lane_loses_the_message_in_parts() -> None:
     inlet = Inlet()
     inlet.parts(1, bytes(BIG), 50, end=1)
     inlet.flow.torn()
@@ -472,8 +472,8 @@ def test_a_lane_that_falls_in_the_middle_has_lost_that_message() -> None:
 
 
 @pytest.mark.parametrize("small", [False, True])
-def test_what_comes_in_the_middle_of_another_ends_that_and_is_whole(small: bool) -> None:
-    """The sender knows sooner than we do that a lane has gone, and goes on by the other one."""
+def test_newer_message_ends_one_in_parts(small: bool) -> None:
+    """The sender notices sooner than the receiver that a lane is gone, and goes on by the other one."""
     inlet = Inlet()
     inlet.message(1, b"one")
     inlet.parts(2, bytes(BIG), 50, end=1)
@@ -489,7 +489,7 @@ def test_what_comes_in_the_middle_of_another_ends_that_and_is_whole(small: bool)
 
 
 @pytest.mark.parametrize("contract", [BEST, RELIABLE], ids=["best_effort", "reliable"])
-def test_what_comes_late_in_the_middle_of_another_does_not_disturb_it(contract: Contract) -> None:
+def test_late_message_does_not_disturb_one_in_parts(contract: Contract) -> None:
     inlet = Inlet(contract)
     inlet.flow.begin_epoch(1, 1)
     for sequence in (1, 2, 3):
@@ -505,7 +505,7 @@ def test_what_comes_late_in_the_middle_of_another_does_not_disturb_it(contract: 
     assert inlet.called_back == 0
 
 
-def test_the_same_number_again_in_the_middle_is_no_mixture() -> None:
+def test_same_number_in_the_middle_restarts_the_message() -> None:
     inlet = Inlet()
     inlet.parts(1, bytes(BIG), 50, end=1)
     inlet.message(1, b"one")
@@ -538,7 +538,7 @@ def test_of_what_an_outage_held_up_the_newest_counts(clock: Clock) -> None:
     assert inlet.flow.quality.messages == 2
 
 
-def test_the_last_command_before_the_cable_was_pulled_still_counts(clock: Clock) -> None:
+def test_last_command_before_an_outage_is_delivered(clock: Clock) -> None:
     inlet = Inlet(error=0.001, first=2)
     burst(inlet, clock, [9.0, 8.0, 7.0])
     assert inlet.got == []
@@ -564,7 +564,7 @@ def test_the_hold_is_counted_from_the_first_of_the_burst(clock: Clock) -> None:
 
 
 @pytest.mark.parametrize(("error", "age"), [(None, 60.0), (1.0, 1.0), (0.001, 0.1), (0.001, -5.0)])
-def test_what_is_not_surely_old_is_not_held(clock: Clock, error: float | None, age: float) -> None:
+def test_message_of_uncertain_age_is_not_held(clock: Clock, error: float | None, age: float) -> None:
     inlet = Inlet(error=error, first=2)
     burst(inlet, clock, [age])
     assert inlet.got == [b"\2"]
@@ -592,7 +592,7 @@ def test_what_no_silence_held_up_is_not_thrown_away(clock: Clock, resumed: float
     assert inlet.counts == (0, 0, 0, 0)
 
 
-def test_what_was_sent_before_a_silence_ended_gives_way_and_what_was_sent_since_does_not(clock: Clock) -> None:
+def test_messages_from_before_a_silence_are_stale(clock: Clock) -> None:
     inlet = Inlet(error=0.001, first=2)
     inlet.resumed = clock.now - 0.5
     burst(inlet, clock, [0.9, 0.7, 0.55, 0.3])  # the third was held up for 50 ms, and by us for the rest
@@ -609,7 +609,7 @@ def test_kept_messages_are_as_old_as_they_are(clock: Clock, contract: Contract, 
     assert inlet.got == [bytes([n + 1]) for n in range(kept)]
 
 
-def test_a_large_message_takes_the_place_of_what_was_held_and_is_not_disturbed_by_it(clock: Clock) -> None:
+def test_large_message_replaces_a_held_one(clock: Clock) -> None:
     inlet = Inlet(error=0.001, first=2)
     burst(inlet, clock, [9.0])
     inlet.parts(3, bytes(BIG), 50, end=1, stamp_ns=clock.wall_ns())
@@ -708,7 +708,7 @@ def test_a_new_route_brings_nothing_again(kept: str, sent: str, new: str, contra
     assert replayed(messages(kept), messages(sent), contract, cut=cut) == messages(new)
 
 
-def test_a_large_message_of_another_size_is_streamed_and_ends_the_replay() -> None:
+def test_message_of_another_size_ends_the_replay() -> None:
     inlet = Inlet()
     inlet.flow.expect_replay([framed(bytes(BIG)), framed(b"b")])
     inlet.parts(1, bytes(BIG - 1), 50, end=1)
@@ -751,7 +751,7 @@ def test_a_few_large_ones_are_acknowledged_at_once(clock: Clock) -> None:
     assert clock.due == []
 
 
-def test_a_torn_reliable_message_reaches_nobody_by_half_and_comes_again_whole(clock: Clock) -> None:
+def test_torn_reliable_message_is_delivered_whole(clock: Clock) -> None:
     inlet = Inlet(RELIABLE)
     inlet.flow.begin_epoch(1, 1)
     inlet.message(1, b"one")
@@ -769,7 +769,7 @@ def test_a_torn_reliable_message_reaches_nobody_by_half_and_comes_again_whole(cl
     assert inlet.acks == [3]
 
 
-def test_over_a_new_link_it_goes_on_and_what_overflowed_is_the_exact_gap(clock: Clock) -> None:
+def test_overflow_is_the_exact_gap_on_a_new_link(clock: Clock) -> None:
     inlet = Inlet(RELIABLE)
     assert inlet.flow.begin_epoch(5, 1)
     inlet.message(1, b"1")
@@ -790,7 +790,7 @@ def test_over_a_new_link_it_goes_on_and_what_overflowed_is_the_exact_gap(clock: 
     assert inlet.flow.position == (5, 9)
 
 
-def test_a_sender_that_gave_up_begins_anew_and_it_is_known_that_something_is_missing(clock: Clock) -> None:
+def test_new_epoch_shows_that_messages_are_missing(clock: Clock) -> None:
     inlet = Inlet(RELIABLE)
     inlet.flow.begin_epoch(5, 1)
     inlet.message(1)
@@ -804,7 +804,7 @@ def test_a_sender_that_gave_up_begins_anew_and_it_is_known_that_something_is_mis
     assert inlet.counts == (0, 0, 0, 0)
 
 
-def test_what_an_outage_held_up_is_delivered_when_it_is_reliable_unless_it_has_a_lifespan(clock: Clock) -> None:
+def test_reliable_messages_survive_an_outage_within_their_lifespan(clock: Clock) -> None:
     for contract, delivered in ((RELIABLE, 4), (Contract(reliability=Reliability.RELIABLE, lifespan=1.0), 1)):
         inlet = Inlet(contract, error=0.001)
         inlet.flow.begin_epoch(1, 1)

@@ -1,4 +1,4 @@
-"""One source's way to one peer, with a clock that is told the time and a link that writes down what it is given."""
+"""Route senders under a simulated clock, with a link that records what is sent."""
 
 from __future__ import annotations
 
@@ -34,135 +34,133 @@ def clock() -> Iterator[Clock]:
 
 
 def best_effort(link: Link, contract: Contract | None = None, *, large: bool = False) -> RouteSender:
-    leg = make_route_sender(link, 7, contract or Contract(), 0, large=large)
-    assert not leg.reliable
-    return leg
+    sender = make_route_sender(link, 7, contract or Contract(), 0, large=large)
+    assert not sender.reliable
+    return sender
 
 
 def reliable(link: Link, contract: Contract = RELIABLE, *, large: bool = False) -> ReliableRouteSender:
-    leg = make_route_sender(link, 7, contract, 5, large=large)
-    assert isinstance(leg, ReliableRouteSender)
-    assert leg.reliable
-    return leg
+    sender = make_route_sender(link, 7, contract, 5, large=large)
+    assert isinstance(sender, ReliableRouteSender)
+    assert sender.reliable
+    return sender
 
 
-def answer(link: Link, leg: RouteSender) -> None:
-    leg.fenced(link.fences.popleft()[1])
+def answer(link: Link, sender: RouteSender) -> None:
+    sender.fenced(link.fences.popleft()[1])
 
 
-def on_bulk(link: Link, leg: RouteSender) -> None:
-    leg.message(0, LARGE)
-    answer(link, leg)
-    assert leg.lane == "bulk"
+def on_bulk(link: Link, sender: RouteSender) -> None:
+    sender.message(0, LARGE)
+    answer(link, sender)
+    assert sender.lane == "bulk"
 
 
 # --- best effort ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("clock")
-def test_small_messages_go_at_once_numbered_from_1_with_their_stamp() -> None:
+def test_small_messages_are_sent_at_once() -> None:
     link = Link()
-    leg = best_effort(link)
+    sender = best_effort(link)
     for n in range(5):
-        assert leg.message(100 + n, memoryview(SMALL + bytes([n]))) == 0
+        assert sender.message(100 + n, memoryview(SMALL + bytes([n]))) == 0
     assert link.sent == [("express", n + 1, SMALL + bytes([n])) for n in range(5)]
     assert link.stamps == [100, 101, 102, 103, 104]
     assert set(link.routes) == {7}
-    assert (leg.lane, leg.large, leg.dropped, leg.skipped) == ("express", False, 0, 0)
+    assert (sender.lane, sender.large, sender.dropped, sender.skipped) == ("express", False, 0, 0)
 
 
 @pytest.mark.usefixtures("clock")
-def test_the_first_large_one_and_what_follows_wait_for_the_fence_and_keep_their_order() -> None:
+def test_messages_behind_a_fence_keep_their_order() -> None:
     link = Link()
-    leg = best_effort(link)
-    leg.message(0, b"1")
+    sender = best_effort(link)
+    sender.message(0, b"1")
     buffer = bytearray(LARGE)
-    leg.message(0, memoryview(buffer))
+    sender.message(0, memoryview(buffer))
     buffer[:] = b"x" * len(buffer)  # the stream's buffer is used again
-    leg.message(0, b"3")
-    leg.message(0, LARGE)
+    sender.message(0, b"3")
+    sender.message(0, LARGE)
     assert link.log == [("express", "message", 7, 1), ("express", "fence", 7, 1)]
-    assert (leg.lane, leg.large) == ("express", True)
-    leg.fenced(99)
+    assert (sender.lane, sender.large) == ("express", True)
+    sender.fenced(99)
     assert len(link.sent) == 1
-    answer(link, leg)
+    answer(link, sender)
     assert link.sent == [("express", 1, b"1"), ("bulk", 2, LARGE), ("bulk", 3, b"3"), ("bulk", 4, LARGE)]
-    leg.message(0, b"5")
+    sender.message(0, b"5")
     assert link.sent[-1] == ("bulk", 5, b"5")
-    leg.fenced(1)
+    sender.fenced(1)
     assert len(link.sent) == 5, "answered twice"
 
 
 def test_from_express_to_bulk_and_back_again(clock: Clock) -> None:
     link = Link()
-    leg = best_effort(link)
-    on_bulk(link, leg)
+    sender = best_effort(link)
+    on_bulk(link, sender)
     clock.advance(mesh_limits.EXPRESS_AGAIN_AFTER)
     for _ in range(ROW - 1):
-        leg.message(0, SMALL)
+        sender.message(0, SMALL)
     assert set(link.lanes) == {"bulk"}
-    leg.message(0, SMALL)
-    leg.message(0, SMALL)
+    sender.message(0, SMALL)
+    sender.message(0, SMALL)
     assert list(link.fences) == [("bulk", 2)]
-    answer(link, leg)
-    leg.message(0, SMALL)
+    answer(link, sender)
+    sender.message(0, SMALL)
     assert link.lanes[-3:] == ["express"] * 3
     assert link.numbers == list(range(1, ROW + 4))
-    leg.message(0, LARGE)
+    sender.message(0, LARGE)
     assert list(link.fences) == [("express", 3)]
-    answer(link, leg)
+    answer(link, sender)
     assert link.sent[-1][:2] == ("bulk", ROW + 4)
 
 
-def test_a_large_one_while_the_way_back_is_fenced_does_not_go_by_the_express_lane(clock: Clock) -> None:
+def test_large_message_waits_for_the_fence_on_the_way_back(clock: Clock) -> None:
     link = Link()
-    leg = best_effort(link)
-    on_bulk(link, leg)
+    sender = best_effort(link)
+    on_bulk(link, sender)
     clock.advance(mesh_limits.EXPRESS_AGAIN_AFTER)
     for _ in range(ROW):
-        leg.message(0, SMALL)
+        sender.message(0, SMALL)
     held = len(link.sent)
-    leg.message(0, LARGE)
-    leg.message(0, SMALL)
-    assert not leg.begin(0, 1 << 20)
-    answer(link, leg)
+    sender.message(0, LARGE)
+    sender.message(0, SMALL)
+    assert not sender.begin(0, 1 << 20)
+    answer(link, sender)
     assert link.lanes[held:] == ["express"], "the small one in front of it"
-    answer(link, leg)
+    answer(link, sender)
     assert link.lanes[held:] == ["express", "bulk", "bulk"]
     assert link.numbers == list(range(1, len(link.sent) + 1))
 
 
 @pytest.mark.usefixtures("clock")
 @pytest.mark.parametrize(("history", "kept"), [(History.KEEP_LAST, 3), (History.KEEP_ALL, 10)])
-def test_what_is_held_keeps_to_the_depth_and_the_newest_stay(history: History, kept: int) -> None:
+def test_held_messages_keep_to_the_depth(history: History, kept: int) -> None:
     link = Link()
-    leg = best_effort(link, Contract(depth=3, history=history), large=True)
-    drops = [leg.message(0, bytes([n])) for n in range(10)]
+    sender = best_effort(link, Contract(depth=3, history=history), large=True)
+    drops = [sender.message(0, bytes([n])) for n in range(10)]
     assert drops == [0] * kept + [1] * (10 - kept)
-    assert leg.dropped == 10 - kept
-    answer(link, leg)
+    assert sender.dropped == 10 - kept
+    answer(link, sender)
     assert [payload[0] for _, _, payload in link.sent] == list(range(10 - kept, 10))
     assert link.numbers == list(range(11 - kept, 11)), "the gap says how many are missing"
 
 
-def test_what_is_held_keeps_to_the_bytes_but_one_message_always_fits(
-    clock: Clock, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_held_bytes_are_bounded(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mesh_limits, "LINK_QUEUE_BYTES", 1000)
     link = Link()
-    leg = best_effort(link, large=True)
-    assert leg.message(0, bytes(400)) == 0
-    assert leg.message(0, bytes(400)) == 0
-    assert leg.message(0, bytes(300)) == 1
-    assert leg.message(0, bytes(5000)) == 2
-    assert leg.message(0, bytes(1000)) == 1
-    answer(link, leg)
+    sender = best_effort(link, large=True)
+    assert sender.message(0, bytes(400)) == 0
+    assert sender.message(0, bytes(400)) == 0
+    assert sender.message(0, bytes(300)) == 1
+    assert sender.message(0, bytes(5000)) == 2
+    assert sender.message(0, bytes(1000)) == 1
+    answer(link, sender)
     assert [len(payload) for _, _, payload in link.sent] == [1000]
     clock.advance(mesh_limits.EXPRESS_AGAIN_AFTER)
     for _ in range(ROW):
-        leg.message(0, b"")
+        sender.message(0, b"")
     assert link.fences
-    assert leg.message(0, bytes(1000)) == 0, "the count of bytes began anew"
+    assert sender.message(0, bytes(1000)) == 0, "the count of bytes began anew"
 
 
 @pytest.mark.usefixtures("clock")
@@ -171,66 +169,66 @@ def test_what_is_held_keeps_to_the_bytes_but_one_message_always_fits(
 )
 def test_the_priority_outweighs_the_size(priority: Priority, lane: str | None) -> None:
     link = Link()
-    leg = best_effort(link, Contract(priority=priority))
+    sender = best_effort(link, Contract(priority=priority))
     assert bool(link.fences) is (priority is Priority.LOW), "a low one changes its lane before its first message"
     if link.fences:
-        answer(link, leg)
-    leg.message(0, SMALL)
-    leg.message(0, LARGE)
+        answer(link, sender)
+    sender.message(0, SMALL)
+    sender.message(0, LARGE)
     if link.fences:
-        answer(link, leg)
+        answer(link, sender)
     assert link.lanes == ([lane] * 2 if lane else ["express", "bulk"])
 
 
 @pytest.mark.usefixtures("clock")
-def test_a_source_that_is_known_to_be_large_changes_its_lane_before_its_first_message() -> None:
+def test_large_source_changes_its_lane_first() -> None:
     link = Link()
-    leg = best_effort(link, large=True)
+    sender = best_effort(link, large=True)
     assert list(link.fences) == [("express", 1)]
-    assert leg.large
-    answer(link, leg)
-    leg.message(0, LARGE)
+    assert sender.large
+    answer(link, sender)
+    sender.message(0, LARGE)
     assert link.lanes == ["bulk"]
 
 
 @pytest.mark.usefixtures("clock")
-def test_bulk_lost_while_the_fence_is_on_the_express_lane_its_answer_is_waited_for() -> None:
+def test_bulk_lost_during_an_express_fence_waits_for_it() -> None:
     link = Link()
-    leg = best_effort(link, large=True)
-    leg.message(0, SMALL)
-    leg.lane_lost()
+    sender = best_effort(link, large=True)
+    sender.message(0, SMALL)
+    sender.lane_lost()
     assert not link.sent, "the fence is on the other lane"
-    answer(link, leg)
+    answer(link, sender)
     assert link.lanes == ["bulk"]
 
 
-def test_bulk_lost_nothing_of_it_comes_behind_what_goes_by_the_express_lane_now(clock: Clock) -> None:
+def test_lost_bulk_lane_delivers_nothing_late(clock: Clock) -> None:
     """What waits for the lane's next connection would come late; the fence behind it would never be answered."""
     link = Link()
-    leg = best_effort(link)
-    on_bulk(link, leg)
+    sender = best_effort(link)
+    on_bulk(link, sender)
     clock.advance(mesh_limits.EXPRESS_AGAIN_AFTER)
     for _ in range(ROW):
-        leg.message(0, SMALL)
+        sender.message(0, SMALL)
     number = link.fences.popleft()[1]
     link.log.clear()
-    leg.lane_lost()
+    sender.lane_lost()
     assert link.log == [("bulk", "discard", 7), ("express", "message", 7, ROW + 1)]
-    leg.fenced(number)
-    leg.message(0, SMALL)
+    sender.fenced(number)
+    sender.message(0, SMALL)
     assert link.numbers == list(range(1, ROW + 3))
     assert link.bulk.terms[7] == (core_limits.ROUTE_QUEUE_MESSAGES, mesh_limits.BULK_STALE_AGE, False), "they hold on"
 
 
 @pytest.mark.usefixtures("clock")
-def test_bulk_lost_without_a_fence_what_waits_for_its_next_connection_stays() -> None:
+def test_bulk_lost_without_a_fence_keeps_what_waits() -> None:
     link = Link()
-    leg = best_effort(link)
-    on_bulk(link, leg)
+    sender = best_effort(link)
+    on_bulk(link, sender)
     link.log.clear()
-    leg.lane_lost()
+    sender.lane_lost()
     assert link.log == []
-    leg.message(0, LARGE)
+    sender.message(0, LARGE)
     assert link.log == [("bulk", "message", 7, 2)]
 
 
@@ -255,7 +253,7 @@ def test_bulk_lost_without_a_fence_what_waits_for_its_next_connection_stays() ->
         ),
     ],
 )
-def test_both_lanes_are_told_what_may_wait(
+def test_both_lanes_get_the_bounds(
     contract: Contract, depth: int, ages: tuple[float | None, ...], strict: bool
 ) -> None:
     link = Link()
@@ -265,23 +263,23 @@ def test_both_lanes_are_told_what_may_wait(
 
 
 @pytest.mark.usefixtures("clock")
-def test_what_a_lane_dropped_is_told_to_the_caller() -> None:
+def test_drops_of_a_lane_are_returned() -> None:
     link = Link()
-    leg = best_effort(link)
+    sender = best_effort(link)
     link.drops.extend([3, 0, 2])
-    assert [leg.message(0, SMALL) for _ in range(3)] == [3, 0, 2]
-    assert leg.dropped == 0, "the lane's own count has them"
+    assert [sender.message(0, SMALL) for _ in range(3)] == [3, 0, 2]
+    assert sender.dropped == 0, "the lane's own count has them"
 
 
 @pytest.mark.usefixtures("clock")
 def test_sequences_wrap() -> None:
     link = Link()
-    leg = best_effort(link)
-    leg.sequence = (1 << 32) - 2
+    sender = best_effort(link)
+    sender.sequence = (1 << 32) - 2
     for _ in range(3):
-        leg.message(0, SMALL)
-    leg.message(0, LARGE)
-    answer(link, leg)
+        sender.message(0, SMALL)
+    sender.message(0, LARGE)
+    answer(link, sender)
     assert link.numbers == [(1 << 32) - 1, 0, 1, 2]
 
 
@@ -293,16 +291,16 @@ BIG = 300_000
 @pytest.mark.usefixtures("clock")
 def test_parts_go_as_they_come_once_the_lane_is_right() -> None:
     link = Link()
-    leg = best_effort(link)
-    assert not leg.begin(11, BIG), "the first one is what changes the lane: it is wanted whole"
-    leg.message(11, bytes(BIG))
-    assert not leg.begin(12, BIG), "and so is what comes before the fence is answered"
-    leg.message(12, bytes(BIG))
-    answer(link, leg)
-    assert leg.begin(13, BIG)
+    sender = best_effort(link)
+    assert not sender.begin(11, BIG), "the first one is what changes the lane: it is wanted whole"
+    sender.message(11, bytes(BIG))
+    assert not sender.begin(12, BIG), "and so is what comes before the fence is answered"
+    sender.message(12, bytes(BIG))
+    answer(link, sender)
+    assert sender.begin(13, BIG)
     link.drops.extend([1, 2])
-    assert leg.part(memoryview(bytes(BIG - 1))) == 1
-    assert leg.part(memoryview(b"z")) == 2
+    assert sender.part(memoryview(bytes(BIG - 1))) == 1
+    assert sender.part(memoryview(b"z")) == 2
     assert [(lane, number, len(payload)) for lane, number, payload in link.sent] == [
         ("bulk", 1, BIG),
         ("bulk", 2, BIG),
@@ -315,24 +313,24 @@ def test_parts_go_as_they_come_once_the_lane_is_right() -> None:
 @pytest.mark.usefixtures("clock")
 def test_parts_of_an_urgent_topic_go_by_the_express_lane() -> None:
     link = Link()
-    leg = best_effort(link, Contract(priority=Priority.HIGH))
-    assert leg.begin(0, BIG)
-    leg.part(bytes(BIG))
+    sender = best_effort(link, Contract(priority=Priority.HIGH))
+    assert sender.begin(0, BIG)
+    sender.part(bytes(BIG))
     assert link.lanes == ["express"]
 
 
 @pytest.mark.usefixtures("clock")
-def test_an_abort_takes_its_number_with_it_and_the_next_one_begins_anew() -> None:
+def test_aborted_message_uses_its_number() -> None:
     link = Link()
-    leg = best_effort(link, large=True)
-    answer(link, leg)
-    leg.begin(0, BIG)
-    leg.part(bytes(10))
-    leg.abort()
-    leg.abort()
-    assert leg.part(bytes(10)) == 0
+    sender = best_effort(link, large=True)
+    answer(link, sender)
+    sender.begin(0, BIG)
+    sender.part(bytes(10))
+    sender.abort()
+    sender.abort()
+    assert sender.part(bytes(10)) == 0
     assert link.log[-2:] == [("bulk", "open", 7, 1, BIG), ("bulk", "abandon", 7, 1)]
-    leg.message(0, LARGE)
+    sender.message(0, LARGE)
     assert link.numbers == [2]
 
 
@@ -341,62 +339,62 @@ def test_an_abort_takes_its_number_with_it_and_the_next_one_begins_anew() -> Non
 
 def test_of_too_many_the_newest_goes_when_its_turn_comes(clock: Clock) -> None:
     link = Link()
-    leg = best_effort(link, Contract(max_rate=10.0))
+    sender = best_effort(link, Contract(max_rate=10.0))
     for n in range(10):
-        leg.message(n, bytes([n]))
+        sender.message(n, bytes([n]))
         clock.advance(0.008)
     assert [payload[0] for _, _, payload in link.sent] == [0]
     clock.advance(0.1)
     assert [payload[0] for _, _, payload in link.sent] == [0, 9]
     assert link.stamps == [0, 9], "the time of publication, not that of the turn"
     assert link.numbers == [1, 2], "what was left out is no gap"
-    assert (leg.skipped, leg.dropped) == (8, 0)
+    assert (sender.skipped, sender.dropped) == (8, 0)
     assert clock.due == []
 
 
-def test_a_newer_one_that_comes_on_the_beat_takes_the_place_of_the_one_that_waits(clock: Clock) -> None:
+def test_newer_message_replaces_the_waiting_one(clock: Clock) -> None:
     link = Link()
-    leg = best_effort(link, Contract(max_rate=10.0))
-    leg.message(0, b"a")
+    sender = best_effort(link, Contract(max_rate=10.0))
+    sender.message(0, b"a")
     clock.advance(0.05)
-    leg.message(0, b"b")
+    sender.message(0, b"b")
     clock.advance(0.045)  # a tenth of the interval early is on time
-    leg.message(0, b"c")
+    sender.message(0, b"c")
     clock.advance(1.0)
     assert [payload for _, _, payload in link.sent] == [b"a", b"c"]
-    assert leg.skipped == 1
+    assert sender.skipped == 1
 
 
 def test_a_pause_costs_the_next_one_nothing(clock: Clock) -> None:
     link = Link()
-    leg = best_effort(link, Contract(max_rate=10.0))
+    sender = best_effort(link, Contract(max_rate=10.0))
     for n in range(5):
-        leg.message(0, bytes([n]))
+        sender.message(0, bytes([n]))
         clock.advance(1.0)
     assert len(link.sent) == 5
-    assert leg.skipped == 0
+    assert sender.skipped == 0
 
 
 @pytest.mark.parametrize("hertz", [30.01, 29.99, 30.0])
-def test_a_source_of_nearly_the_same_rate_loses_only_what_it_has_too_many_of(clock: Clock, hertz: float) -> None:
+def test_nearly_equal_rate_loses_only_the_surplus(clock: Clock, hertz: float) -> None:
     link = Link()
-    leg = best_effort(link, Contract(max_rate=30.0))
+    sender = best_effort(link, Contract(max_rate=30.0))
     for _ in range(9_000):
-        leg.message(0, SMALL)
+        sender.message(0, SMALL)
         clock.advance(1 / hertz)
-    assert leg.skipped <= 4
-    assert len(link.sent) + leg.skipped >= 8_999
+    assert sender.skipped <= 4
+    assert len(link.sent) + sender.skipped >= 8_999
 
 
 @settings(deadline=None, max_examples=60)
 @given(st.sampled_from([1.0, 30.0, 200.0]), st.lists(st.floats(0, 3), min_size=1, max_size=80))
-def test_any_source_keeps_to_the_rate_and_ends_with_its_newest(rate: float, gaps: list[float]) -> None:
+def test_rate_is_kept_and_the_newest_is_sent(rate: float, gaps: list[float]) -> None:
     with running(Clock()) as clock:
         link, went = Link(), []
-        leg = best_effort(link, Contract(max_rate=rate))
+        sender = best_effort(link, Contract(max_rate=rate))
         for number, gap in enumerate(gaps):
             before = len(link.sent)
-            leg.message(number, number.to_bytes(4, "big"))
+            sender.message(number, number.to_bytes(4, "big"))
             if len(link.sent) > before:
                 went.append(clock.now)
             until = clock.now + gap / rate
@@ -409,19 +407,19 @@ def test_any_source_keeps_to_the_rate_and_ends_with_its_newest(rate: float, gaps
         order = [int.from_bytes(payload, "big") for _, _, payload in link.sent]
         assert order == sorted(set(order))
         assert order[-1] == len(gaps) - 1, "the newest is never lost"
-        assert leg.skipped == len(gaps) - len(order)
+        assert sender.skipped == len(gaps) - len(order)
         for first in range(len(went)):
             for last in range(first + 1, len(went)):
                 assert last - first <= (went[last] - went[first]) * rate + 0.6 + 1e-3
 
 
-def test_a_throttled_topic_of_large_messages_is_wanted_whole_and_changes_its_lane_too(clock: Clock) -> None:
+def test_downsampled_large_messages_are_sent_whole(clock: Clock) -> None:
     link = Link()
-    leg = best_effort(link, Contract(max_rate=10.0))
+    sender = best_effort(link, Contract(max_rate=10.0))
     for n in range(4):
-        assert not leg.begin(n, BIG)
-        leg.message(n, bytes(BIG))
-    answer(link, leg)
+        assert not sender.begin(n, BIG)
+        sender.message(n, bytes(BIG))
+    answer(link, sender)
     clock.advance(0.1)
     assert link.lanes == ["bulk", "bulk"]
     assert link.stamps == [0, 3]
@@ -429,10 +427,10 @@ def test_a_throttled_topic_of_large_messages_is_wanted_whole_and_changes_its_lan
 
 def test_nothing_more_happens_when_it_is_closed(clock: Clock) -> None:
     link = Link()
-    leg = best_effort(link, Contract(max_rate=10.0))
-    leg.message(0, b"a")
-    leg.message(0, b"b")
-    leg.close()
+    sender = best_effort(link, Contract(max_rate=10.0))
+    sender.message(0, b"a")
+    sender.message(0, b"b")
+    sender.close()
     clock.advance(1.0)
     assert len(link.sent) == 1
     held = best_effort(link, large=True)
@@ -449,22 +447,20 @@ def test_nothing_more_happens_when_it_is_closed(clock: Clock) -> None:
 # --- reliable -------------------------------------------------------------------------------------------------
 
 
-def test_the_window_bounds_what_is_under_way_and_acknowledgements_move_it(
-    clock: Clock, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_acknowledgements_move_the_window(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mesh_limits, "RELIABLE_WINDOW_MESSAGES", 4)
     link = Link()
-    leg = reliable(link)
+    sender = reliable(link)
     for n in range(10):
-        assert leg.message(n, bytes([n])) == 0
+        assert sender.message(n, bytes([n])) == 0
     assert link.numbers == [1, 2, 3, 4]
-    leg.acknowledged(2)
+    sender.acknowledged(2)
     assert link.numbers == [1, 2, 3, 4, 5, 6]
-    leg.acknowledged(6)
-    leg.acknowledged(10)
+    sender.acknowledged(6)
+    sender.acknowledged(10)
     assert [payload[0] for _, _, payload in link.sent] == list(range(10))
     assert link.stamps == list(range(10))
-    assert leg.sender.idle
+    assert sender.sender.idle
     assert clock.due == [], "TCP repeats; no timer of ours does"
 
 
@@ -472,79 +468,79 @@ def test_the_window_bounds_what_is_under_way_and_acknowledgements_move_it(
 def test_beyond_its_bounds_the_oldest_is_lost_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mesh_limits, "RELIABLE_WINDOW_MESSAGES", 2)
     link = Link()
-    leg = reliable(link, Contract(reliability=Reliability.RELIABLE, depth=5))
-    lost = [leg.message(0, bytes([n])) for n in range(9)]
+    sender = reliable(link, Contract(reliability=Reliability.RELIABLE, depth=5))
+    lost = [sender.message(0, bytes([n])) for n in range(9)]
     # 1 and 2 are under way: to drop them frees no place that is known to be lost.
-    assert sum(lost) == leg.dropped == 2
-    leg.acknowledged(2)
-    leg.acknowledged(6)
-    leg.acknowledged(8)
+    assert sum(lost) == sender.dropped == 2
+    sender.acknowledged(2)
+    sender.acknowledged(6)
+    sender.acknowledged(8)
     assert link.numbers == [1, 2, 5, 6, 7, 8, 9]
 
 
 @pytest.mark.usefixtures("clock")
-def test_it_is_wanted_whole_and_changes_its_lane_behind_a_fence() -> None:
+def test_reliable_message_changes_its_lane_behind_a_fence() -> None:
     link = Link()
-    leg = reliable(link)
-    leg.message(0, SMALL)
-    assert not leg.begin(0, BIG)
-    leg.message(0, bytes(BIG))
-    leg.message(0, SMALL)
+    sender = reliable(link)
+    sender.message(0, SMALL)
+    assert not sender.begin(0, BIG)
+    sender.message(0, bytes(BIG))
+    sender.message(0, SMALL)
     assert link.log == [("express", "message", 7, 1), ("express", "fence", 7, 1)]
-    leg.acknowledged(1)
+    sender.acknowledged(1)
     assert link.numbers == [1], "an acknowledgement opens the window, not the fence"
-    answer(link, leg)
+    answer(link, sender)
     assert link.sent == [("express", 1, SMALL), ("bulk", 2, bytes(BIG)), ("bulk", 3, SMALL)]
-    assert leg.sender.in_flight == 2
+    assert sender.sender.in_flight == 2
 
 
 @pytest.mark.usefixtures("clock")
-def test_bulk_lost_what_was_on_it_is_sent_again_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lost_bulk_lane_is_replayed(monkeypatch: pytest.MonkeyPatch) -> None:
     link = Link()
-    leg = reliable(link)
-    leg.message(0, LARGE)
-    answer(link, leg)
+    sender = reliable(link)
+    sender.message(0, LARGE)
+    answer(link, sender)
     for n in range(4):
-        leg.message(0, bytes([n]))
-    leg.acknowledged(2)
+        sender.message(0, bytes([n]))
+    sender.acknowledged(2)
     link.log.clear()
-    leg.lane_lost()
+    sender.lane_lost()
     assert link.log == [
         ("bulk", "discard", 7),  # or the peer would see those that wait before those that were torn: a gap
         ("bulk", "message", 7, 3),
         ("bulk", "message", 7, 4),
         ("bulk", "message", 7, 5),
     ]
-    leg.acknowledged(5)
-    leg.lane_lost()
+    sender.acknowledged(5)
+    sender.lane_lost()
     assert link.numbers == [1, 2, 3, 4, 5, 3, 4, 5]
-    assert leg.sender.idle
+    assert sender.sender.idle
 
 
 @pytest.mark.usefixtures("clock")
-def test_bulk_lost_while_a_fence_is_on_the_express_lane_nothing_is_sent_twice() -> None:
+def test_bulk_lost_during_an_express_fence_replays_nothing() -> None:
     link = Link()
-    leg = reliable(link)
-    leg.message(0, SMALL)
-    leg.message(0, LARGE)
-    leg.lane_lost()
+    sender = reliable(link)
+    sender.message(0, SMALL)
+    sender.message(0, LARGE)
+    sender.lane_lost()
     assert link.numbers == [1]
-    answer(link, leg)
+    answer(link, sender)
     assert link.numbers == [1, 2]
 
 
-def test_bulk_lost_on_the_way_back_all_goes_by_the_express_lane(clock: Clock) -> None:
+def test_bulk_lost_on_the_way_back_uses_the_express_lane(clock: Clock) -> None:
     link = Link()
-    leg = reliable(link)
-    leg.message(0, LARGE)
-    answer(link, leg)
+    sender = reliable(link)
+    sender.message(0, LARGE)
+    answer(link, sender)
     clock.advance(mesh_limits.EXPRESS_AGAIN_AFTER)
     for _ in range(ROW):
-        leg.message(0, SMALL)
+        sender.message(0, SMALL)
     assert list(link.fences) == [("bulk", 2)]
-    leg.acknowledged(100)
+    sender.acknowledged(100)
     link.log.clear()
-    leg.lane_lost()
+    sender.lane_lost()
     assert link.log == [("bulk", "discard", 7)] + [
         ("express", "message", 7, number) for number in range(101, ROW + 2)
     ]
@@ -553,42 +549,42 @@ def test_bulk_lost_on_the_way_back_all_goes_by_the_express_lane(clock: Clock) ->
 @pytest.mark.usefixtures("clock")
 def test_an_old_acknowledgement_does_no_harm() -> None:
     link = Link()
-    leg = reliable(link, large=True)
-    answer(link, leg)
+    sender = reliable(link, large=True)
+    answer(link, sender)
     for _ in range(5):
-        leg.message(0, SMALL)
-    leg.acknowledged(4)
-    leg.acknowledged(2)
-    leg.lane_lost()
+        sender.message(0, SMALL)
+    sender.acknowledged(4)
+    sender.acknowledged(2)
+    sender.lane_lost()
     assert link.numbers == [1, 2, 3, 4, 5, 5]
 
 
 @pytest.mark.usefixtures("clock")
-def test_an_acknowledgement_of_what_was_never_sent_is_the_peers_error() -> None:
+def test_acknowledgement_of_unsent_messages_is_an_error() -> None:
     link = Link()
-    leg = reliable(link)
-    leg.message(0, SMALL)
+    sender = reliable(link)
+    sender.message(0, SMALL)
     with pytest.raises(RemoteProtocolError):
-        leg.acknowledged(2)
+        sender.acknowledged(2)
 
 
 @pytest.mark.usefixtures("clock")
 @pytest.mark.parametrize("after", [0, 1, 2, 3])
-def test_over_a_new_link_it_goes_on_behind_what_the_peer_has(after: int) -> None:
+def test_new_link_goes_on_behind_the_peers_position(after: int) -> None:
     old, new = Link(), Link()
-    leg = reliable(old)
+    sender = reliable(old)
     for n in range(3):
-        leg.message(0, bytes([n]))
-    leg.suspend()
-    leg.message(0, bytes([3]))
-    leg.message(0, LARGE)
+        sender.message(0, bytes([n]))
+    sender.suspend()
+    sender.message(0, bytes([3]))
+    sender.message(0, LARGE)
     assert len(old.sent) == 3
-    leg.acknowledged(2)  # what still came over the old link, behind the end
-    leg.resume(new, 9, after)
+    sender.acknowledged(2)  # what still came over the old link, behind the end
+    sender.resume(new, 9, after)
     assert new.numbers == list(range(after + 1, 5))
     assert set(new.routes) <= {9}
     assert list(new.fences) == [("express", 1)], "the large one"
-    answer(new, leg)
+    answer(new, sender)
     assert new.sent[-1] == ("bulk", 5, LARGE)
     assert new.numbers == list(range(after + 1, 6))
     assert 9 in new.express.terms
@@ -596,59 +592,59 @@ def test_over_a_new_link_it_goes_on_behind_what_the_peer_has(after: int) -> None
 
 
 @pytest.mark.usefixtures("clock")
-def test_over_a_new_link_a_topic_of_large_messages_changes_its_lane_first() -> None:
+def test_large_topic_changes_its_lane_on_a_new_link() -> None:
     old, new = Link(), Link()
-    leg = reliable(old, large=True)
-    answer(old, leg)
-    leg.message(0, LARGE)
-    leg.suspend()
-    leg.lane_lost()
-    leg.fenced(1)
-    leg.resume(new, 8, 0)
+    sender = reliable(old, large=True)
+    answer(old, sender)
+    sender.message(0, LARGE)
+    sender.suspend()
+    sender.lane_lost()
+    sender.fenced(1)
+    sender.resume(new, 8, 0)
     assert new.log == [("express", "fence", 8, 2)]
-    leg.fenced(1)
+    sender.fenced(1)
     assert not new.sent
-    answer(new, leg)
+    answer(new, sender)
     assert new.sent == [("bulk", 1, LARGE)]
 
 
 @pytest.mark.usefixtures("clock")
-def test_what_was_acknowledged_since_a_peer_said_where_it_is_counts() -> None:
-    """Of two links that come up at once, the word of the one that is given up comes last."""
+def test_later_acknowledgement_outweighs_the_position() -> None:
+    """Of two links that come up at once, the message of the one that is given up comes last."""
     old, new = Link(), Link()
-    leg = reliable(old)
+    sender = reliable(old)
     for _ in range(3):
-        leg.message(0, SMALL)
-    leg.acknowledged(2)
-    leg.suspend()
-    leg.resume(new, 8, 1)
+        sender.message(0, SMALL)
+    sender.acknowledged(2)
+    sender.suspend()
+    sender.resume(new, 8, 1)
     assert new.numbers == [3]
 
 
 @pytest.mark.usefixtures("clock")
 def test_a_peer_cannot_go_on_where_it_never_was() -> None:
     old, new = Link(), Link()
-    leg = reliable(old)
-    leg.message(0, SMALL)
-    leg.suspend()
+    sender = reliable(old)
+    sender.message(0, SMALL)
+    sender.suspend()
     with pytest.raises(RemoteProtocolError):
-        leg.resume(new, 8, 2)
+        sender.resume(new, 8, 2)
     assert not new.log
-    leg.resume(new, 9, 1)
-    leg.message(0, SMALL)
+    sender.resume(new, 9, 1)
+    sender.message(0, SMALL)
     assert new.numbers == [2]
 
 
-def test_a_throttled_one_keeps_the_newest_over_the_loss_of_its_link(clock: Clock) -> None:
+def test_downsampled_route_keeps_the_newest_over_a_link_loss(clock: Clock) -> None:
     old, new = Link(), Link()
-    leg = reliable(old, Contract(reliability=Reliability.RELIABLE, max_rate=10.0))
+    sender = reliable(old, Contract(reliability=Reliability.RELIABLE, max_rate=10.0))
     for n in range(3):
-        leg.message(n, bytes([n]))
-    leg.suspend()
+        sender.message(n, bytes([n]))
+    sender.suspend()
     clock.advance(0.5)
-    leg.resume(new, 8, 1)
+    sender.resume(new, 8, 1)
     assert [payload for _, _, payload in new.sent] == [bytes([2])]
-    assert leg.skipped == 1
+    assert sender.skipped == 1
 
 
 class FallingLink(RuleBasedStateMachine):
@@ -662,14 +658,14 @@ class FallingLink(RuleBasedStateMachine):
         self.running = running(Clock())
         self.clock = self.running.__enter__()
         self.link = Link()
-        self.leg = reliable(self.link)
+        self.sender = reliable(self.link)
         self.published = 0
         self.came = 0
         self.ways: dict[str, deque[tuple[str, int]]] = {"express": deque(), "bulk": deque()}
         self.marks: deque[tuple[str, int]] = deque()
 
     def collect(self) -> None:
-        """What the leg gave to the lanes is under way."""
+        """What the sender gave to the lanes is under way."""
         for lane, kind, *rest in self.link.log:
             if kind == "discard":
                 self.ways[str(lane)].clear()
@@ -681,7 +677,7 @@ class FallingLink(RuleBasedStateMachine):
     @rule(payload=st.sampled_from([SMALL, LARGE]), count=st.integers(1, 5))
     def publish(self, payload: bytes, count: int) -> None:
         for _ in range(count):
-            self.leg.message(0, payload)
+            self.sender.message(0, payload)
         self.published += count
         self.collect()
 
@@ -705,7 +701,7 @@ class FallingLink(RuleBasedStateMachine):
     def mark(self, count: int) -> None:
         for _ in range(min(count, len(self.marks))):
             kind, number = self.marks.popleft()
-            (self.leg.fenced if kind == "fenced" else self.leg.acknowledged)(number)
+            (self.sender.fenced if kind == "fenced" else self.sender.acknowledged)(number)
         self.collect()
 
     @rule(gone=st.integers(0, 3))
@@ -713,20 +709,20 @@ class FallingLink(RuleBasedStateMachine):
         """What the connection had is lost; what waited for it in the lane's queue is not."""
         for _ in range(min(gone, len(self.ways["bulk"]))):
             self.ways["bulk"].popleft()
-        self.leg.lane_lost()
+        self.sender.lane_lost()
         self.collect()
 
     @rule(meanwhile=st.integers(0, 3), payload=st.sampled_from([SMALL, LARGE]))
     def lose_link(self, meanwhile: int, payload: bytes) -> None:
-        self.leg.suspend()
+        self.sender.suspend()
         self.link = Link()
         for way in self.ways.values():
             way.clear()
         self.marks.clear()
         for _ in range(meanwhile):
-            self.leg.message(0, payload)
+            self.sender.message(0, payload)
         self.published += meanwhile
-        self.leg.resume(self.link, 7, self.came)
+        self.sender.resume(self.link, 7, self.came)
         self.collect()
 
     def teardown(self) -> None:
@@ -737,8 +733,8 @@ class FallingLink(RuleBasedStateMachine):
                 self.carry("bulk", 1000)
                 self.mark(1000)
             assert self.came == self.published
-            assert self.leg.sender.idle
-            assert self.leg.dropped == 0
+            assert self.sender.sender.idle
+            assert self.sender.dropped == 0
             assert not any(self.ways.values())
         finally:
             self.running.__exit__(None, None, None)

@@ -25,8 +25,9 @@ from rmpa.ros.master.effects import ParamUpdate
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.bridge.io.bridge import Bridge, PeerSession
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.ros.core.api import Core
+    from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
 OURS = "http://127.0.0.1:1/"
@@ -74,11 +75,14 @@ class Side:
         self.counters = Counters()
         self.asks = PeerRpc(self.counters)
         self.links: dict[int, PeerSession] = {}
-        bridge = SimpleNamespace(
-            node=SimpleNamespace(uri=OURS), asks=self.asks, counters=self.counters, attached=self.links.values
-        )
         self.params = Params(
-            cast("Core", self.core), cast("Bridge", bridge), params or ParamSettings(), time or TimeSettings()
+            cast("Core", self.core),
+            cast("SlaveNode", SimpleNamespace(uri=OURS)),
+            self.asks,
+            self.links.values,
+            self.counters,
+            params or ParamSettings(),
+            time or TimeSettings(),
         )
         self.core.told = self.params.param_update
 
@@ -112,7 +116,7 @@ class Side:
             await asyncio.sleep(0)
 
     async def ask(self, what: str, args: dict[str, Any], number: int = 1) -> Any:
-        return await self.asks.ask(self.links[number], what, args)
+        return await self.asks.request(self.links[number], what, args)
 
     async def drive(self, steps: Any) -> Any:
         try:
@@ -286,7 +290,7 @@ async def test_an_owner_that_comes_back_without_it_takes_nothing_away(sides: Any
     again = Side("base")
     sides(again)
     join(again, pad, 2)
-    await until(lambda: again.params._desk._last == {"/robot_description": None})
+    await until(lambda: again.params._server._last == {"/robot_description": None})
     await pad.ask(transfer.NAMES, {}, 2)  # its answer comes behind what was told
     await until(lambda: not pad.params._follower._working)
     await again.look()
@@ -403,7 +407,7 @@ async def test_other_rules_leave_the_rest_alone(sides: Any) -> None:
     await pad.look()
     await base.look()
     assert pad.core.get("/base/robot_description") == "mine", "it is ours again"
-    assert list(base.params._desk.followed) == ["/arm"]
+    assert list(base.params._server.followed) == ["/arm"]
 
 
 async def test_a_namespace_that_may_not_be_read_in_full_is_not_followed(sides: Any) -> None:
@@ -424,7 +428,7 @@ async def test_values_that_do_not_parse_change_nothing(sides: Any, caplog: pytes
     base.core.set("/arm", 1)
     join(base, pad)
     await until(lambda: pad.core.get("/arm") == 1)
-    base.asks.tell(base.links[1], transfer.VALUE, {"key": "/arm", "exists": True, "size": 3, "text": "<x>"})
+    base.asks.notify(base.links[1], transfer.VALUE, {"key": "/arm", "exists": True, "size": 3, "text": "<x>"})
     await until(lambda: pad.states() == {"/arm": "refused"})
     assert pad.core.get("/arm") == 1
     assert "/arm is not as over there" in caplog.text

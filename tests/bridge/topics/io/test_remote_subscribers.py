@@ -31,7 +31,7 @@ from rmpa.config.settings import PolicySettings
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.bridge.io.bridge import PeerSession
+    from rmpa.bridge.session.peer_session import PeerSession
 
 GOAL = Source("/count/goal", "/client")
 CHATTER = Source("/chatter", "/client")
@@ -77,10 +77,13 @@ class World:
         self.warned: list[str] = []
         self.listeners: dict[Source, tuple[str, ...]] = {}
         link = SimpleNamespace(name="base", send_control=lambda payload: self.sent.append(decode(payload)))
-        inbound = SimpleNamespace(prefix="/rmpa/base", publication=self._publication)
-        self.peer = cast("PeerSession", SimpleNamespace(peer=1, link=link, inbound=inbound))
+        proxies = SimpleNamespace(prefix="/rmpa/base")
+        self.peer = cast("PeerSession", SimpleNamespace(peer=1, link=link, proxies=proxies))
+        topics = {1: SimpleNamespace(publication=self._publication)}
         refusals = SimpleNamespace(refuse=lambda _now, kind, _who, _text: self.warned.append(kind))
-        self.presence = RemoteSubscribers(self.exports, self.imports, {1: self.peer}.get, cast("Any", refusals))
+        self.presence = RemoteSubscribers(
+            self.exports, self.imports, cast("Any", {1: self.peer}), cast("Any", topics), cast("Any", refusals)
+        )
         self.exports.link_up(1)
         self.imports.link_up(1)
 
@@ -98,7 +101,7 @@ class World:
     def publish(self, source: Source, type_name: str, route: int) -> None:
         """A source of ours that the peer has open."""
         self.exports.graph(source.topic, {source.node: LocalSource(type_name, URI)})
-        self.exports.tell()
+        self.exports.advertise()
         self.exports.opened(1, OpenRoute(route, source.topic, source.node))
         self.exports.described(source, Description(type_name, MD5, "", False))
 
@@ -173,14 +176,14 @@ async def test_nobody_stays_behind_a_route_a_link_or_the_end(world: World) -> No
     world.publish(GOAL, TYPE, 7)
     ends: list[Callable[[], None]] = [
         lambda: world.presence.route_over(1, GOAL),
-        lambda: world.presence.link_down(world.peer),
+        lambda: world.presence.link_down(world.peer.peer),
     ]
     for end in ends:
         assert world.told(7, "/server") == ["/rmpa/base/server"]
         end()
         assert connected() == []
     world.told(7, "/server")
-    await world.presence.close()
+    world.presence.close()
     assert connected() == []
 
 

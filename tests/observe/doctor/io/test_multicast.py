@@ -73,7 +73,7 @@ def test_agents_ignore_the_doctors_packet(monkeypatch: pytest.MonkeyPatch) -> No
 
     monkeypatch.setattr(GroupReceiver, "wait", note)
     hear_ourselves([LO], GROUP, PORT)
-    assert [intake.take(data, ("127.0.0.1", 1), 0.0, multicast=True) for data in heard] == [None]
+    assert [intake.parse(data, ("127.0.0.1", 1), 0.0, multicast=True) for data in heard] == [None]
     assert counters.as_dict() == {"beacon.other_domain": 1}
 
 

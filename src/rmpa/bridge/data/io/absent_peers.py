@@ -1,4 +1,4 @@
-"""Peers that are away for longer than their routes wait: what is known of them in case they come back."""
+"""Peers without a link for longer than their routes wait: what is kept of them in case they come back."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Absent:
-    """A peer whose place in the local graph was given up.
+    """A peer whose proxies were removed from the local graph.
 
     Args:
         peer: Its number, under which the outbound side counts what it misses.
-        identity: Which run of which module it was.
+        identity: The run of the module.
         since: When its last link ended, monotonic seconds.
-        pasts: What is known of the reliable sources that it brought.
+        pasts: What is known of its reliable sources.
         counted: Whether the outbound side still counts.
     """
 
@@ -36,10 +36,10 @@ class Absent:
 
 
 class AbsentPeers:
-    """At most ``limits.ABSENT_PEERS_MAX`` of them; the one away for longest is forgotten first.
+    """Up to ``limits.ABSENT_PEERS_MAX`` absent peers; the one that has been away longest is forgotten first.
 
     Args:
-        uncount: Called with a peer's number when what it misses is not to be counted any more.
+        uncount: Called with a peer's number when what it misses is not counted any more.
         forget: Called with a peer's number when it is forgotten.
     """
 
@@ -49,19 +49,28 @@ class AbsentPeers:
         self._forget = forget
 
     def get(self, peer: int) -> Absent | None:
-        """One of them, by its number."""
+        """The absent peer with this number."""
         return self._absent.get(peer)
 
     def add(self, absent: Absent) -> None:
-        """A peer's place in the graph was given up."""
+        """Keep a peer whose proxies were removed."""
         self._absent[absent.peer] = absent
         while len(self._absent) > limits.ABSENT_PEERS_MAX:
             peer, _ = self._absent.popitem(last=False)
             self._uncount(peer)
             self._forget(peer)
 
+    def number_of(self, identity: Identity) -> int | None:
+        """The number of this very run of a peer, if ``back`` is going to return it."""
+        for peer, absent in self._absent.items():
+            if absent.identity.instance == identity.instance:
+                return peer
+            if absent.identity.guid.place == identity.guid.place or absent.identity.name == identity.name:
+                return None
+        return None
+
     def back(self, identity: Identity) -> Absent | None:
-        """A peer has a link: itself, if it was away, or the run of its module that it follows; forgotten here."""
+        """Take out a peer that has a link again: the same run, or the run before of the same module."""
         for peer, absent in list(self._absent.items()):
             was = absent.identity
             if was.instance == identity.instance:
@@ -73,14 +82,18 @@ class AbsentPeers:
         return None
 
     def unheard(self, subscribed: Callable[[str], bool]) -> None:
-        """Nobody misses what comes on topics that nobody subscribes to any more."""
+        """Stop counting as missed what is published on topics without local subscribers.
+
+        Args:
+            subscribed: Whether a topic has local subscribers.
+        """
         for absent in self._absent.values():
             for past in absent.pasts.values():
                 if past.missed and not subscribed(past.topic):
                     past.forget_position(missed=False)
 
     def expire(self, now: float) -> None:
-        """Those away for longer than ``limits.OUTAGE_COUNTED`` are not counted for any more."""
+        """Stop counting for peers that have been away for longer than ``limits.OUTAGE_COUNTED``."""
         for peer, absent in list(self._absent.items()):
             if absent.counted and now - absent.since > limits.OUTAGE_COUNTED:
                 self._absent[peer] = replace(absent, counted=False)

@@ -1,4 +1,4 @@
-"""How the messages of one link are dated here."""
+"""The time base of one link: relates the peer's time stamps to the local clock."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ if TYPE_CHECKING:
 
 
 def _never() -> float:
-    """No silence so far."""
+    """There was no silence so far."""
     return -math.inf
 
 
 class LinkTime:
-    """How a link's messages are dated here: one for all of its flows, renewed whenever the link knows better."""
+    """Offset of the peer's clock, and the end of the last silence; shared by all flows of a link."""
 
     __slots__ = ("ahead_ns", "error_ns", "resumed_at")
 
     def __init__(self) -> None:
         self.resumed_at: Callable[[], float] = _never
-        """When the link's last silence was last seen, monotonic seconds; see ``runtime.stream``."""
+        """Returns when the link's last silence was last seen, monotonic seconds; see ``runtime.stream``."""
         self.ahead_ns = 0
-        """The peer's wall clock less ours."""
+        """The peer's wall clock less the local one, ns."""
         self.error_ns: int | None = None
-        """± bound of that; ``None`` while nothing is known."""
+        """The offset is true within ± this many ns; ``None`` while nothing is known."""
 
     def set(self, offset: float | None, error: float | None) -> None:
-        """Take a link's estimate, in seconds."""
+        """Set the offset and its error bound, in seconds."""
         self.ahead_ns = round((offset or 0.0) * 1e9)
         self.error_ns = None if error is None else round(error * 1e9)

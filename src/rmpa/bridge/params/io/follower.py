@@ -16,9 +16,9 @@ from rmpa.core.errors import RemoteProtocolError, RmpaError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from rmpa.bridge.io.bridge import PeerSession
     from rmpa.bridge.params.rules import Followed
     from rmpa.bridge.session.peer_rpc import PeerRpc
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import FollowRule
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
@@ -30,8 +30,8 @@ class ParamFollower:
 
     Args:
         core: The local core.
-        asks: Asks the owners; gets the handler of their news.
-        attached: The peers that are linked now.
+        rpc: Asks the owners; gets the handler of their news.
+        linked: The peers that are linked now.
         rules: What is followed.
         counters: Counts ``param.put_back`` and ``param.refused``.
     """
@@ -39,34 +39,34 @@ class ParamFollower:
     def __init__(
         self,
         core: ParamCore,
-        asks: PeerRpc,
-        attached: Callable[[], Iterable[PeerSession]],
+        rpc: PeerRpc,
+        linked: Callable[[], Iterable[PeerSession]],
         rules: Iterable[FollowRule],
         counters: Counters,
     ) -> None:
         self._core = core
-        self._asks = asks
-        self._attached = attached
+        self._rpc = rpc
+        self._linked = linked
         self.following = Following(rules)
         self._refusals = RefusalLog(_log, counters)
         self._working: asyncio.Task[None] | None = None
         self._asking: dict[int, asyncio.Task[None]] = {}
         self._subscribed: set[str] = set()
         self._left: set[str] = set()
-        asks.on_tell(transfer.VALUE, self._told)
+        rpc.on_notification(transfer.VALUE, self._told)
 
     # --- what the part tells -------------------------------------------------------------------------------------
 
-    def link_up(self, attached: PeerSession) -> None:
+    def link_up(self, session: PeerSession) -> None:
         """A peer is linked: follow what is its."""
-        mine, others = self.following.linked(attached.peer, attached.link.name)
+        mine, others = self.following.linked(session.peer, session.link.name)
         if others:
             text = (
-                f"two peers are named {attached.link.name}; its parameters are followed from the one that came first"
+                f"two peers are named {session.link.name}; its parameters are followed from the one that came first"
             )
-            self._refuse("param.two_owners", attached.link.name, text)
+            self._refuse("param.two_owners", session.link.name, text)
         if mine:
-            self._ask(attached)
+            self._ask(session)
 
     def link_down(self, peer: int) -> None:
         """A link is gone: its parameters stay as they are, until their owner is back."""
@@ -74,12 +74,12 @@ class ParamFollower:
         if task is not None:
             task.cancel()
         owners = {entry.rule.owner for entry in self.following.unlinked(peer)}
-        for attached in self._attached():
-            if attached.peer != peer and attached.link.name in owners:
-                self.link_up(attached)
+        for session in self._linked():
+            if session.peer != peer and session.link.name in owners:
+                self.link_up(session)
 
     def touched(self, key: str) -> bool:
-        """Somebody here has changed a parameter; whether it is one that follows, or in one, or around one."""
+        """A local node has changed a parameter; return whether it is a followed one, in one, or around one."""
         found = self.following.touched(key)
         for entry in found:
             entry.doubted = True
@@ -89,10 +89,10 @@ class ParamFollower:
         """Follow these from now on."""
         gone, _ = self.following.change(rules)
         self._left |= {entry.rule.to for entry in gone}
-        for attached in self._attached():
-            self.following.linked(attached.peer, attached.link.name)
-            if any(attached.link.name in (e.rule.owner for e in entries) for entries in (gone, self.following)):
-                self._ask(attached)
+        for session in self._linked():
+            self.following.linked(session.peer, session.link.name)
+            if any(session.link.name in (e.rule.owner for e in entries) for entries in (gone, self.following)):
+                self._ask(session)
 
     async def look(self, *, restarted: bool) -> None:
         """Put back what was changed here, and ask again for what was refused.
@@ -112,9 +112,9 @@ class ParamFollower:
             elif entry.known and not entry.due and (entry.doubted or len(entry.text or "") <= limits.PARAM_SMALL):
                 await self._compare(entry)
         refused = {entry.peer for entry in self.following if entry.peer is not None and not entry.known}
-        for attached in self._attached():
-            if attached.peer in refused:
-                self._ask(attached)
+        for session in self._linked():
+            if session.peer in refused:
+                self._ask(session)
         self._work_soon()
 
     async def close(self) -> None:
@@ -131,22 +131,22 @@ class ParamFollower:
 
     # --- the owners ----------------------------------------------------------------------------------------------
 
-    def _ask(self, attached: PeerSession) -> None:
-        if attached.peer in self._asking:
+    def _ask(self, session: PeerSession) -> None:
+        if session.peer in self._asking:
             return
-        task = asyncio.create_task(self._follow(attached), name=f"follow parameters of {attached.link.name}")
-        self._asking[attached.peer] = task
-        task.add_done_callback(lambda done: self._asked(attached.peer, done))
+        task = asyncio.create_task(self._follow(session), name=f"follow parameters of {session.link.name}")
+        self._asking[session.peer] = task
+        task.add_done_callback(lambda done: self._asked(session.peer, done))
 
     def _asked(self, peer: int, task: asyncio.Task[None]) -> None:
         if self._asking.get(peer) is task:
             del self._asking[peer]
 
-    async def _follow(self, attached: PeerSession) -> None:
-        peer, name = attached.peer, attached.link.name
+    async def _follow(self, session: PeerSession) -> None:
+        peer, name = session.peer, session.link.name
         keys = [entry.rule.key for entry in self.following if entry.peer == peer]
         try:
-            answer = await self._asks.ask(attached, transfer.FOLLOW, {"keys": keys})
+            answer = await self._rpc.request(session, transfer.FOLLOW, {"keys": keys})
             refused = answer.get("refused", {}) if isinstance(answer, dict) else {}
         except RmpaError as error:
             refused = dict.fromkeys(keys, str(error))
@@ -162,17 +162,17 @@ class ParamFollower:
         entry.known = False
         self._refuse("param.refused", str(entry.rule), f"{entry.rule} is not followed: {entry.problem}")
 
-    def _told(self, attached: PeerSession, args: dict[str, Any]) -> None:
+    def _told(self, session: PeerSession, args: dict[str, Any]) -> None:
         key, exists, text, refused = (args.get(name) for name in ("key", "exists", "text", "refused"))
         if not isinstance(key, str) or not (text is None or isinstance(text, str)):
             raise RemoteProtocolError("news of a parameter without its key, or with a value that is no text")
         transfer.check_size(len(text or ""))
         if refused is not None:
             for entry in self.following:
-                if entry.peer == attached.peer and entry.rule.key == key:
+                if entry.peer == session.peer and entry.rule.key == key:
                     self._refused(entry, str(refused))
             return
-        for entry in self.following.told(attached.peer, key, exists=bool(exists), text=text):
+        for entry in self.following.told(session.peer, key, exists=bool(exists), text=text):
             entry.problem = ""
         self._work_soon()
 
@@ -203,22 +203,22 @@ class ParamFollower:
             self._working = None
 
     async def _read(self, entry: Followed) -> None:
-        attached = next((one for one in self._attached() if one.peer == entry.peer), None)
+        session = next((one for one in self._linked() if one.peer == entry.peer), None)
         entry.ask = False
-        if attached is None:
+        if session is None:
             return
         steps = transfer.reading(transfer.GET, {"key": entry.rule.key})
         text = ""
         try:
             question = next(steps)
             while True:
-                question = steps.send(await self._asks.ask(attached, *question, limits.PARAM_ASK_TIMEOUT))
+                question = steps.send(await self._rpc.request(session, *question, limits.PARAM_ASK_TIMEOUT))
         except StopIteration as done:
             text = done.value
         except RmpaError:
             entry.ask = entry.peer is not None  # its owner may have deleted it meanwhile, and tells that next
             raise
-        if entry.ask or entry.peer != attached.peer:
+        if entry.ask or entry.peer != session.peer:
             return  # it has changed again since
         learn(entry, text)
 
@@ -257,7 +257,7 @@ class ParamFollower:
         return True
 
     async def _compare(self, entry: Followed) -> None:
-        """See whether somebody here has set what is another module's; then put it back and say so."""
+        """Look whether a local node has set what is another module's; then put it back and log it."""
         if entry.text is None and not entry.had:
             return
         entry.doubted = False

@@ -20,9 +20,9 @@ from rmpa.runtime.event_loop import yield_to_data, yielding_to_data
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from rmpa.bridge.io.bridge import PeerSession
     from rmpa.bridge.params.rules import ParamPolicy
     from rmpa.bridge.session.peer_rpc import PeerRpc
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 _log = logging.getLogger(__name__)
@@ -34,17 +34,17 @@ class ParamServer:
     Args:
         core: The local core.
         policy: What peers may do.
-        asks: Gets the handlers.
+        rpc: Gets the handlers.
         most: How many parameters one peer may follow.
     """
 
     def __init__(
-        self, core: ParamCore, policy: ParamPolicy, asks: PeerRpc, most: int = config_limits.FOLLOWED_MAX
+        self, core: ParamCore, policy: ParamPolicy, rpc: PeerRpc, most: int = config_limits.FOLLOWED_MAX
     ) -> None:
         self._core = core
         self.most = most
         self.policy = policy
-        self._asks = asks
+        self._rpc = rpc
         self._transfers: dict[int, transfer.Transfers] = defaultdict(transfer.Transfers)
         self._followers: dict[int, tuple[PeerSession, set[str]]] = {}
         self._last: dict[str, str | None] = {}
@@ -52,13 +52,13 @@ class ParamServer:
         self._left: set[str] = set()
         self._changed: dict[str, None] = {}
         self._telling: asyncio.Task[None] | None = None
-        asks.on(transfer.GET, self._get)
-        asks.on(transfer.NAMES, self._names)
-        asks.on(transfer.MORE, lambda attached, args: self._of(attached).more(args, self._now()))
-        asks.on(transfer.PUT, lambda attached, args: self._of(attached).put(args, self._now()))
-        asks.on(transfer.SET, self._set)
-        asks.on(transfer.DELETE, self._delete)
-        asks.on(transfer.FOLLOW, self._follow)
+        rpc.on_request(transfer.GET, self._get)
+        rpc.on_request(transfer.NAMES, self._names)
+        rpc.on_request(transfer.MORE, lambda session, args: self._of(session).more(args, self._now()))
+        rpc.on_request(transfer.PUT, lambda session, args: self._of(session).put(args, self._now()))
+        rpc.on_request(transfer.SET, self._set)
+        rpc.on_request(transfer.DELETE, self._delete)
+        rpc.on_request(transfer.FOLLOW, self._follow)
 
     # --- what the part tells -------------------------------------------------------------------------------------
 
@@ -69,7 +69,7 @@ class ParamServer:
             self._forget_unfollowed()
 
     def touched(self, key: str) -> bool:
-        """A parameter has changed; whether somebody follows it, what it is in, or something in it."""
+        """A parameter has changed; return whether a peer follows it, what it is in, or something in it."""
         found = [followed for followed in self._last if overlap(followed, key)]
         self._tell_soon(found)
         return bool(found)
@@ -94,16 +94,16 @@ class ParamServer:
                         self._tell_soon([key])
 
     def judge_again(self) -> None:
-        """The rules have changed: tell those who may not follow any more."""
-        for attached, keys in self._followers.values():
+        """The rules have changed: tell the peers that may not follow any more."""
+        for session, keys in self._followers.values():
             for key in [key for key in keys if self.policy.why_not_follow(key)]:
                 keys.discard(key)
                 args = {"key": key, "exists": False, "size": 0, "refused": self.policy.why_not_follow(key)}
-                self._asks.tell(attached, transfer.VALUE, args)
+                self._rpc.notify(session, transfer.VALUE, args)
         self._forget_unfollowed()
 
     async def close(self) -> None:
-        """Tell nobody any more."""
+        """Tell the peers nothing any more."""
         if self._telling is not None:
             self._telling.cancel()
             await asyncio.gather(self._telling, return_exceptions=True)
@@ -115,41 +115,41 @@ class ParamServer:
 
     # --- questions ----------------------------------------------------------------------------------------------
 
-    async def _get(self, attached: PeerSession, args: dict[str, Any]) -> dict[str, object]:
+    async def _get(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         key = self._key(args.get("key"))
         found, value = await self._core.get(key)
         self._refuse(self._why_not_get(key, value))
         if not found:
             raise RmpaError(f"there is no parameter {key}")
-        return self._of(attached).answer(await write_text(key, value), self._now())
+        return self._of(session).answer(await write_text(key, value), self._now())
 
-    async def _names(self, attached: PeerSession, _args: dict[str, Any]) -> dict[str, object]:
+    async def _names(self, session: PeerSession, _args: dict[str, Any]) -> dict[str, object]:
         names = [name for name in yielding_to_data(await self._core.names()) if not self.policy.why_not_get(name)]
-        return self._of(attached).answer(await write_text("the list of parameters", names), self._now())
+        return self._of(session).answer(await write_text("the list of parameters", names), self._now())
 
-    async def _set(self, attached: PeerSession, args: dict[str, Any]) -> dict[str, object]:
+    async def _set(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         key = self._key(args.get("key"))
-        value = await read_text(self._of(attached).written(args, self._now()))
+        value = await read_text(self._of(session).written(args, self._now()))
         parameters = list(yielding_to_data(leaves(key, value)))
         for name, _ in yielding_to_data(parameters):
             self._refuse(key_problem(name) or self.policy.why_not_set(name.rstrip("/") or "/"))
         for number, (name, one) in enumerate(parameters):
             await self._core.set(name, one, PEERS)
             yield_to_data()
-            if number % limits.LEARNT_AT_ONCE == 0:
+            if number % limits.APPLIED_AT_ONCE == 0:
                 await asyncio.sleep(0)
-        _log.info("< %s sets %d parameters at %s", attached.link.name, len(parameters), key)
+        _log.info("< %s sets %d parameters at %s", session.link.name, len(parameters), key)
         return {"count": len(parameters)}
 
-    async def _delete(self, attached: PeerSession, args: dict[str, Any]) -> dict[str, object]:
+    async def _delete(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         key = self._key(args.get("key"))
         self._refuse(self.policy.why_not_set(key))
         if not await self._core.delete(key, PEERS):
             raise RmpaError(f"there is no parameter {key}")
-        _log.info("< %s deletes parameter %s", attached.link.name, key)
+        _log.info("< %s deletes parameter %s", session.link.name, key)
         return {}
 
-    async def _follow(self, attached: PeerSession, args: dict[str, Any]) -> dict[str, object]:
+    async def _follow(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         """From now on a peer follows these keys, and none of those that it did before."""
         keys = args.get("keys")
         if not isinstance(keys, list) or len(keys) > config_limits.FOLLOW_RULES_MAX:
@@ -166,7 +166,7 @@ class ParamServer:
                 refused[str(given)[: config_limits.CROSSING_NAME_MAX]] = why
             else:
                 wanted.add(key)
-        self._followers[attached.peer] = (attached, wanted)
+        self._followers[session.peer] = (session, wanted)
         self._forget_unfollowed()
         for key in wanted:
             self._last.setdefault(key, "")
@@ -231,9 +231,9 @@ class ParamServer:
                 args["text"] = text
         if key in self._last:
             self._last[key] = text if text is None or len(text) <= limits.PARAM_SMALL else ""
-        for attached, keys in list(self._followers.values()):
+        for session, keys in list(self._followers.values()):
             if key in keys:
-                self._asks.tell(attached, transfer.VALUE, args)
+                self._rpc.notify(session, transfer.VALUE, args)
 
     async def _small_text(self, key: str) -> str | None:
         text = await self._core.get_text(key)
@@ -245,8 +245,8 @@ class ParamServer:
             del self._last[key]
             self._left.add(key)
 
-    def _of(self, attached: PeerSession) -> transfer.Transfers:
-        return self._transfers[attached.peer]
+    def _of(self, session: PeerSession) -> transfer.Transfers:
+        return self._transfers[session.peer]
 
     def _now(self) -> float:
         return asyncio.get_running_loop().time()

@@ -17,12 +17,15 @@ from rmpa.config import limits as config_limits
 from rmpa.core.errors import RmpaError, UnreachableError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
-    from rmpa.bridge.io.bridge import Bridge, PeerSession
     from rmpa.bridge.params.rules import Followed
+    from rmpa.bridge.session.peer_rpc import PeerRpc
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import ParamSettings, Settings, TimeSettings
+    from rmpa.core.counters import Counters
     from rmpa.ros.core.api import Core
+    from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 _log = logging.getLogger(__name__)
@@ -33,25 +36,29 @@ class Params(Part):
 
     Args:
         core: The local core.
-        bridge: Its node is told of changes, its asks carry the questions; add this part to it.
+        node: The agent's own node, which is told of changes.
+        rpc: Carries the requests between the modules.
+        linked: The peers that have a link now.
+        counters: Counts ``param.put_back`` and ``param.refused``.
         params: What peers may do, and what is followed.
-        time: Whether time is shared, and whose is followed.
+        time: Whether time is shared, and which peer's is followed.
         most: How many parameters one peer may follow here.
     """
 
     def __init__(
         self,
         core: Core,
-        bridge: Bridge,
+        node: SlaveNode,
+        rpc: PeerRpc,
+        linked: Callable[[], Iterable[PeerSession]],
+        counters: Counters,
         params: ParamSettings,
         time: TimeSettings,
         most: int = config_limits.FOLLOWED_MAX,
     ) -> None:
-        self._core = ParamCore(core, bridge.node)
-        self._desk = ParamServer(self._core, ParamPolicy(params, time), bridge.asks, most)
-        self._follower = ParamFollower(
-            self._core, bridge.asks, bridge.attached, follow_rules(params, time), bridge.counters
-        )
+        self._core = ParamCore(core, node)
+        self._server = ParamServer(self._core, ParamPolicy(params, time), rpc, most)
+        self._follower = ParamFollower(self._core, rpc, linked, follow_rules(params, time), counters)
         self._looking: asyncio.Task[None] | None = None
         self._run: XmlRpcValue = None
 
@@ -68,23 +75,23 @@ class Params(Part):
     def reload(self, settings: Settings) -> None:
         """Other rules hold from now on; what they do not concern goes on untouched."""
         params, time = settings.params, settings.time
-        self._desk.policy = ParamPolicy(params, time)
-        self._desk.most = settings.limits.params
-        self._desk.judge_again()
+        self._server.policy = ParamPolicy(params, time)
+        self._server.most = settings.limits.params
+        self._server.judge_again()
         self._follower.change(follow_rules(params, time))
 
-    def link_up(self, attached: PeerSession) -> None:
+    def link_up(self, session: PeerSession) -> None:
         """A peer is linked."""
-        self._follower.link_up(attached)
+        self._follower.link_up(session)
 
-    def link_down(self, attached: PeerSession) -> None:
+    def link_down(self, session: PeerSession) -> None:
         """A link is gone."""
-        self._desk.link_down(attached.peer)
-        self._follower.link_down(attached.peer)
+        self._server.link_down(session.peer)
+        self._follower.link_down(session.peer)
 
     def param_update(self, key: str) -> bool:
         """A parameter has changed in the local core."""
-        return any((self._desk.touched(key), self._follower.touched(key)))
+        return any((self._server.touched(key), self._follower.touched(key)))
 
     def reconcile(self) -> None:
         """Look whether all is as it should be."""
@@ -96,18 +103,18 @@ class Params(Part):
         if self._looking is not None:
             self._looking.cancel()
             await asyncio.gather(self._looking, return_exceptions=True)
-        await self._desk.close()
+        await self._server.close()
         await self._follower.close()
         with contextlib.suppress(RmpaError, TimeoutError):
             async with asyncio.timeout(limits.PARAM_LEAVE_TIMEOUT):
-                for key in {*self._desk.followed, *self._follower.subscribed}:
+                for key in {*self._server.followed, *self._follower.subscribed}:
                     await self._core.leave(key)
 
     async def _look(self) -> None:
         try:
             run = await self._core.run_id()
             restarted, self._run = self._run not in (None, run), run
-            await self._desk.look(restarted=restarted)
+            await self._server.look(restarted=restarted)
             await self._follower.look(restarted=restarted)
         except UnreachableError:
             pass  # the core itself says so

@@ -1,7 +1,7 @@
 """How requests and replies cross a link: small ones by the express lane, larger ones by the bulk lane in fragments.
 
-Nothing of a call may be dropped without a word: what waits for a slow link is bounded by ``Budget``, and who would go
-beyond it is told so.
+Nothing of a call may be dropped without a word: what waits for a slow link is bounded by ``Budget``, and a call
+that would go beyond it fails with that reason.
 """
 
 from __future__ import annotations
@@ -189,7 +189,7 @@ class BodySender:
 
 
 class BodyReceiver:
-    """Takes bodies that come on one route (``bridge.session.part.DataTaker``); what they are for says who inherits.
+    """Takes the bodies that come on one route, as its ``bridge.data.io.receiver.DataHandler``; for subclasses.
 
     Args:
         budget: What the peer's bodies may hold while they are put together.

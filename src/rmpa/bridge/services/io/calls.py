@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _OK: Final = b"\x01"
 _FAILED: Final = b"\x00"
 _RECENT: Final = 64
-"""Large replies whose fate is not known when the bulk lane is lost: they leave within a lease, so some do."""
+"""Large replies that may be lost with the bulk lane; they leave within a lease, so only some can be."""
 
 
 def _text(body: Buffer) -> str:
@@ -67,7 +67,7 @@ class Caller(BodyReceiver):
     Args:
         link: The peer's.
         requests: The route that requests go out on; the peer's.
-        what: The service and whose it is, for texts.
+        what: The service and its peer, for texts.
         budgets: The peer's.
         stats: Of the service.
     """
@@ -107,7 +107,7 @@ class Caller(BodyReceiver):
         self._sender.send(serial, call.request)
 
     def body(self, sequence: int, body: bytes | bytearray) -> None:
-        """A reply came; one that nobody waits for any more is dropped."""
+        """A reply came; one that is not waited for any more is dropped."""
         call, began, _ = self._pending.pop(sequence, (None, 0.0, False))
         if call is None:
             return
@@ -129,7 +129,7 @@ class Caller(BodyReceiver):
         self._fail(sequence, f"{self._what}: its reply was lost on the way: {reason}")
 
     def lane_lost(self) -> None:
-        """The bulk lane's connection is gone, and nobody knows what it took with it."""
+        """The bulk lane's connection is gone, and it is unknown what was lost with it."""
         self.drop("the connection for large messages was lost")
         for sequence, (_, _, bulk) in list(self._pending.items()):
             if bulk:
@@ -208,7 +208,7 @@ class Server(BodyReceiver):
         self._reply_failed(sequence, f"the request was lost on its way: {reason}")
 
     def lane_lost(self) -> None:
-        """The bulk lane's connection is gone: who waits for a reply that was on it is told so."""
+        """The bulk lane's connection is gone: calls fail whose replies may have been on it."""
         self.drop("the connection for large messages was lost")
         for sequence in self._recent:
             self._send(sequence, False, b"the connection for large messages was lost behind the call")

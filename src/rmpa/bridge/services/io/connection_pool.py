@@ -62,7 +62,7 @@ class ServicePool:
 
     @property
     def unused(self) -> bool:
-        """Whether nothing is open and nobody waits."""
+        """Whether nothing is open and no call waits."""
         return not self.size and not self._queue
 
     async def describe(self) -> ServiceDescription:
@@ -97,7 +97,7 @@ class ServicePool:
         self._take(_Waiting(body, self._loop.time() + timeout, done))
 
     def close_idle(self, before: float) -> None:
-        """Close the connections that nobody has used since ``before`` (``loop.time()``)."""
+        """Close the connections that were not used since ``before`` (``loop.time()``)."""
         kept = []
         for connection, since in self._idle:
             if since < before or connection.closed:
@@ -143,7 +143,7 @@ class ServicePool:
         try:
             connection = await self._connect()
         except RmpaError as error:
-            # What waits has no better prospects than this attempt; whoever calls again makes a new one.
+            # What waits would fail as this attempt did; the next call makes a new one.
             self._on_lost()
             while self._queue and not self._busy:
                 self._queue.popleft().done(False, str(error).encode(errors="replace"))

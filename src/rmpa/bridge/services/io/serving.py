@@ -30,7 +30,7 @@ from rmpa.runtime.event_loop import yielding_to_data
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Coroutine, Mapping
 
-    from rmpa.bridge.io.bridge import PeerSession
+    from rmpa.bridge.session.peer_sessions import PeerSessions
     from rmpa.ros.core.api import Core
 
 _MD5_LENGTH: Final = 32
@@ -44,7 +44,7 @@ class Serving:
     Args:
         core: The local core.
         exports: The plan; it is told what servers say.
-        attached: The peers, by number.
+        sessions: The peers.
         budgets: What their calls may hold, likewise.
         act: Carries out what the plan makes of that.
     """
@@ -53,13 +53,13 @@ class Serving:
         self,
         core: Core,
         exports: ServiceExports,
-        attached: Mapping[int, PeerSession],
+        sessions: PeerSessions,
         budgets: Mapping[int, Budgets],
         act: Callable[[list[ExportAction]], None],
     ) -> None:
         self._core = core
         self._exports = exports
-        self._attached = attached
+        self._sessions = sessions
         self._budgets = budgets
         self._act = act
         self.stats: dict[str, CallStats] = {}
@@ -92,9 +92,9 @@ class Serving:
                 server = self._servers.pop((action.peer, action.requests), None)
                 if server is not None:
                     server.close()
-                attached = self._attached.get(action.peer)
-                if attached is not None:
-                    attached.takers.pop(action.requests, None)
+                session = self._sessions.get(action.peer)
+                if session is not None:
+                    session.handlers.pop(action.requests, None)
             case ServerGone():
                 pool = self._pools.pop(action.service, None)
                 if pool is not None:
@@ -107,7 +107,7 @@ class Serving:
                 server.lane_lost()
 
     def close_idle(self, before: float) -> None:
-        """Close the connections that nobody has used since ``before`` (``loop.time()``)."""
+        """Close the connections that were not used since ``before`` (``loop.time()``)."""
         for service, pool in list(self._pools.items()):
             pool.close_idle(before)
             if pool.unused and not self._exports.callers(service):
@@ -145,11 +145,11 @@ class Serving:
         self._act(self._exports.described(action.service, action.server, about))
 
     def _serve(self, action: ServeRoute) -> None:
-        attached = self._attached.get(action.peer)
-        if attached is None or attached.away is not None:
+        session = self._sessions.get(action.peer)
+        if session is None or not session.linked:
             return
         server = Server(
-            attached.link,
+            session.link,
             action.route,
             self._pool(action.service, action.server),
             action.timeout,
@@ -157,10 +157,10 @@ class Serving:
             self.stats.setdefault(action.service, CallStats()),
         )
         self._servers[action.peer, action.requests] = server
-        attached.takers[action.requests] = server
+        session.handlers[action.requests] = server
 
     async def _look_after(self) -> None:
-        """Notice servers that were killed: who provides a service and does not listen any more is suspected."""
+        """Notice servers that were killed: a node with a service that does not listen any more is suspected."""
         while True:
             servers = dict(self._exports.offered)
             cost = 0.0
@@ -173,7 +173,7 @@ class Serving:
 
 
 def _listening() -> tuple[set[int] | None, frozenset[str], float]:
-    """Ports that somebody listens at, this machine's addresses, and the processor's seconds; for a thread."""
+    """The ports with a listener, this machine's addresses, and the processor's seconds; for a thread."""
     began = time.thread_time()
     try:
         ports, here = listening_ports(), frozenset(local_addresses())

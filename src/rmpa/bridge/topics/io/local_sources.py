@@ -1,4 +1,4 @@
-"""Who publishes a topic in the local graph, and with which type: what the exports are told."""
+"""The publishers of a topic in the local graph, each with its type: what the exports are told."""
 
 from __future__ import annotations
 

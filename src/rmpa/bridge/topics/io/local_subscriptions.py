@@ -18,6 +18,7 @@ from rmpa.mesh.resume_table import ResumeTable
 from rmpa.ros.node.subscription import PublisherConnection
 from rmpa.ros.wire.tcpros import TopicDescription as TcprosDescription
 from rmpa.runtime.descriptors import DESCRIPTORS
+from rmpa.runtime.machine_timer import MachineTimer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -69,9 +70,10 @@ class LocalSubscriptions:
         self._on_lost = on_lost
         self._connections: dict[Source, PublisherConnection] = {}
         self._flows: dict[Source, ExportFlow] = {}
-        self._legs: dict[tuple[int, int], RouteSender] = {}
+        self._senders: dict[tuple[int, int], RouteSender] = {}
         self._parked: ResumeTable[tuple[int, Source]] = ResumeTable()
-        self._timer: asyncio.TimerHandle | None = None
+        # What is kept goes when its outage has lasted for too long.
+        self._timer = MachineTimer(self._parked.next_timer, lambda now: self._give_up(self._parked.expire(now)))
         self._on_given_up = on_given_up
         self._on_let_go = on_let_go
         self._on_missed = on_missed
@@ -122,33 +124,37 @@ class LocalSubscriptions:
     def add_route(self, action: AddRoute, link: DataLink) -> None:
         """Send a source to one more peer, or go on where its last link ended."""
         flow = self._flows[action.source]
-        leg = flow.by_peer.get(action.peer)
+        route_sender = flow.by_peer.get(action.peer)
         self._claim(action.peer, action.source)
-        if action.after is not None and isinstance(leg, ReliableRouteSender) and leg.sender.epoch == action.epoch:
+        if (
+            action.after is not None
+            and isinstance(route_sender, ReliableRouteSender)
+            and route_sender.sender.epoch == action.epoch
+        ):
             try:
-                leg.resume(link, action.route, action.after)
+                route_sender.resume(link, action.route, action.after)
             except RemoteProtocolError:
                 flow.remove(action.peer)  # the link is closed for it; the next one begins a numbering of its own
                 raise
-            if missed := leg.missed():
+            if missed := route_sender.missed():
                 self._on_missed(action.source, action.peer, missed, _TOO_LONG)
         else:
             self._end(action.source, action.peer, at_least=True)
-            leg = flow.add(action.peer, link, action.route, action.contract, action.epoch)
-        self._legs[action.peer, action.route] = leg
+            route_sender = flow.add(action.peer, link, action.route, action.contract, action.epoch)
+        self._senders[action.peer, action.route] = route_sender
 
     def suspend_route(self, action: SuspendRoute) -> None:
         """Keep a source's messages for a peer whose link is gone."""
         flow = self._flows.get(action.source)
         if flow is not None:
-            leg = flow.by_peer.get(action.peer)
-            self._forget(leg, action.peer)
-            if isinstance(leg, ReliableRouteSender):
+            route_sender = flow.by_peer.get(action.peer)
+            self._forget(route_sender, action.peer)
+            if isinstance(route_sender, ReliableRouteSender):
                 key = (action.peer, action.source)
                 flow.suspend(action.peer, self._keeper(key))
                 until = asyncio.get_running_loop().time() + action.outage
-                self._give_up(self._parked.park(key, leg.sender, until))
-                self._set_timer()
+                self._give_up(self._parked.park(key, route_sender.sender, until))
+                self._timer.arm()
 
     def _keeper(self, key: tuple[int, Source]) -> Callable[[bytes, int], object]:
         """What takes the messages of a source for a peer that is away."""
@@ -157,10 +163,10 @@ class LocalSubscriptions:
     def inherit(self, old: int, new: int) -> None:
         """A module has another run: what the old one missed until now is told to the new one if it asks."""
         for source, flow in self._flows.items():
-            leg = flow.inherit(old, new)
-            if isinstance(leg, ReliableRouteSender):
+            route_sender = flow.inherit(old, new)
+            if isinstance(route_sender, ReliableRouteSender):
                 self._parked.move((old, source), (new, source))
-                leg.suspend(self._keeper((new, source)))
+                route_sender.suspend(self._keeper((new, source)))
         self.losses.inherit(old, new)
         self._heirs.add(new)
 
@@ -182,10 +188,10 @@ class LocalSubscriptions:
     def following(self, source: Source, peer: int, after: int) -> int | None:
         """The sequence of the next message of a suspended route; see ``bridge.data.losses.Kept``."""
         flow = self._flows.get(source)
-        leg = flow.by_peer.get(peer) if flow is not None else None
-        if not isinstance(leg, ReliableRouteSender):
+        route_sender = flow.by_peer.get(peer) if flow is not None else None
+        if not isinstance(route_sender, ReliableRouteSender):
             return None
-        waiting = leg.sender.following
+        waiting = route_sender.sender.following
         # What is kept may have come: what the peer has is not sent again.
         return waiting if is_later(waiting, after) else serial_add(after, 1)
 
@@ -201,23 +207,25 @@ class LocalSubscriptions:
     def lost(self, source: Source, peer: int) -> int:
         """Messages that a peer has missed of a reliable source, as far as is known."""
         flow = self._flows.get(source)
-        leg = flow.by_peer.get(peer) if flow is not None else None
-        return self.losses.count(source, peer) + (leg.sender.lost if isinstance(leg, ReliableRouteSender) else 0)
+        route_sender = flow.by_peer.get(peer) if flow is not None else None
+        return self.losses.count(source, peer) + (
+            route_sender.sender.lost if isinstance(route_sender, ReliableRouteSender) else 0
+        )
 
     def _end(self, source: Source, peer: int, *, wished: bool = False, at_least: bool = False) -> None:
         """Let go of the way to a peer, if there is one, and write down what the peer misses."""
         flow = self._flows.get(source)
-        leg = flow.by_peer.get(peer) if flow is not None else None
-        if flow is None or leg is None:
+        route_sender = flow.by_peer.get(peer) if flow is not None else None
+        if flow is None or route_sender is None:
             return
-        if isinstance(leg, ReliableRouteSender):
-            self.losses.end(source, peer, leg.sender.ended(), wished=wished, at_least=at_least)
-        self._forget(leg, peer)
+        if isinstance(route_sender, ReliableRouteSender):
+            self.losses.end(source, peer, route_sender.sender.ended(), wished=wished, at_least=at_least)
+        self._forget(route_sender, peer)
         flow.remove(peer)
 
     def _claim(self, peer: int, source: Source) -> None:
         self._parked.claim((peer, source), None)
-        self._set_timer()
+        self._timer.arm()
 
     def _give_up(self, keys: list[tuple[int, Source]]) -> None:
         """What was kept for peers that are away has gone: from now on it is only counted."""
@@ -227,42 +235,25 @@ class LocalSubscriptions:
             self._end(source, peer, at_least=True)
             self._on_given_up(source, peer)
 
-    def _set_timer(self) -> None:
-        """Let go of what is kept when its outage has lasted for too long."""
-        due = self._parked.next_timer()
-        if self._timer is not None:
-            if self._timer.when() == due:
-                return
-            self._timer.cancel()
-            self._timer = None
-        if due is not None:
-            self._timer = asyncio.get_running_loop().call_at(due, self._outlasted, due)
-
-    def _outlasted(self, due: float) -> None:
-        self._timer = None
-        self._give_up(self._parked.expire(max(due, asyncio.get_running_loop().time())))
-        self._set_timer()
-
-    def leg(self, peer: int, route: int) -> RouteSender | None:
+    def sender(self, peer: int, route: int) -> RouteSender | None:
         """One peer's route."""
-        return self._legs.get((peer, route))
+        return self._senders.get((peer, route))
 
     def lane_lost(self, peer: int) -> None:
         """The connection of a peer's bulk lane is gone."""
-        for (owner, _), leg in list(self._legs.items()):
+        for (owner, _), route_sender in list(self._senders.items()):
             if owner == peer:
-                leg.lane_lost()
+                route_sender.lane_lost()
 
-    def _forget(self, leg: RouteSender | None, peer: int) -> None:
-        if leg is not None and self._legs.get((peer, leg.route)) is leg:
-            del self._legs[peer, leg.route]
+    def _forget(self, route_sender: RouteSender | None, peer: int) -> None:
+        if route_sender is not None and self._senders.get((peer, route_sender.route)) is route_sender:
+            del self._senders[peer, route_sender.route]
 
     def close(self) -> None:
         """Leave all publishers."""
         for source in list(self._connections):
             self.disconnect(source)
-        if self._timer is not None:
-            self._timer.cancel()
+        self._timer.close()
 
     def _header(self, source: Source, fields: Mapping[str, str]) -> None:
         about = TcprosDescription.from_header(fields)
@@ -297,10 +288,10 @@ class LocalSubscriptions:
         if flow is not None:
             for peer in list(flow.by_peer):
                 self._claim(peer, source)
-                leg = flow.by_peer[peer]
-                self._forget(leg, peer)
-                if isinstance(leg, ReliableRouteSender):
-                    self.losses.end(source, peer, leg.sender.ended(), wished=False, at_least=False)
+                route_sender = flow.by_peer[peer]
+                self._forget(route_sender, peer)
+                if isinstance(route_sender, ReliableRouteSender):
+                    self.losses.end(source, peer, route_sender.sender.ended(), wished=False, at_least=False)
             flow.close()
         if flow is not None and not any(s.topic == source.topic for s in self._flows):
             self._core.call("unregisterSubscriber", OWN_NODE, source.topic, self._node.uri)

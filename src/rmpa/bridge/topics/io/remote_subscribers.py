@@ -1,4 +1,4 @@
-"""Who listens over there: names the local listeners to a peer, and lets a peer's listeners be seen here.
+"""Names the local subscribers to a peer, and lets a peer's subscribers be seen by publishers here.
 
 See ``bridge.topics.audience`` for the topics that need it.
 """
@@ -12,18 +12,19 @@ from typing import TYPE_CHECKING
 from rmpa.bridge import limits
 from rmpa.bridge.messages import Audience, encode
 from rmpa.bridge.proxy_names import proxied_node, proxy_name
-from rmpa.bridge.session.part import Part
 from rmpa.bridge.topics.audience import audience, is_watched
-from rmpa.bridge.topics.imports import RouteState
+from rmpa.bridge.topics.remote_topic import RouteState
 from rmpa.ros.node.subscription import PublisherConnection
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Mapping
 
-    from rmpa.bridge.io.bridge import PeerSession
     from rmpa.bridge.messages import Message, Source
+    from rmpa.bridge.session.peer_session import PeerSession
+    from rmpa.bridge.session.peer_sessions import PeerSessions
     from rmpa.bridge.topics.exports import Exports
     from rmpa.bridge.topics.imports import Imports
+    from rmpa.bridge.topics.io.peer_topics import PeerTopics
     from rmpa.core.counters import RefusalLog
 
 _log = logging.getLogger(__name__)
@@ -46,13 +47,14 @@ class _IgnoreParts:
         """The rest does not come."""
 
 
-class RemoteSubscribers(Part):
+class RemoteSubscribers:
     """Both ends of it, for all peers.
 
     Args:
         exports: Finds the source of a peer's route.
         imports: Finds the route of a peer's source.
-        attached: Finds a peer by its number.
+        sessions: The peers.
+        topics: Their topics in the local graph, by the numbers of their sessions.
         refusals: Says and counts ``audience.too_many``.
     """
 
@@ -60,15 +62,17 @@ class RemoteSubscribers(Part):
         self,
         exports: Exports,
         imports: Imports,
-        attached: Callable[[int], PeerSession | None],
+        sessions: PeerSessions,
+        topics: Mapping[int, PeerTopics],
         refusals: RefusalLog,
     ) -> None:
         self._exports = exports
         self._imports = imports
-        self._attached = attached
+        self._sessions = sessions
+        self._topics = topics
         self._refusals = refusals
         self._told: dict[tuple[int, Source], tuple[int, tuple[str, ...]]] = {}
-        """What each peer was last told: the route, and who listens."""
+        """What each peer was last told: the route, and the listeners."""
         self._changed: dict[tuple[int, Source], None] = {}
         self._soon: asyncio.Handle | None = None
         self._shown: dict[tuple[int, Source], dict[str, PublisherConnection]] = {}
@@ -81,7 +85,7 @@ class RemoteSubscribers(Part):
     # --- our listeners, to the peer that publishes ------------------------------------------------------------------
 
     def changed(self, peer: int, source: Source) -> None:
-        """Somebody local has begun or ceased to listen to a peer's source, or its route is open."""
+        """A local node has begun or ceased to listen to a peer's source, or its route is open."""
         entry = self._imports.get(peer, source)
         if entry is None or not is_watched(entry.type):
             return
@@ -94,50 +98,50 @@ class RemoteSubscribers(Part):
         self._soon = None
         changed, self._changed = self._changed, {}
         for peer, source in changed:
-            attached, entry = self._attached(peer), self._imports.get(peer, source)
-            if attached is None or entry is None or entry.state not in {RouteState.OPEN, RouteState.LINGERING}:
+            session, entry = self._sessions.get(peer), self._imports.get(peer, source)
+            if session is None or entry is None or entry.state not in {RouteState.OPEN, RouteState.LINGERING}:
                 self._told.pop((peer, source), None)
                 continue
-            publication = attached.inbound.publication(source)
+            publication = self._topics[peer].publication(source)
             names = audience(publication.listeners) if publication is not None else ()
             before, known = self._told.get((peer, source), (0, ()))
             if names != (known if before == entry.route else ()):
                 self._told[peer, source] = (entry.route, names)
-                attached.link.send_control(encode(Audience(entry.route, names)))
+                session.link.send_control(encode(Audience(entry.route, names)))
 
     # --- the peer's listeners, to our publisher ---------------------------------------------------------------------
 
-    def message(self, attached: PeerSession, message: Message) -> bool:
-        """A peer says who listens to one of its routes; one that was closed meanwhile is left alone."""
+    def message(self, session: PeerSession, message: Message) -> bool:
+        """A peer names the listeners of one of its routes; one that was closed meanwhile is left alone."""
         if not isinstance(message, Audience):
             return False
-        source = self._exports.source(attached.peer, message.route)
+        source = self._exports.source(session.peer, message.route)
         local = self._exports.offered.get(source) if source is not None else None
         if source is None or local is None or not is_watched(local.type):
             return True
         if self._exports.description(source) is None:
             return True  # its publisher has just gone
-        names = {name for node in message.nodes if (name := self._name(attached, node))}
-        shown = self._shown.setdefault((attached.peer, source), {})
+        names = {name for node in message.nodes if (name := self._name(session, node))}
+        shown = self._shown.setdefault((session.peer, source), {})
         for name in shown.keys() - names:
             shown.pop(name).close()
         for name in sorted(names - shown.keys()):
-            if self._count(attached.peer) >= limits.AUDIENCES_MAX:
-                text = f"{attached.link.name}: more than {limits.AUDIENCES_MAX} of its nodes listen to actions here"
+            if self._count(session.peer) >= limits.AUDIENCES_MAX:
+                text = f"{session.link.name}: more than {limits.AUDIENCES_MAX} of its nodes listen to actions here"
                 now = asyncio.get_running_loop().time()
-                self._refusals.refuse(now, "audience.too_many", attached.link.name, text)
+                self._refusals.refuse(now, "audience.too_many", session.link.name, text)
                 break
             shown[name] = self._connect(source, local.uri, name)
         if not shown:
-            del self._shown[attached.peer, source]
+            del self._shown[session.peer, source]
         return True
 
-    def _name(self, attached: PeerSession, node: str) -> str:
+    def _name(self, session: PeerSession, node: str) -> str:
         """What a listener is here; one that a relay names for another module is what stands for that; else empty."""
         whose = proxied_node(node)
         if whose is None:
-            return proxy_name(attached.inbound.prefix, node)
-        relay = attached.link.name
+            return proxy_name(session.proxies.prefix, node)
+        relay = session.link.name
         return node if any((o.name, via) == (whose[0], relay) for o, via in self._imports.ways) else ""
 
     def _count(self, peer: int) -> int:
@@ -154,14 +158,14 @@ class RemoteSubscribers(Part):
         for connection in self._shown.pop((peer, source), {}).values():
             connection.close()
 
-    def link_down(self, attached: PeerSession) -> None:
-        """A link is gone: nobody over there can be seen any more."""
-        for peer, source in [key for key in self._shown if key[0] == attached.peer]:
-            self.route_over(peer, source)
-        for key in [key for key in self._told if key[0] == attached.peer]:
+    def link_down(self, peer: int) -> None:
+        """A link is gone: the peer's listeners leave."""
+        for owner, source in [key for key in self._shown if key[0] == peer]:
+            self.route_over(owner, source)
+        for key in [key for key in self._told if key[0] == peer]:
             del self._told[key]
 
-    async def close(self) -> None:
+    def close(self) -> None:
         """Leave all publishers."""
         if self._soon is not None:
             self._soon.cancel()

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import rmpa
 from rmpa.config.settings import Settings
-from rmpa.config.sources import Flags, load_settings
+from rmpa.config.sources import load_settings
 from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.discovery.io.interfaces import choose, list_interfaces
 from rmpa.observe import limits
@@ -99,7 +99,7 @@ def look_at(environ: Mapping[str, str], config: str | None = None) -> DoctorInpu
 
 def _settings(environ: Mapping[str, str], config: str | None) -> tuple[Settings, tuple[Check, ...]]:
     try:
-        loaded = load_settings(Flags(config=config), environ, host_name=socket.gethostname())
+        loaded = load_settings({"config": config}, environ, host_name=socket.gethostname())
     except ConfigError as error:
         return Settings(), (Check("settings", FAIL, str(error), "`rmpa up` will not start", where=error.source),)
     settings = loaded.settings
@@ -121,14 +121,14 @@ def _interfaces(given: DoctorInput) -> Iterable[Check]:
 def _multicast(given: DoctorInput) -> Iterable[Check]:
     """Send and receive on each interface that an agent would use, at the agents' own port."""
     settings = given.settings
-    if not settings.multicast:
+    if not settings.multicast.enabled:
         return [Check("multicast", SKIPPED, "the settings switch it off (discovery.multicast)")]
     usable = choose(list_interfaces(), settings.interfaces)
     try:
-        echoes = hear_ourselves(usable, settings.group, settings.discovery_port)
+        echoes = hear_ourselves(usable, settings.multicast.group, settings.discovery_port)
     except StartError as error:
         return [Check("multicast", FAIL, f"{error.what} {error.problem}", error.remedy)]
-    return judge_multicast(echoes, settings.group, settings.discovery_port)
+    return judge_multicast(echoes, settings.multicast.group, settings.discovery_port)
 
 
 def _mtu_probing(given: DoctorInput) -> Iterable[Check]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, Self
 from rmpa.core.errors import ConfigError, StartError
 from rmpa.discovery import limits as discovery_limits
 from rmpa.discovery.beacon import MAGIC, VERSION, BeaconKind
-from rmpa.discovery.io.sockets import Membership, open_receiver, receive
+from rmpa.discovery.io.sockets import GroupMembership, open_receiver, receive
 from rmpa.observe import limits
 from rmpa.observe.doctor.network import MulticastEcho
 
@@ -104,7 +104,7 @@ class GroupReceiver(_Socket):
         except OSError as error:
             problem = f"cannot be opened ({error.strerror})"
             raise StartError(f"UDP port {port}", problem, "`ss -ulnp` shows who has it") from None
-        self._members = Membership(self._sock, group)
+        self._members = GroupMembership(self._sock, group)
         self._names: dict[int, str] = {}
 
     def join(self, interfaces: Iterable[Interface]) -> dict[str, str]:

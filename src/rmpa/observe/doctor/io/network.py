@@ -105,7 +105,7 @@ def probe_ports(settings: Settings, ours: Mapping[int, str], agents: Mapping[int
         ports.append(_tcp("the mesh (TCP)", "", settings.port, ours))
     number = settings.discovery_port
     try:
-        open_receiver(settings.group, number).close()
+        open_receiver(settings.multicast.group, number).close()
     except OSError as error:
         ports.append(Port("beacons (UDP)", number, error.strerror or str(error), _owner(number)))
     else:

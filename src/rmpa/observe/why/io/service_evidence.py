@@ -19,8 +19,9 @@ from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.runtime.event_loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from rmpa.bridge.io.bridge import Bridge, PeerSession
+    from rmpa.bridge.io.bridge import Bridge
     from rmpa.bridge.services.io.part import Services
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.ros.core.api import Core
 
@@ -106,7 +107,7 @@ class ServiceEvidence:
         wire = name_in(args, "service")
         peer = session.link.name
         seen = self._services.exports.seen
-        for service in self._bridge.names.of(peer).locals_of(wire):
+        for service in self._bridge.topics.names.of(peer).locals_of(wire):
             server = seen.get(service)
             if server is None:
                 for node in self._core.state().services.get(service, {}):

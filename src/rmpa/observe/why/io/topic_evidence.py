@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import Policy, is_own
-from rmpa.bridge.proxy_names import proxy_name
 from rmpa.config import limits as config_limits
 from rmpa.config.values import did_you_mean
 from rmpa.core.contract import Reliability
@@ -25,7 +24,8 @@ from rmpa.ros.wire.tcpros import printable
 from rmpa.runtime.event_loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from rmpa.bridge.io.bridge import Bridge, PeerSession
+    from rmpa.bridge.io.bridge import Bridge
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.observe.io.snapshot_builder import SnapshotBuilder
     from rmpa.observe.snapshot import PeerInfo
@@ -65,7 +65,7 @@ class TopicEvidence:
 
         A user may write either: a name that no topic of the peer can have here is taken for the peer's own.
         """
-        names = self._bridge.names.of(peer)
+        names = self._bridge.topics.names.of(peer)
         wires = names.wires_of(topic)
         return (topic, wires[0]) if wires else (names.local_name(topic), topic)
 
@@ -81,27 +81,26 @@ class TopicEvidence:
         if session is None or peer is None:
             return TopicAtSubscriber(snapshot, topic)
         proxies = {}
-        publishers, standing = self._core.publishers(topic), dict(session.inbound)
-        for number, source in list(self._bridge.imports.at(topic)):
-            entry = self._bridge.imports.get(number, source)
+        publishers, standing = self._core.publishers(topic), dict(session.proxies)
+        for number, source in list(self._bridge.topics.imports.at(topic)):
+            entry = self._bridge.topics.imports.get(number, source)
             if number != session.peer or entry is None:
                 continue
             if (entry.origin.instance if entry.origin else session.link.identity.instance.hex()) != peer.instance:
                 continue
             node = source.node
-            name = session.inbound.names.get(node) or proxy_name(session.inbound.prefix, node)
+            name = session.proxies.name(node)
             proxies[node] = ProxyState(
                 name=name,
                 registered=node in standing and publishers.get(name) == standing[node].node.uri,
                 conflict=entry.conflict,
                 connections=self._connections(session, source),
-                mismatches=self._bridge.mismatches(source),
+                mismatches=self._bridge.topics.mismatches(source),
             )
         return TopicAtSubscriber(snapshot, topic, session.link.name, proxies)
 
-    @staticmethod
-    def _connections(session: PeerSession, source: Source) -> tuple[SubscriberConnection, ...]:
-        publication = session.inbound.publication(source)
+    def _connections(self, session: PeerSession, source: Source) -> tuple[SubscriberConnection, ...]:
+        publication = self._bridge.topics.of(session).publication(source)
         return tuple(
             SubscriberConnection(
                 number=link.number,
@@ -125,7 +124,7 @@ class TopicEvidence:
         wire = name_in(args, "topic")
         instance = args.get("instance") or ""
         asker = session.link.name
-        names = self._bridge.names.of(asker)
+        names = self._bridge.topics.names.of(asker)
         state = self._core.state()
         sources: list[PublisherReport] = []
         subscribers: list[str] = []
@@ -150,7 +149,7 @@ class TopicEvidence:
 
     async def _similar(self, asker: str, wire: str) -> str:
         """The topic of this module whose name on the wire is most like this one; empty if none is."""
-        names, state = self._bridge.names.of(asker), self._core.state()
+        names, state = self._bridge.topics.names.of(asker), self._core.state()
         known = {
             names.wire_name(topic, state.types.get(topic, ""))
             for topic, nodes in yielding_to_data(list(state.publishers.items()))
@@ -161,7 +160,7 @@ class TopicEvidence:
 
     def _relayed(self, topic: str, instance: object) -> list[str]:
         """The proxies of the nodes of a module whose topic this one relays."""
-        offered = self._bridge.exports.offered
+        offered = self._bridge.topics.exports.offered
         return [
             node
             for node in self._core.publishers(topic)
@@ -171,7 +170,7 @@ class TopicEvidence:
         ]
 
     def _report(self, session: PeerSession, source: Source, wire: str) -> PublisherReport:
-        exports = self._bridge.exports
+        exports = self._bridge.topics.exports
         local = exports.offered.get(source)
         kind = local.type if local is not None else self._core.type_of(source.topic)
         node = source.node if local is None or local.origin is None else local.origin.node
@@ -179,7 +178,7 @@ class TopicEvidence:
         if decision.allowed:
             special = self._policy.judge_for(session.link.name, source.topic, kind, wire)
             decision = special if special.rule else decision
-        flow = self._bridge.outbound.flows.get(source)
+        flow = self._bridge.topics.outbound.flows.get(source)
         contract = exports.contract(source, session.peer)
         reliable = contract is not None and contract.reliability is Reliability.RELIABLE
         return PublisherReport(
@@ -192,7 +191,7 @@ class TopicEvidence:
             route="open" if session.peer in exports.flowing(source) else "opening" if contract is not None else "",
             messages=flow.messages if flow is not None else 0,
             dropped=flow.dropped if flow is not None and not reliable else 0,
-            lost=self._bridge.outbound.lost(source, session.peer),
+            lost=self._bridge.topics.outbound.lost(source, session.peer),
             oversized=flow.oversized if flow is not None else 0,
             oversized_bytes=flow.oversized_bytes if flow is not None else 0,
             beyond=exports.beyond.limit if exports.is_beyond(source) else 0,

@@ -19,8 +19,9 @@ from rmpa.observe.why.services import ServiceAtServer, diagnose_service
 from rmpa.observe.why.topics import diagnose_topic, find_peer, peer_stages
 
 if TYPE_CHECKING:
-    from rmpa.bridge.io.bridge import Bridge, PeerSession
+    from rmpa.bridge.io.bridge import Bridge
     from rmpa.bridge.services.io.part import Services
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.observe.io.snapshot_builder import SnapshotBuilder
     from rmpa.observe.snapshot import PeerInfo
@@ -55,9 +56,9 @@ class WhyService:
         self._snapshots = snapshots
         self._topics = TopicEvidence(settings, core, bridge, snapshots)
         self._services = ServiceEvidence(settings, core, bridge, services)
-        bridge.asks.on(TOPIC, self._topics.answer)
-        bridge.asks.on(SERVICE, self._services.answer)
-        bridge.asks.on(HERE, self._answer_here)
+        bridge.rpc.on_request(TOPIC, self._topics.answer)
+        bridge.rpc.on_request(SERVICE, self._services.answer)
+        bridge.rpc.on_request(HERE, self._answer_here)
 
     def reload(self, settings: Settings) -> None:
         """Other settings hold from now on."""
@@ -91,7 +92,7 @@ class WhyService:
 
     def _is_service(self, name: str) -> bool:
         state = self._core.state()
-        if name in state.publishers or name in state.subscribers or any(self._bridge.imports.at(name)):
+        if name in state.publishers or name in state.subscribers or any(self._bridge.topics.imports.at(name)):
             return False
         return name in state.services or self._services.known(name)
 
@@ -107,7 +108,7 @@ class WhyService:
 
     def _carrier(self, peer: PeerInfo) -> PeerSession | None:
         """The link that carries what a peer publishes: its own, or that of the relay that passes it on."""
-        for session in self._bridge.attached():
+        for session in self._bridge.sessions.linked():
             if str(session.link.guid) == peer.guid or (peer.via and session.link.name == peer.via):
                 return session
         return None
@@ -189,7 +190,7 @@ class WhyService:
         if session is None or session.link.name != to:
             stages = begin if begin[-1].level is FAIL else (*begin, _no_link(to))
             return (Diagnosis.of(stages, name=topic, peer=here, to=to),)
-        question = {"topic": self._bridge.names.wire_name(to, topic, self._core.type_of(topic))}
+        question = {"topic": self._bridge.topics.names.wire_name(to, topic, self._core.type_of(topic))}
         try:
             found = await self._ask(session, HERE, question, tuple[Diagnosis, ...], limits.WHY_TIMEOUT)
             if not found:
@@ -201,7 +202,7 @@ class WhyService:
             return (Diagnosis.of((*begin, silent), name=topic, peer=here, to=to),)
 
     async def _answer_here(self, session: PeerSession, args: dict[str, Any]) -> tuple[Diagnosis, ...]:
-        topic = self._bridge.names.local_name(session.link.name, name_in(args, "topic"))
+        topic = self._bridge.topics.names.local_name(session.link.name, name_in(args, "topic"))
         return (await self._arrives(str(session.link.guid), topic))[: limits.WHY_SOURCES_MAX]
 
     # --- services ---------------------------------------------------------------------------------------------
@@ -245,7 +246,7 @@ class WhyService:
         kind: type[_T],
         limit: float = limits.ASK_TIMEOUT,
     ) -> _T:
-        value = await self._bridge.asks.ask(session, what, args, limit)
+        value = await self._bridge.rpc.request(session, what, args, limit)
         try:
             return msgspec.convert(value, kind)
         except (msgspec.ValidationError, RecursionError) as error:

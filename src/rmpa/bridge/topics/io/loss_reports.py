@@ -15,13 +15,15 @@ from rmpa.mesh import limits as mesh_limits
 from rmpa.ros import limits as ros_limits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from rmpa.bridge.data.io.absent_peers import AbsentPeers
     from rmpa.bridge.data.io.export_flow import ExportFlow
-    from rmpa.bridge.io.bridge import PeerSession
     from rmpa.bridge.session.peer_rpc import PeerRpc
+    from rmpa.bridge.session.peer_session import PeerSession
+    from rmpa.bridge.session.peer_sessions import PeerSessions
     from rmpa.bridge.topics.exports import Exports
+    from rmpa.bridge.topics.io.peer_topics import PeerTopics
     from rmpa.core.counters import Counters, RefusalLog
 
 OVERSIZED: Final = "message.oversized"
@@ -35,9 +37,10 @@ class LossReports:
 
     Args:
         exports: Finds the peers that a source goes to.
-        attached: Finds a peer by its number.
+        sessions: The peers.
+        topics: Their topics in the local graph, by the numbers of their sessions.
         absent: Those that were given up.
-        asks: Brings news to the peers, and from them.
+        rpc: Brings news to the peers, and from them.
         counters: ``message.given_up``, ``route.given_up``.
         refusals: Says and counts ``route.missed``, ``message.oversized`` and ``message.oversized_there``.
     """
@@ -45,25 +48,27 @@ class LossReports:
     def __init__(
         self,
         exports: Exports,
-        attached: Callable[[int], PeerSession | None],
+        sessions: PeerSessions,
+        topics: Mapping[int, PeerTopics],
         absent: AbsentPeers,
-        asks: PeerRpc,
+        rpc: PeerRpc,
         counters: Counters,
         refusals: RefusalLog,
     ) -> None:
         self._exports = exports
-        self._attached = attached
+        self._sessions = sessions
+        self._topics = topics
         self._absent = absent
-        self._asks = asks
+        self._rpc = rpc
         self._counters = counters
         self._refusals = refusals
-        asks.on_tell(OVERSIZED, self._oversized_there)
+        rpc.on_notification(OVERSIZED, self._oversized_there)
 
     def away(self, peer: int) -> tuple[str, float]:
         """A peer that is away: its name, and for how many seconds it has been."""
         now = asyncio.get_running_loop().time()
-        if (attached := self._attached(peer)) is not None:
-            return attached.link.name, now - attached.away_since
+        if (session := self._sessions.get(peer)) is not None:
+            return session.link.name, now - session.away_since
         if (absent := self._absent.get(peer)) is not None:
             return absent.identity.name, now - absent.since
         return "a peer", 0.0
@@ -92,8 +97,8 @@ class LossReports:
 
     def missed(self, source: Source, peer: int, count: int, why: str) -> None:
         """It is known for good how many messages of a reliable source a peer has missed."""
-        attached = self._attached(peer)
-        name = attached.link.name if attached is not None else "a peer"
+        session = self._sessions.get(peer)
+        name = session.link.name if session is not None else "a peer"
         self._counters.add("message.given_up", count)
         self._say("route.missed", f"{name} {source}", f"{source}: {name} has missed {count} messages: {why}")
 
@@ -114,12 +119,12 @@ class LossReports:
 
     def tell_oversized(self, source: Source, flow: ExportFlow, peer: int) -> None:
         """Say to one of them what was left out until now, if anything was."""
-        attached, offer = self._attached(peer), self._exports.offer(peer, source)
-        if flow.oversized and attached is not None and attached.away is None and offer is not None:
+        session, offer = self._sessions.get(peer), self._exports.offer(peer, source)
+        if flow.oversized and session is not None and session.linked and offer is not None:
             told = {"topic": offer.topic, "node": offer.node, "count": flow.oversized, "size": flow.oversized_bytes}
-            self._asks.tell(attached, OVERSIZED, told)
+            self._rpc.notify(session, OVERSIZED, told)
 
-    def _oversized_there(self, attached: PeerSession, args: dict[str, Any]) -> None:
+    def _oversized_there(self, session: PeerSession, args: dict[str, Any]) -> None:
         """A peer has left out messages of its publisher."""
         names = (args.get("topic"), args.get("node"))
         numbers = (args.get("count"), args.get("size"))
@@ -128,8 +133,8 @@ class LossReports:
                 source = Source(topic, node)
             case _:
                 raise RemoteProtocolError(f"{OVERSIZED} names no source, or no number of messages")
-        if attached.inbound.left_out(source, count, size):
-            who = f"{attached.link.name}: {source}"
+        if self._topics[session.peer].left_out(source, count, size):
+            who = f"{session.link.name}: {source}"
             text = f"{who}: its messages of {size} bytes are too long to cross and are left out ({count} until now)"
             self._say("message.oversized_there", who, text)
 

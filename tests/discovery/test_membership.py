@@ -1,4 +1,4 @@
-"""The roster machine, alone and in pairs, under a clock that is an argument."""
+"""The membership protocol, alone and in pairs, under a clock that is an argument."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from rmpa.discovery.events import (
     SendMulticast,
     SendUnicast,
 )
-from rmpa.discovery.roster import Roster
+from rmpa.discovery.membership import MembershipProtocol
 
 T0 = 1000.0
 
@@ -52,29 +52,29 @@ class Speaker:
 
 
 class Harness:
-    """A started roster of peer 1 with a clock in hand."""
+    """A started membership protocol of peer 1 with a clock in hand."""
 
     def __init__(self, *, multicast: bool = True, name: str = "") -> None:
         self.now = T0
-        self.roster = Roster(who(1, name=name), rng=lambda: 0.0, multicast=multicast)
-        self.roster.start(T0)
+        self.membership = MembershipProtocol(who(1, name=name), rng=lambda: 0.0, multicast=multicast)
+        self.membership.start(T0)
 
     def hear(self, beacon: Beacon, *, multicast: bool = True, source: tuple[str, int] | None = None) -> None:
-        self.roster.receive(beacon, source or beacon.identity.guid.endpoint, self.now, multicast=multicast)
+        self.membership.receive(beacon, source or beacon.identity.guid.endpoint, self.now, multicast=multicast)
 
     def run(self, seconds: float) -> list[Output]:
         """Let time pass; return what was sent meanwhile."""
-        sent = self.roster.outputs()
+        sent = self.membership.outputs()
         end = self.now + seconds
-        while (timer := self.roster.next_timer()) is not None and timer <= end:
+        while (timer := self.membership.next_timer()) is not None and timer <= end:
             self.now = max(self.now, timer)
-            self.roster.handle_timer(self.now)
-            sent += self.roster.outputs()
+            self.membership.handle_timer(self.now)
+            sent += self.membership.outputs()
         self.now = end
         return sent
 
     def present(self) -> list[str]:
-        return [view.identity.name for view in self.roster.peers() if view.present]
+        return [view.identity.name for view in self.membership.peers() if view.present]
 
 
 @pytest.fixture
@@ -88,7 +88,7 @@ def unicasts(outputs: list[Output], kind: BeaconKind) -> list[tuple[str, int]]:
     return [o.address for o in outputs if isinstance(o, SendUnicast) and o.beacon.kind is kind]
 
 
-def test_a_burst_then_silence_but_for_the_heartbeat() -> None:
+def test_burst_is_followed_by_heartbeats_only() -> None:
     harness = Harness()
     kinds = [(o.beacon.kind, o.beacon.sequence) for o in harness.run(4.9) if isinstance(o, SendMulticast)]
     assert kinds == [(BeaconKind.ANNOUNCE, n) for n in range(1, len(limits.BURST_OFFSETS) + 1)]
@@ -97,27 +97,27 @@ def test_a_burst_then_silence_but_for_the_heartbeat() -> None:
 
 
 def test_jitter_stays_in_its_bounds() -> None:
-    roster = Roster(who(1), rng=lambda: 0.999, multicast=True)
-    roster.start(T0)
-    assert roster.next_timer() == pytest.approx(T0 + 0.1 + limits.BURST_JITTER, abs=0.001)
-    roster.handle_timer(T0 + 1)
-    assert roster.next_timer() == pytest.approx(T0 + 4.5, abs=0.01)
+    membership = MembershipProtocol(who(1), rng=lambda: 0.999, multicast=True)
+    membership.start(T0)
+    assert membership.next_timer() == pytest.approx(T0 + 0.1 + limits.BURST_JITTER, abs=0.001)
+    membership.handle_timer(T0 + 1)
+    assert membership.next_timer() == pytest.approx(T0 + 4.5, abs=0.01)
 
 
 def test_an_unknown_peer_is_found_and_answered_by_unicast(one: Harness) -> None:
     speaker = Speaker(who(2))
     one.hear(speaker())
-    assert one.roster.events() == [PeerFound(who(2), ("10.0.0.2", 40002), HeardBy.MULTICAST)]
-    assert unicasts(one.roster.outputs(), BeaconKind.ANSWER) == [("10.0.0.2", 40002)]
+    assert one.membership.events() == [PeerFound(who(2), ("10.0.0.2", 40002), HeardBy.MULTICAST)]
+    assert unicasts(one.membership.outputs(), BeaconKind.ANSWER) == [("10.0.0.2", 40002)]
     one.now += 1
     one.hear(speaker())
-    assert one.roster.events() == []
-    assert one.roster.outputs() == []
+    assert one.membership.events() == []
+    assert one.membership.outputs() == []
 
 
 def test_the_answer_also_goes_where_the_packet_came_from(one: Harness) -> None:
     one.hear(Speaker(who(2))(), source=("192.0.2.9", 5555))
-    assert unicasts(one.roster.outputs(), BeaconKind.ANSWER) == [("10.0.0.2", 40002), ("192.0.2.9", 5555)]
+    assert unicasts(one.membership.outputs(), BeaconKind.ANSWER) == [("10.0.0.2", 40002), ("192.0.2.9", 5555)]
 
 
 def test_each_announce_is_answered_but_not_faster_than_the_limit(one: Harness) -> None:
@@ -125,15 +125,15 @@ def test_each_announce_is_answered_but_not_faster_than_the_limit(one: Harness) -
     answered = 0
     for _ in range(10):
         one.hear(speaker(BeaconKind.ANNOUNCE))
-        answered += len(unicasts(one.roster.outputs(), BeaconKind.ANSWER))
+        answered += len(unicasts(one.membership.outputs(), BeaconKind.ANSWER))
         one.now += limits.ANSWER_INTERVAL / 2
     assert answered == 5
 
 
 def test_an_answer_is_not_answered(one: Harness) -> None:
     one.hear(Speaker(who(2))(BeaconKind.ANSWER), multicast=False)
-    assert one.roster.events()
-    assert one.roster.outputs() == []
+    assert one.membership.events()
+    assert one.membership.outputs() == []
 
 
 def test_forged_beacons_do_not_make_an_amplifier(one: Harness) -> None:
@@ -141,13 +141,13 @@ def test_forged_beacons_do_not_make_an_amplifier(one: Harness) -> None:
         host = Guid.of(IPv4Address(0x0A010000 + i), 4000)
         beacon = Speaker(replace(who(2), guid=host, instance=i.to_bytes(16, "big")))()
         one.hear(beacon, source=("192.0.2.7", i + 1))
-    assert len(unicasts(one.roster.outputs(), BeaconKind.ANSWER)) <= limits.ANSWERS_PER_SECOND
+    assert len(unicasts(one.membership.outputs(), BeaconKind.ANSWER)) <= limits.ANSWERS_PER_SECOND
 
 
 def test_our_own_echo_is_ignored(one: Harness) -> None:
     one.hear(Speaker(who(1))())
-    assert (one.roster.events(), one.roster.outputs()) == ([], [])
-    assert one.roster.counters["beacon.echo"] == 1
+    assert (one.membership.events(), one.membership.outputs()) == ([], [])
+    assert one.membership.counters["beacon.echo"] == 1
 
 
 def test_silence_for_the_lease_loses_an_unlinked_peer(one: Harness) -> None:
@@ -155,11 +155,11 @@ def test_silence_for_the_lease_loses_an_unlinked_peer(one: Harness) -> None:
     one.run(15.9)
     assert one.present() == ["peer2"]
     one.run(0.2)
-    assert one.roster.events()[-1] == PeerLost(who(2), LossReason.SILENCE)
-    assert one.roster.peers() == ()
+    assert one.membership.events()[-1] == PeerLost(who(2), LossReason.SILENCE)
+    assert one.membership.peers() == ()
 
 
-@pytest.mark.parametrize(("asked", "granted"), [(0.0, limits.ROSTER_LEASE_MIN), (4e6, limits.ROSTER_LEASE_MAX)])
+@pytest.mark.parametrize(("asked", "granted"), [(0.0, limits.LEASE_MIN), (4e6, limits.LEASE_MAX)])
 def test_a_lease_has_bounds(one: Harness, asked: float, granted: float) -> None:
     one.hear(Speaker(who(2))(lease=asked))
     one.run(granted - 0.1)
@@ -168,13 +168,13 @@ def test_a_lease_has_bounds(one: Harness, asked: float, granted: float) -> None:
     assert one.present() == []
 
 
-def test_a_linked_peer_is_never_lost_by_silence_and_its_lease_begins_when_the_link_falls(one: Harness) -> None:
+def test_lease_of_a_linked_peer_begins_when_the_link_falls(one: Harness) -> None:
     one.hear(Speaker(who(2))())
-    one.roster.link_up(who(2), one.now)
+    one.membership.link_up(who(2), one.now)
     one.run(1000)
     assert one.present() == ["peer2"]
-    assert one.roster.peers()[0].linked
-    one.roster.link_down(who(2).guid, one.now)
+    assert one.membership.peers()[0].linked
+    one.membership.link_down(who(2).guid, one.now)
     one.run(15.9)
     assert one.present() == ["peer2"]
     one.run(0.2)
@@ -182,8 +182,8 @@ def test_a_linked_peer_is_never_lost_by_silence_and_its_lease_begins_when_the_li
 
 
 def test_a_link_alone_finds_a_peer(one: Harness) -> None:
-    one.roster.link_up(who(2), one.now)
-    assert one.roster.events() == [PeerFound(who(2), None, HeardBy.LINK)]
+    one.membership.link_up(who(2), one.now)
+    assert one.membership.events() == [PeerFound(who(2), None, HeardBy.LINK)]
 
 
 def test_goodbye_and_its_late_shadow(one: Harness) -> None:
@@ -192,11 +192,11 @@ def test_goodbye_and_its_late_shadow(one: Harness) -> None:
     one.hear(speaker())
     newest = speaker()
     one.hear(speaker(BeaconKind.GOODBYE))
-    assert one.roster.events()[-1] == PeerLost(who(2), LossReason.GOODBYE)
+    assert one.membership.events()[-1] == PeerLost(who(2), LossReason.GOODBYE)
     one.hear(late)
     one.hear(newest)
-    assert one.roster.events() == []
-    assert one.roster.counters["beacon.late"] == 2
+    assert one.membership.events() == []
+    assert one.membership.counters["beacon.late"] == 2
     one.hear(speaker())
     assert one.present() == ["peer2"]
 
@@ -204,29 +204,29 @@ def test_goodbye_and_its_late_shadow(one: Harness) -> None:
 def test_goodbye_of_a_linked_peer_waits_for_its_link(one: Harness) -> None:
     speaker = Speaker(who(2))
     one.hear(speaker())
-    one.roster.link_up(who(2), one.now)
+    one.membership.link_up(who(2), one.now)
     one.hear(speaker(BeaconKind.GOODBYE))
     assert one.present() == ["peer2"]
-    one.roster.link_down(who(2).guid, one.now)
-    assert one.roster.events()[-1] == PeerLost(who(2), LossReason.GOODBYE)
+    one.membership.link_down(who(2).guid, one.now)
+    assert one.membership.events()[-1] == PeerLost(who(2), LossReason.GOODBYE)
 
 
 def test_a_stranger_that_says_goodbye_is_not_met(one: Harness) -> None:
     one.hear(Speaker(who(2))(BeaconKind.GOODBYE))
-    assert (one.roster.events(), one.roster.outputs(), one.roster.peers()) == ([], [], ())
+    assert (one.membership.events(), one.membership.outputs(), one.membership.peers()) == ([], [], ())
 
 
 def test_we_say_goodbye_and_nothing_after_it(one: Harness) -> None:
     one.hear(Speaker(who(2))())
     one.hear(Speaker(who(3))(), multicast=False)
     one.run(6)
-    one.roster.goodbye(one.now)
-    outputs = one.roster.outputs()
+    one.membership.goodbye(one.now)
+    outputs = one.membership.outputs()
     assert [o.beacon.kind for o in outputs] == [BeaconKind.GOODBYE] * 2
     assert unicasts(outputs, BeaconKind.GOODBYE) == [("10.0.0.3", 40003)]
     one.hear(Speaker(who(4))())
-    assert one.roster.next_timer() is None
-    assert one.roster.outputs() == []
+    assert one.membership.next_timer() is None
+    assert one.membership.outputs() == []
 
 
 def test_restart_is_told_from_ghost(one: Harness) -> None:
@@ -234,26 +234,26 @@ def test_restart_is_told_from_ghost(one: Harness) -> None:
     one.hear(old())
     late = old()
     one.hear(new())
-    assert one.roster.events()[-1] == PeerRestarted(who(2, 2), who(2), ("10.0.0.2", 40002))
+    assert one.membership.events()[-1] == PeerRestarted(who(2, 2), who(2), ("10.0.0.2", 40002))
     one.now += 0.5
     one.hear(late)
-    assert one.roster.events() == []
-    assert [v.identity for v in one.roster.peers()] == [who(2, 2)]
+    assert one.membership.events() == []
+    assert [v.identity for v in one.membership.peers()] == [who(2, 2)]
 
 
 def test_a_restart_behind_a_link_waits_until_the_link_falls(one: Harness) -> None:
     old, new = Speaker(who(2)), Speaker(who(2, run=2))
     one.hear(old())
-    one.roster.link_up(who(2), one.now)
-    one.roster.events()
+    one.membership.link_up(who(2), one.now)
+    one.membership.events()
     one.now += 0.4
     one.hear(new(BeaconKind.ANNOUNCE))
-    assert one.roster.events() == []
+    assert one.membership.events() == []
     one.now += 0.4
-    one.roster.outputs()
-    one.roster.link_down(who(2).guid, one.now)
-    assert [type(e) for e in one.roster.events()] == [PeerRestarted]
-    assert unicasts(one.roster.outputs(), BeaconKind.ANSWER) == [("10.0.0.2", 40002)]
+    one.membership.outputs()
+    one.membership.link_down(who(2).guid, one.now)
+    assert [type(e) for e in one.membership.events()] == [PeerRestarted]
+    assert unicasts(one.membership.outputs(), BeaconKind.ANSWER) == [("10.0.0.2", 40002)]
 
 
 def test_a_ghost_behind_a_live_link_changes_nothing(one: Harness) -> None:
@@ -261,21 +261,21 @@ def test_a_ghost_behind_a_live_link_changes_nothing(one: Harness) -> None:
     one.hear(old())
     late = old()
     one.hear(new())
-    one.roster.link_up(who(2, 2), one.now)
-    one.roster.events()
+    one.membership.link_up(who(2, 2), one.now)
+    one.membership.events()
     one.hear(late)
     one.now += 1
-    one.roster.link_down(who(2).guid, one.now)
-    assert one.roster.events() == []
+    one.membership.link_down(who(2).guid, one.now)
+    assert one.membership.events() == []
     assert one.present() == ["peer2"]
 
 
 def test_a_link_of_a_replaced_run_that_falls_late_changes_nothing(one: Harness) -> None:
-    one.roster.link_up(who(2), one.now)
-    one.roster.link_up(who(2, 2), one.now)
-    assert [type(e) for e in one.roster.events()] == [PeerFound, PeerRestarted]
-    one.roster.link_down(who(2).guid, one.now, who(2).instance)
-    assert one.roster.peers()[0].linked
+    one.membership.link_up(who(2), one.now)
+    one.membership.link_up(who(2, 2), one.now)
+    assert [type(e) for e in one.membership.events()] == [PeerFound, PeerRestarted]
+    one.membership.link_down(who(2).guid, one.now, who(2).instance)
+    assert one.membership.peers()[0].linked
 
 
 def test_a_ghost_that_came_last_gives_way_when_it_stays_silent(one: Harness) -> None:
@@ -285,9 +285,9 @@ def test_a_ghost_that_came_last_gives_way_when_it_stays_silent(one: Harness) -> 
     one.run(0.6)
     one.hear(live())
     one.run(limits.HEARTBEAT_LATE)
-    one.roster.events()
+    one.membership.events()
     one.hear(live())
-    assert one.roster.events() == [PeerRestarted(who(2, 2), who(2), ("10.0.0.2", 40002))]
+    assert one.membership.events() == [PeerRestarted(who(2, 2), who(2), ("10.0.0.2", 40002))]
 
 
 def twins(one: Harness, *, linked: bool = False) -> tuple[Speaker, Speaker]:
@@ -295,7 +295,7 @@ def twins(one: Harness, *, linked: bool = False) -> tuple[Speaker, Speaker]:
     left, right = Speaker(who(2, name="left")), Speaker(who(2, run=2, name="right"))
     one.hear(left())
     if linked:
-        one.roster.link_up(who(2, name="left"), one.now)
+        one.membership.link_up(who(2, name="left"), one.now)
     one.run(2.5)
     one.hear(right())
     one.run(2.5)
@@ -307,7 +307,7 @@ def twins(one: Harness, *, linked: bool = False) -> tuple[Speaker, Speaker]:
 
 def test_two_live_peers_with_one_guid_stay_out_until_one_is_silent(one: Harness) -> None:
     left, right = twins(one)
-    events = one.roster.events()
+    events = one.membership.events()
     assert [type(e) for e in events] == [PeerFound, PeerRestarted, PeerConflict, PeerLost]
     assert isinstance(events[-1], PeerLost)
     assert events[-1].reason is LossReason.CONFLICT
@@ -316,18 +316,18 @@ def test_two_live_peers_with_one_guid_stay_out_until_one_is_silent(one: Harness)
     assert "two live peers share one GUID address 10.0.0.2:40002" in text
     assert "--port" in text
     assert "NAT" in text
-    views = one.roster.peers()
+    views = one.membership.peers()
     assert {v.identity.name for v in views} == {"left", "right"}
     assert all(v.conflicts for v in views)
     for _ in range(6):
         one.run(2.5)
         one.hear(left())
         one.hear(right())
-    assert one.roster.events() == []
+    assert one.membership.events() == []
     for _ in range(8):
         one.run(2.5)
         one.hear(left())
-    cleared, found = one.roster.events()
+    cleared, found = one.membership.events()
     assert cleared == ConflictCleared(ConflictKind.GUID, who(2, name="left"))
     assert isinstance(found, PeerFound)
     assert one.present() == ["left"]
@@ -335,20 +335,20 @@ def test_two_live_peers_with_one_guid_stay_out_until_one_is_silent(one: Harness)
 
 def test_a_conflict_ends_with_a_goodbye(one: Harness) -> None:
     _, right = twins(one)
-    one.roster.events()
+    one.membership.events()
     one.hear(right(BeaconKind.GOODBYE))
     one.run(0)
-    assert [type(e) for e in one.roster.events()] == [ConflictCleared, PeerFound]
+    assert [type(e) for e in one.membership.events()] == [ConflictCleared, PeerFound]
     assert one.present() == ["left"]
 
 
 def test_a_working_link_survives_a_conflict(one: Harness) -> None:
     twins(one, linked=True)
-    events = one.roster.events()
+    events = one.membership.events()
     assert [type(e) for e in events] == [PeerFound, PeerConflict]
     assert one.present() == ["left"]
-    one.roster.link_down(who(2).guid, one.now)
-    assert [type(e) for e in one.roster.events()] == [PeerLost]
+    one.membership.link_down(who(2).guid, one.now)
+    assert [type(e) for e in one.membership.events()] == [PeerLost]
 
 
 def test_somebody_else_with_our_guid(one: Harness) -> None:
@@ -356,17 +356,17 @@ def test_somebody_else_with_our_guid(one: Harness) -> None:
     one.hear(twin())
     one.run(5)
     one.hear(twin())
-    (event,) = one.roster.events()
+    (event,) = one.membership.events()
     assert isinstance(event, PeerConflict)
     assert event.kind is ConflictKind.OWN_GUID
     assert "twin has our own GUID address 10.0.0.1:40001" in str(event)
     for _ in range(3):
         one.run(5)
         one.hear(twin())
-    assert one.roster.events() == []
-    assert [v.identity.name for v in one.roster.peers()] == ["twin"]
+    assert one.membership.events() == []
+    assert [v.identity.name for v in one.membership.peers()] == ["twin"]
     one.run(20)
-    assert one.roster.events() == [ConflictCleared(ConflictKind.OWN_GUID, who(1))]
+    assert one.membership.events() == [ConflictCleared(ConflictKind.OWN_GUID, who(1))]
 
 
 def test_two_peers_of_one_name_both_stay_and_it_is_said_once(one: Harness) -> None:
@@ -375,12 +375,12 @@ def test_two_peers_of_one_name_both_stay_and_it_is_said_once(one: Harness) -> No
         one.hear(first())
         one.hear(second())
         one.run(5)
-    conflicts = [e for e in one.roster.events() if isinstance(e, PeerConflict)]
+    conflicts = [e for e in one.membership.events() if isinstance(e, PeerConflict)]
     assert [str(c) for c in conflicts] == [
         "two peers are named base: 10.0.0.3:40003#1 and 10.0.0.2:40002#1; rename one: --name"
     ]
     assert one.present() == ["base", "base"]
-    assert all("rename one" in view.conflicts[0] for view in one.roster.peers())
+    assert all("rename one" in view.conflicts[0] for view in one.membership.peers())
 
 
 def moved(identity: Identity, port: int) -> Identity:
@@ -388,106 +388,106 @@ def moved(identity: Identity, port: int) -> Identity:
     return replace(identity, guid=Guid.of(identity.guid.address, port, 9), instance=bytes([port & 255] * 16))
 
 
-def test_a_killed_agent_that_starts_again_at_another_port_is_no_namesake_of_its_ghost(one: Harness) -> None:
+def test_agent_restarted_at_another_port_has_no_name_conflict(one: Harness) -> None:
     ghost = who(2, name="base")
     again = moved(ghost, 50000)
     one.hear(Speaker(ghost)())
-    one.roster.link_up(ghost, one.now)
+    one.membership.link_up(ghost, one.now)
     one.run(3)
-    one.roster.link_down(ghost.guid, one.now)
-    one.roster.events()
+    one.membership.link_down(ghost.guid, one.now)
+    one.membership.events()
     one.run(0.3)
     speaker = Speaker(again)
     one.hear(speaker())
-    assert one.roster.events() == [
+    assert one.membership.events() == [
         PeerFound(again, again.guid.endpoint, HeardBy.MULTICAST),
         PeerLost(ghost, LossReason.MOVED),
     ]
     for _ in range(3):
         one.run(5)
         one.hear(speaker())
-    assert one.roster.events() == []
+    assert one.membership.events() == []
     assert one.present() == ["base"]
 
 
-def test_a_namesake_on_the_same_machine_that_lives_comes_back_and_is_said(one: Harness) -> None:
+def test_live_peer_of_the_same_name_and_machine_is_a_conflict(one: Harness) -> None:
     first = Speaker(who(2, name="base"))
     second = Speaker(moved(first.identity, 50000))
     one.hear(first())
     one.run(1)
     one.hear(second())
     one.run(4)
-    one.roster.link_up(second.identity, one.now)
+    one.membership.link_up(second.identity, one.now)
     one.hear(first())
-    events = one.roster.events()
+    events = one.membership.events()
     assert [e.kind for e in events if isinstance(e, PeerConflict)] == [ConflictKind.NAME]
     assert one.present() == ["base", "base"]
 
 
-def test_a_namesake_elsewhere_is_said_only_once_it_has_shown_to_live(one: Harness) -> None:
+def test_name_conflict_needs_proof_that_both_are_alive(one: Harness) -> None:
     first, second = Speaker(who(2, name="base")), Speaker(who(3, name="base"))
     one.hear(first())
     one.run(1)
     one.hear(second())
-    assert not [e for e in one.roster.events() if isinstance(e, PeerConflict)]
-    assert not any(view.conflicts for view in one.roster.peers())
+    assert not [e for e in one.membership.events() if isinstance(e, PeerConflict)]
+    assert not any(view.conflicts for view in one.membership.peers())
     one.run(1)
     one.hear(first())
-    assert [e.kind for e in one.roster.events() if isinstance(e, PeerConflict)] == [ConflictKind.NAME]
+    assert [e.kind for e in one.membership.events() if isinstance(e, PeerConflict)] == [ConflictKind.NAME]
 
 
 def test_a_peer_with_our_own_name() -> None:
     one = Harness(name="base")
     one.hear(Speaker(who(2, name="base"))())
-    assert [e.kind for e in one.roster.events() if isinstance(e, PeerConflict)] == [ConflictKind.NAME]
+    assert [e.kind for e in one.membership.events() if isinstance(e, PeerConflict)] == [ConflictKind.NAME]
 
 
 def test_a_peer_that_changes(one: Harness) -> None:
     speaker = Speaker(who(2))
     one.hear(speaker())
-    one.roster.events()
+    one.membership.events()
     speaker.identity = replace(who(2), addresses=(IPv4Address("192.0.2.2"),))
     one.hear(speaker())
-    assert one.roster.events() == [PeerChanged(speaker.identity, who(2))]
+    assert one.membership.events() == [PeerChanged(speaker.identity, who(2))]
 
 
 def test_a_handshake_without_addresses_changes_nothing(one: Harness) -> None:
     full = replace(who(2), addresses=(IPv4Address("192.0.2.2"),))
     one.hear(Speaker(full)())
-    one.roster.events()
-    one.roster.link_up(who(2), one.now)
-    assert one.roster.events() == []
-    assert one.roster.peers()[0].identity == full
+    one.membership.events()
+    one.membership.link_up(who(2), one.now)
+    assert one.membership.events() == []
+    assert one.membership.peers()[0].identity == full
 
 
-def test_gossip_only_leads_to_greetings_that_end(one: Harness) -> None:
+def test_gossip_leads_to_announcements_that_end(one: Harness) -> None:
     one.hear(Speaker(who(2))(BeaconKind.ANSWER, who(3).guid), multicast=False)
-    sent = one.roster.outputs() + one.run(limits.GREETING_FORGET)
+    sent = one.membership.outputs() + one.run(limits.CANDIDATE_LIFETIME)
     greeted = [a for a in unicasts(sent, BeaconKind.ANNOUNCE) if a == ("10.0.0.3", 40003)]
     assert 5 <= len(greeted) <= 10
     assert ("10.0.0.3", 40003) not in unicasts(one.run(100), BeaconKind.ANNOUNCE)
     assert one.present() == []
 
 
-def test_greetings_go_on_while_somebody_speaks_of_the_address(one: Harness) -> None:
+def test_announcements_go_on_while_gossip_mentions_the_address(one: Harness) -> None:
     speaker = Speaker(who(2))
     for _ in range(20):
         one.hear(speaker(BeaconKind.HEARTBEAT, who(3).guid))
         one.run(5)
-    one.roster.outputs()
-    assert ("10.0.0.3", 40003) in unicasts(one.run(limits.GREETING_MAX), BeaconKind.ANNOUNCE)
+    one.membership.outputs()
+    assert ("10.0.0.3", 40003) in unicasts(one.run(limits.CANDIDATE_RETRY_MAX), BeaconKind.ANNOUNCE)
 
 
-def test_a_greeted_peer_that_answers_is_found_by_gossip(one: Harness) -> None:
+def test_candidate_that_answers_is_found_by_gossip(one: Harness) -> None:
     one.hear(Speaker(who(2))(BeaconKind.ANSWER, who(3).guid), multicast=False)
     one.hear(Speaker(who(3))(BeaconKind.ANSWER), multicast=False)
     assert one.present() == ["peer2", "peer3"]
-    assert one.roster.peers()[1].found_by is HeardBy.GOSSIP
-    sent = one.roster.outputs() + one.run(15)
+    assert one.membership.peers()[1].found_by is HeardBy.GOSSIP
+    sent = one.membership.outputs() + one.run(15)
     assert unicasts(sent, BeaconKind.ANNOUNCE).count(("10.0.0.3", 40003)) == 1
 
 
-def test_a_lost_peer_that_multicast_cannot_bring_back_is_greeted_again(one: Harness) -> None:
+def test_lost_unicast_peer_becomes_a_candidate(one: Harness) -> None:
     one.hear(Speaker(who(2))(BeaconKind.ANNOUNCE), multicast=False)
     one.run(15.9)
     sent = one.run(10)
@@ -495,26 +495,28 @@ def test_a_lost_peer_that_multicast_cannot_bring_back_is_greeted_again(one: Harn
     assert unicasts(sent, BeaconKind.ANNOUNCE).count(("10.0.0.2", 40002)) >= 3
 
 
-def test_a_peer_that_is_heard_elsewhere_is_passed_on_with_where(one: Harness) -> None:
+def test_gossip_carries_the_observed_address(one: Harness) -> None:
     """Its GUID's address may be of a network that whoever is told cannot reach."""
     one.hear(Speaker(who(2))(), source=("172.16.0.2", 40002))
     one.hear(Speaker(who(3))(BeaconKind.ANNOUNCE), multicast=False)
-    answers = [o.beacon for o in one.roster.outputs() if isinstance(o, SendUnicast) and o.address[0] == "10.0.0.3"]
-    assert [(b.gossip, b.elsewhere) for b in answers] == [((who(2).guid,), (("172.16.0.2", 40002),))]
+    answers = [
+        o.beacon for o in one.membership.outputs() if isinstance(o, SendUnicast) and o.address[0] == "10.0.0.3"
+    ]
+    assert [(b.gossip, b.observed) for b in answers] == [((who(2).guid,), (("172.16.0.2", 40002),))]
 
 
-def test_whoever_is_told_of_an_address_greets_it_unless_it_knows_who_is_there(one: Harness) -> None:
+def test_gossiped_address_of_an_unknown_peer_is_contacted(one: Harness) -> None:
     known = replace(who(4), addresses=(IPv4Address("172.16.0.4"),))
     one.hear(Speaker(known)())
-    one.roster.outputs()
+    one.membership.outputs()
     places = (("172.16.0.2", 40002), ("172.16.0.4", 40004), ("10.0.0.1", 40001), ("127.0.0.1", 40005))
-    one.hear(replace(Speaker(who(3))(BeaconKind.ANSWER, who(2).guid), elsewhere=places), multicast=False)
-    sent = one.roster.outputs() + one.run(1)
+    one.hear(replace(Speaker(who(3))(BeaconKind.ANSWER, who(2).guid), observed=places), multicast=False)
+    sent = one.membership.outputs() + one.run(1)
     assert set(unicasts(sent, BeaconKind.ANNOUNCE)) == {("10.0.0.2", 40002), ("172.16.0.2", 40002)}
     one.hear(Speaker(who(2))(BeaconKind.ANSWER), multicast=False, source=("172.16.0.2", 40002))
     assert "peer2" in one.present()
-    one.roster.outputs()
-    assert unicasts(one.run(limits.GREETING_FORGET / 2), BeaconKind.ANNOUNCE) == []
+    one.membership.outputs()
+    assert unicasts(one.run(limits.CANDIDATE_LIFETIME / 2), BeaconKind.ANNOUNCE) == []
 
 
 def test_gossip_is_bounded(one: Harness) -> None:
@@ -522,9 +524,9 @@ def test_gossip_is_bounded(one: Harness) -> None:
     for i in range(10):
         guids = [Guid.of(IPv4Address(0x0A020000 + 100 * i + j), 1) for j in range(limits.BEACON_GOSSIP_MAX)]
         one.hear(speaker(BeaconKind.HEARTBEAT, *guids))
-    greeted = unicasts(one.roster.outputs(), BeaconKind.ANNOUNCE)
-    assert len(greeted) == limits.GREETINGS_MAX
-    assert one.roster.counters["gossip.full"]
+    greeted = unicasts(one.membership.outputs(), BeaconKind.ANNOUNCE)
+    assert len(greeted) == limits.CANDIDATES_MAX
+    assert one.membership.counters["gossip.full"]
 
 
 def test_loopback_gossip_from_afar_is_not_believed(one: Harness) -> None:
@@ -534,24 +536,24 @@ def test_loopback_gossip_from_afar_is_not_believed(one: Harness) -> None:
 
 def test_an_answer_carries_gossip_but_not_the_listener(one: Harness) -> None:
     one.hear(Speaker(who(3))())
-    one.roster.outputs()
+    one.membership.outputs()
     one.hear(Speaker(who(2))())
-    (answer,) = [o for o in one.roster.outputs() if isinstance(o, SendUnicast)]
+    (answer,) = [o for o in one.membership.outputs() if isinstance(o, SendUnicast)]
     assert answer.beacon.gossip == (who(3).guid,)
 
 
-def test_seeds_are_greeted_at_start_and_with_each_heartbeat_until_met() -> None:
+def test_seeds_get_announcements_until_they_are_members() -> None:
     seed = ("10.9.0.1", 11411)
     one = Harness()
-    one.roster.set_seeds([seed, seed])
-    assert unicasts(one.roster.outputs(), BeaconKind.ANNOUNCE) == [seed]
+    one.membership.set_seeds([seed, seed])
+    assert unicasts(one.membership.outputs(), BeaconKind.ANNOUNCE) == [seed]
     one.run(1)
     assert unicasts(one.run(10), BeaconKind.ANNOUNCE) == [seed] * 2
     one.hear(Speaker(who(2))(BeaconKind.ANSWER), multicast=False, source=seed)
     assert unicasts(one.run(10), BeaconKind.ANNOUNCE) == []
 
 
-def test_a_peer_not_heard_by_multicast_gets_unicast_heartbeats_with_gossip(one: Harness) -> None:
+def test_peer_without_multicast_gets_unicast_heartbeats(one: Harness) -> None:
     one.hear(Speaker(who(3))())
     far = Speaker(who(2))
     one.hear(far(BeaconKind.ANNOUNCE), multicast=False)
@@ -577,37 +579,37 @@ def test_a_deaf_peers_unicast_heartbeat_is_answered(one: Harness) -> None:
     one.hear(speaker())
     one.run(1)
     one.hear(speaker(), multicast=False)
-    assert unicasts(one.roster.outputs(), BeaconKind.ANSWER) == [("10.0.0.2", 40002)]
+    assert unicasts(one.membership.outputs(), BeaconKind.ANSWER) == [("10.0.0.2", 40002)]
 
 
 def test_without_multicast_nothing_is_shouted() -> None:
     one = Harness(multicast=False)
-    one.roster.set_seeds([("10.9.0.1", 11411)])
+    one.membership.set_seeds([("10.9.0.1", 11411)])
     one.hear(Speaker(who(2))(BeaconKind.ANSWER), multicast=False)
     sent = one.run(20)
-    one.roster.goodbye(one.now)
-    sent += one.roster.outputs()
+    one.membership.goodbye(one.now)
+    sent += one.membership.outputs()
     assert sent
     assert not [o for o in sent if isinstance(o, SendMulticast)]
     assert ("10.0.0.2", 40002) in unicasts(sent, BeaconKind.HEARTBEAT)
 
 
-def test_a_change_of_interfaces_gives_a_shorter_burst_with_the_new_addresses(one: Harness) -> None:
-    one.roster.interfaces_changed(one.now, (IPv4Address("10.8.0.1"),))
+def test_change_of_interfaces_sends_a_shorter_burst(one: Harness) -> None:
+    one.membership.interfaces_changed(one.now, (IPv4Address("10.8.0.1"),))
     sent = [o for o in one.run(1) if isinstance(o, SendMulticast)]
     assert [o.beacon.kind for o in sent] == [BeaconKind.ANNOUNCE] * len(limits.BURST_AGAIN_OFFSETS)
     assert sent[0].beacon.identity.addresses == (IPv4Address("10.8.0.1"),)
 
 
-def test_the_roster_is_bounded_and_links_go_first(one: Harness) -> None:
-    for i in range(2 * core_limits.ROSTER_PEERS_MAX):
+def test_membership_is_bounded_and_links_go_first(one: Harness) -> None:
+    for i in range(2 * core_limits.PEERS_MAX):
         guid = Guid.of(IPv4Address(0x0A010000 + i), 4000)
         one.hear(Speaker(replace(who(2), guid=guid, instance=i.to_bytes(16, "big"), name=f"n{i}"))())
-    assert len(one.roster.peers()) == core_limits.ROSTER_PEERS_MAX - 1
-    assert one.roster.counters["roster.full"]
-    one.roster.link_up(who(3), one.now)
+    assert len(one.membership.peers()) == core_limits.PEERS_MAX - 1
+    assert one.membership.counters["roster.full"]
+    one.membership.link_up(who(3), one.now)
     assert "peer3" in one.present()
-    assert len(one.roster.peers()) == core_limits.ROSTER_PEERS_MAX - 1
+    assert len(one.membership.peers()) == core_limits.PEERS_MAX - 1
 
 
 def test_sequence_numbers_wrap(one: Harness) -> None:
@@ -639,95 +641,95 @@ def flood(one: Harness, count: int, *, first: int = 0) -> None:
     """So many peers say once that they are there, for two minutes."""
     for number in range(first, first + count):
         one.hear(Speaker(forged(number))(BeaconKind.ANNOUNCE, lease=120.0))
-        one.roster.outputs()
-        one.roster.events()
+        one.membership.outputs()
+        one.membership.events()
 
 
-def test_peers_without_a_link_that_do_not_hear_us_share_a_few_heartbeats(one: Harness) -> None:
-    flood(one, core_limits.ROSTER_PEERS_MAX - 2)
+def test_unlinked_peers_share_a_few_unicast_heartbeats(one: Harness) -> None:
+    flood(one, core_limits.PEERS_MAX - 2)
     one.hear(Speaker(who(2))(BeaconKind.ANNOUNCE), multicast=False)
-    one.roster.link_up(who(2), one.now)
+    one.membership.link_up(who(2), one.now)
     one.run(limits.MULTICAST_SILENCE + limits.HEARTBEAT_INTERVAL)
     sent = unicasts(one.run(60.0), BeaconKind.HEARTBEAT)
     linked = who(2).guid.endpoint
     assert sent.count(linked) >= 11, "who is linked gets each heartbeat"
     others = [address for address in sent if address != linked]
-    assert len(others) <= (60 + limits.HEARTBEAT_INTERVAL) * limits.WHISPERS_PER_SECOND
-    assert len(set(others)) == core_limits.ROSTER_PEERS_MAX - 2, "each in turn"
-    assert one.roster.counters["beacon.whisper_limited"]
+    assert len(others) <= (60 + limits.HEARTBEAT_INTERVAL) * limits.UNICAST_HEARTBEATS_PER_SECOND
+    assert len(set(others)) == core_limits.PEERS_MAX - 2, "each in turn"
+    assert one.membership.counters["beacon.whisper_limited"]
 
 
 def test_who_spoke_once_and_has_no_link_is_not_passed_on_for_long(one: Harness) -> None:
     flood(one, 300)
-    one.roster.link_up(who(3), one.now)
+    one.membership.link_up(who(3), one.now)
     one.run(limits.MULTICAST_SILENCE)
     for output in one.run(60.0):
         assert set(output.beacon.gossip) <= {who(3).guid}
     one.hear(Speaker(who(2))(BeaconKind.ANNOUNCE), multicast=False)
-    (answer,) = one.roster.outputs()
+    (answer,) = one.membership.outputs()
     assert answer.beacon.gossip == (who(3).guid,)
 
 
-def test_greetings_of_many_invented_addresses_are_few(one: Harness) -> None:
+def test_announcements_to_many_forged_addresses_are_few(one: Harness) -> None:
     speaker, sent = Speaker(who(2)), 0
     for second in range(60):
         for part in range(8):
             guids = [Guid.of(IPv4Address(0x0A020000 + 64 * part + j), 1) for j in range(limits.BEACON_GOSSIP_MAX)]
             one.hear(speaker(BeaconKind.HEARTBEAT, *guids))
-        sent += len(unicasts(one.roster.outputs() + one.run(1.0), BeaconKind.ANNOUNCE))
-        assert sent <= limits.GREETINGS_MAX + (second + 1) * limits.GREETINGS_PER_SECOND
-    assert sent >= 40 * limits.GREETINGS_PER_SECOND
+        sent += len(unicasts(one.membership.outputs() + one.run(1.0), BeaconKind.ANNOUNCE))
+        assert sent <= limits.CANDIDATES_MAX + (second + 1) * limits.CANDIDATES_PER_SECOND
+    assert sent >= 40 * limits.CANDIDATES_PER_SECOND
 
 
-def test_in_a_full_roster_who_missed_a_heartbeat_gives_way_but_not_to_many(one: Harness) -> None:
-    flood(one, core_limits.ROSTER_PEERS_MAX - 1)
+def test_full_membership_evicts_silent_peers_at_a_limited_rate(one: Harness) -> None:
+    flood(one, core_limits.PEERS_MAX - 1)
     one.hear(Speaker(who(3))())
     assert "peer3" not in one.present(), "all spoke a moment ago"
     one.run(limits.HEARTBEAT_LATE)
     one.hear(Speaker(who(4))())
     assert "peer4" in one.present()
     flood(one, 1000, first=1000)
-    assert len(one.present()) == core_limits.ROSTER_PEERS_MAX - 1
+    assert len(one.present()) == core_limits.PEERS_MAX - 1
     new = [name for name in one.present() if name.startswith("n1") and len(name) > 4]
-    assert len(new) <= limits.ROSTER_EVICTIONS_PER_SECOND
-    assert one.roster.counters["roster.full"] >= 1000 - limits.ROSTER_EVICTIONS_PER_SECOND
+    assert len(new) <= limits.EVICTIONS_PER_SECOND
+    assert one.membership.counters["roster.full"] >= 1000 - limits.EVICTIONS_PER_SECOND
 
 
 def test_a_linked_peer_gives_way_to_nobody(one: Harness) -> None:
-    one.roster.link_up(who(3), one.now)
-    flood(one, core_limits.ROSTER_PEERS_MAX - 2)
+    one.membership.link_up(who(3), one.now)
+    flood(one, core_limits.PEERS_MAX - 2)
     for second in range(60):
         one.run(1.0)
         flood(one, 100, first=1000 + 100 * second)
     assert "peer3" in one.present()
-    assert len(one.roster.peers()) == core_limits.ROSTER_PEERS_MAX - 1
+    assert len(one.membership.peers()) == core_limits.PEERS_MAX - 1
 
 
-def test_a_beacon_that_was_forged_while_its_place_was_linked_takes_no_seat_when_the_link_falls(one: Harness) -> None:
+def test_old_forged_beacon_takes_no_endpoint_when_the_link_falls(one: Harness) -> None:
     one.hear(Speaker(who(2))())
-    one.roster.link_up(who(2), one.now)
+    one.membership.link_up(who(2), one.now)
     one.run(1)
     one.hear(Speaker(replace(who(2, 2), name="eve"))(BeaconKind.ANNOUNCE, lease=120.0))
     one.run(limits.HEARTBEAT_LATE + 1)
-    one.roster.events()
-    one.roster.link_down(who(2).guid, one.now)
-    assert one.roster.events() == []
+    one.membership.events()
+    one.membership.link_down(who(2).guid, one.now)
+    assert one.membership.events() == []
     assert one.present() == ["peer2"]
 
 
 def test_whose_link_is_known(one: Harness) -> None:
-    assert one.roster.is_linked(who(1).guid, who(1).instance), "our own echo"
+    assert one.membership.is_linked(who(1).guid, who(1).instance), "our own echo"
     one.hear(Speaker(who(2))())
-    assert not one.roster.is_linked(who(2).guid, who(2).instance)
-    one.roster.link_up(who(2), one.now)
-    assert one.roster.is_linked(who(2).guid, who(2).instance)
-    assert not one.roster.is_linked(who(2).guid, who(2, 2).instance)
-    one.roster.link_down(who(2).guid, one.now)
-    assert not one.roster.is_linked(who(2).guid, who(2).instance)
+    assert not one.membership.is_linked(who(2).guid, who(2).instance)
+    one.membership.link_up(who(2), one.now)
+    assert one.membership.is_linked(who(2).guid, who(2).instance)
+    assert not one.membership.is_linked(who(2).guid, who(2, 2).instance)
+    one.membership.link_down(who(2).guid, one.now)
+    assert not one.membership.is_linked(who(2).guid, who(2).instance)
 
 
-def test_timers_and_names_are_those_of_the_seats_whatever_happens() -> None:
-    """The remembered answers against a look at every seat, over a thousand random events."""
+def test_indexes_agree_with_the_endpoints() -> None:
+    """The remembered answers against a look at every endpoint, over a thousand random events."""
     rng = random.Random(3)
     one = Harness()
     speakers = [Speaker(replace(who(2 + n // 2, 1 + n % 2), name=f"name{n % 5}")) for n in range(24)]
@@ -738,15 +740,15 @@ def test_timers_and_names_are_those_of_the_seats_whatever_happens() -> None:
             kind = rng.choice([*BeaconKind])
             one.hear(speaker(kind, lease=rng.choice([2.0, 16.0])), multicast=rng.random() < 0.5)
         elif what == 5:
-            one.roster.link_up(speaker.identity, one.now)
+            one.membership.link_up(speaker.identity, one.now)
         elif what == 6:
-            one.roster.link_down(speaker.identity.guid, one.now)
+            one.membership.link_down(speaker.identity.guid, one.now)
         one.run(rng.choice([0.0, 0.1, 3.0]))
-        one.roster.events()
-        seats = one.roster._seats
-        timers = [at for seat in seats if (at := seat.next_timer()) is not None]
-        assert seats.next_timer() == min(timers, default=None)
-        assert seats.present() == [s.current for s in seats if s.present and s.current is not None]
+        one.membership.events()
+        endpoints = one.membership._endpoints
+        timers = [at for endpoint in endpoints if (at := endpoint.next_timer()) is not None]
+        assert endpoints.next_timer() == min(timers, default=None)
+        assert endpoints.present() == [e.current for e in endpoints if e.present and e.current is not None]
         for name in {f"name{n}" for n in range(5)}:
-            having = [s for s in seats if s.current is not None and s.current.identity.name == name]
-            assert seats.named(name) == having
+            having = [e for e in endpoints if e.current is not None and e.current.identity.name == name]
+            assert endpoints.with_name(name) == having

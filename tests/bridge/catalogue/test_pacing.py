@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rmpa.bridge import limits
 from rmpa.bridge.actions import Send
-from rmpa.bridge.pacing import Pacing
+from rmpa.bridge.catalogue.pacing import Pacing
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.config.settings import PolicySettings
@@ -30,11 +30,11 @@ def test_a_peer_that_is_not_ready_is_told_later_and_holds_up_no_other() -> None:
         exports.graph(f"/t{number}", {"/n": LocalSource("a/B", "http://127.0.0.1:9/")})
     ready = {2}
     told = {1: 0, 2: 0}
-    while actions := exports.tell(ready.__contains__):
+    while actions := exports.advertise(ready.__contains__):
         for action in actions:
             assert isinstance(action, Send)
             told[action.peer] += len(action.message.added)  # type: ignore[union-attr] # an advertisement
     assert told == {1: 0, 2: 200}
-    assert exports.untold
+    assert exports.pending
     ready.add(1)
-    assert len(exports.tell(ready.__contains__)) == 1
+    assert len(exports.advertise(ready.__contains__)) == 1

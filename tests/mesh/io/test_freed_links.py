@@ -1,4 +1,4 @@
-"""A link that has ended is gone at once, with all that waited for it: without the collector, which looks late."""
+"""A link that has ended is freed at once, with all that waited for it, before the garbage collector runs."""
 
 from __future__ import annotations
 

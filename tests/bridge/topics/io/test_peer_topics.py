@@ -12,7 +12,10 @@ from rmpa.bridge import limits
 from rmpa.bridge.actions import Describe, Detach, Publish, Retract
 from rmpa.bridge.data.qos_events import QosEventKind
 from rmpa.bridge.messages import Description, Source
-from rmpa.bridge.topics.io.proxies import PeerProxies
+from rmpa.bridge.session.peer_proxies import PeerProxies
+from rmpa.bridge.session.peer_session import PeerSession
+from rmpa.bridge.session.proxy_nodes import ProxyNodes
+from rmpa.bridge.topics.io.peer_topics import PeerTopics
 from rmpa.core.contract import Contract, Durability, Liveliness, Reliability
 from rmpa.core.outbox import FIRST
 from rmpa.mesh import limits as mesh_limits
@@ -74,18 +77,20 @@ class Proxied:
         self.acks: list[int] = []
         self.loop = asyncio.get_running_loop()
         self.core = Core(cast("Any", SimpleNamespace(name="a", named=self.named.append)))
-        self.inbound = PeerProxies(
-            cast("RosCore", self.core),
-            "/rmpa/b",
+        core = cast("RosCore", self.core)
+        self.proxies = PeerProxies("/rmpa/b", ProxyNodes(core))
+        self.topics = PeerTopics(
+            core,
+            PeerSession(1, cast("Any", None), self.proxies),
             on_demand=lambda _source, wanted: self.demands.append(wanted),
             on_mismatch=lambda _source, _who, text: pytest.fail(text),
             on_occurred=lambda _source, occurred: self.occurred.append((self.loop.time(), occurred)),
         )
 
     async def publish(self) -> Publication:
-        self.inbound.publish(Publish(1, CMD, "a/B"))
+        self.topics.publish(Publish(1, CMD, "a/B"))
         await asyncio.sleep(0.01)
-        publication = self.inbound.publication(CMD)
+        publication = self.topics.publication(CMD)
         assert publication is not None
         return publication
 
@@ -101,8 +106,8 @@ class Proxied:
         **told: Any,
     ) -> ImportFlow:
         about = Description("a/B", MD5, definition, latching)
-        self.inbound.describe(Describe(1, CMD, route, about, contract, epoch, first, **told), self.acks.append)
-        return self.inbound.flows[route]
+        self.topics.describe(Describe(1, CMD, route, about, contract, epoch, first, **told), self.acks.append)
+        return self.topics.flows[route]
 
     def kinds(self) -> list[QosEventKind]:
         return [occurred.kind for _, occurred in self.occurred]
@@ -114,7 +119,8 @@ def play(scene: Callable[[Proxied], Coroutine[object, object, None]]) -> None:
     async def main() -> None:
         proxied = Proxied()
         await scene(proxied)
-        await proxied.inbound.close()
+        proxied.topics.close()
+        await proxied.proxies.close()
         assert proxied.core.publishers("/cmd") == {}
 
     with made_up(loop):
@@ -130,9 +136,9 @@ def test_a_source_appears_flows_and_disappears() -> None:
         assert proxied.demands == [True]
         flow = proxied.describe(Contract())
         flow.message(1, 0, framed("one"))
-        proxied.inbound.detach(Detach(1, CMD, 1))
-        assert proxied.inbound.flows == {}
-        proxied.inbound.retract(Retract(1, CMD))
+        proxied.topics.detach(Detach(1, CMD, 1))
+        assert proxied.topics.flows == {}
+        proxied.topics.retract(Retract(1, CMD))
         await asyncio.sleep(0.01)
         assert listener.texts == ["one"]
         assert listener.closed
@@ -144,8 +150,8 @@ def test_a_source_appears_flows_and_disappears() -> None:
 def test_what_is_described_before_its_proxy_is_there_or_after_it_went_is_left_alone() -> None:
     async def scene(proxied: Proxied) -> None:
         about = Description("a/B", MD5, "", False)
-        proxied.inbound.describe(Describe(1, CMD, 1, about, Contract()), proxied.acks.append)
-        assert proxied.inbound.flows == {}
+        proxied.topics.describe(Describe(1, CMD, 1, about, Contract()), proxied.acks.append)
+        assert proxied.topics.flows == {}
 
     play(scene)
 
@@ -155,7 +161,7 @@ def test_the_contract_bounds_what_waits_for_a_subscriber_and_says_what_is_kept()
         publication = await proxied.publish()
         proxied.describe(Contract(durability=Durability.TRANSIENT_LOCAL, depth=2), latching=True)
         for number, text in enumerate("abc", 1):
-            proxied.inbound.flows[1].message(number, 0, framed(text))
+            proxied.topics.flows[1].message(number, 0, framed(text))
         assert publication._queue_messages == 2
         assert Heard(publication).texts == ["b", "c"]
 
@@ -168,7 +174,7 @@ def test_hung_up_on_in_the_middle_the_proxy_is_named_twice_and_not_at_once() -> 
         flow = proxied.describe(Contract())
         proxied.named.clear()
         flow.part(1, 0, FIRST, framed("half", 1000)[:500])
-        proxied.inbound.link_down()
+        proxied.topics.link_down()
         assert listener.closed
         assert proxied.named == [], "rospy has not noticed yet"
         for delay in limits.CALL_BACK_DELAYS:
@@ -186,8 +192,8 @@ def test_another_header_hangs_up_on_the_old_subscribers_and_calls_them_back() ->
         publication = await proxied.publish()
         listener = Heard(publication)
         proxied.describe(Contract(), latching=True)
-        proxied.inbound.flows[1].message(1, 0, framed("map"))
-        proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+        proxied.topics.flows[1].message(1, 0, framed("map"))
+        proxied.topics.detach(Detach(1, CMD, 1, keep=True))
         proxied.named.clear()
         flow = proxied.describe(Contract(), route=2, latching=True, definition="string data")
         assert listener.closed
@@ -209,10 +215,10 @@ def test_a_reliable_source_goes_on_with_the_same_flow() -> None:
         flow = proxied.describe(SURE, epoch=5)
         flow.message(1, 0, framed("one"))
         flow.part(2, 0, FIRST, framed("half", 1000)[:500])
-        proxied.inbound.link_down()
-        proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
-        assert proxied.inbound.position(CMD) == (5, 1)
-        assert proxied.inbound.flow(CMD, 1) is flow
+        proxied.topics.link_down()
+        proxied.topics.detach(Detach(1, CMD, 1, keep=True))
+        assert proxied.topics.position(CMD) == (5, 1)
+        assert proxied.topics.flow(CMD, 1) is flow
         assert proxied.describe(SURE, route=4, epoch=5) is flow
         flow.message(2, 0, framed("two"))
         flow.message(5, 0, framed("five"))
@@ -230,8 +236,8 @@ def test_a_sender_that_began_anew_is_said_and_brings_nothing_again() -> None:
         listener = Heard(await proxied.publish())
         flow = proxied.describe(SURE, epoch=5, latching=True)
         flow.message(1, 0, framed("map"))
-        proxied.inbound.link_down()
-        proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+        proxied.topics.link_down()
+        proxied.topics.detach(Detach(1, CMD, 1, keep=True))
         assert proxied.describe(SURE, epoch=6, latching=True) is flow
         flow.message(1, 0, framed("map"))
         flow.message(2, 0, framed("new map"))
@@ -249,8 +255,8 @@ def test_what_a_sender_says_that_it_has_given_up_is_lost(
         await proxied.publish()
         flow = proxied.describe(SURE, epoch=5)
         flow.message(1, 0, framed("one"))
-        proxied.inbound.link_down()
-        proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+        proxied.topics.link_down()
+        proxied.topics.detach(Detach(1, CMD, 1, keep=True))
         assert proxied.describe(SURE, route=2, **told) is flow
         assert (flow.lost, proxied.kinds()) == (lost, kinds)
 
@@ -262,9 +268,9 @@ def test_where_a_numbering_goes_on_a_gap_is_counted_once() -> None:
         listener = Heard(await proxied.publish())
         flow = proxied.describe(SURE, epoch=5)
         flow.message(1, 0, framed("one"))
-        proxied.inbound.retract(Retract(1, CMD))
+        proxied.topics.retract(Retract(1, CMD))
         await asyncio.sleep(1.0)
-        assert proxied.inbound.position(CMD) == (5, 1)
+        assert proxied.topics.position(CMD) == (5, 1)
         again = Heard(await proxied.publish())
         new = proxied.describe(SURE, route=2, epoch=5, following=8)
         assert new is not flow
@@ -280,8 +286,8 @@ def test_a_contract_that_changed_meanwhile_makes_a_new_flow_that_loses_nothing()
         listener = Heard(await proxied.publish())
         old = proxied.describe(SURE, epoch=5)
         old.message(1, 0, framed("one"))
-        proxied.inbound.link_down()
-        proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+        proxied.topics.link_down()
+        proxied.topics.detach(Detach(1, CMD, 1, keep=True))
         new = proxied.describe(Contract(reliability=Reliability.RELIABLE, depth=7), epoch=5)
         assert new is not old
         new.message(1, 0, framed("one"))
@@ -298,20 +304,20 @@ def test_what_is_not_to_go_on_any_more_is_forgotten(how: str) -> None:
         publication = await proxied.publish()
         flow = proxied.describe(SURE, epoch=5, latching=True)
         flow.message(1, 0, framed("one"))
-        proxied.inbound.link_down()
-        proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+        proxied.topics.link_down()
+        proxied.topics.detach(Detach(1, CMD, 1, keep=True))
         if how == "detach":
-            proxied.inbound.detach(Detach(1, CMD, 0))
+            proxied.topics.detach(Detach(1, CMD, 0))
             assert publication.latched == ()
         else:
-            proxied.inbound.retract(Retract(1, CMD))
+            proxied.topics.retract(Retract(1, CMD))
         # A source that leaves the graph while its peer is away is still missed.
-        assert proxied.inbound.position(CMD) == (None if how == "detach" else (5, 1))
-        proxied.inbound.unheard(lambda topic: topic == CMD.topic)
-        assert proxied.inbound.position(CMD) == (None if how == "detach" else (5, 1))
-        proxied.inbound.unheard(lambda _: False)
-        assert proxied.inbound.position(CMD) is None
-        assert proxied.inbound._latest == {}
+        assert proxied.topics.position(CMD) == (None if how == "detach" else (5, 1))
+        proxied.topics.unheard(lambda topic: topic == CMD.topic)
+        assert proxied.topics.position(CMD) == (None if how == "detach" else (5, 1))
+        proxied.topics.unheard(lambda _: False)
+        assert proxied.topics.position(CMD) is None
+        assert proxied.topics._latest == {}
         await asyncio.sleep(mesh_limits.ACK_DELAY * 2)
         assert proxied.acks == []
 
@@ -323,8 +329,8 @@ def test_a_short_silence_of_a_latched_source_brings_its_message_to_nobody_twice(
         publication = await proxied.publish()
         listener = Heard(publication)
         proxied.describe(Contract(), latching=True).message(1, 0, framed("map"))
-        proxied.inbound.link_down()
-        proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+        proxied.topics.link_down()
+        proxied.topics.detach(Detach(1, CMD, 1, keep=True))
         late = Heard(publication)
         flow = proxied.describe(Contract(), latching=True)
         flow.message(1, 0, framed("map"))
@@ -350,7 +356,7 @@ def test_a_missed_deadline_is_said_when_it_is_missed() -> None:
         assert [(round(now - began, 3), occurred.kind) for now, occurred in proxied.occurred] == [
             (1.9, QosEventKind.DEADLINE_MISSED)
         ]
-        proxied.inbound.detach(Detach(1, CMD, 1))
+        proxied.topics.detach(Detach(1, CMD, 1))
         await asyncio.sleep(60.0)
         assert len(proxied.occurred) == 1, "nobody waits for it any more"
 
@@ -361,11 +367,11 @@ def test_while_its_peer_is_away_a_source_misses_its_deadlines() -> None:
     async def scene(proxied: Proxied) -> None:
         await proxied.publish()
         proxied.describe(Contract(deadline=0.2))
-        proxied.inbound.link_down()
-        proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+        proxied.topics.link_down()
+        proxied.topics.detach(Detach(1, CMD, 1, keep=True))
         await asyncio.sleep(0.5)
         assert proxied.kinds() == [QosEventKind.DEADLINE_MISSED] * 2
-        proxied.inbound.retract(Retract(1, CMD))
+        proxied.topics.retract(Retract(1, CMD))
         await asyncio.sleep(60.0)
         assert len(proxied.occurred) == 2
 
@@ -377,14 +383,14 @@ def test_a_source_that_leaves_with_its_peer_is_lost_at_once_however_the_link_end
     async def scene(proxied: Proxied) -> None:
         await proxied.publish()
         proxied.describe(ALIVE)
-        proxied.inbound.link_down()
+        proxied.topics.link_down()
         if silent:
-            proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+            proxied.topics.detach(Detach(1, CMD, 1, keep=True))
             await asyncio.sleep(mesh_limits.AWAY_GRACE)
             assert proxied.occurred == []
         else:
-            proxied.inbound.detach(Detach(1, CMD, 1))
-        proxied.inbound.retract(Retract(1, CMD))
+            proxied.topics.detach(Detach(1, CMD, 1))
+        proxied.topics.retract(Retract(1, CMD))
         assert proxied.kinds() == [QosEventKind.LIVELINESS_LOST]
         await asyncio.sleep(60.0)
         assert len(proxied.occurred) == 1
@@ -397,8 +403,8 @@ def test_a_source_that_is_back_within_its_lease_was_never_lost() -> None:
         await proxied.publish()
         contract = Contract(reliability=Reliability.RELIABLE, liveliness_lease=5.0)
         proxied.describe(contract, epoch=5)
-        proxied.inbound.link_down()
-        proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+        proxied.topics.link_down()
+        proxied.topics.detach(Detach(1, CMD, 1, keep=True))
         await asyncio.sleep(4.0)
         proxied.describe(contract, epoch=5)
         await asyncio.sleep(60.0)
@@ -413,8 +419,8 @@ def test_a_source_whose_peer_stays_away_is_lost_when_its_lease_is_over() -> None
         proxied.describe(Contract(reliability=Reliability.RELIABLE, liveliness_lease=5.0), epoch=5)
         await asyncio.sleep(10.0)
         began = proxied.loop.time()
-        proxied.inbound.link_down()
-        proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+        proxied.topics.link_down()
+        proxied.topics.detach(Detach(1, CMD, 1, keep=True))
         await asyncio.sleep(20.0)
         [(lost, occurred)] = proxied.occurred
         assert occurred.kind is QosEventKind.LIVELINESS_LOST
@@ -438,7 +444,7 @@ def test_one_that_must_say_itself_that_it_lives_is_watched_by_its_messages() -> 
 def test_all_is_registered_again_that_the_core_has_lost() -> None:
     async def scene(proxied: Proxied) -> None:
         await proxied.publish()
-        assert proxied.inbound.reconcile({"/cmd": dict(proxied.core.publishers("/cmd"))}) == 0
-        assert proxied.inbound.reconcile({}) == 1
+        assert proxied.topics.reconcile({"/cmd": dict(proxied.core.publishers("/cmd"))}) == 0
+        assert proxied.topics.reconcile({}) == 1
 
     play(scene)

@@ -1,0 +1,97 @@
+"""Hands the data frames that arrive on the links to the handlers of their routes: the path of every message."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.mesh.frames import FrameKind
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from rmpa.bridge.data.io.route_sender import RouteSender
+    from rmpa.core.counters import Counters
+    from rmpa.mesh.io.link import PeerLink
+
+
+class DataHandler(Protocol):
+    """Takes the data that arrives on one route."""
+
+    def message(self, sequence: int, stamp_ns: int, framed: memoryview) -> None:
+        """A whole message, its 4-byte length in front; only valid during the call."""
+        ...
+
+    def part(self, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
+        """A part of a large one (``core.outbox`` FIRST, LAST, ABORT); only valid during the call."""
+        ...
+
+
+class DataReceiver:
+    """Finds the handler of a frame by its link and its route; drops frames of routes that were closed meanwhile.
+
+    Args:
+        counters: Counts dropped frames as ``route.unknown``.
+        sender: ``(peer, route)``: finds the sender that an acknowledgement is for.
+    """
+
+    def __init__(self, counters: Counters, sender: Callable[[int, int], RouteSender | None]) -> None:
+        self._counters = counters
+        self._sender = sender
+        self._handlers: dict[PeerLink, Mapping[int, DataHandler]] = {}
+        self._peers: dict[PeerLink, int] = {}
+
+    def link_up(self, link: PeerLink, peer: int, handlers: Mapping[int, DataHandler]) -> None:
+        """Data may come on a link from now on.
+
+        Args:
+            link: Which.
+            peer: The number of its peer's session.
+            handlers: Of each open route, by its id; changes as routes are opened and closed.
+        """
+        self._handlers[link] = handlers
+        self._peers[link] = peer
+
+    def link_down(self, link: PeerLink) -> None:
+        """A link is gone: what still comes on it is dropped."""
+        self._handlers.pop(link, None)
+        self._peers.pop(link, None)
+
+    def data(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
+        """A data frame with a whole message came.
+
+        Raises:
+            RemoteProtocolError: It does not hold one message; the link is to be closed.
+        """
+        handlers = self._handlers.get(link)
+        handler = handlers.get(route) if handlers is not None else None
+        if handler is None:
+            self._counters.add("route.unknown")
+            return
+        if len(payload) < 4 or int.from_bytes(payload[:4], "little") != len(payload) - 4:
+            raise RemoteProtocolError(
+                f"a data frame of {len(payload)} bytes on route {route} does not hold one message"
+            )
+        handler.message(sequence, stamp_ns, payload)
+
+    def part(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
+        """A part of a large message came."""
+        handlers = self._handlers.get(link)
+        if handlers is None:
+            return
+        handler = handlers.get(route)
+        if handler is None:
+            self._counters.add("route.unknown")
+        else:
+            handler.part(sequence, stamp_ns, flags, part)
+
+    def mark(self, link: PeerLink, kind: FrameKind, route: int, sequence: int) -> None:
+        """An acknowledgement, or the answer to a fence, came."""
+        peer = self._peers.get(link)
+        sender = self._sender(peer, route) if peer is not None else None
+        if sender is None:
+            return
+        if kind is FrameKind.ACK:
+            sender.acknowledged(sequence)
+        elif kind is FrameKind.FENCED:
+            sender.fenced(sequence)

@@ -1,0 +1,220 @@
+"""The nodes in the local graph that stand for the nodes of one peer."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from rmpa.bridge.proxy_names import proxy_name
+from rmpa.core.errors import RmpaError
+from rmpa.core.open_files import remedy
+from rmpa.ros.wire.xmlrpc import RosReply
+from rmpa.runtime.descriptors import is_shortage
+from rmpa.runtime.event_loop import yielding_to_data
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterator
+
+    from rmpa.bridge.session.proxy_nodes import ProxyNodes
+    from rmpa.ros.node.slave_node import SlaveNode
+
+_log = logging.getLogger(__name__)
+
+
+async def _refuse_to_end(node: str, _caller: str, _reason: str) -> RosReply:
+    return RosReply(0, f"{node} is a node of another module", 0)
+
+
+def _nothing(_node: SlaveNode) -> None:
+    """Nothing is taken away when the proxy goes."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Hold:
+    """One thing that a proxy is there for: a topic or a service of its node.
+
+    Args:
+        node: The peer's node.
+        key: Names the thing among those of its node.
+        ready: Gets the proxy once it is there, and registers the thing.
+        left: Takes the thing away again, before the proxy goes.
+    """
+
+    node: str
+    key: str
+    ready: Callable[[SlaveNode], None]
+    left: Callable[[SlaveNode], None]
+
+
+@dataclass(frozen=True, slots=True)
+class _Release:
+    """A thing is to leave its proxy."""
+
+    node: str
+    key: str
+
+
+@dataclass(slots=True)
+class Proxy:
+    """A node of a peer, standing in the local graph.
+
+    Args:
+        node: What stands there.
+        held: What it is there for.
+    """
+
+    node: SlaveNode
+    held: dict[str, _Hold] = field(default_factory=dict)
+
+
+class PeerProxies:
+    """The proxies of one peer: each is there while something holds it.
+
+    Making a proxy may bind sockets, which takes a turn of the loop; so what changes the graph is done one after the
+    other by a task, in the order in which it was asked for.
+
+    Args:
+        prefix: The namespace of this peer's proxies.
+        nodes: Makes the proxies.
+        on_kill: ``(node, caller id, reason) -> reply``: a proxy was asked to end; the node is the peer's.
+    """
+
+    def __init__(
+        self,
+        prefix: str,
+        nodes: ProxyNodes,
+        on_kill: Callable[[str, str, str], Awaitable[RosReply]] = _refuse_to_end,
+    ) -> None:
+        self.prefix = prefix
+        self._nodes = nodes
+        self._on_kill = on_kill
+        self._proxies: dict[str, Proxy] = {}
+        self._holds: dict[tuple[str, str], _Hold] = {}
+        self._jobs: asyncio.Queue[_Hold | _Release | None] = asyncio.Queue()
+        self.problems: dict[str, str] = {}
+        """Why the proxy of a node could not be made, ready to read; it is tried again by ``reconcile``."""
+        self.names: dict[str, str] = {}
+        """The proxies' names of nodes of other modules that the peer relays; others are named by ``prefix``."""
+        self._task = asyncio.create_task(self._work(), name=f"proxies {prefix}")
+
+    def __len__(self) -> int:
+        return len(self._proxies)
+
+    def __iter__(self) -> Iterator[tuple[str, Proxy]]:
+        """Each node of the peer that has a proxy, and the proxy."""
+        return iter(self._proxies.items())
+
+    def name(self, node: str) -> str:
+        """The name of the proxy of one of the peer's nodes."""
+        return self.names.get(node) or proxy_name(self.prefix, node)
+
+    def get(self, node: str) -> SlaveNode | None:
+        """The proxy of one of the peer's nodes, if it is there."""
+        proxy = self._proxies.get(node)
+        return proxy.node if proxy is not None else None
+
+    def hold(
+        self,
+        node: str,
+        key: str,
+        ready: Callable[[SlaveNode], None],
+        left: Callable[[SlaveNode], None] = _nothing,
+    ) -> None:
+        """Have a proxy stand for a node because of one topic or service, until ``release``.
+
+        Args:
+            node: In the peer's graph.
+            key: Names the topic or service at ``release``.
+            ready: Gets the proxy in a moment, to register the topic or service there.
+            left: Gets the proxy when the topic or service is to leave it; only after ``ready``.
+        """
+        job = self._holds[node, key] = _Hold(node, key, ready, left)
+        self._jobs.put_nowait(job)
+
+    def release(self, node: str, key: str) -> None:
+        """A topic or service needs the proxy no longer: it leaves in a moment."""
+        self._holds.pop((node, key), None)
+        self._jobs.put_nowait(_Release(node, key))
+
+    def reconcile(self) -> None:
+        """Try again what has failed, and forget what was known of nodes that have gone."""
+        if not self._jobs.empty():
+            return
+        if self.names or self.problems:
+            there = set(self._proxies)
+            there.update(node for node, _ in yielding_to_data(list(self._holds)))
+            self.names = {node: name for node, name in self.names.items() if node in there}
+            self.problems = {node: text for node, text in self.problems.items() if node in there}
+        for hold in yielding_to_data(list(self._holds.values())):
+            proxy = self._proxies.get(hold.node)
+            if proxy is None or proxy.held.get(hold.key) is not hold:
+                self._jobs.put_nowait(hold)
+
+    async def close(self) -> None:
+        """Take away everything that is still there."""
+        self._jobs.put_nowait(None)
+        await self._task
+
+    async def _work(self) -> None:
+        while (job := await self._jobs.get()) is not None:
+            try:
+                await (self._hold(job) if isinstance(job, _Hold) else self._release(job))
+            except (RmpaError, OSError) as error:
+                self._failed(job.node, error)
+            except Exception:  # noqa: BLE001 - the task's top: one thing that fails must not stop the others
+                _log.exception("! %s: %s failed; the others go on", self.prefix, job)
+        for node in list(self._proxies):
+            await self._close_proxy(node)
+
+    async def _hold(self, hold: _Hold) -> None:
+        if self._holds.get((hold.node, hold.key)) is not hold:
+            return  # released before its turn came
+        proxy = await self._proxy(hold.node)
+        if self._holds.get((hold.node, hold.key)) is not hold:
+            # Released while the proxy's sockets were being made: to register it would change a topic's type.
+            if not proxy.held:
+                await self._close_proxy(hold.node)
+        elif (before := proxy.held.get(hold.key)) is not hold:
+            if before is not None:
+                before.left(proxy.node)
+            hold.ready(proxy.node)
+            proxy.held[hold.key] = hold
+
+    async def _release(self, job: _Release) -> None:
+        proxy = self._proxies.get(job.node)
+        if proxy is None:
+            return
+        hold = proxy.held.pop(job.key, None)
+        if hold is not None:
+            hold.left(proxy.node)
+        if not proxy.held:
+            await self._close_proxy(job.node)
+
+    async def _proxy(self, node: str) -> Proxy:
+        """The proxy of a node, made if it is not there."""
+        proxy = self._proxies.get(node)
+        if proxy is None:
+            made = self._nodes.make(self.name(node), lambda caller, reason: self._on_kill(node, caller, reason))
+            await made.start()
+            self.problems.pop(node, None)
+            proxy = self._proxies[node] = Proxy(made)
+        return proxy
+
+    async def _close_proxy(self, node: str) -> None:
+        proxy = self._proxies.pop(node)
+        for hold in proxy.held.values():
+            hold.left(proxy.node)
+        await proxy.node.close()
+
+    def _failed(self, node: str, error: Exception) -> None:
+        """Log why a proxy could not be made, once for each reason; ``reconcile`` tries again."""
+        text = (
+            f"no file descriptor is left for its proxy; {remedy(os.getpid())}" if is_shortage(error) else str(error)
+        )
+        if self.problems.get(node) != text:
+            self.problems[node] = text
+            level = logging.DEBUG if is_shortage(error) else logging.ERROR  # a shortage is told for the process
+            _log.log(level, "! %s: %s is not in the local graph: %s", self.prefix, node, text)

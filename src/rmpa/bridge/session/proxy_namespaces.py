@@ -1,0 +1,56 @@
+"""Names the proxies: one namespace for each module whose nodes stand in the local graph."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rmpa.bridge.proxy_names import proxy_name, proxy_prefix
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from rmpa.bridge.messages import Origin
+
+
+class ProxyNamespaces:
+    """The namespaces of linked peers and of modules that relays pass on; no two modules share one."""
+
+    def __init__(self) -> None:
+        self._linked: dict[int, tuple[str, str]] = {}
+        """Of each session: its module's instance, and the namespace."""
+        self._relayed: dict[str, str] = {}
+        """Of each relayed module's instance: the namespace."""
+
+    def add(self, peer: int, identity: Identity) -> str:
+        """The namespace of a linked peer, until ``remove``."""
+        instance = identity.instance.hex()
+        prefix = proxy_prefix(identity, self._taken(instance))
+        self._linked[peer] = (instance, prefix)
+        return prefix
+
+    def remove(self, peer: int) -> None:
+        """A peer is gone for good."""
+        self._linked.pop(peer, None)
+
+    def relayed_name(self, origin: Origin) -> str:
+        """The name of the proxy of a relayed node: the same as if its module had a link."""
+        prefix = self._relayed.get(origin.instance)
+        if prefix is None:
+            module = Identity(Guid.parse(origin.guid), bytes.fromhex(origin.instance), origin.name)
+            prefix = self._relayed[origin.instance] = proxy_prefix(module, self._taken(origin.instance))
+        return proxy_name(prefix, origin.node)
+
+    def forget_unused(self, names: Collection[str]) -> None:
+        """Forget relayed modules of whose proxies none is among ``names``."""
+        self._relayed = {
+            instance: prefix
+            for instance, prefix in self._relayed.items()
+            if any(name.startswith(f"{prefix}/") for name in names)
+        }
+
+    def _taken(self, instance: str) -> set[str]:
+        """The namespaces that a module must leave to others."""
+        linked = {prefix for other, prefix in self._linked.values() if other != instance}
+        return linked | {prefix for other, prefix in self._relayed.items() if other != instance}

@@ -1,0 +1,199 @@
+"""The routes that this module asks peers for: opened on demand, asked for again when they are lost. Pure."""
+
+from __future__ import annotations
+
+from heapq import heappop, heappush
+from typing import TYPE_CHECKING
+
+from msgspec import UnsetType
+
+from rmpa.bridge import limits
+from rmpa.bridge.actions import Action, Describe, Detach, Send, Warn
+from rmpa.bridge.messages import CloseRoute, OpenRoute, RouteClosed, RouteOpened, Source
+from rmpa.bridge.topics.remote_topic import RemoteTopic, RouteState
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection
+
+    from rmpa.core.contract import Contracts
+
+
+class ImportRoutes:
+    """Drives the states of every remote source's route.
+
+    Args:
+        find: ``(peer, source)``: finds a remote source.
+        contracts: What this module asks for.
+        position: ``(peer, source)``: epoch and last message of a reliable route that outlived its link, or ``None``.
+    """
+
+    def __init__(
+        self,
+        find: Callable[[int, Source], RemoteTopic | None],
+        contracts: Contracts,
+        position: Callable[[int, Source], tuple[int, int] | None],
+    ) -> None:
+        self._find = find
+        self.contracts = contracts
+        self._position = position
+        self._routes: dict[int, dict[int, Source]] = {}
+        """Of each linked peer: what was asked for or is open, by its route."""
+        self._last_route: dict[int, int] = {}
+        # (when, serial, peer, source); what no longer is a source's timer is passed over.
+        self._timers: list[tuple[float, int, int, Source]] = []
+        self._serial = 0
+
+    def link_up(self, peer: int) -> None:
+        """A peer has a link: routes are counted anew."""
+        self._routes[peer] = {}
+        self._last_route[peer] = 0
+
+    def link_down(self, peer: int) -> Collection[Source]:
+        """A peer has no link any more; return what was asked for or open."""
+        self._last_route.pop(peer, None)
+        return self._routes.pop(peer, {}).values()
+
+    # --- what happens ------------------------------------------------------------------------------------------
+
+    def opened(self, peer: int, message: RouteOpened, now: float) -> list[Action]:
+        """A route is open; one that was closed here meanwhile is ignored."""
+        routes = self._routes[peer]
+        source = routes.get(message.route)
+        entry = self._find(peer, source) if source is not None else None
+        if source is None or entry is None or entry.state is not RouteState.OPENING:
+            return []
+        if message.description.type != entry.type:
+            del routes[message.route]
+            why = f"it is offered as {entry.type}, but its publisher sends {message.description.type}"
+            return [
+                Send(peer, CloseRoute(message.route)),
+                Warn("mismatch.type", str(source), f"{source}: {why}"),
+                *self._fail(peer, source, entry, why, now),
+            ]
+        entry.enter(RouteState.OPEN)
+        entry.problem = ""
+        entry.backoff.reset()
+        entry.description = message.description
+        entry.contract = message.contract
+        terms = (message.contract, message.epoch, message.first)
+        following, lost = (None if isinstance(n, UnsetType) else n for n in (message.following, message.lost))
+        at_least = message.at_least is True
+        return [Describe(peer, source, message.route, message.description, *terms, following, lost, at_least)]
+
+    def closed(self, peer: int, message: RouteClosed, now: float) -> list[Action]:
+        """The peer has no such route, or no longer."""
+        source = self._routes[peer].pop(message.route, None)
+        entry = self._find(peer, source) if source is not None else None
+        if source is None or entry is None:
+            return []
+        return self._fail(peer, source, entry, message.reason, now)
+
+    def demand(self, peer: int, source: Source, entry: RemoteTopic, now: float, *, wanted: bool) -> list[Action]:
+        """A local node listens to a source, or none does any more."""
+        entry.wanted = wanted
+        if wanted:
+            if entry.state is RouteState.IDLE:
+                return self.open(peer, source, entry, now)
+            if entry.state is RouteState.LINGERING:
+                entry.enter(RouteState.OPEN)
+            return []
+        if entry.state is RouteState.OPEN:
+            self._enter(peer, source, entry, RouteState.LINGERING, now + limits.ROUTE_LINGER)
+            return []
+        if entry.state in {RouteState.OPENING, RouteState.WAITING}:
+            return self.close(peer, source, entry)
+        return []
+
+    def suspend(self, entry: RemoteTopic) -> None:
+        """The link of an entry's peer is gone, and the entry stays."""
+        entry.problem = "its peer is away"
+        if entry.state is RouteState.LINGERING:
+            entry.enter(RouteState.IDLE)
+        elif entry.state in {RouteState.OPEN, RouteState.OPENING}:
+            entry.enter(RouteState.WAITING)
+        entry.timer = None
+
+    # --- opening and closing -----------------------------------------------------------------------------------
+
+    def open(self, peer: int, source: Source, entry: RemoteTopic, now: float) -> list[Action]:
+        """Ask for a source, or wait for the peer's next link."""
+        routes = self._routes.get(peer)
+        if routes is None:
+            entry.enter(RouteState.OPENING)
+            entry.enter(RouteState.WAITING)
+            return []
+        self._last_route[peer] += 1
+        route = entry.route = self._last_route[peer]
+        routes[route] = source
+        self._enter(peer, source, entry, RouteState.OPENING, now + limits.ROUTE_OPEN_TIMEOUT)
+        contract = entry.asked = self.contracts.of(entry.topic, entry.type)
+        epoch, after = self._position(peer, source) or (0, 0)
+        return [Send(peer, OpenRoute(route, source.topic, source.node, contract, epoch, after))]
+
+    def close(self, peer: int, source: Source, entry: RemoteTopic, *, missed: bool = False) -> list[Action]:
+        """Leave a source alone, whatever its state."""
+        actions: list[Action] = []
+        if entry.route:
+            self._routes.get(peer, {}).pop(entry.route, None)
+            actions += [Send(peer, CloseRoute(entry.route)), Detach(peer, source, entry.route, missed=missed)]
+        elif entry.state is RouteState.WAITING and entry.timer is None:
+            actions.append(Detach(peer, source, 0))  # what waited for a new link to go on
+        entry.route = 0
+        entry.backoff.reset()
+        if entry.state is RouteState.OPEN:
+            entry.enter(RouteState.LINGERING)
+        if entry.state is not RouteState.IDLE:
+            entry.enter(RouteState.IDLE)
+        return actions
+
+    def _fail(self, peer: int, source: Source, entry: RemoteTopic, reason: str, now: float) -> list[Action]:
+        missed = entry.wanted and entry.state is not RouteState.LINGERING
+        actions: list[Action] = [Detach(peer, source, entry.route, missed=missed)]
+        entry.route = 0
+        entry.problem = reason
+        if entry.state is RouteState.LINGERING:
+            entry.enter(RouteState.IDLE)
+        else:
+            self._enter(peer, source, entry, RouteState.WAITING, now + entry.backoff.delay())
+        return actions
+
+    # --- timers ------------------------------------------------------------------------------------------------
+
+    def _enter(self, peer: int, source: Source, entry: RemoteTopic, state: RouteState, timer: float) -> None:
+        """Change a state, which is looked at again at a time."""
+        entry.enter(state, timer)
+        self._serial += 1
+        entry.serial = self._serial
+        heappush(self._timers, (timer, self._serial, peer, source))
+
+    def next_timer(self) -> float | None:
+        """When ``handle_timer`` is due."""
+        while self._timers and not self._is_pending(self._timers[0]):
+            heappop(self._timers)
+        return self._timers[0][0] if self._timers else None
+
+    def handle_timer(self, now: float) -> list[Action]:
+        """Do what is due, or a part of it: then ``next_timer`` is due again at once."""
+        actions: list[Action] = []
+        for _ in range(limits.APPLIED_AT_ONCE):
+            if (due := self.next_timer()) is None or due > now:
+                break
+            _, _, peer, source = heappop(self._timers)
+            entry = self._find(peer, source)
+            if entry is None:
+                continue
+            if entry.state is RouteState.LINGERING:
+                actions += self.close(peer, source, entry)
+            elif entry.state is RouteState.OPENING:
+                self._routes[peer].pop(entry.route, None)
+                actions.append(Send(peer, CloseRoute(entry.route)))
+                actions += self._fail(peer, source, entry, "the peer has not answered", now)
+            elif entry.state is RouteState.WAITING:
+                actions += self.open(peer, source, entry, now)
+        return actions
+
+    def _is_pending(self, timer: tuple[float, int, int, Source]) -> bool:
+        """Whether this is still its source's timer."""
+        when, serial, peer, source = timer
+        entry = self._find(peer, source)
+        return entry is not None and entry.timer == when and entry.serial == serial

@@ -1,0 +1,509 @@
+"""Topics across the mesh: what this module publishes goes to peers, and what they publish stands here.
+
+The two plans are pure (``topics.imports``, ``topics.exports``); this part of the bridge carries them out. A message
+takes this way::
+
+    publisher → ExportFlow (LocalSubscriptions) → RouteSender ⇢ link
+         link ⇢ DataReceiver → ImportFlow (PeerTopics) → Publication → subscribers
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING
+
+from rmpa.bridge import actions as act
+from rmpa.bridge.data.io.absent_peers import Absent, AbsentPeers
+from rmpa.bridge.data.qos_events import shown_seconds
+from rmpa.bridge.messages import (
+    Advertise,
+    CloseRoute,
+    Mismatch,
+    OpenRoute,
+    RouteClosed,
+    RouteOpened,
+    Source,
+)
+from rmpa.bridge.naming import Names
+from rmpa.bridge.policy import Policy, is_own
+from rmpa.bridge.relay import LinkedPeer
+from rmpa.bridge.session.graph_driver import GraphDriver
+from rmpa.bridge.session.part import Part
+from rmpa.bridge.topics.claims import ClaimDeadlines
+from rmpa.bridge.topics.exports import Exports
+from rmpa.bridge.topics.imports import Imports
+from rmpa.bridge.topics.io.local_sources import LocalSources
+from rmpa.bridge.topics.io.local_subscriptions import LocalSubscriptions
+from rmpa.bridge.topics.io.loss_reports import LossReports
+from rmpa.bridge.topics.io.peer_topics import PeerTopics
+from rmpa.bridge.topics.io.remote_subscribers import RemoteSubscribers
+from rmpa.bridge.topics.mismatches import Mismatches
+from rmpa.core.contract import Contracts, Priority
+from rmpa.core.counters import RefusalLog
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.mesh import limits as mesh_limits
+from rmpa.mesh.frames import FrameKind
+from rmpa.ros.master.effects import GraphChange, RegistrationKind
+from rmpa.runtime.event_loop import yield_to_data
+from rmpa.runtime.machine_timer import MachineTimer
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+    from rmpa.bridge.data.io.export_flow import ExportFlow
+    from rmpa.bridge.data.qos_events import QosEvent
+    from rmpa.bridge.messages import Message
+    from rmpa.bridge.relay import Relay
+    from rmpa.bridge.session.peer_rpc import PeerRpc
+    from rmpa.bridge.session.peer_session import PeerSession
+    from rmpa.bridge.session.peer_sessions import PeerSessions
+    from rmpa.config.settings import LimitSettings, Settings
+    from rmpa.core.counters import Counters
+    from rmpa.core.identity import Identity
+    from rmpa.ros.core.api import Core
+    from rmpa.ros.node.slave_node import SlaveNode
+
+_log = logging.getLogger(__name__)
+
+
+class Topics(Part):
+    """Both directions, for all peers.
+
+    Args:
+        core: The local core.
+        node: The agent's own node, which subscribes to what peers want.
+        sessions: The peers.
+        rpc: Brings news to the peers, and from them.
+        relay: Offers what comes from one peer to others.
+        policy: What may cross.
+        contracts: What the topics of this module need.
+        names: How names read at the peers, and theirs here.
+        most: How much of one peer is taken, and how much is offered.
+        rng: Uniform numbers in [0, 1) for back-off jitter.
+        counters: Counts what happens, by name.
+    """
+
+    advertisement = "advertise"
+
+    def __init__(
+        self,
+        core: Core,
+        node: SlaveNode,
+        sessions: PeerSessions,
+        rpc: PeerRpc,
+        relay: Relay,
+        policy: Policy,
+        *,
+        contracts: Contracts,
+        names: Names,
+        most: LimitSettings,
+        rng: Callable[[], float],
+        counters: Counters,
+    ) -> None:
+        self._core = core
+        self._sessions = sessions
+        self._relay = relay
+        self._counters = counters
+        self.names = names
+        """How names read at the peers, and theirs here; another one after ``reload``."""
+        self._peers: dict[int, PeerTopics] = {}
+        self.imports = Imports(policy, rng, contracts, self._position, names, most)
+        """The inbound plan."""
+        self.outbound = LocalSubscriptions(
+            core,
+            node,
+            on_described=lambda source, description: self._act(self.exports.described(source, description)),
+            on_lost=lambda source, reason: self._act(self.exports.lost(source, reason)),
+            on_given_up=self._given_up,
+            on_let_go=lambda keys: self.losses.let_go(keys, self.outbound.lost),
+            on_missed=self._missed,
+            on_oversized=self._oversized,
+            on_malformed=lambda source, text: self._driver.warn(
+                "publisher.malformed", str(source), f"{source}: {text}"
+            ),
+        )
+        """The subscriptions to local publishers, and the routes to the peers."""
+        self.exports = Exports(policy, contracts, names, most, self.outbound)
+        """The outbound plan."""
+        refusals = RefusalLog(_log, counters)
+        self._driver: GraphDriver[act.Action, Advertise] = GraphDriver(
+            sessions,
+            refusals,
+            exports=self.exports,
+            imports=self.imports,
+            look_at=self._look_at,
+            advertisement=Advertise,
+            apply=self._apply,
+            do=self._do,
+            # Data may be right behind it, and nothing that waits belongs before it.
+            is_urgent=lambda action: isinstance(action, act.Describe),
+            on_told=self._told,
+            on_idle=self._forget_mismatches,
+        )
+        self._act = self._driver.act
+        self._absent = AbsentPeers(lambda peer: self._act(self.exports.unclaimed(peer)), self.outbound.forget)
+        self._claims = ClaimDeadlines()
+        self._claims_timer = MachineTimer(self._claims.next_timer, self._claims_over)
+        self._mismatches = Mismatches()
+        self.losses = LossReports(self.exports, sessions, self._peers, self._absent, rpc, counters, refusals)
+        """What does not reach its listeners, for the monitor."""
+        self._subscribers = RemoteSubscribers(self.exports, self.imports, sessions, self._peers, refusals)
+        self._local = LocalSources(core, relay, lambda source: self.exports.description(source) is not None)
+        self._ticker: asyncio.TimerHandle | None = None
+        self._closed = False
+
+    def of(self, session: PeerSession) -> PeerTopics:
+        """The topics of a peer as they stand in the local graph."""
+        return self._peers[session.peer]
+
+    def mismatches(self, source: Source) -> tuple[str, ...]:
+        """Definitions that did not fit a source's, here or over there, ready to read; forgotten with the source."""
+        return self._mismatches.texts(source)
+
+    @property
+    def idle(self) -> bool:
+        """Whether every change of the local graph was looked at."""
+        return self._driver.idle
+
+    # --- the bridge's part -------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Follow the local graph."""
+        self._look_at_all()
+
+    async def close(self) -> None:
+        """Leave all local publishers."""
+        self._closed = True
+        if self._ticker is not None:
+            self._ticker.cancel()
+        self._driver.close()
+        self._claims_timer.close()
+        self._subscribers.close()
+        self.outbound.close()
+
+    def reload(self, settings: Settings) -> None:
+        """Other rules hold from now on; what they leave as it is goes on untouched."""
+        policy, contracts = Policy(settings.policy, settings.peers, settings.time), Contracts(settings.contracts)
+        self.names = Names(settings.peers)
+        most, now = settings.limits, asyncio.get_running_loop().time()
+        self._act(self.exports.apply_rules(policy, contracts, self.names, most))
+        self._driver.rejudge(self.imports.apply_rules(policy, contracts, self.names, now, most))
+        self._look_at_all()
+
+    def remembered(self, identity: Identity) -> int | None:
+        """The number under which is known what this run of a peer has missed, and what it has sent."""
+        return self._absent.number_of(identity)
+
+    def link_up(self, session: PeerSession) -> None:
+        """Tell what this module has; what the peer has is told by the peer."""
+        peer, identity = session.peer, session.link.identity
+        now = asyncio.get_running_loop().time()
+        if peer in self._peers:
+            _log.info("= %s is back: reliable topics go on", session.link.name)
+            self._claims.begin(peer, now)
+        else:
+            self._begin(session, now)
+        self.imports.ways.instance = self._relay.instance
+        linked = LinkedPeer(identity.name, identity.instance.hex(), identity.guid)
+        self._act(self.imports.link_up(peer, identity.name, linked))
+        self._act(self.exports.link_up(peer, identity.name, linked.instance))
+        self._told()
+        self._driver.schedule()
+
+    def _begin(self, session: PeerSession, now: float) -> None:
+        peer, identity = session.peer, session.link.identity
+        absent = self._absent.back(identity)
+        if absent is not None:
+            again = absent.identity.instance == identity.instance
+            if not again:
+                self.exports.inherit(absent.peer, peer)
+                self.outbound.inherit(absent.peer, peer)
+            away = shown_seconds(now - absent.since)
+            _log.info("= %s is back after %s%s", session.link.name, away, "" if again else ", another run of it")
+            self._claims.begin(peer, now)
+        self._peers[peer] = PeerTopics(
+            self._core,
+            session,
+            counters=self._counters,
+            on_demand=lambda source, wanted: self._demand(peer, source, wanted=wanted),
+            on_mismatch=lambda source, subscriber, text: self._mismatched(peer, source, subscriber, text),
+            on_occurred=lambda source, occurred: self._occurred(session, source, occurred),
+            on_listeners=lambda source: self._subscribers.changed(peer, source),
+            pasts=absent.pasts if absent is not None else None,
+        )
+
+    def link_down(self, session: PeerSession) -> None:
+        """Retract what came over the link, but for what a reliable route brings back."""
+        peer = session.peer
+        self._claims.forget(peer)
+        self._claims_timer.arm()
+        interrupted = self._peers[peer].link_down()
+        if interrupted:
+            # What is published until the next link stands is sent to no peer, and has no number that could be missed.
+            self._counters.add("route.interrupted", interrupted)
+        self._subscribers.link_down(peer)
+        self._driver.link_down(session)
+        exports, _ = self.exports.link_away(peer)
+        self._act(exports)
+        if session.link.silent:
+            # Most silences end soon, by a new link: until then nothing leaves the local graph.
+            imports, _ = self.imports.link_away(peer, briefly=True)
+            self._act(imports)
+
+    def grace_over(self, session: PeerSession) -> bool:
+        """Only what a reliable route needs stays and waits for the peer."""
+        peer = session.peer
+        if not self.exports.waits_for(peer) and not self.imports.waits_for(peer):
+            self._act(self.imports.detached(peer))
+            return False
+        imports, _ = self.imports.link_away(peer)
+        self._act(imports)
+        longest = max(*self.imports.outages(peer), self.exports.outage(peer), 0.0)
+        _log.info("= %s is away: its reliable topics wait for %s", session.link.name, shown_seconds(longest))
+        return True
+
+    def outlasted(self, session: PeerSession, seconds: float) -> float | None:
+        """Give up what was kept for the contract's ``outage``."""
+        peer = session.peer
+        self._act(self.imports.outlasted(peer, seconds))
+        outages = {*self.imports.outages(peer), self.exports.outage(peer)}
+        return min((outage for outage in outages if outage > seconds), default=None)
+
+    def gone(self, session: PeerSession) -> None:
+        """Retract all that is left of a peer; what it misses, and what it was known by, is remembered for a while."""
+        peer = session.peer
+        topics = self._peers.pop(peer)
+        self._claims.forget(peer)
+        self._claims_timer.arm()
+        self._mismatches.peer_gone(session.link.name)
+        absent = Absent(peer, session.link.identity, session.away_since, topics.leave())
+        counting = self.exports.waits_for(peer)
+        for action in self.exports.link_down(peer, counting=True):
+            self._act([action])
+        # Its actions are what closing the proxies does at once.
+        self._driver.free(self.imports.link_down(peer))
+        self._driver.gone(session)
+        self._relay.peer_gone(peer)
+        self._act(self.imports.unlinked(peer))
+        topics.close()
+        if counting or absent.pasts:
+            self._absent.add(absent)
+        else:
+            self.outbound.forget(peer)
+
+    def lane_lost(self, session: PeerSession) -> None:
+        """Messages on the bulk lane may be torn, in both directions."""
+        for flow in self._peers[session.peer].flows.values():
+            if flow.contract.priority is not Priority.HIGH:
+                flow.torn()
+        self.outbound.lane_lost(session.peer)
+
+    # --- messages ----------------------------------------------------------------------------------------------
+
+    def advertised(self, session: PeerSession, payload: bytes) -> None:
+        """A peer says what it publishes."""
+        self._driver.advertised(session, payload)
+
+    def message(self, session: PeerSession, message: Message) -> bool:
+        """Take what is said of topics and their routes."""
+        peer, now = session.peer, asyncio.get_running_loop().time()
+        match message:
+            case Advertise():
+                for actions in self._apply(session, message):
+                    self._act(actions)
+            case OpenRoute():
+                self._act(self.exports.opened(peer, message))
+            case RouteOpened():
+                self._act(self.imports.opened(peer, message, now))
+            case CloseRoute():
+                self._act(self.exports.closed(peer, message))
+            case RouteClosed():
+                if actions := self.imports.closed(peer, message, now):
+                    _log.info("< %s closes route %d: %s", session.link.name, message.route, message.reason)
+                    self._act(actions)
+            case Mismatch():
+                self._mismatched_there(session, message)
+            case _:
+                return self._subscribers.message(session, message)
+        return True
+
+    def _apply(self, session: PeerSession, message: Advertise) -> Iterator[list[act.Action]]:
+        if message.added or message.removed:
+            changes = (len(message.added), len(message.removed))
+            _log.info("< %s publishes %d more topics, %d less", session.link.name, *changes)
+        now = asyncio.get_running_loop().time
+        return (
+            self.imports.take_in(session.peer, change, now())
+            for change in self.imports.portions(session.peer, message)
+        )
+
+    # --- peers that are back ------------------------------------------------------------------------------------
+
+    def _told(self) -> None:
+        """Some peers that are back may have been told everything: then they claim soon what waits for them."""
+        now = asyncio.get_running_loop().time()
+        for peer in self._claims.untold:
+            if not self.exports.beginning(peer):
+                self._claims.told(peer, now)
+        self._claims_timer.arm()
+
+    def _claims_over(self, now: float) -> None:
+        for peer in self._claims.handle_timer(now):
+            self._act(self.exports.unclaimed(peer))
+            self.outbound.unclaimed(peer)
+
+    def _position(self, peer: int, source: Source) -> tuple[int, int] | None:
+        topics = self._peers.get(peer)
+        return topics.position(source) if topics is not None else None
+
+    def _missed(self, source: Source, peer: int, count: int, why: str) -> None:
+        self.losses.missed(source, peer, count, why)
+
+    def _oversized(self, source: Source, flow: ExportFlow) -> None:
+        self.losses.oversized(source, flow)
+
+    def _given_up(self, source: Source, peer: int) -> None:
+        self.losses.uncounted(source)
+        self._act(self.exports.given_up(source, peer))
+
+    # --- the local graph ---------------------------------------------------------------------------------------
+
+    def graph_changed(self, change: GraphChange) -> None:
+        """A node publishes or subscribes, or no longer does."""
+        self._local.changed(change)
+        if change.kind is RegistrationKind.SUBSCRIBER and self._mismatches:
+            self._forget_mismatch(change.name, change.node)
+        if change.kind is not RegistrationKind.SERVICE:
+            self._driver.look((change.name,))
+
+    def _look_at_all(self) -> None:
+        self._driver.look((*self.exports.topics, *self._core.state().publishers))
+
+    def _look_at(self, topics: Iterable[str]) -> None:
+        for topic in topics:
+            local = self._local.of(topic)
+            self._act(self.exports.graph(topic, local | self._local.relayed(topic)))
+            self._act(self.imports.local_type(topic, next((one.type for one in reversed(local.values())), None)))
+
+    def reconcile(self) -> None:
+        """Register again what is missing, and forget what no node listens to any more."""
+        self._look_at_all()
+        self._absent.expire(asyncio.get_running_loop().time())
+        state = self._core.state()
+
+        def subscribed(topic: str) -> bool:
+            return any(not is_own(node) for node in state.subscribers.get(topic, ()))
+
+        self._absent.unheard(subscribed)
+        for topics in list(self._peers.values()):
+            topics.unheard(subscribed)
+            yield_to_data()
+            if again := topics.reconcile(state.publishers):
+                self._counters.add("proxy.registered_again", again)
+
+    def _demand(self, peer: int, source: Source, *, wanted: bool) -> None:
+        self._act(self.imports.demand(peer, source, asyncio.get_running_loop().time(), wanted=wanted))
+
+    def _occurred(self, session: PeerSession, source: Source, occurred: QosEvent) -> None:
+        text = f"{session.link.name}: {source}: {occurred.text}"
+        self._driver.warn(f"contract.{occurred.kind.value}", f"{session.peer} {source}", text)
+
+    # --- definitions that do not fit -----------------------------------------------------------------------------
+
+    def _mismatched(self, peer: int, source: Source, subscriber: str, text: str) -> None:
+        self._mismatches.add(source, subscriber, text)
+        self._act(self.imports.mismatched(peer, source, subscriber, text))
+
+    def _mismatched_there(self, session: PeerSession, message: Mismatch) -> None:
+        source = self.exports.local(session.peer, message.source)
+        if source is None:
+            return  # it went meanwhile
+        subscriber = f"{session.link.name}{message.subscriber}"
+        if not message.text:
+            self._mismatches.mended(source, subscriber)
+            return
+        self._mismatches.add(source, subscriber, message.text)
+        where = f"{session.link.name}: {source}"
+        self._driver.warn("mismatch.remote", where, f"{where}: {message.text}")
+
+    def _forget_mismatch(self, topic: str, subscriber: str) -> None:
+        """A local subscriber has gone, or begins again: that it did not fit before is over, here and over there."""
+        for peer, source in list(self.imports.at(topic)):
+            if self._mismatches.mended(source, subscriber):
+                self._act([act.Send(peer, Mismatch(source.topic, source.node, subscriber, ""))])
+
+    def _forget_mismatches(self) -> None:
+        """Forget those of sources that are gone."""
+        if self._mismatches:
+            self._mismatches.keep(lambda source: source in self.exports.offered or self.imports.knows(source))
+
+    # --- carrying out ------------------------------------------------------------------------------------------
+
+    def _do(self, action: act.Action) -> None:
+        match action:
+            case act.Publish() | act.Retract() | act.Describe() | act.Detach():
+                self._do_inbound(action)
+            case act.Connect():
+                self.outbound.connect(action)
+            case act.Disconnect():
+                self.outbound.disconnect(action.source)
+            case act.SuspendRoute():
+                self._subscribers.route_over(action.peer, action.source)
+                self.outbound.suspend_route(action)
+            case act.AddRoute():
+                self._add_route(action)
+            case act.RemoveRoute():
+                self._subscribers.route_over(action.peer, action.source)
+                self.outbound.remove_route(action)
+                session = self._sessions.get(action.peer)
+                if session is not None and session.linked:
+                    session.link.close_route(action.route)
+
+    def _add_route(self, action: act.AddRoute) -> None:
+        session = self._sessions.get(action.peer)
+        if session is None:
+            return
+        try:
+            self.outbound.add_route(action, session.link)
+            self.losses.tell_oversized(action.source, self.outbound.flows[action.source], action.peer)
+        except RemoteProtocolError as error:
+            # Here, for what waits to be done has other causes. The next link begins a new numbering.
+            self._driver.refuse(session, error)
+            if session.linked:
+                self._act(self.exports.closed(action.peer, CloseRoute(action.route)))
+            else:
+                self._act(self.exports.given_up(action.source, action.peer))
+
+    def _do_inbound(self, action: act.Incoming) -> None:
+        session, topics = self._sessions.get(action.peer), self._peers.get(action.peer)
+        if session is None or topics is None:
+            return
+        match action:
+            case act.Publish():
+                source = action.source
+                name = self._sessions.proxy_name(session, source.node, action.origin)
+                place = (action.topic or source.topic, name)
+                self._relay.pass_on(session.peer, session.link.identity, source, place, action.origin)
+                topics.publish(action)
+            case act.Retract():
+                self._relay.gone(action.peer, action.source)
+                topics.retract(action)
+            case act.Describe():
+                # This link: of the next one the same number is another source's route.
+                route, link = action.route, session.link
+                if self._ticker is None:
+                    self._tick_later()
+                topics.describe(action, lambda last: link.mark(FrameKind.ACK, route, last))
+                self._subscribers.changed(action.peer, action.source)
+            case act.Detach():
+                topics.detach(action)
+
+    def _tick_later(self) -> None:
+        self._ticker = asyncio.get_running_loop().call_later(mesh_limits.STALE_TICK, self._tick)
+
+    def _tick(self) -> None:
+        """Wake up now and then while data comes: a link that was silent is told from an agent that slept."""
+        self._ticker = None
+        if not self._closed and any(topics.flows for topics in self._peers.values()):
+            self._tick_later()

@@ -1,0 +1,360 @@
+"""The topics of one peer: their publications at the proxies, and what arrives on their routes."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import OrderedDict
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+from rmpa.bridge import limits
+from rmpa.bridge.data.io.import_flow import ImportFlow
+from rmpa.core.contract import Durability, Reliability
+from rmpa.mesh import limits as mesh_limits
+from rmpa.ros.node.publication import Publication
+from rmpa.ros.wire.tcpros import TopicDescription, printable
+from rmpa.runtime.event_loop import yielding_to_data
+from rmpa.runtime.machine_timer import MachineTimer
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from rmpa.bridge.actions import Describe, Detach, Publish, Retract
+    from rmpa.bridge.data.losses import ReceptionHistory
+    from rmpa.bridge.data.qos_events import QosEvent
+    from rmpa.bridge.messages import Source
+    from rmpa.bridge.session.peer_session import PeerSession
+    from rmpa.core.counters import Counters
+    from rmpa.ros.core.api import Core
+    from rmpa.ros.node.slave_node import SlaveNode
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Published:
+    """A topic of the peer at its proxy: its local end, whose ``topic`` is its name here, and its message type."""
+
+    node: SlaveNode
+    publication: Publication
+    type: str
+
+
+class PeerTopics:
+    """The topics that one peer publishes, as they stand in the local graph.
+
+    Args:
+        core: The local core, in which the proxies are registered as publishers.
+        session: The peer: its proxies, the handlers of its routes and the time of its link.
+        counters: Counts messages that reach no subscriber.
+        on_demand: Called with a source and whether a local node listens to it.
+        on_mismatch: Called with a source, the caller id of a refused subscriber and the text it was told.
+        on_occurred: Called with a source and an event of its contract.
+        on_listeners: Called with a source when other nodes than before are served with it.
+        pasts: The histories of reliable sources that ``leave`` of another one returned.
+    """
+
+    def __init__(
+        self,
+        core: Core,
+        session: PeerSession,
+        *,
+        counters: Counters | None = None,
+        on_demand: Callable[[Source, bool], None],
+        on_mismatch: Callable[[Source, str, str], None],
+        on_occurred: Callable[[Source, QosEvent], None],
+        on_listeners: Callable[[Source], None] = lambda _: None,
+        pasts: Mapping[Source, ReceptionHistory] | None = None,
+    ) -> None:
+        self._core = core
+        self._session = session
+        self._counters = counters
+        self._on_demand = on_demand
+        self._on_mismatch = on_mismatch
+        self._on_occurred = on_occurred
+        self._on_listeners = on_listeners
+        self._published: dict[Source, _Published] = {}
+        self.flows: dict[int, ImportFlow] = {}
+        """Of each open route, by its id."""
+        self._latest: dict[Source, ImportFlow] = {}
+        """Of each source: the flow of its route, or of the one that its last link had."""
+        self._watches: dict[Source, MachineTimer] = {}
+        """Of each of these: the timer of its contract."""
+        self._pasts: OrderedDict[Source, ReceptionHistory] = OrderedDict(pasts or {})
+        """Of each reliable source without a flow that had one: what its next one must know."""
+
+    def publication(self, source: Source) -> Publication | None:
+        """The local end of a source, if it is there."""
+        published = self._published.get(source)
+        return published.publication if published is not None else None
+
+    def flow(self, source: Source, route: int) -> ImportFlow | None:
+        """The flow of a source's open route, or the one that waits for its peer to come back."""
+        return self.flows.get(route) or self._latest.get(source)
+
+    def publish(self, action: Publish) -> None:
+        """Let a source appear; takes a moment."""
+        self._session.proxies.hold(
+            action.source.node,
+            _key(action.source),
+            lambda node: self._publish(action, node),
+            lambda node: self._unpublish(action.source, node),
+        )
+
+    def retract(self, action: Retract) -> None:
+        """Let a source disappear: its data stops at once, its registration a moment later."""
+        self._over(action.source, missed=True)
+        self._session.proxies.release(action.source.node, _key(action.source))
+
+    def describe(self, action: Describe, on_ack: Callable[[int], None]) -> None:
+        """Data of a source will come on a route; its subscribers learn what it is.
+
+        Args:
+            action: What is known of it.
+            on_ack: Acknowledges the messages of a reliable route.
+        """
+        publication = self.publication(action.source)
+        if publication is None:
+            return
+        flow, goes_on = self._flow(action, publication, on_ack)
+        self.flows[action.route] = self._session.handlers[action.route] = flow
+        about = action.description
+        text = about.definition.encode("latin-1").decode(errors="surrogateescape")
+        if publication.describe(TopicDescription(about.type, about.md5, text, about.latching)):
+            self._call_back_soon(action.source, publication)
+        if not goes_on:
+            flow.expect_replay(publication.latched)
+
+    def position(self, source: Source) -> tuple[int, int] | None:
+        """Where a reliable source goes on that outlived its link, or that lost its route though a node listens."""
+        flow = self._latest.get(source)
+        if flow is not None:
+            return flow.position
+        past = self._pasts.get(source)
+        return past.receiver.position() if past is not None and past.receiver is not None else None
+
+    def past(self, source: Source) -> ReceptionHistory | None:
+        """What is known of a reliable source without a route."""
+        return self._pasts.get(source)
+
+    def left_out(self, source: Source, count: int, size: int) -> bool:
+        """A source's agent says how many of its messages were too long; whether that is news of an open route.
+
+        Args:
+            source: Which.
+            count: Messages, since that agent connected to the publisher.
+            size: The last one's bytes.
+        """
+        flow = self._latest.get(source)
+        if flow is None or (count, size) == (flow.oversized, flow.oversized_bytes):
+            return False
+        flow.oversized, flow.oversized_bytes = count, size
+        return True
+
+    def unheard(self, subscribed: Callable[[str], bool]) -> None:
+        """Messages of topics without a local subscriber are not missed any more.
+
+        Args:
+            subscribed: Whether a local node subscribes to a topic.
+        """
+        for past in self._pasts.values():
+            if past.missed and not subscribed(past.topic):
+                past.forget_position(missed=False)
+
+    def _flow(
+        self, action: Describe, publication: Publication, on_ack: Callable[[int], None]
+    ) -> tuple[ImportFlow, bool]:
+        """The flow of a route, and whether it goes on exactly where it was when its link fell."""
+        source, contract = action.source, action.contract
+        reliable = contract.reliability is Reliability.RELIABLE
+        flow = self._latest.pop(source, None)
+        outlived = flow is not None and flow.contract == contract and reliable
+        past = self._pasts.pop(source, None)
+        if flow is not None and outlived:
+            flow.rebind(on_ack)
+            flow.watch.link_up(asyncio.get_running_loop().time())
+            missed = True
+        else:
+            if flow is not None:
+                past = flow.past(publication.topic, missed=True)
+                self._end(source, flow)
+            missed = past is not None and past.missed
+            flow = ImportFlow(
+                publication,
+                contract,
+                self._session.time,
+                on_ack=on_ack,
+                on_torn=lambda: self._call_back_soon(source, publication),
+                on_broken=lambda occurred: self._on_occurred(source, occurred),
+                counters=self._counters,
+                past=past if reliable else None,
+            )
+        same = missed and flow.position is not None and flow.position[0] == action.epoch
+        flow.begin_epoch(action.epoch, action.first)
+        publication.bound(contract.depth)
+        if contract.durability is Durability.TRANSIENT_LOCAL:
+            publication.keep(contract.kept)
+        self._latest[source] = flow
+        if source not in self._watches:
+            on_due = partial(self._watch_due, source, flow)
+            self._watches[source] = MachineTimer(flow.watch.next_timer, on_due)
+        self._watches[source].arm()
+        if reliable:
+            self._count_missed(flow, action, missed=missed, same=same)
+        return flow, outlived and same
+
+    @staticmethod
+    def _count_missed(flow: ImportFlow, action: Describe, *, missed: bool, same: bool) -> None:
+        """Count what the peer says that it has given up.
+
+        Args:
+            flow: The source's.
+            action: What the peer says.
+            missed: Whether a node listened before, so that nothing may be lost unseen.
+            same: Whether the numbering goes on.
+        """
+        if same:
+            if action.following is not None:
+                flow.skip(action.following)
+            return
+        if action.lost is not None:
+            flow.missed(action.lost)
+        if action.at_least or (missed and action.lost is None):
+            what = "more than that" if action.lost else "its agent was restarted, or knows nothing of what it missed"
+            flow.missed_unknown(what)
+
+    def _watch_due(self, source: Source, flow: ImportFlow, now: float) -> None:
+        for occurred in flow.watch.handle_timer(now):
+            self._on_occurred(source, occurred)
+
+    def _end(self, source: Source, flow: ImportFlow) -> None:
+        if (timer := self._watches.pop(source, None)) is not None:
+            timer.close()
+        flow.close()
+
+    def _over(self, source: Source, *, missed: bool) -> None:
+        """No flow of a source goes on; its proxy may go with it, so the lease is not waited for.
+
+        Args:
+            source: Which.
+            missed: Whether a local node listens all the same.
+        """
+        flow = self._latest.pop(source, None)
+        if flow is None:
+            if not missed and (past := self._pasts.get(source)) is not None:
+                past.forget_position(missed=False)
+        else:
+            self._remember(source, flow, missed=missed)
+            for occurred in flow.watch.link_gone(asyncio.get_running_loop().time()):
+                self._on_occurred(source, occurred)
+            self._end(source, flow)
+
+    def _remember(self, source: Source, flow: ImportFlow, *, missed: bool) -> None:
+        publication = self.publication(source)
+        past = flow.past(publication.topic if publication is not None else source.topic, missed=missed)
+        if past is not None and (missed or past.lost or past.counts):
+            self._pasts[source] = past
+            if len(self._pasts) > mesh_limits.LOSSES_REMEMBERED:
+                self._pasts.popitem(last=False)
+
+    def leave(self) -> dict[Source, ReceptionHistory]:
+        """The peer has been away for too long: what is to be known when it is back."""
+        for source, flow in self._latest.items():
+            self._remember(source, flow, missed=True)
+        return dict(self._pasts)
+
+    def _call_back_soon(self, source: Source, publication: Publication) -> None:
+        """Subscribers were hung up on: they come again when the master names the proxy.
+
+        rospy only then, and only if it has noticed the end by that time.
+        """
+        for delay in limits.CALL_BACK_DELAYS:
+            asyncio.get_running_loop().call_later(delay, self._call_back, source, publication)
+
+    def _call_back(self, source: Source, publication: Publication) -> None:
+        published = self._published.get(source)
+        if published is not None and published.publication is publication:
+            self._register(published)
+
+    def link_down(self) -> int:
+        """The link is gone: what it brought in part is dropped, and the sources are not known to live any more.
+
+        Returns:
+            How many best-effort routes were open: what they miss from now on cannot be counted.
+        """
+        now = asyncio.get_running_loop().time()
+        for flow in self.flows.values():
+            flow.torn()
+            flow.watch.link_down(now)
+        return sum(flow.contract.reliability is not Reliability.RELIABLE for flow in self.flows.values())
+
+    def detach(self, action: Detach) -> None:
+        """No data comes on a route any more, or not until its peer is back."""
+        flow = self.flows.pop(action.route, None)
+        self._session.handlers.pop(action.route, None)
+        if action.keep:
+            if flow is not None:
+                self._watches[action.source].arm()
+            return
+        self._over(action.source, missed=action.missed)
+        publication = self.publication(action.source)
+        if publication is not None:
+            publication.forget_latched()
+
+    def reconcile(self, publishers: Mapping[str, Mapping[str, str]]) -> int:
+        """Register again what is missing from the local graph; return how many that were."""
+        missing = [
+            published
+            for published in yielding_to_data(list(self._published.values()))
+            if publishers.get(published.publication.topic, {}).get(published.node.name) != published.node.uri
+        ]
+        for published in missing:
+            self._register(published)
+        return len(missing)
+
+    def close(self) -> None:
+        """End all flows; the publications go with the proxies."""
+        for source, flow in list(self._latest.items()):
+            self._end(source, flow)
+        self._latest.clear()
+        for route in self.flows:
+            self._session.handlers.pop(route, None)
+        self.flows.clear()
+
+    # --- at the proxies ----------------------------------------------------------------------------------------
+
+    def _publish(self, action: Publish, node: SlaveNode) -> None:
+        source = action.source
+        publication = Publication(
+            action.topic or source.topic,
+            node.name,
+            on_first_subscriber=lambda: self._on_demand(source, True),
+            on_last_subscriber=lambda: self._on_demand(source, False),
+            on_mismatch=lambda fields, text: self._on_mismatch(source, printable(fields.get("callerid", "")), text),
+            on_listeners=lambda: self._on_listeners(source),
+        )
+        node.add_publication(publication)
+        published = self._published[source] = _Published(node, publication, action.type)
+        self._register(published)
+
+    def _unpublish(self, source: Source, node: SlaveNode) -> None:
+        published = self._published.pop(source, None)
+        if published is None:
+            return  # the node did not take it
+        topic = published.publication.topic
+        self._core.call("unregisterPublisher", node.name, topic, node.uri)
+        # rospy never leaves a publisher because the master says so: it must be hung up on.
+        node.remove_publication(topic)
+
+    def _register(self, published: _Published) -> None:
+        node, topic = published.node, published.publication.topic
+        code, status, _ = self._core.call("registerPublisher", node.name, topic, published.type, node.uri)
+        if code != 1:
+            _log.error("! the local core does not take %s of %s: %s", topic, node.name, status)
+
+
+def _key(source: Source) -> str:
+    """What a source is called among the things of its node."""
+    return f"topic {source.topic}"

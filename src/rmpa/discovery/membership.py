@@ -1,0 +1,575 @@
+"""The membership protocol: which peers are there, by beacons and links alone (paper, section 4.3). Sans-I/O.
+
+Inputs are ``start``, ``receive``, ``link_up``, ``link_down``, ``interfaces_changed``, ``set_seeds`` and
+``handle_timer``; after each of them take ``outputs()`` (beacons to send) and ``events()`` (what happened).
+
+As in SWIM, members are learnt by gossip and kept by heartbeats with a lease; unlike there a peer only becomes a
+member by a beacon of its own or a link, never because another peer says so.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits as core_limits
+from rmpa.core.clock import earliest
+from rmpa.core.counters import Counters
+from rmpa.core.identity import Identity
+from rmpa.core.serial_number import serial_add
+from rmpa.core.token_bucket import TokenBucket
+from rmpa.discovery import limits
+from rmpa.discovery.beacon import Address, Beacon, BeaconKind
+from rmpa.discovery.endpoint import Endpoint, EndpointChange, PeerInstance
+from rmpa.discovery.endpoint_table import EndpointTable
+from rmpa.discovery.events import (
+    ConflictCleared,
+    ConflictKind,
+    Event,
+    HeardBy,
+    LossReason,
+    Output,
+    PeerChanged,
+    PeerConflict,
+    PeerFound,
+    PeerLost,
+    PeerRestarted,
+    SendMulticast,
+    SendUnicast,
+)
+from rmpa.discovery.gossip import GossipCandidates, GossipSelector
+from rmpa.discovery.unicast import AnswerLimit, UnicastHeartbeats
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+    from ipaddress import IPv4Address
+
+    from rmpa.core.guid import Guid
+    from rmpa.discovery.events import PeerView
+
+_NEVER: Final = float("-inf")
+
+
+class MembershipProtocol:
+    """The peers of one domain, as one agent knows them.
+
+    Args:
+        identity: This agent's own.
+        rng: Uniform numbers in [0, 1), for jitter; seeded by simulations.
+        multicast: Whether to send to the group at all.
+        lease: Seconds of silence after which peers may count this agent as gone.
+        counters: Where refusals are counted.
+    """
+
+    def __init__(
+        self,
+        identity: Identity,
+        *,
+        rng: Callable[[], float],
+        multicast: bool = True,
+        lease: float = core_limits.PEER_LEASE,
+        counters: Counters | None = None,
+    ) -> None:
+        self.counters = counters if counters is not None else Counters()
+        self._own = identity
+        self._rng = rng
+        self._multicast = multicast
+        self._lease_ms = round(lease * 1000)
+        self._endpoints = EndpointTable()
+        self._evictions = TokenBucket(limits.EVICTIONS_PER_SECOND, limits.EVICTIONS_PER_SECOND)
+        self._no_eviction_until = _NEVER
+        self._reported_names: set[frozenset[bytes]] = set()
+        self._answers = AnswerLimit()
+        self._candidates = GossipCandidates(rng)
+        self._seeds: tuple[Address, ...] = ()
+        self._burst: list[float] = []
+        self._heartbeat_at: float | None = None
+        self._disseminate_at: float | None = None
+        self._disseminated_at = _NEVER
+        self._sequence = 0
+        self._gossip_selector = GossipSelector()
+        self._unicast_heartbeats = UnicastHeartbeats()
+        self._closed = False
+        self._outputs: list[Output] = []
+        self._events: list[Event] = []
+
+    # --- inputs -----------------------------------------------------------------------------------------------
+
+    def start(self, now: float) -> None:
+        """Announce this agent: a burst of beacons, then only heartbeats."""
+        own = PeerInstance(self._own, now, now, core_limits.PEER_LEASE, HeardBy.LINK, HeardBy.LINK, linked=True)
+        self._endpoints.add(self._own.guid.place, Endpoint(own, own=True))
+        self._burst = self._burst_times(now, limits.BURST_OFFSETS)
+        self._heartbeat_at = self._next_heartbeat(now)
+        self.handle_timer(now)
+
+    def receive(self, beacon: Beacon, source: Address, now: float, *, multicast: bool) -> None:
+        """Take in one beacon.
+
+        Args:
+            beacon: As parsed; of this domain.
+            source: The packet's source address and port.
+            now: Monotonic seconds.
+            multicast: Whether it came to the group, or else to this agent's own port.
+        """
+        identity = beacon.identity
+        if self._closed or identity.instance == self._own.instance:
+            self.counters.add("beacon.echo")
+            return
+        key = identity.guid.place
+        endpoint = self._endpoints.get(key)
+        if endpoint is None:
+            if len(self._endpoints) >= core_limits.PEERS_MAX and not self._evict_silent(now):
+                self.counters.add("roster.full")
+                return
+            endpoint = self._endpoints.add(key, Endpoint())
+        previous = endpoint.current.identity if endpoint.current is not None else None
+        change = endpoint.receive(beacon, now, source, multicast=multicast)
+        if change in {EndpointChange.KNOWN, EndpointChange.STALE}:
+            self._endpoints.heard(key)
+        else:
+            self._endpoints.changed(key)
+        candidates = [self._candidates.answered(address) for address in {identity.guid.endpoint, source}]
+        self._apply(endpoint, change, now, previous=previous, source=source)
+        if (
+            change in {EndpointChange.NEW, EndpointChange.RESTARTED}
+            and not multicast
+            and endpoint.current is not None
+        ):
+            self._infer_multicast(endpoint.current, beacon, source, now, was_candidate=any(candidates))
+        if change is EndpointChange.STALE:
+            self.counters.add("beacon.late")
+        elif change in {EndpointChange.NEW, EndpointChange.RESTARTED, EndpointChange.KNOWN, EndpointChange.CHANGED}:
+            self._answer_if_unknown(endpoint, change, beacon, now, multicast=multicast)
+            self._apply_gossip(beacon, now)
+        self._remove_if_empty(key)
+
+    def link_up(self, identity: Identity, now: float, source: Address | None = None) -> None:
+        """A link to this peer is up: it is a member for as long as the link is up, however silent.
+
+        Args:
+            identity: As in the link's handshake.
+            now: Monotonic seconds.
+            source: Where beacons can be sent to it, if that is known to differ from its GUID's endpoint.
+        """
+        key = identity.guid.place
+        endpoint = self._endpoints.get(key)
+        if endpoint is None:
+            if len(self._endpoints) >= core_limits.PEERS_MAX and not self._evict():
+                self.counters.add("roster.full")
+                return
+            endpoint = self._endpoints.add(key, Endpoint())
+        if endpoint.own:
+            self.counters.add("roster.own_link")
+            return
+        previous = endpoint.current.identity if endpoint.current is not None else None
+        change = endpoint.link_up(identity, now)
+        self._endpoints.changed(key)
+        if source is not None and endpoint.current is not None:
+            endpoint.current.source = source
+        self._candidates.answered(identity.guid.endpoint)
+        self._apply(endpoint, change, now, previous=previous, source=source)
+        if not endpoint.present:
+            self._peer_found(endpoint, now)
+
+    def link_down(self, guid: Guid, now: float, instance: bytes | None = None) -> None:
+        """The link to this peer fell: its lease begins now.
+
+        Args:
+            guid: The peer's.
+            now: Monotonic seconds.
+            instance: The run's; the link of a run that was superseded meanwhile changes nothing.
+        """
+        key = guid.place
+        endpoint = self._endpoints.get(key)
+        if endpoint is None or endpoint.own or endpoint.current is None:
+            return
+        previous = endpoint.current.identity
+        if instance is not None and previous.instance != instance:
+            return
+        change = endpoint.link_down(now)
+        self._endpoints.changed(key)
+        if change is EndpointChange.CONFLICT:
+            self._peer_lost(endpoint, LossReason.CONFLICT)
+            return
+        source = endpoint.current.source
+        self._apply(endpoint, change, now, previous=previous, source=source)
+        if change is EndpointChange.RESTARTED:
+            self._send_answer(endpoint.current, now)
+        self._remove_if_empty(key)
+
+    def interfaces_changed(self, now: float, addresses: tuple[IPv4Address, ...] | None = None) -> None:
+        """Interfaces came or went: announce this agent again, with its present addresses if they are given."""
+        if self._closed:
+            return
+        if addresses is not None:
+            own = self._own
+            self._own = Identity(own.guid, own.instance, own.name, own.domain, addresses)
+        self._burst = self._burst_times(now, limits.BURST_AGAIN_OFFSETS)
+        self.handle_timer(now)
+
+    def set_seeds(self, seeds: Iterable[Address]) -> None:
+        """Send announcements to these addresses, now and with each heartbeat; they replace the former seeds."""
+        known = self._seeds
+        self._seeds = tuple(dict.fromkeys(seeds))
+        if self._heartbeat_at is not None:
+            for address in self._seeds:
+                if address not in known:
+                    self._send(BeaconKind.ANNOUNCE, address)
+
+    def goodbye(self, now: float) -> None:
+        """Tell the peers that this agent ends; nothing is sent or taken in afterwards."""
+        if self._closed or self._heartbeat_at is None:
+            return
+        if self._multicast:
+            self._outputs.append(SendMulticast(self._beacon(BeaconKind.GOODBYE)))
+        for peer in self._unicast_heartbeats.choose(self._unheard_by_multicast(now), now)[0]:
+            for address in peer.addresses:
+                self._send(BeaconKind.GOODBYE, address)
+        self._closed = True
+
+    def next_timer(self) -> float | None:
+        """When to call ``handle_timer``, in seconds of the clock; ``None``: never."""
+        if self._closed:
+            return None
+        return earliest(
+            self._heartbeat_at,
+            self._disseminate_at,
+            self._unicast_heartbeats.at,
+            self._burst[0] if self._burst else None,
+            self._candidates.next_timer(),
+            self._endpoints.next_timer(),
+        )
+
+    def handle_timer(self, now: float) -> None:
+        """Do what is due."""
+        if self._closed or self._heartbeat_at is None:
+            return
+        self._expire_leases(now)
+        if self._burst and self._burst[0] <= now:
+            self._burst = [at for at in self._burst if at > now]
+            self._send_multicast(BeaconKind.ANNOUNCE, now)
+            for address in self._seeds:
+                self._send(BeaconKind.ANNOUNCE, address)
+        if self._heartbeat_at <= now:
+            self._heartbeat_at = self._next_heartbeat(now)
+            self._send_multicast(BeaconKind.HEARTBEAT, now)
+            self._plan_unicast_heartbeats(now)
+            met = {address for peer in self._endpoints.present() for address in peer.addresses} if self._seeds else ()
+            for address in self._seeds:
+                if address not in met:
+                    self._send(BeaconKind.ANNOUNCE, address)
+        if self._disseminate_at is not None and self._disseminate_at <= now:
+            self._disseminate(now)
+        for peer in self._unicast_heartbeats.take_some():
+            gossip = self._gossip(self._endpoints.present(), peer, now)
+            for address in peer.addresses:
+                self._send(BeaconKind.HEARTBEAT, address, gossip)
+        for address in self._candidates.take_due(now):
+            self._send(BeaconKind.ANNOUNCE, address)
+
+    # --- outputs and views ------------------------------------------------------------------------------------
+
+    def outputs(self) -> list[Output]:
+        """The beacons to send, in order; each is returned once."""
+        taken, self._outputs = self._outputs, []
+        return taken
+
+    def events(self) -> list[Event]:
+        """What happened, in order; each event is returned once."""
+        taken, self._events = self._events, []
+        return taken
+
+    def peers(self) -> tuple[PeerView, ...]:
+        """All peers in GUID order, those included that a conflict keeps from being members."""
+        return self._endpoints.views()
+
+    def silent_seeds(self) -> list[Address]:
+        """Seeds at whose address no member is."""
+        met = {host for peer in self._endpoints.present() for host, _ in peer.addresses}
+        return [seed for seed in self._seeds if seed[0] not in met]
+
+    def is_linked(self, guid: Guid, instance: bytes) -> bool:
+        """Whether this run of a peer has a link; this agent itself counts as linked."""
+        endpoint = self._endpoints.get(guid.place)
+        peer = endpoint.current if endpoint is not None else None
+        return peer is not None and peer.linked and peer.identity.instance == instance
+
+    @property
+    def identity(self) -> Identity:
+        """This agent's own, as the next beacon will carry it."""
+        return self._own
+
+    # --- changes to events ------------------------------------------------------------------------------------
+
+    def _apply(
+        self,
+        endpoint: Endpoint,
+        change: EndpointChange,
+        now: float,
+        *,
+        previous: Identity | None,
+        source: Address | None,
+    ) -> None:
+        current = endpoint.current
+        if current is None:
+            return
+        if change is EndpointChange.KNOWN and endpoint.present:
+            self._report_name_conflict(endpoint)
+        elif change is EndpointChange.NEW:
+            self._peer_found(endpoint, now)
+        elif change is EndpointChange.CHANGED and previous is not None and endpoint.present:
+            self._events.append(PeerChanged(current.identity, previous))
+            self._report_name_conflict(endpoint)
+        elif change is EndpointChange.RESTARTED and previous is not None:
+            if endpoint.present:
+                self._events.append(PeerRestarted(current.identity, previous, source))
+                self._report_name_conflict(endpoint)
+                self._schedule_dissemination(now)
+            elif not endpoint.conflict:
+                self._peer_found(endpoint, now)
+        elif change is EndpointChange.LEAVING and not current.linked:
+            self._peer_lost(endpoint, LossReason.GOODBYE)
+            endpoint.remove_current()
+            self._clear_conflict(endpoint, now)
+            self._endpoints.changed(current.identity.guid.place)
+        elif change is EndpointChange.CONFLICT:
+            kind = ConflictKind.OWN_GUID if endpoint.own else ConflictKind.GUID
+            rival = max(endpoint.rivals(), key=lambda v: v.heard)
+            self._events.append(PeerConflict(kind, rival.identity, current.identity))
+            if not current.linked:
+                self._peer_lost(endpoint, LossReason.CONFLICT)
+        elif change is EndpointChange.WAITING:
+            self._clear_conflict(endpoint, now)
+            self._endpoints.changed(current.identity.guid.place)
+
+    def _peer_found(self, endpoint: Endpoint, now: float) -> None:
+        peer = endpoint.current
+        if peer is None or endpoint.own:
+            return
+        endpoint.present = True
+        peer.since = now
+        self._endpoints.changed(peer.identity.guid.place)
+        self._events.append(PeerFound(peer.identity, peer.source, peer.found_by))
+        self._remove_predecessors(endpoint, peer)
+        self._report_name_conflict(endpoint)
+        self._schedule_dissemination(now)
+
+    def _peer_lost(self, endpoint: Endpoint, reason: LossReason) -> None:
+        if endpoint.present and endpoint.current is not None:
+            endpoint.present = False
+            self._endpoints.changed(endpoint.current.identity.guid.place)
+            self._events.append(PeerLost(endpoint.current.identity, reason))
+            self._reported_names = {
+                pair for pair in self._reported_names if endpoint.current.identity.instance not in pair
+            }
+
+    def _remove_predecessors(self, endpoint: Endpoint, peer: PeerInstance) -> None:
+        """Remove the former run of an agent that was killed and started again at another port.
+
+        It has the same name and address, and no link. If it is alive after all, its next beacon brings it back.
+        """
+        for other in self._endpoints.with_name(peer.identity.name):
+            former = other.current
+            if (
+                former is not None
+                and other is not endpoint
+                and not other.own
+                and not former.linked
+                and former.heard < peer.since
+                and former.identity.guid.address == peer.identity.guid.address
+            ):
+                key = former.identity.guid.place
+                self._peer_lost(other, LossReason.MOVED)
+                other.remove_current()
+                self._endpoints.changed(key)
+                self._remove_if_empty(key)
+
+    def _report_name_conflict(self, endpoint: Endpoint) -> None:
+        """Report once that two peers share a name, if both are certainly alive."""
+        for one, other in self._endpoints.same_name(endpoint):
+            pair = frozenset({one.identity.instance, other.identity.instance})
+            if pair not in self._reported_names:
+                self._reported_names.add(pair)
+                self._events.append(PeerConflict(ConflictKind.NAME, one.identity, other.identity))
+                return
+
+    def _clear_conflict(self, endpoint: Endpoint, now: float) -> None:
+        """After a run of this endpoint fell silent or left: report a conflict that is over."""
+        endpoint.expire_others(now)
+        if endpoint.conflict and endpoint.current is not None and not endpoint.rivals():
+            endpoint.conflict = False
+            kind = ConflictKind.OWN_GUID if endpoint.own else ConflictKind.GUID
+            self._events.append(ConflictCleared(kind, endpoint.current.identity))
+            if not endpoint.present:
+                self._peer_found(endpoint, now)
+                if not endpoint.own:
+                    self._send_answer(endpoint.current, now)
+
+    def _expire_leases(self, now: float) -> None:
+        for key in self._endpoints.take_expired(now):
+            endpoint = self._endpoints.get(key)  # one that came back may have removed another
+            if endpoint is None:
+                continue
+            peer = endpoint.current
+            if peer is not None and not peer.linked and peer.deadline <= now:
+                self._peer_lost(endpoint, LossReason.SILENCE)
+                endpoint.remove_current()
+                if peer.multicast_at + limits.MULTICAST_SILENCE < now:
+                    # No multicast will bring it back once the network heals: announcements must.
+                    self._candidates.add(peer.identity.guid.endpoint, now)
+            self._clear_conflict(endpoint, now)
+            self._endpoints.changed(key)
+            self._remove_if_empty(key)
+
+    def _remove_if_empty(self, key: int) -> None:
+        endpoint = self._endpoints.get(key)
+        if endpoint is not None and endpoint.current is None and not endpoint.others:
+            self._endpoints.remove(key)
+
+    def _evict(self) -> bool:
+        """Make room for a linked peer: remove the unlinked one that is silent for longest."""
+        oldest = self._endpoints.oldest_unlinked()
+        if oldest is not None:
+            self._remove(oldest[1])
+        return oldest is not None
+
+    def _evict_silent(self, now: float) -> bool:
+        """Make room for a peer that was heard: remove an unlinked one that missed a heartbeat, for it may be forged.
+
+        The rate is limited, for the one that was heard may be forged too.
+        """
+        if now < self._no_eviction_until:
+            return False
+        heard, key = self._endpoints.oldest_unlinked() or (now, 0)
+        self._no_eviction_until = heard + limits.HEARTBEAT_LATE
+        if now >= self._no_eviction_until and self._evictions.take(now):
+            self._remove(key)
+            return True
+        self._no_eviction_until = max(self._no_eviction_until, self._evictions.next(now))
+        return False
+
+    def _remove(self, key: int) -> None:
+        endpoint = self._endpoints.get(key)
+        if endpoint is not None:
+            self._peer_lost(endpoint, LossReason.SILENCE)
+            self._endpoints.remove(key)
+
+    # --- sending ----------------------------------------------------------------------------------------------
+
+    def _beacon(self, kind: BeaconKind, gossip: tuple[Guid, ...] = ()) -> Beacon:
+        self._sequence = serial_add(self._sequence, 1)
+        return Beacon(kind, self._own, self._lease_ms, self._sequence, gossip, self._observed_addresses(gossip))
+
+    def _observed_addresses(self, gossip: tuple[Guid, ...]) -> tuple[Address, ...]:
+        """Source addresses of gossiped peers whose GUID has another address; receivers may only reach the former."""
+        found = []
+        for guid in gossip:
+            endpoint = self._endpoints.get(guid.place)
+            source = endpoint.current.source if endpoint is not None and endpoint.current is not None else None
+            if source is not None and source != guid.endpoint and not source[0].startswith("127."):
+                found.append(source)
+        return tuple(found)
+
+    def _send(self, kind: BeaconKind, address: Address, gossip: tuple[Guid, ...] = ()) -> None:
+        if not self._closed:
+            self._outputs.append(SendUnicast(self._beacon(kind, gossip), address))
+
+    def _send_multicast(self, kind: BeaconKind, now: float) -> None:
+        """Send to the group, with gossip about the peers that multicast does not reach."""
+        if self._multicast:
+            gossip = self._gossip(self._unheard_by_multicast(now), None, now)
+            self._outputs.append(SendMulticast(self._beacon(kind, gossip)))
+
+    def _plan_unicast_heartbeats(self, now: float) -> None:
+        """Queue unicast heartbeats, with gossip about all peers, for the peers that multicast does not reach."""
+        if not self._unicast_heartbeats.plan(self._unheard_by_multicast(now), now):
+            self.counters.add("beacon.whisper_limited")
+
+    def _disseminate(self, now: float) -> None:
+        """Send heartbeats early, because of what their gossip says about newly found peers."""
+        self._disseminate_at = None
+        self._disseminated_at = now
+        self._plan_unicast_heartbeats(now)
+        if self._unheard_by_multicast(now):
+            self._send_multicast(BeaconKind.HEARTBEAT, now)
+
+    def _schedule_dissemination(self, now: float) -> None:
+        """A peer was found: soon tell the peers that cannot hear it themselves."""
+        if self._disseminate_at is None and self._heartbeat_at is not None and len(self._endpoints.present()) > 1:
+            self._disseminate_at = max(now, self._disseminated_at + limits.DISSEMINATION_INTERVAL)
+
+    def _answer_if_unknown(
+        self, endpoint: Endpoint, change: EndpointChange, beacon: Beacon, now: float, *, multicast: bool
+    ) -> None:
+        """Answer a sender that does not know this agent, or may not."""
+        peer = endpoint.current
+        if peer is None or peer.linked or endpoint.conflict or beacon.kind is BeaconKind.ANSWER:
+            return
+        unknown = change in {EndpointChange.NEW, EndpointChange.RESTARTED}
+        # A unicast heartbeat means that its sender hears none of our multicasts. If we hear none of its either, our
+        # own heartbeats go there by unicast anyway.
+        deaf = not multicast and now - peer.multicast_at <= limits.MULTICAST_SILENCE
+        if unknown or deaf or beacon.kind is BeaconKind.ANNOUNCE:
+            self._send_answer(peer, now)
+
+    def _send_answer(self, peer: PeerInstance, now: float) -> None:
+        gossip: tuple[Guid, ...] | None = None
+        for address in peer.addresses:
+            if self._answers.allows(address, now):
+                gossip = self._gossip(self._endpoints.present(), peer, now) if gossip is None else gossip
+                self._send(BeaconKind.ANSWER, address, gossip)
+            else:
+                self.counters.add("beacon.answer_limited")
+
+    def _infer_multicast(
+        self, peer: PeerInstance, beacon: Beacon, source: Address, now: float, *, was_candidate: bool
+    ) -> None:
+        """Infer how a peer was found whose first beacon came by unicast.
+
+        A candidate was found by gossip. One that answers unasked has heard a multicast of ours; its own multicasts
+        are expected to be heard here too, for a while.
+        """
+        if was_candidate:
+            peer.found_by = HeardBy.GOSSIP
+        elif beacon.kind is BeaconKind.ANSWER and self._multicast and source not in self._seeds:
+            peer.multicast_at = now - limits.HEARTBEAT_INTERVAL
+
+    def _apply_gossip(self, beacon: Beacon, now: float) -> None:
+        """Announce this agent to unknown peers of the sender; only their own beacon makes them members."""
+        for guid in beacon.gossip:
+            if guid.place in self._endpoints or (guid.is_loopback and not self._own.guid.is_loopback):
+                continue
+            if not self._candidates.add(guid.endpoint, now):
+                self.counters.add("gossip.full")
+        for address in self._unknown_addresses(beacon.observed):
+            if not self._candidates.add(address, now):
+                self.counters.add("gossip.full")
+        for address in self._candidates.take_due(now):
+            self._send(BeaconKind.ANNOUNCE, address)
+
+    def _unknown_addresses(self, addresses: tuple[Address, ...]) -> list[Address]:
+        """Of these addresses the ones that belong to no member and not to this agent."""
+        if not addresses:
+            return []
+        met = {*self._own.endpoints}
+        for peer in self._endpoints.present():
+            met.update(peer.identity.endpoints, peer.addresses)
+        loopback = self._own.guid.is_loopback
+        return [a for a in addresses if a not in met and (loopback or not a[0].startswith("127."))]
+
+    def _gossip(self, peers: list[PeerInstance], to: PeerInstance | None, now: float) -> tuple[Guid, ...]:
+        identity = to.identity if to is not None else self._own
+        return self._gossip_selector.choose(peers, to, now, loopback=identity.guid.is_loopback)
+
+    # --- queries ----------------------------------------------------------------------------------------------
+
+    def _unheard_by_multicast(self, now: float) -> list[PeerInstance]:
+        """Members that get their heartbeats by unicast."""
+        silence = limits.MULTICAST_SILENCE
+        return [v for v in self._endpoints.present() if not self._multicast or now - v.multicast_at > silence]
+
+    def _burst_times(self, now: float, offsets: tuple[float, ...]) -> list[float]:
+        return [now + offset + (limits.BURST_JITTER * self._rng() if offset else 0.0) for offset in offsets]
+
+    def _next_heartbeat(self, now: float) -> float:
+        return now + limits.HEARTBEAT_INTERVAL * (1.0 - limits.HEARTBEAT_JITTER * self._rng())

@@ -1,0 +1,148 @@
+"""When a session begins, waits for its peer, goes on and ends."""
+
+from __future__ import annotations
+
+import asyncio
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
+
+from rmpa.bridge.session.part import Part
+from rmpa.bridge.session.peer_session import PeerSession, PeerState
+from rmpa.bridge.session.peer_sessions import PeerSessions
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity
+from rmpa.mesh import limits as mesh_limits
+from tests.bridge.io.virtual import VirtualLoop, run
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine
+
+    from rmpa.mesh.io.link import PeerLink
+    from rmpa.ros.wire.xmlrpc import RosReply
+
+GRACE = mesh_limits.AWAY_GRACE
+
+
+class Keeper(Part):
+    """Notes what it is told, and keeps something for each of these seconds."""
+
+    def __init__(self, *outages: float) -> None:
+        self.outages = outages
+        self.told: list[str] = []
+
+    def link_up(self, session: PeerSession) -> None:
+        self.told.append(f"up {session.peer}")
+
+    def link_down(self, session: PeerSession) -> None:
+        self.told.append("down")
+
+    def grace_over(self, session: PeerSession) -> bool:
+        self.told.append("grace over")
+        return bool(self.outages)
+
+    def outlasted(self, session: PeerSession, seconds: float) -> float | None:
+        return min((outage for outage in self.outages if outage > seconds), default=None)
+
+    def gone(self, session: PeerSession) -> None:
+        self.told.append("gone")
+
+
+class Link:
+    """What a session needs of a link to a run of the peer."""
+
+    name = "far"
+    resumed_at = 0.0
+
+    def __init__(self, run_number: int, *, silent: bool) -> None:
+        self.identity = Identity(Guid.of("10.0.0.1", 1000), bytes([run_number]) * 16, self.name)
+        self.guid = self.identity.guid
+        self.silent = silent
+
+
+class Scene:
+    """The sessions of one bridge with one part."""
+
+    def __init__(self, *outages: float) -> None:
+        self.part = Keeper(*outages)
+        nodes, receiver = SimpleNamespace(), SimpleNamespace(link_up=lambda *_: None, link_down=lambda _: None)
+        self.sessions = PeerSessions([self.part], cast("Any", nodes), cast("Any", receiver), self._killed)
+
+    async def _killed(self, *_: object) -> RosReply:
+        raise NotImplementedError
+
+    def link(self, run_number: int = 1, *, silent: bool = True) -> PeerLink:
+        link = cast("PeerLink", Link(run_number, silent=silent))
+        self.sessions.link_up(link)
+        return link
+
+    def states(self) -> list[PeerState]:
+        return [session.state for session in self.sessions]
+
+
+def play(scene: Callable[[Scene], Coroutine[object, object, None]], *outages: float) -> list[str]:
+    """Play a scene; return what the part was told."""
+    loop, told = VirtualLoop(), []
+
+    async def main() -> None:
+        made = Scene(*outages)
+        await scene(made)
+        told.extend(made.part.told)
+        await made.sessions.close()
+        assert made.states() == []
+
+    run(main(), loop)
+    return told
+
+
+def test_a_short_silence_goes_unnoticed() -> None:
+    async def scene(made: Scene) -> None:
+        made.sessions.link_down(made.link())
+        assert made.states() == [PeerState.SILENT]
+        await asyncio.sleep(GRACE / 2)
+        made.link()
+        await asyncio.sleep(GRACE)
+        assert made.states() == [PeerState.LINKED]
+
+    assert play(scene) == ["up 1", "down", "up 1"]
+
+
+def test_a_session_that_nothing_waits_for_ends_after_the_grace() -> None:
+    async def scene(made: Scene) -> None:
+        made.sessions.link_down(made.link())
+        await asyncio.sleep(GRACE + 0.1)
+        assert made.states() == []
+        made.link()
+
+    assert play(scene) == ["up 1", "down", "grace over", "gone", "up 2"]
+
+
+def test_a_link_that_was_closed_in_order_has_no_grace() -> None:
+    async def scene(made: Scene) -> None:
+        made.sessions.link_down(made.link(silent=False))
+        assert made.states() == []
+
+    assert play(scene) == ["up 1", "down", "grace over", "gone"]
+
+
+def test_a_session_waits_for_as_long_as_something_is_kept() -> None:
+    async def scene(made: Scene) -> None:
+        made.sessions.link_down(made.link())
+        await asyncio.sleep(8.9)
+        assert made.states() == [PeerState.AWAY]
+        await asyncio.sleep(0.2)
+        assert made.states() == []
+
+    assert play(scene, 3.0, 9.0) == ["up 1", "down", "grace over", "gone"]
+
+
+def test_another_run_of_the_peer_ends_the_session_that_waits() -> None:
+    async def scene(made: Scene) -> None:
+        made.sessions.link_down(made.link(1))
+        await asyncio.sleep(1.0)
+        link = made.link(2)
+        assert made.states() == [PeerState.LINKED]
+        [session] = made.sessions.linked()
+        assert made.sessions.of(link) is session
+        assert made.sessions.get(1) is None
+
+    assert play(scene, 9.0) == ["up 1", "down", "grace over", "gone", "up 2"]

@@ -1,0 +1,144 @@
+"""What follows from the declarations of the settings: documentation, JSON Schema, options of ``rmpa up``."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from rmpa.cli.main import cli
+from rmpa.cli.up import up
+from rmpa.config.reference import SCHEMA_FILE, json_schema, json_value, schema_text, with_settings_tables
+from rmpa.config.settings import SETTINGS, TABLES, Multicast
+from rmpa.config.sources import load_settings
+from rmpa.core.errors import ConfigError
+from tests.core.example import EXAMPLE, uncommented
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+@pytest.fixture(scope="module")
+def validate() -> Any:
+    return pytest.importorskip("fastjsonschema").compile(json_schema())
+
+
+def test_documentation_is_up_to_date() -> None:
+    page = (DOCS / "settings.md").read_text()
+    assert page == with_settings_tables(page), "run make reference"
+    assert (DOCS / SCHEMA_FILE).read_text() == schema_text(), "run make reference"
+
+
+def test_documentation_has_every_setting_and_every_list_of_tables() -> None:
+    page = (DOCS / "settings.md").read_text()
+    for setting in SETTINGS:
+        assert (
+            setting.title if setting.is_list_of_tables else f"| `{(setting.key or (setting.env,))[-1]}` |"
+        ) in page
+    assert {setting.key[0] for setting in SETTINGS if len(setting.key) > 1} == set(TABLES)
+
+
+def test_no_two_settings_share_a_name() -> None:
+    for names in ([s.key for s in SETTINGS], [s.env for s in SETTINGS], [s.option_name for s in SETTINGS]):
+        given = [name for name in names if name]
+        assert len(given) == len(set(given))
+
+
+def test_every_default_can_be_read_again() -> None:
+    for setting in SETTINGS:
+        if setting.default not in ("", ()):
+            assert setting.type.read(json_value(setting.default)) == setting.default, setting.name
+
+
+def test_up_has_an_option_for_each_setting_that_declares_one() -> None:
+    options = {name for parameter in up.params for name in (*parameter.opts, *parameter.secondary_opts)}
+    assert options == {"--config"} | {part for s in SETTINGS if s.option for part in s.option.split("/")}
+
+
+def test_schema_accepts_the_example_file(validate: Any) -> None:
+    validate(tomllib.loads(EXAMPLE.read_text()))
+    validate(tomllib.loads(uncommented(EXAMPLE.read_text())))
+
+
+def test_schema_accepts_the_files_of_the_documentation(validate: Any) -> None:
+    blocks = [
+        block.partition("```")[0] for page in DOCS.glob("*.md") for block in page.read_text().split("```toml\n")[1:]
+    ]
+    assert len(blocks) > 20
+    for block in blocks:
+        try:
+            validate(tomllib.loads(block))
+        except Exception as error:
+            raise AssertionError(block) from error
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "domian = 3",
+        "domain = 233",
+        "core = 5",
+        "[core]\nprot = 1",
+        "[core]\nmode = 'extern'",
+        "[core]\nport = 0",
+        "name = 'robot-1'",
+        "[log]\nlevel = 'wran'",
+        "[bridge]\nallow = '/a'",
+        "[realtime]\ncpus = [1, 1]",
+        "[discovery]\nmulticast = 5",
+        "[[contract]]\ntopics = ['/a']\ndept = 1",
+        "[[contract]]\ntopics = []",
+        "[[contract]]\ntopics = ['/a']\nreliability = 'reliabel'",
+        "[[peer]]\nprefix = '/a'",
+        "[[peer]]\nname = 'a'\n[[peer.remap]]\nfrom = '/a'\nto = '/b'",
+        "[[peer]]\nname = 'a'\nremap_in = {'/a' = 1}",
+        "[[service]]\nnames = ['/a']",
+        "[[param]]\nkey = '/a'",
+        "[param]\nkey = '/a'",
+    ],
+)
+def test_schema_refuses_what_the_agent_refuses(validate: Any, tmp_path: Path, text: str) -> None:
+    (tmp_path / "rmpa.toml").write_text(text)
+    with pytest.raises(ConfigError):
+        load_settings({}, {}, host_name="a", cwd=tmp_path)
+    with pytest.raises(ValueError, match="data"):
+        validate(tomllib.loads(text))
+
+
+def test_schema_has_defaults_and_descriptions_for_editors() -> None:
+    core = json_schema()["properties"]["core"]["properties"]["port"]
+    assert core["default"] == 11311
+    assert core["description"] == "The ROS core's port."
+    assert (core["minimum"], core["maximum"]) == (1, 65535)
+
+
+def test_config_show_says_where_each_setting_comes_from(tmp_path: Path) -> None:
+    file = tmp_path / "rmpa.toml"
+    file.write_text('domain = 3\n[discovery]\nmulticast = false\n[[contract]]\ntopics = ["/a"]\ndepth = 1\n')
+    run = CliRunner(env={"RMPA_PORT": "40001"}).invoke(cli, ["config", "show", "--config", str(file)])
+    rows = {row.split()[0]: row.split() for row in run.output.splitlines()}
+    assert rows["domain"] == ["domain", "3", f"{file}:1"]
+    assert rows["discovery.multicast"][1:] == ["false", f"{file}:3"]
+    assert rows["[[contract]]"][1:] == ["1", "table", f"{file}:4"]
+    assert rows["mesh.port"][1:] == ["40001", "RMPA_PORT"]
+    assert rows["core.port"][1:] == ["11311", "default"]
+
+
+def test_config_show_prints_one_json_document(tmp_path: Path) -> None:
+    import msgspec
+
+    (tmp_path / "rmpa.toml").write_text('[[service]]\nnames = ["/a"]\ntimeout = 2\n')
+    run = CliRunner().invoke(cli, ["config", "show", "--json", "--config", str(tmp_path / "rmpa.toml")])
+    found = {entry["name"]: entry for entry in msgspec.json.decode(run.output)["settings"]}
+    assert found["[[service]]"]["value"] == [{"names": ["/a"], "timeout": 2.0}]
+    assert found["discovery.multicast"] == {
+        "name": "discovery.multicast",
+        "value": str(Multicast()),
+        "from": "default",
+    }
+
+
+def test_config_schema_prints_the_schema() -> None:
+    assert CliRunner().invoke(cli, ["config", "schema"]).output == schema_text()
