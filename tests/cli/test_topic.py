@@ -35,9 +35,12 @@ def talking(place: Place, core: RosCore) -> Iterator[subprocess.Popen[str]]:
     ) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "publishing on /cmd at 50 Hz; Ctrl-C to end\n"
-        yield process
-        process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 0
+        try:
+            yield process
+            process.send_signal(signal.SIGINT)
+            assert process.wait(30) == 0
+        finally:
+            process.kill()
     assert core.state().publishers.get("/cmd") is None
 
 

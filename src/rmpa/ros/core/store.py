@@ -50,7 +50,7 @@ def is_locked(error: OSError) -> bool:
     return getattr(error.__cause__, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_BUSY
 
 
-class _DamagedError(Exception):
+class _DamagedFileError(Exception):
     """The file is not a state file."""
 
 
@@ -138,7 +138,7 @@ class CoreStore:
     def _open(self) -> list[Row]:
         try:
             return self._read()
-        except _DamagedError as error:
+        except _DamagedFileError as error:
             why = str(error)
         except sqlite3.DatabaseError as error:
             if getattr(error, "sqlite_errorcode", 0) & 0xFF not in _DAMAGED:
@@ -151,7 +151,7 @@ class CoreStore:
         connection = self._connected()
         rows = connection.execute("SELECT kind, name, value FROM kept ORDER BY rowid").fetchall()
         if not all(isinstance(kind, str) and isinstance(name, str) and type(v) is bytes for kind, name, v in rows):
-            raise _DamagedError("a row of it is of another kind")
+            raise _DamagedFileError("a row of it is of another kind")
         return rows
 
     def _connected(self) -> sqlite3.Connection:
@@ -160,7 +160,7 @@ class CoreStore:
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         os.close(os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
         if self.path.stat().st_size > 2 * limits.CORE_STATE_BYTES:
-            raise _DamagedError("it is larger than a core's file can be")
+            raise _DamagedFileError("it is larger than a core's file can be")
         connection = sqlite3.connect(self.path, timeout=limits.CORE_STATE_LOCKED, check_same_thread=False)
         self._connection = connection
         # The lock is held until the end: it keeps other processes away, and SQLite needs no shared memory.
@@ -173,11 +173,11 @@ class CoreStore:
             for query in ("PRAGMA application_id", "PRAGMA user_version", "SELECT count(*) FROM sqlite_master")
         )
         if tables and application != _APPLICATION:
-            raise _DamagedError("it is another program's")
+            raise _DamagedFileError("it is another program's")
         if version > _VERSION:
-            raise _DamagedError(f"it is of version {version}; this release reads {_VERSION}")
+            raise _DamagedFileError(f"it is of version {version}; this release reads {_VERSION}")
         if (found := connection.execute("PRAGMA quick_check(1)").fetchone()[0]) != "ok":
-            raise _DamagedError(found)
+            raise _DamagedFileError(found)
         connection.executescript(_SCHEMA)
         self._inode = self.path.stat().st_ino
         return connection

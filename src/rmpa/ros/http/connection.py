@@ -21,7 +21,7 @@ _PIECE: Final = 16 * KIB
 """Bytes parsed at once: the granularity of the bound on headers; pending data goes first in between."""
 
 
-class ConnectionOwner(Protocol):
+class HttpConnectionOwner(Protocol):
     """What a connection asks of its server."""
 
     def admit(self, connection: HttpConnection) -> bool:
@@ -56,7 +56,7 @@ class HttpConnection(asyncio.Protocol):
         gone: Done when the connection is closed.
     """
 
-    def __init__(self, server: ConnectionOwner) -> None:
+    def __init__(self, server: HttpConnectionOwner) -> None:
         self._server = server
         self._loop = asyncio.get_running_loop()
         self._requests = RequestParser(lambda size: server.reserve(self, size), self._begin)

@@ -117,7 +117,7 @@ class XmlRpcServer:
         for connection in list(self._connections):
             connection.abort()
 
-    # --- http.connection.ConnectionOwner ----------------------------------------------------------------------
+    # --- http.connection.HttpConnectionOwner -------------------------------------------------------------------
 
     def admit(self, connection: HttpConnection) -> bool:
         """Whether there is room for a new connection; another one may be closed for it."""
