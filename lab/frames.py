@@ -60,7 +60,7 @@ def read(file: TextIO, held: Mapping[str, str]) -> pd.DataFrame:
     if unknown := sorted({kind.removesuffix("?") for kind in held.values()} - _TYPES.keys()):
         raise ValueError(f"{unknown[0]!r} is not what a column may hold")
     types = {name: "float64" if kind == "int?" else _TYPES[kind.removesuffix("?")] for name, kind in held.items()}
-    table = pd.read_csv(file, dtype=types, na_values=["", "nan"], keep_default_na=False)
+    table = pd.read_csv(file, dtype=types, na_values=["", "nan"], keep_default_na=False, skip_blank_lines=False)
     if list(table.columns) != list(held):
         raise ValueError(f"it has the columns {', '.join(table.columns)}, not {', '.join(held)}")
     if list(table.index) != list(range(len(table))):
