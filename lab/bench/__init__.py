@@ -1,1 +1,1 @@
-"""The measurements: ``python -m bench``; see ``README.md``."""
+"""The measurements: ``python -m lab bench``; see ``README.md``."""

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.bridge import limits
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings, Settings
 from rmpa.core.errors import ConfigError
+from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import CheckLevel
 from tests.agent.test_agent import DEADLINE, node, running, settings, until  # noqa: F401 - a fixture among them
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "WHY_WINDOW", 0.2)
+    monkeypatch.setattr(observe_limits, "WHY_WINDOW", 0.2)
 
 
 async def ask(agent: Agent, name: str, peer: str | None = None) -> tuple[Diagnosis, ...]:
@@ -183,7 +183,7 @@ async def test_services(settings: Callable[..., Settings]) -> None:  # noqa: F81
 
 
 async def test_a_server_that_is_stuck(settings: Callable[..., Settings], monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
-    monkeypatch.setattr(limits, "WHY_PROBE", 0.3)
+    monkeypatch.setattr(observe_limits, "WHY_PROBE", 0.3)
     async with running(settings("a"), settings("b")) as (a, b):
         with socket.create_server(("127.0.0.1", 0)) as stuck:  # takes connections, and says nothing
             uri = f"rosrpc://127.0.0.1:{stuck.getsockname()[1]}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rmpa.ros.master import stored_rows
-from rmpa.ros.master.api import MasterApi
+from rmpa.ros.master.master_api import MasterApi
 from rmpa.ros.wire.xmlrpc import response_pieces
 
 if TYPE_CHECKING:

@@ -255,7 +255,7 @@ def test_peer_that_died_in_a_pause_is_given_up_within_its_lease() -> None:
     time.now += 60.0
     dialler.link.handle_timer(time.now)
     assert is_up(dialler)
-    pass_time(dialler.link, time, limits.LINK_LEASE)
+    pass_time(dialler.link, time, limits.EXPRESS_LEASE)
     assert not is_up(dialler)
 
 

@@ -209,7 +209,7 @@ def test_bulk_lane_has_its_own_lease() -> None:
 def test_acceptor_promises_the_bulk_lease() -> None:
     time = Time()
     dialler = side(ConnectionRole.DIALLER, LOW, time, expected=HIGH.guid, lease=limits.BULK_LEASE, lane=Lane.BULK)
-    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time, lease=limits.LINK_LEASE)
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time, lease=limits.EXPRESS_LEASE)
     deliver(dialler.link.take_output(), acceptor.link, time.now)
     acceptor.link.accept(time.now)
     exchange(dialler, acceptor, time)

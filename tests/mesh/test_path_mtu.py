@@ -46,7 +46,7 @@ def test_lost_large_segments_are_a_black_hole() -> None:
     assert lane.look(0.2, 2) is Progress.WAITING, "its acknowledgement may be on the way"
     assert lane.suspected()
     assert lane.look(0.1, 2) is Progress.BLACK_HOLE
-    assert lane.now - 100.0 < limits.LINK_LEASE
+    assert lane.now - 100.0 < limits.EXPRESS_LEASE
 
 
 def test_unanswered_probe_proves_nothing() -> None:

@@ -61,7 +61,7 @@ class MeshScenario(Scenario):
             mock.patch("rmpa.runtime.acceptor.Acceptor._has_room", return_value=True),
             mock.patch.multiple(
                 limits,
-                LINK_LEASE=slower * limits.LINK_LEASE,
+                EXPRESS_LEASE=slower * limits.EXPRESS_LEASE,
                 KEEPALIVE_INTERVAL=slower * limits.KEEPALIVE_INTERVAL,
                 CLOCK_INTERVAL=slower * limits.CLOCK_INTERVAL,
                 BULK_LEASE=slower * limits.BULK_LEASE,

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Final
 from rmpa.agent.core_choice import make_core
 from rmpa.agent.network import Network
 from rmpa.agent.reload import Reloader, SighupHandler
-from rmpa.bridge.io.bounds import Bounds
 from rmpa.bridge.io.bridge import Bridge
+from rmpa.bridge.io.limit_reports import LimitReports
+from rmpa.bridge.io.node_requests import NodeRequests
 from rmpa.bridge.naming import Names
 from rmpa.bridge.params.io.part import Params
 from rmpa.bridge.policy import Policy
@@ -29,7 +30,6 @@ from rmpa.core.open_files import remedy
 from rmpa.observe.io.control_operations import ControlOperations
 from rmpa.observe.io.control_server import ControlServer
 from rmpa.observe.io.diagnostics import Diagnostics
-from rmpa.observe.io.node_requests import NodeRequests
 from rmpa.observe.io.peer_clocks import PeerClocks
 from rmpa.observe.io.runtime_dir import runtime_dir
 from rmpa.observe.io.snapshot_builder import SnapshotBuilder, SnapshotSources
@@ -104,8 +104,10 @@ class Agent:
             settings.limits,
             self.bridge.counters,
         )
-        bounds = Bounds(self.bridge.sessions, self.bridge.rpc, self.bridge.topics, self.services, settings.limits)
-        for part in (self.params, self.services, bounds):
+        reports = LimitReports(
+            self.bridge.sessions, self.bridge.rpc, self.bridge.topics, self.services, settings.limits
+        )
+        for part in (self.params, self.services, reports):
             self.bridge.add(part)
         self.network = Network(settings, self.bridge)
         self.reloader = Reloader(settings, load, self.apply_settings)
@@ -117,7 +119,7 @@ class Agent:
             bridge=self.bridge,
             clocks=self._clocks,
             services=self.services,
-            bounds=bounds,
+            limit_reports=reports,
             endpoint=lambda: self.network.endpoint,
             counters=(counters,),
             notes=self._notes,

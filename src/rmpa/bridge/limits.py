@@ -62,18 +62,6 @@ ASKS_AT_ONCE: Final = 64
 """Questions of one peer that are being answered; further ones are refused at once."""
 ASK_TIMEOUT: Final = 5.0
 """For another agent's answer."""
-WHY_WINDOW: Final = 1.0
-"""Between the two looks of ``rmpa why`` at what flows: a topic of some messages a second has moved by then."""
-WHY_TIMEOUT: Final = 12.0
-"""For a peer's own walk: its window, and two questions to us of ASK_TIMEOUT each at the worst."""
-WHY_SILENT: Final = 2.0
-"""A topic that was silent for less than this is not called so, whatever its rate."""
-WHY_SILENT_PERIODS: Final = 10.0
-"""In its own longest usual periods, likewise."""
-WHY_PROBE: Final = 2.0
-"""For a service's server to answer a probe: it is on the same machine as the agent that asks."""
-WHY_SOURCES_MAX: Final = 64
-"""Publishers of one topic in one module that ``rmpa why`` tells of."""
 PARAM_PORTION: Final = 16 * KIB
 """Characters of a parameter that cross at once: a millisecond of a 100 Mbit/s link, and the next portion is asked for
 when this one is there, so commands do not wait behind megabytes."""

@@ -17,7 +17,7 @@ NAMES_REMEMBERED: Final = 256
 REMAPS_MAX: Final = 256
 """Renaming rules in one direction of a ``[[peer]]``; each is compared with each other one."""
 CONTRACT_DEPTH_MAX: Final = 100_000
-"""Messages that a contract may let wait: 100 s of a 1 kHz topic. ``LINK_QUEUE_BYTES`` bounds their bytes."""
+"""Messages that a contract may let wait: 100 s of a 1 kHz topic. ``LANE_QUEUE_BYTES`` bounds their bytes."""
 CONTRACT_TIME_MIN: Final = 0.001
 """Shortest deadline, lifespan and lease: a timer that is due more often would delay the messages it watches."""
 CONTRACT_TIME_MAX: Final = 86_400.0

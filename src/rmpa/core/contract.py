@@ -184,7 +184,7 @@ class Contracts:
         found = self._known.get((topic, type_name))
         if found is None:
             values = {key: value for key, (value, _) in self.explain(topic, type_name).items()}
-            found = Contract(**values)  # type: ignore[arg-type] # as Rule.values promises
+            found = Contract(**values)  # type: ignore[arg-type] # as ContractRule.values promises
             if len(self._known) >= limits.CONTRACTS_REMEMBERED:
                 del self._known[next(iter(self._known))]
             self._known[topic, type_name] = found

@@ -78,7 +78,7 @@ class EndpointTable:
         return sorted(self._timers.take(now))
 
     def present(self) -> list[PeerInstance]:
-        """The peers that are members, in the order of their GUIDs; not to be changed by the caller."""
+        """The peers that are members, without this agent, by GUID; not to be changed by the caller."""
         if self._present is None:
             self._present = [e.current for e in self if e.present and e.current is not None]
         return self._present

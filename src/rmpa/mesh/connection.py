@@ -30,7 +30,7 @@ from rmpa.mesh import frames, limits
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import HandshakeError, Hello, Lane, Refuse, judge_welcome
 from rmpa.mesh.keepalive import Keepalive
-from rmpa.mesh.timing import LinkClock
+from rmpa.mesh.remote_clock import RemoteClock
 from rmpa.runtime import limits as runtime_limits
 
 if TYPE_CHECKING:
@@ -224,11 +224,11 @@ class ConnectionProtocol:
         on_part: OnPart | None = None,
         expected: Guid | None = None,
         lane: Lane = Lane.EXPRESS,
-        lease: float = limits.LINK_LEASE,
+        lease: float = limits.EXPRESS_LEASE,
         label: str = "?",
     ) -> None:
         self.role = role
-        self.clock = LinkClock()
+        self.clock = RemoteClock()
         self.remote: Hello | None = None
         """What the remote side said of itself, as soon as it did."""
         self.on_event = on_event

@@ -39,15 +39,15 @@ class Keepalive:
         self.sent = now
         """When this side last sent a ping or a pong."""
         self._pinged = self._up_at = now
-        self._remote_lease = limits.LINK_LEASE
+        self._remote_lease = limits.EXPRESS_LEASE
         self._excused = self._excused_at = 0.0
 
     def promise(self, lease: float) -> None:
         """Promise another lease, in seconds; before the handshake ends."""
         self.lease = lease
-        self._interval = lease * limits.KEEPALIVE_INTERVAL / limits.LINK_LEASE
+        self._interval = lease * limits.KEEPALIVE_INTERVAL / limits.EXPRESS_LEASE
         if self._acceptor:
-            self._interval *= limits.KEEPALIVE_ANSWERED
+            self._interval *= limits.ACCEPTOR_KEEPALIVE_FACTOR
 
     def begin(self, remote_lease: float, now: float) -> None:
         """The handshake is done; the remote side promised ``remote_lease`` seconds."""
@@ -60,7 +60,12 @@ class Keepalive:
 
     @property
     def due(self) -> float:
-        """When to look next: the next ping, or the end of the lease."""
+        """When to look next: the next ping, or the end of the lease.
+
+        While the connection is up it may only move to a later time: the driver does not arm its timer anew after
+        each receive. The same timer looks at the path MTU and for a peer that is gone, so it stays below
+        ``limits.GHOST_QUIET``.
+        """
         return min(self.lease_end, self.sent + self._interval, self._pinged + limits.CLOCK_INTERVAL)
 
     @property

@@ -11,14 +11,14 @@ from rmpa.core.limits import PEER_LEASE
 from rmpa.core.sizes import KIB, MIB, UINT32_MAX
 
 # --- mesh -------------------------------------------------------------------------------------------------------
-LINK_LEASE: Final = 1.0
+EXPRESS_LEASE: Final = 1.0
 """A link on which nothing arrived for this long is dead (TCP alone would take two hours)."""
 PAUSE_NOTICED: Final = 0.1
 """A timer that fires later than this shows that the process did not run: such time is not counted as a peer's
 silence."""
 KEEPALIVE_INTERVAL: Final = 0.25
 """A quarter of the lease: three keepalives may be late before the link falls."""
-KEEPALIVE_ANSWERED: Final = 1.2
+ACCEPTOR_KEEPALIVE_FACTOR: Final = 1.2
 """The acceptor's interval in those of the dialler: the dialler pings, and the pong counts as a sign of life."""
 HANDSHAKE_TIMEOUT: Final = 3.0
 """From connect to welcome; a connection that takes longer is a port scanner's, or stuck."""
@@ -48,9 +48,9 @@ CONTROL_PAYLOAD_MAX: Final = 16 * MIB
 """A control frame: the graph of a peer with a few thousand topics and their message definitions."""
 HELLO_PAYLOAD_MAX: Final = 4 * KIB
 """Before the handshake nothing larger is read from a peer."""
-PENDING_LINKS_MAX: Final = 64
+PENDING_CONNECTIONS_MAX: Final = 64
 """Accepted connections that have not finished their handshake."""
-LINK_QUEUE_BYTES: Final = 64 * MIB
+LANE_QUEUE_BYTES: Final = 64 * MIB
 """Data that waits for one lane of a slow link, over all topics; beyond it the oldest message is dropped."""
 EXPRESS_MESSAGE_MAX: Final = 8 * KIB
 """Messages up to this size are small: they go by the express lane unless their contract says otherwise. A full one
@@ -134,10 +134,10 @@ PATH_PROVEN_SEGMENTS: Final = 2
 """Full segments of the smaller size that must be acknowledged before the size is known to have been the problem."""
 PATHS_MAX: Final = 512
 """Addresses remembered as black holes, as many as there are links; the oldest is forgotten first."""
-LINK_UNSENT_BYTES: Final = 64 * KIB
+EXPRESS_UNSENT_BYTES: Final = 64 * KIB
 """Bytes that the kernel queues for one link before they can be sent (TCP_NOTSENT_LOWAT): control frames cannot
 overtake what waits there, and no rule can drop it. A pong on 5 Mbit/s was 1.2 s late without it, 0.3 s with it."""
-LINK_URGENT_BYTES: Final = 32 * MIB
+CONNECTION_URGENT_BYTES: Final = 32 * MIB
 """Control frames that wait for one link: two of the longest. Beyond it the link is closed: they are never dropped."""
 CLOCK_SAMPLES: Final = 16
 """Exchanges remembered for a peer's clock: 4 to 16 s of keepalives; older ones have a large error (CLOCK_DRIFT)."""

@@ -342,7 +342,7 @@ class Peering:
         if refuse.code == Refusal.ALREADY_LINKED:
             # The peer has a link that was lost or is about to be accepted here: it ends within the lease.
             if peer.link is None:
-                self._dial_at(peer, now + max(limits.LINK_LEASE, self._pause(peer)))
+                self._dial_at(peer, now + max(limits.EXPRESS_LEASE, self._pause(peer)))
             return
         if refuse.code in _OTHER_PEER or refuse.code not in _SELDOM_MENDED:
             self._retry(peer, now)

@@ -57,3 +57,17 @@ DOCTOR_CLOCK_STEP: Final = 0.005
 """That the wall clock may move against the monotonic one meanwhile; slewing makes 0.15 ms."""
 DOCTOR_CLOCK_APART: Final = 0.02
 """Between the clocks of two modules, from which on tf complains: two periods of a 100 Hz transform."""
+
+# --- why --------------------------------------------------------------------------------------------------------
+WHY_WINDOW: Final = 1.0
+"""Between the two looks of ``rmpa why`` at what flows: a topic of some messages a second has moved by then."""
+WHY_TIMEOUT: Final = 12.0
+"""For a peer's own walk: its window, and two questions to us of ASK_TIMEOUT each at the worst."""
+WHY_SILENT: Final = 2.0
+"""A topic that was silent for less than this is not called so, whatever its rate."""
+WHY_SILENT_PERIODS: Final = 10.0
+"""In its own longest usual periods, likewise."""
+WHY_PROBE: Final = 2.0
+"""For a service's server to answer a probe: it is on the same machine as the agent that asks."""
+WHY_SOURCES_MAX: Final = 64
+"""Publishers of one topic in one module that ``rmpa why`` tells of."""

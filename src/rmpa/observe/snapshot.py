@@ -92,7 +92,7 @@ class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
         remote: ``address:port`` of the other end of the TCP connection.
         dialled: Whether this agent dialled; else the peer did.
         up_ago: Seconds since it came up.
-        rtt: The least of the last round trips, seconds.
+        rtt: The last round trip on the wire, seconds.
         clock_offset: The peer's wall clock less this machine's, seconds.
         clock_error: Bound of that offset's error, ± seconds.
         bytes_in: Received since it came up.

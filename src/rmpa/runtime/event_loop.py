@@ -71,7 +71,7 @@ class DirectSelector(selectors.BaseSelector):
         self._readers[fd] = reader
 
     def write_directly(self, fd: int, writer: Callable[[], None] | None) -> None:
-        """Call ``writer`` when ``fd`` is writable, as long as it has a direct reader too; ``None``: as above."""
+        """Call ``writer`` when ``fd`` is writable, as long as it has a direct reader too; ``None``: no more."""
         if writer is not None and fd in self._readers:
             self._writers[fd] = writer
         else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rmpa.bridge import limits
-from rmpa.bridge.catalogue.bounds import NodePlaces
+from rmpa.bridge.catalogue.peer_limits import NodePlaces
 from rmpa.bridge.catalogue.peer_offers import Change, PeerOffers
 
 Offers = PeerOffers[str, int, str]

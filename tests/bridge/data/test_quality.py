@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.bridge import limits
-from rmpa.bridge.data.peer_clock import PeerClock
+from rmpa.bridge.data.peer_clock import PeerClockHistory
 from rmpa.bridge.data.quality import Quality
 from rmpa.core.stats import SampleSummary
 from rmpa.mesh import limits as mesh_limits
@@ -20,9 +20,9 @@ SECOND = 1_000_000_000
 WALL = 1_700_000_000 * SECOND
 
 
-def clock(offset: float = 0.0, error: float = 0.0, now: float = 0.0) -> PeerClock:
+def clock(offset: float = 0.0, error: float = 0.0, now: float = 0.0) -> PeerClockHistory:
     """A clock with one estimate."""
-    found = PeerClock()
+    found = PeerClockHistory()
     found.add(offset, error, now)
     return found
 
@@ -120,7 +120,7 @@ def test_the_rate_of_a_source_that_died_falls() -> None:
 
 def test_latency_is_corrected_by_the_clock_of_its_time() -> None:
     """Clocks that drift apart by 10 ppm: a minute later the offset is another."""
-    quality, known = Quality(), PeerClock()
+    quality, known = Quality(), PeerClockHistory()
     for second in range(51):
         ahead = 2.0 + second * 1e-5
         feed(quality, [second + 0.5], latency=0.001, ahead=ahead + 5e-6)
@@ -134,7 +134,7 @@ def test_latency_is_corrected_by_the_clock_of_its_time() -> None:
 
 
 def test_latencies_before_a_clock_step_are_dropped() -> None:
-    quality, known = Quality(), PeerClock()
+    quality, known = Quality(), PeerClockHistory()
     feed(quality, [1.0, 2.0], latency=0.001)
     known.add(0.0, 0.0005, 2.5)
     known.add(0.0004, 0.0002, 3.6)  # within both bounds

@@ -25,7 +25,7 @@ class Wire:
     """One direction of one connection: the lane's stream, the kernel's buffers and the other end's parser."""
 
     def __init__(self, deliver: Callable[[Frame], None]) -> None:
-        self.outbox = Outbox(1, mesh_limits.LINK_URGENT_BYTES)
+        self.outbox = Outbox(1, mesh_limits.CONNECTION_URGENT_BYTES)
         self.lost = False
         self._deliver = deliver
         self._flying = bytearray()

@@ -98,7 +98,7 @@ async def settled(world: World) -> None:
 async def outage(world: World, speaker: Speaker, seconds: float) -> None:
     """The cable is out, the publisher goes on; each side notices by its lease, or a little before."""
     world.cut()
-    noticed = [min(seconds / 2, mesh_limits.LINK_LEASE * world.rng.uniform(0.3, 1.0)) for _ in world.sides]
+    noticed = [min(seconds / 2, mesh_limits.EXPRESS_LEASE * world.rng.uniform(0.3, 1.0)) for _ in world.sides]
     for index, when in enumerate(noticed):
         silent = world.rng.random() < 0.7
         asyncio.get_running_loop().call_later(when, lambda i=index, s=silent: world.notice(i, silent=s))  # type: ignore[misc] # bound here

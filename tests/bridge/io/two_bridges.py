@@ -187,13 +187,13 @@ class World:
         began = asyncio.get_running_loop().time()
         for index in self.rng.sample((0, 1), 2):
             if self.rng.random() < 0.8:
-                await asyncio.sleep(min(seconds, mesh_limits.LINK_LEASE) * self.rng.random() / 2)
+                await asyncio.sleep(min(seconds, mesh_limits.EXPRESS_LEASE) * self.rng.random() / 2)
                 self.notice(index, silent=self.rng.random() < 0.6)
         self.cut()
         await asyncio.sleep(
-            max(0.0, began + min(seconds, mesh_limits.LINK_LEASE) - asyncio.get_running_loop().time())
+            max(0.0, began + min(seconds, mesh_limits.EXPRESS_LEASE) - asyncio.get_running_loop().time())
         )
-        if seconds > mesh_limits.LINK_LEASE:
+        if seconds > mesh_limits.EXPRESS_LEASE:
             for index in (0, 1):
                 self.notice(index, silent=True)
         await asyncio.sleep(max(0.0, began + seconds - asyncio.get_running_loop().time()))
@@ -274,8 +274,8 @@ class World:
     async def wait(self, seconds: float) -> None:
         """Let time go on; a link that nothing came over for as long as a lease would be no link."""
         while seconds > 0:
-            await asyncio.sleep(min(seconds, mesh_limits.LINK_LEASE / 2))
-            seconds -= mesh_limits.LINK_LEASE / 2
+            await asyncio.sleep(min(seconds, mesh_limits.EXPRESS_LEASE / 2))
+            seconds -= mesh_limits.EXPRESS_LEASE / 2
             if seconds > 0:
                 self._carry_all()
 

@@ -21,7 +21,7 @@ from rmpa.bridge.services.imports import (
     OpenedService,
     Provide,
     ServiceImports,
-    SessionState,
+    ServiceRouteState,
     Withdraw,
 )
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings
@@ -134,7 +134,7 @@ def test_a_refusal_ends_the_attempt(imports: ServiceImports) -> None:
     assert imports.closed(1, ServiceClosed(ROUTE, "no")) == []
     remote = imports.get(1, "/add")
     assert remote is not None
-    assert (remote.state, remote.problem) == (SessionState.IDLE, "no")
+    assert (remote.state, remote.problem) == (ServiceRouteState.IDLE, "no")
 
 
 def test_a_link_that_falls_ends_calls_and_keeps_services_until_the_peer_is_gone(imports: ServiceImports) -> None:
@@ -212,5 +212,5 @@ def test_other_rules_touch_only_what_they_change(imports: ServiceImports) -> Non
     assert gone == Withdraw(1, "/sub", "/n", "policy: services.deny has '/sub'")
     remote = imports.get(1, "/add")
     assert remote is not None
-    assert remote.state is SessionState.OPEN
+    assert remote.state is ServiceRouteState.OPEN
     assert apply_rules(imports, rules()) == [Provide(1, "/sub", "/n")]

@@ -38,7 +38,7 @@ from rmpa.bridge.services.imports import (
     OpenedService,
     Provide,
     ServiceImports,
-    SessionState,
+    ServiceRouteState,
     Withdraw,
 )
 from rmpa.config.settings import ServiceSettings
@@ -289,5 +289,5 @@ def test_a_peer_may_say_anything(said: list[Message | str]) -> None:
             else:
                 world._to_caller(word)
     for _, remote in world.imports:
-        assert (remote.state is SessionState.OPEN) is (remote.requests != 0)
+        assert (remote.state is ServiceRouteState.OPEN) is (remote.requests != 0)
     world.forget()

@@ -4,7 +4,7 @@ import msgspec
 import pytest
 
 from rmpa.bridge.actions import Action, AddRoute, Connect, Disconnect, RemoveRoute, Send, SuspendRoute, Warn
-from rmpa.bridge.catalogue.bounds import Beyond
+from rmpa.bridge.catalogue.peer_limits import Beyond
 from rmpa.bridge.messages import (
     Advertise,
     CloseRoute,

@@ -255,7 +255,7 @@ async def test_another_domain_is_refused_with_what_to_do(caplog: pytest.LogCaptu
 async def test_stopped_peer_is_down_after_its_lease(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(limits, "LINK_QUEUE_BYTES", 4 * MIB)
+    monkeypatch.setattr(limits, "LANE_QUEUE_BYTES", 4 * MIB)
     async with peers(1) as (one,):
         stopped = Identity(Guid.of("127.0.0.1", 9), b"s" * 16, "stopped")
         sock, answer = await raw(one, stopped, lease=0.5)
@@ -279,7 +279,7 @@ async def test_stopped_peer_is_down_after_its_lease(
 
 
 async def test_unread_control_frames_close_the_link(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "LINK_URGENT_BYTES", MIB)
+    monkeypatch.setattr(limits, "CONNECTION_URGENT_BYTES", MIB)
     async with peers(1) as (one,):
         sock, _ = await raw(one, Identity(Guid.of("127.0.0.1", 9), b"s" * 16, "deaf"), lease=60.0)
         await until(lambda: bool(one.ups), "a link")
@@ -301,7 +301,7 @@ def test_kernel_queue_stays_short_for_a_slow_peer() -> None:
                 while True:
                     sock.send(bytes(16 * KIB))
             unsent = fcntl.ioctl(sock, _SIOCOUTQNSD, bytes(4))
-    assert int.from_bytes(unsent, sys.byteorder) <= 2 * limits.LINK_UNSENT_BYTES
+    assert int.from_bytes(unsent, sys.byteorder) <= 2 * limits.EXPRESS_UNSENT_BYTES
     assert counters.as_dict() == {}
 
 

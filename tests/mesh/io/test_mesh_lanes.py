@@ -69,7 +69,7 @@ async def test_the_sockets_of_both_lanes_have_their_options() -> None:
         for peer, far in ((one, other), (other, one)):
             express = peer.link(far)
             wanted = [
-                (express.connection, 46, 5, limits.LINK_UNSENT_BYTES),
+                (express.connection, 46, 5, limits.EXPRESS_UNSENT_BYTES),
                 (bulk_of(express), 8, 2, limits.BULK_UNSENT_BYTES),
             ]
             for connection, dscp, priority, unsent in wanted:
@@ -120,7 +120,7 @@ async def test_both_sides_promise_the_bulk_lanes_lease() -> None:
     async with linked_pair() as (one, other):
         for link in (one.link(other), other.link(one)):
             leases = [k.remote.lease for k in (link.connection, bulk_of(link)) if k.remote is not None]
-            assert leases == [limits.LINK_LEASE, limits.BULK_LEASE]
+            assert leases == [limits.EXPRESS_LEASE, limits.BULK_LEASE]
 
 
 async def test_handlers_receive_from_both_lanes() -> None:

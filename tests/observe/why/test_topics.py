@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.bridge import limits as bridge_limits
 from rmpa.config import limits as config_limits
+from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import Check, CheckLevel
 from rmpa.observe.snapshot import FilesInfo, LinkInfo, PeerInfo, RouteInfo, SampleSpread, Snapshot, TopicInfo
 from rmpa.observe.why.diagnosis import (
@@ -498,9 +498,9 @@ def test_each_publisher_has_its_diagnosis() -> None:
 
 
 def test_the_number_of_diagnoses_is_bounded() -> None:
-    many = tuple(msgspec.structs.replace(SOURCE, node=f"/n{i}") for i in range(10 * bridge_limits.WHY_SOURCES_MAX))
+    many = tuple(msgspec.structs.replace(SOURCE, node=f"/n{i}") for i in range(10 * observe_limits.WHY_SOURCES_MAX))
     found = Case(there=TopicAtPublisher(sources=many), source=None, source_later=None).walk()
-    assert len(found) == bridge_limits.WHY_SOURCES_MAX
+    assert len(found) == observe_limits.WHY_SOURCES_MAX
 
 
 def test_a_peer_is_found_by_guid_and_a_typo_gets_a_hint() -> None:

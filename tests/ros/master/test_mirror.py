@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.ros.master.api import MasterApi
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
+from rmpa.ros.master.master_api import MasterApi
 from rmpa.ros.master.mirror import Call, Mirror, stale_registrations
 from rmpa.ros.master.survey import lookup_calls, read_lookups, read_survey, survey_calls
 

@@ -6,8 +6,8 @@ import copy
 
 import pytest
 
-from rmpa.ros.master.api import MasterApi
 from rmpa.ros.master.effects import Effect, PublisherUpdate, Shutdown
+from rmpa.ros.master.master_api import MasterApi
 from rmpa.ros.master.unverified import NodeRecord
 
 TALKER, HEARER, NEW = "http://h:1/", "http://h:2/", "http://h:3/"

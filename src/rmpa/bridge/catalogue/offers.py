@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 
 from rmpa.bridge import limits
 from rmpa.bridge.actions import Warn
-from rmpa.bridge.catalogue.bounds import Beyond
+from rmpa.bridge.catalogue.peer_limits import Beyond
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterator, Mapping

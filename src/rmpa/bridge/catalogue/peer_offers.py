@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from rmpa.bridge import limits
-from rmpa.bridge.catalogue.bounds import Beyond, NodePlaces, Surplus
+from rmpa.bridge.catalogue.peer_limits import Beyond, NodePlaces, Surplus
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -57,7 +57,7 @@ class KeptMessages(Protocol):
 class NothingKept:
     """A ``KeptMessages`` that keeps none."""
 
-    def following(self, source: Source, peer: int, after: int) -> int | None:  # noqa: ARG002 - as Kept has it
+    def following(self, source: Source, peer: int, after: int) -> int | None:  # noqa: ARG002 - as KeptMessages has it
         """Not known."""
         return None
 

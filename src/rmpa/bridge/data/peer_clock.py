@@ -29,7 +29,7 @@ class ClockEstimate:
     error: float
 
 
-class PeerClock:
+class PeerClockHistory:
     """The estimates of one peer's clock over the last minute; ``add`` one about every second.
 
     An estimate that contradicts the one before shows that a clock was set: earlier estimates are void, and so are

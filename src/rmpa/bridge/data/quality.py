@@ -20,7 +20,7 @@ from rmpa.core.stats import SampleSummary
 from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
-    from rmpa.bridge.data.peer_clock import PeerClock
+    from rmpa.bridge.data.peer_clock import PeerClockHistory
 
 _NS: Final = 1e-9
 _MARKS: Final = 16
@@ -134,7 +134,7 @@ class Quality:
         """When the last message came, in monotonic seconds; ``None`` if none did."""
         return self._times[self._slot - 1] if self.messages else None
 
-    def summary(self, clock: PeerClock | None, now: float, *, latching: bool = False) -> QualitySummary:
+    def summary(self, clock: PeerClockHistory | None, now: float, *, latching: bool = False) -> QualitySummary:
         """Summarize the messages of the last ``limits.QUALITY_SPAN``, as far as the rings hold them.
 
         Args:
@@ -184,7 +184,9 @@ class Quality:
             return times[first:]
         return times
 
-    def _latencies(self, times: array[float], clock: PeerClock, *, latching: bool) -> tuple[list[float], float]:
+    def _latencies(
+        self, times: array[float], clock: PeerClockHistory, *, latching: bool
+    ) -> tuple[list[float], float]:
         """The known latencies, oldest first, and the bound of their errors.
 
         Each is corrected by the first estimate of the peer's clock after its arrival; the newest ones by the last.

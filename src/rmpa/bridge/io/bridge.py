@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
 from rmpa.bridge.data.io.receiver import DataReceiver
-from rmpa.bridge.io.node_shutdown import RemoteKills
+from rmpa.bridge.io.proxy_kills import ProxyKills
 from rmpa.bridge.messages import decode, op_of
 from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import OWN_NODE, Policy
@@ -64,7 +64,7 @@ class Bridge:
         self.counters = Counters()
         self.rpc = PeerRpc(self.counters)
         """Requests to the peers, and theirs."""
-        kills = RemoteKills(self.rpc)
+        kills = ProxyKills(self.rpc)
         self.node = SlaveNode(
             OWN_NODE,
             core.node_host,

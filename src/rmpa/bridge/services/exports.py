@@ -33,7 +33,7 @@ from rmpa.core.errors import RemoteProtocolError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from rmpa.bridge.catalogue.bounds import Beyond
+    from rmpa.bridge.catalogue.peer_limits import Beyond
     from rmpa.bridge.messages import Origin
     from rmpa.bridge.services.rules import ServiceRules
 
@@ -106,7 +106,7 @@ ExportAction = Send | Warn | Probe | ServeRoute | EndRoute | ServerGone
 
 
 @dataclass(slots=True)
-class _ServiceSession:
+class _ServiceRoute:
     """One peer's wish to call a service.
 
     Args:
@@ -129,7 +129,7 @@ class _Callers:
         routes: Counts our routes: even ones, the odd ones are for our own calls.
     """
 
-    sessions: dict[int, _ServiceSession] = field(default_factory=dict)
+    sessions: dict[int, _ServiceRoute] = field(default_factory=dict)
     routes: int = 0
 
 
@@ -304,7 +304,7 @@ class ServiceExports:
         waiting = any(
             s.service == service and not s.requests for p in self._peers.values() for s in p.sessions.values()
         )
-        peer.sessions[message.route] = _ServiceSession(service, message.timeout)
+        peer.sessions[message.route] = _ServiceRoute(service, message.timeout)
         if service in self._about:
             return self._start(service)
         return [] if waiting else [Probe(service, server)]

@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.actions import Send, Warn
-from rmpa.bridge.catalogue import bounds
-from rmpa.bridge.catalogue.bounds import Beyond, NodePlaces
+from rmpa.bridge.catalogue import peer_limits
+from rmpa.bridge.catalogue.peer_limits import Beyond, NodePlaces
 from rmpa.bridge.catalogue.peer_offers import PeerOffers
 from rmpa.bridge.messages import (
     AdvertiseServices,
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.services.rules import ServiceRules
 
 
-class SessionState(Enum):
+class ServiceRouteState(Enum):
     """Where a remote service stands."""
 
     IDLE = auto()
@@ -60,8 +60,8 @@ class SessionState(Enum):
     """It can be called."""
 
 
-_S = SessionState
-TRANSITIONS: Final[Mapping[SessionState, frozenset[SessionState]]] = {
+_S = ServiceRouteState
+TRANSITIONS: Final[Mapping[ServiceRouteState, frozenset[ServiceRouteState]]] = {
     _S.IDLE: frozenset({_S.OPENING}),
     _S.OPENING: frozenset({_S.OPEN, _S.IDLE}),
     _S.OPEN: frozenset({_S.IDLE}),
@@ -150,7 +150,7 @@ class RemoteService:
     name: str
     shown: bool = False
     hidden: str = ""
-    state: SessionState = SessionState.IDLE
+    state: ServiceRouteState = ServiceRouteState.IDLE
     route: int = 0
     requests: int = 0
     due: float = 0.0
@@ -216,7 +216,7 @@ class ServiceImports:
         found = self._peers.get(peer)
         return found is not None and found.away
 
-    def beyond(self, peer: int) -> bounds.Beyond:
+    def beyond(self, peer: int) -> peer_limits.Beyond:
         """What a peer offers beyond ``limits.services``."""
         known, limit = self._peers.get(peer), self._most.services
         return known.beyond("services", limit) if known is not None else Beyond("services", limit, 0)
@@ -318,7 +318,7 @@ class ServiceImports:
             actions += self._remove(peer, offer.service, f"another node of {known.name} provides it now")
         elif len(known.entries) >= self._most.services:
             known.surplus.add(offer.service, offer)
-            text = bounds.warning(known.name, "services", self._most.services)
+            text = peer_limits.warning(known.name, "services", self._most.services)
             return [Warn("services.too_many", known.name, text)]
         name = self._rules.local_name(offer.origin.name if offer.origin else known.name, offer.service)
         remote = known.entries[offer.service] = RemoteService(offer.service, offer.node, name, origin=offer.origin)
@@ -464,14 +464,14 @@ class ServiceImports:
         known, remote = self._peers.get(peer), self.get(peer, service)
         if known is None or remote is None or not remote.shown or known.away:
             raise LocalProtocolError(f"{service} of peer {peer} cannot be opened")
-        if remote.state is not SessionState.IDLE:
+        if remote.state is not ServiceRouteState.IDLE:
             return []
         known.serial += 2
         remote.route = limits.SERVICE_ROUTES + known.serial
         remote.due = now + limits.ROUTE_OPEN_TIMEOUT
         known.routes[remote.route] = remote
         self._opening[peer, remote.route] = remote
-        self._enter(remote, SessionState.OPENING)
+        self._enter(remote, ServiceRouteState.OPENING)
         return [Send(peer, OpenService(remote.route, remote.wire, self._rules.timeout(service)))]
 
     def opened(self, peer: int, message: ServiceOpened) -> list[ImportAction]:
@@ -484,10 +484,10 @@ class ServiceImports:
         remote = known.routes.get(message.route) if known is not None else None
         if remote is None:
             return []
-        if remote.state is not SessionState.OPENING:
+        if remote.state is not ServiceRouteState.OPENING:
             raise RemoteProtocolError(f"route {message.route} of {remote.wire} is opened twice")
         del self._opening[peer, message.route]
-        self._enter(remote, SessionState.OPEN)
+        self._enter(remote, ServiceRouteState.OPEN)
         remote.requests = message.requests
         remote.problem = ""
         remote.about = ServiceAbout(message.type, message.md5, message.request_type, message.response_type)
@@ -529,12 +529,12 @@ class ServiceImports:
     def _end(self, peer: int, route: int, reason: str) -> list[ImportAction]:
         remote = self._peers[peer].routes.pop(route)
         self._opening.pop((peer, route), None)
-        self._enter(remote, SessionState.IDLE)
+        self._enter(remote, ServiceRouteState.IDLE)
         requests, remote.route, remote.requests = remote.requests, 0, 0
         remote.problem = reason
         return [EndedService(peer, remote.name, route, requests, reason)]
 
-    def _enter(self, remote: RemoteService, state: SessionState) -> None:
+    def _enter(self, remote: RemoteService, state: ServiceRouteState) -> None:
         if state not in TRANSITIONS[remote.state]:
             raise LocalProtocolError(f"{remote.wire}: {remote.state.name} does not lead to {state.name}")
         remote.state = state

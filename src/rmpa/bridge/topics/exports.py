@@ -50,8 +50,8 @@ from rmpa.core.contract import Contract, Contracts, Durability, Reliability, com
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
 
-    from rmpa.bridge.catalogue.bounds import Beyond
     from rmpa.bridge.catalogue.offers import Portion
+    from rmpa.bridge.catalogue.peer_limits import Beyond
     from rmpa.bridge.data.losses import KeptMessages
     from rmpa.bridge.messages import Origin
     from rmpa.bridge.policy import Policy

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.actions import Action, Detach, Publish, Retract, Send, Warn
-from rmpa.bridge.catalogue import bounds
-from rmpa.bridge.catalogue.bounds import Beyond, NodePlaces
+from rmpa.bridge.catalogue import peer_limits
+from rmpa.bridge.catalogue.peer_limits import Beyond, NodePlaces
 from rmpa.bridge.catalogue.peer_offers import PeerOffers
 from rmpa.bridge.messages import (
     Advertise,
@@ -161,7 +161,7 @@ class Imports:
                     actions.append(Send(peer, Mismatch(source.topic, source.node, "", "")))
         return actions
 
-    def beyond(self, peer: int) -> bounds.Beyond:
+    def beyond(self, peer: int) -> peer_limits.Beyond:
         """What a peer offers beyond ``limits.topics``."""
         known, limit = self._peers.get(peer), self._most.topics
         return known.beyond("topics", limit) if known is not None else Beyond("topics", limit, 0)
@@ -383,7 +383,7 @@ class Imports:
         elif len(known) >= self._most.topics:
             name = self._peers[peer].name
             self._peers[peer].surplus.add(source, offer)
-            return [Warn("topics.too_many", name, bounds.warning(name, "topics", self._most.topics))]
+            return [Warn("topics.too_many", name, peer_limits.warning(name, "topics", self._most.topics))]
         backoff = Backoff(mesh_limits.BACKOFF_FIRST, mesh_limits.BACKOFF_MAX, self._rng)
         topic = self._names_of(self._peers[peer], offer.origin).local_name(source.topic, offer.type)
         entry = known[source] = RemoteTopic(offer.type, topic, backoff, origin=offer.origin)
@@ -395,7 +395,7 @@ class Imports:
         actions += self._show_or_hide(peer, source, entry)
         if entry.crowded:
             name = self._peers[peer].name
-            actions.append(Warn("nodes.too_many", name, bounds.warning(name, "nodes", self._most.nodes)))
+            actions.append(Warn("nodes.too_many", name, peer_limits.warning(name, "nodes", self._most.nodes)))
         return actions + self._report_conflict(peer, source, entry)
 
     def _show_or_hide(self, peer: int, source: Source, entry: RemoteTopic) -> list[Action]:

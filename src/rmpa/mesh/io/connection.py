@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
     from rmpa.mesh.connection import OnData, OnPart
     from rmpa.mesh.handshake import Hello, Refuse
-    from rmpa.mesh.timing import LinkClock
+    from rmpa.mesh.remote_clock import RemoteClock
 
     OnMark = Callable[[FrameKind, int, int], None]
 
@@ -155,7 +155,8 @@ class Connection:
             sock,
             on_bytes=self._receive,
             on_close=self._lost,
-            outbox=Outbox(1, limits.LINK_URGENT_BYTES),
+            # For control frames only: the link puts its lane's outbox in this place (``LaneSender.connect``).
+            outbox=Outbox(1, limits.CONNECTION_URGENT_BYTES),
             segment=segment,
         )
         self._machine = ConnectionProtocol(
@@ -167,7 +168,7 @@ class Connection:
             on_data=_ignore_data,
             expected=expected,
             lane=lane,
-            lease=limits.BULK_LEASE if lane is Lane.BULK else limits.LINK_LEASE,
+            lease=limits.BULK_LEASE if lane is Lane.BULK else limits.EXPRESS_LEASE,
             label=f"{endpoint[0]}:{endpoint[1]}",
         )
         self._timer = MachineTimer(self._machine.next_timer, self._due, now=clock.now)
@@ -213,7 +214,7 @@ class Connection:
         return self._requested_lane if self.dialled or remote is None else remote.lane
 
     @property
-    def clock(self) -> LinkClock:
+    def clock(self) -> RemoteClock:
         """Round-trip time and remote clock, as the pings of this connection show them."""
         return self._machine.clock
 
@@ -222,8 +223,11 @@ class Connection:
         """Monotonic seconds at which bytes last came."""
         return max(self._machine.heard_at, self.stream.last_in)
 
-    def receive(self, data: OnData | None, part: OnPart | None, mark: OnMark | None) -> None:
-        """Pass what comes to these from now on; ``None`` drops it. See ``ConnectionProtocol`` for the arguments."""
+    def deliver_to(self, data: OnData | None, part: OnPart | None, mark: OnMark | None) -> None:
+        """Call these for data, parts and marks from now on; ``None`` drops them.
+
+        Their arguments are those of ``ConnectionProtocol``.
+        """
         self._machine.on_data = _ignore_data if data is None else data
         self._machine.on_part = _ignore_part if part is None else part
         self._on_mark = _ignore_mark if mark is None else mark
@@ -237,7 +241,7 @@ class Connection:
     def send_control(self, payload: bytes) -> None:
         """Send one control frame, before all data that waits; never dropped.
 
-        If more than ``limits.LINK_URGENT_BYTES`` wait the connection is closed: the remote side does not read.
+        If more than ``limits.CONNECTION_URGENT_BYTES`` wait the connection is closed: the remote side does not read.
         """
         if self._machine.state is not ConnectionState.UP:
             return
@@ -369,7 +373,7 @@ class Connection:
 
     def _check_urgent(self) -> None:
         waiting = self.stream.outbox.urgent_bytes
-        if waiting > limits.LINK_URGENT_BYTES:
+        if waiting > limits.CONNECTION_URGENT_BYTES:
             self.abort(f"{self.name} does not read: {waiting} bytes of control frames wait for it")
 
     def _lost(self, error: Exception | None) -> None:
@@ -388,7 +392,7 @@ class Connection:
 
     def _report_end(self, reason: str) -> None:
         self.stream.close()
-        self.receive(None, None, None)
+        self.deliver_to(None, None, None)
         # The machine would hold this object in a cycle until the collector looks, and what waits here may be large.
         self._machine.on_event = _ignore_event
         self._end.set_result(None)

@@ -27,7 +27,7 @@ class LaneSender:
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.outbox = Outbox(core_limits.ROUTE_QUEUE_MESSAGES, limits.LINK_QUEUE_BYTES, frame=pack_fragment_header)
+        self.outbox = Outbox(core_limits.ROUTE_QUEUE_MESSAGES, limits.LANE_QUEUE_BYTES, frame=pack_fragment_header)
         self.ended = False
         """Whether the link is closing: nothing is sent or queued any more."""
         self._stream: Stream | None = None

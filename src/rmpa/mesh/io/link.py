@@ -76,7 +76,7 @@ class PeerLink:
 
     @property
     def used(self) -> bool:
-        """Whether this is the link that is used with its peer."""
+        """Whether this link carries the peer's data; of two links dialled at the same time one does."""
         return self._handlers is not None
 
     @property
@@ -103,7 +103,7 @@ class PeerLink:
 
     @property
     def resumed_at(self) -> float:
-        """When the express lane's last silence was last seen, monotonic seconds; see ``Stream``."""
+        """When the express lane was last polled without bytes before its last silence ended, monotonic seconds."""
         return self.connection.stream.resumed_at
 
     @property
@@ -125,7 +125,7 @@ class PeerLink:
 
     @property
     def busy(self) -> bool:
-        """Whether the next portion of the graph would wait on the express lane, and commands behind it."""
+        """Whether the express lane has a backlog: a further advertisement would delay the commands behind it."""
         stream = self.connection.stream
         return stream.pending_bytes > 0 or stream.unacknowledged > limits.TELL_BACKLOG
 
@@ -195,7 +195,7 @@ class PeerLink:
         self.bulk_connection = None
         self._bulk_bytes_in += bulk.stream.bytes_in
         self._bulk_bytes_out += bulk.stream.bytes_out
-        bulk.receive(None, None, None)
+        bulk.deliver_to(None, None, None)
         self.bulk.disconnect()
         if self._handlers is not None:
             self._handlers.lane_lost(self)
@@ -207,7 +207,7 @@ class PeerLink:
         self.bulk.end()
         if self.bulk_connection is not None:
             bulk, self.bulk_connection = self.bulk_connection, None
-            bulk.receive(None, None, None)
+            bulk.deliver_to(None, None, None)
             bulk.close(reason)
 
     def discard(self) -> int:
@@ -221,9 +221,9 @@ class PeerLink:
     def _receive_from(self, connection: Connection) -> None:
         handlers = self._handlers
         if handlers is None:
-            connection.receive(None, None, None)
+            connection.deliver_to(None, None, None)
         else:
-            connection.receive(partial(handlers.data, self), partial(handlers.part, self), self._marked)
+            connection.deliver_to(partial(handlers.data, self), partial(handlers.part, self), self._marked)
 
     def _marked(self, kind: FrameKind, route: int, sequence: int) -> None:
         """Answer a fence by the express lane, whichever lane it came by; the handlers take the other marks."""

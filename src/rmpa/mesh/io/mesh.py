@@ -474,7 +474,7 @@ class Mesh:
 
     def _has_room(self, address: str) -> bool:
         there = sum(self._connections[k].remote_endpoint[0] == address for k in self._pending)
-        if len(self._pending) < limits.PENDING_LINKS_MAX and there < limits.PENDING_PER_ADDRESS:
+        if len(self._pending) < limits.PENDING_CONNECTIONS_MAX and there < limits.PENDING_PER_ADDRESS:
             return True
         text = f"closed a connection from {address}: too many have not said who they are ({there} from there)"
         self._refusals.refuse(self._clock.now(), "link.pending_full", address, text)

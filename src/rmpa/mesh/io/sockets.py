@@ -30,7 +30,7 @@ _TIME_STAMPS: Final = 12
 
 def tune_express(sock: socket.socket, lanes: LaneSettings, counters: Counters) -> None:
     """Set up the express lane: no Nagle, a time-out for dead peers, a short kernel queue, a high priority."""
-    _tune(sock, limits.LINK_UNSENT_BYTES, lanes.express_dscp, lanes.express_priority, counters)
+    _tune(sock, limits.EXPRESS_UNSENT_BYTES, lanes.express_dscp, lanes.express_priority, counters)
 
 
 def tune_bulk(sock: socket.socket, lanes: LaneSettings, counters: Counters) -> None:

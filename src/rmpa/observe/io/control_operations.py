@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from rmpa.bridge import limits as bridge_limits
+from rmpa.bridge.io import node_requests
 from rmpa.bridge.params.transfer import QUESTIONS as PARAM_REQUESTS
 from rmpa.bridge.policy import OWN_NODE
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
 from rmpa.observe import limits
-from rmpa.observe.io import node_requests
 from rmpa.observe.reload_reply import ReloadReply
 from rmpa.observe.snapshot import FollowedInfo, PingReply, Snapshot
 from rmpa.observe.why.diagnosis import Diagnosis

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rmpa.bridge.data.peer_clock import PeerClock
+from rmpa.bridge.data.peer_clock import PeerClockHistory
 
 if TYPE_CHECKING:
     from rmpa.bridge.io.bridge import Bridge
@@ -19,9 +19,9 @@ class PeerClocks:
 
     def __init__(self, bridge: Bridge) -> None:
         self._bridge = bridge
-        self._clocks: dict[int, PeerClock] = {}
+        self._clocks: dict[int, PeerClockHistory] = {}
 
-    def __getitem__(self, peer: int) -> PeerClock:
+    def __getitem__(self, peer: int) -> PeerClockHistory:
         """The clock of a peer, by its session's number."""
         return self._clocks[peer]
 
@@ -29,7 +29,7 @@ class PeerClocks:
         """Record the present estimates; forget peers that are gone. ``now`` is monotonic seconds."""
         before, self._clocks = self._clocks, {}
         for session in self._bridge.sessions:
-            clock = self._clocks[session.peer] = before.get(session.peer) or PeerClock()
+            clock = self._clocks[session.peer] = before.get(session.peer) or PeerClockHistory()
             offset, error = session.link.clock_offset, session.link.clock_error
             if offset is not None and error is not None and session.linked:
                 clock.add(offset, error, now)

@@ -14,9 +14,9 @@ from rmpa.runtime.system_clock import SystemClock
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rmpa.bridge.catalogue.bounds import Beyond
-    from rmpa.bridge.io.bounds import Bounds
+    from rmpa.bridge.catalogue.peer_limits import Beyond
     from rmpa.bridge.io.bridge import Bridge
+    from rmpa.bridge.io.limit_reports import LimitReports
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.core.identity import Identity
     from rmpa.discovery.events import PeerView
@@ -46,7 +46,7 @@ class PeersSection:
         bounds: Its part for limits.
     """
 
-    def __init__(self, bridge: Bridge, bounds: Bounds) -> None:
+    def __init__(self, bridge: Bridge, bounds: LimitReports) -> None:
         self._bridge = bridge
         self._bounds = bounds
         self._clock = SystemClock()

@@ -25,8 +25,8 @@ from rmpa.runtime.realtime import refused
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator
 
-    from rmpa.bridge.io.bounds import Bounds
     from rmpa.bridge.io.bridge import Bridge
+    from rmpa.bridge.io.limit_reports import LimitReports
     from rmpa.bridge.services.io.part import Services
     from rmpa.config.settings import Settings
     from rmpa.core.counters import Counters
@@ -45,7 +45,7 @@ class SnapshotSources:
         bridge: Its bridge.
         clocks: The clocks of its peers.
         services: The bridge's part for services.
-        bounds: The bridge's part for limits.
+        limit_reports: The bridge's part for limits.
         endpoint: Its place in the network now; ``None`` while it has none.
         counters: The counters of parts that are not named here.
         notes: What else the user should know, each ready to read.
@@ -57,7 +57,7 @@ class SnapshotSources:
     bridge: Bridge
     clocks: PeerClocks
     services: Services
-    bounds: Bounds
+    limit_reports: LimitReports
     endpoint: Callable[[], EndpointView | None]
     counters: tuple[Counters, ...]
     notes: Callable[[], Iterable[str]]
@@ -80,7 +80,7 @@ class SnapshotBuilder:
         self._process.cpu_percent()  # the first call only begins to count
         self._cpu: float | None = None
         self._cpu_known = time.monotonic()
-        self._peers = PeersSection(sources.bridge, sources.bounds)
+        self._peers = PeersSection(sources.bridge, sources.limit_reports)
         self._topics = TopicsSection(settings, sources.core, sources.bridge, sources.clocks)
         self._services = ServicesSection(sources.services)
 
@@ -131,7 +131,7 @@ class SnapshotBuilder:
         if DESCRIPTORS.shortage is not None:
             notes.append(DESCRIPTORS.shortage.problem)
         notes += self._sources.notes()
-        notes += map(own_text, self._sources.bounds.own())
+        notes += map(own_text, self._sources.limit_reports.own())
         missing = refused(self._sources.requests)
         return (*notes, missing) if missing else tuple(notes)
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
 
     from rmpa.bridge.data.losses import ReceptionHistory
-    from rmpa.bridge.data.peer_clock import PeerClock
+    from rmpa.bridge.data.peer_clock import PeerClockHistory
     from rmpa.bridge.data.qos_events import QosWatch
     from rmpa.bridge.data.quality import QualitySummary
     from rmpa.bridge.io.bridge import Bridge
@@ -159,7 +159,7 @@ class TopicsSection:
                 [],
             )
 
-    def _import(self, at: PeerSession, source: Source, entry: RemoteTopic, clock: PeerClock) -> RouteInfo:
+    def _import(self, at: PeerSession, source: Source, entry: RemoteTopic, clock: PeerClockHistory) -> RouteInfo:
         topics = self._bridge.topics.of(at)
         flow = topics.flow(source, entry.route)
         publication = topics.publication(source)

@@ -15,6 +15,7 @@ from rmpa.bridge import limits as bridge_limits
 from rmpa.config import limits as config_limits
 from rmpa.config.values import did_you_mean
 from rmpa.mesh import limits as mesh_limits
+from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check
 from rmpa.observe.why.diagnosis import Diagnosis, until_failure
 from rmpa.ros import limits as ros_limits
@@ -88,7 +89,7 @@ def _linked(peer: PeerInfo) -> Check:
     text = f"linked by {link.remote} for {link.up_ago:.0f} s"
     if link.rtt is not None:
         text += f", round trip {link.rtt * 1e3:.1f} ms"
-    if link.heard_ago is not None and link.heard_ago > mesh_limits.LINK_LEASE / 2:
+    if link.heard_ago is not None and link.heard_ago > mesh_limits.EXPRESS_LEASE / 2:
         text += f"; silent for {link.heard_ago:.1f} s"
         return Check("link", WARN, text, "if it stays so, the cable or the radio is the place to look at")
     if link.path_problem:
@@ -133,7 +134,9 @@ def diagnose_topic(ends: BothEnds, peer: str, later: BothEnds | None = None, wir
 def _nodes(ends: BothEnds, peer: str) -> list[str]:
     reported = [source.node for source in ends.there.sources] if ends.there is not None else []
     known = [route.node for route in _routes(ends.here, peer)]
-    return list(dict.fromkeys([*reported[: bridge_limits.WHY_SOURCES_MAX], *known]))[: bridge_limits.WHY_SOURCES_MAX]
+    return list(dict.fromkeys([*reported[: observe_limits.WHY_SOURCES_MAX], *known]))[
+        : observe_limits.WHY_SOURCES_MAX
+    ]
 
 
 def _routes(here: TopicAtSubscriber, peer: str) -> list[RouteInfo]:
@@ -379,7 +382,7 @@ def _arrived(
     moved = now.messages - before.messages
     sent = report_now.messages - report.messages if report is not None and report_now is not None else None
     rarely = (
-        float(now.contract.get("max_rate") or config_limits.CONTRACT_RATE_MAX) * bridge_limits.WHY_WINDOW < _SEVERAL
+        float(now.contract.get("max_rate") or config_limits.CONTRACT_RATE_MAX) * observe_limits.WHY_WINDOW < _SEVERAL
     )
     if not now.messages or (sent is not None and sent >= _SEVERAL and not moved and not rarely):
         text = f"{peer} has {'sent ' + str(sent) if sent else 'sent some'} meanwhile, and none arrived at {module}"
@@ -398,11 +401,11 @@ def _arrived(
     if (
         usual is not None
         and not moved
-        and age > max(bridge_limits.WHY_SILENT, bridge_limits.WHY_SILENT_PERIODS * usual)
+        and age > max(observe_limits.WHY_SILENT, observe_limits.WHY_SILENT_PERIODS * usual)
     ):
         text = f"nothing for {age:.1f} s; until then a message came every {usual * 1e3:.0f} ms at the latest"
         return Check("arrived", FAIL, text, f"its publisher {now.node} on {peer} has fallen silent: look at it")
-    if usual is None and not now.latched and age > bridge_limits.WHY_SILENT:
+    if usual is None and not now.latched and age > observe_limits.WHY_SILENT:
         return Check("arrived", WARN, text, "a topic of few messages? nothing tells how often they should come")
     return Check("arrived", OK, text)
 

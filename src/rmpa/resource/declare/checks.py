@@ -51,7 +51,7 @@ def read_contract(where: str, terms: Mapping[str, object]) -> Contract:
         key = error.at[-1] if error.at else ""
         remedy = error.remedy or (f"did you mean {error.better}?" if error.better else "")
         raise ConfigError(f"{where}, {key}" if key else where, error.problem, remedy) from None
-    return Contract(**rules[0].values)  # type: ignore[arg-type] # as Rule.values promises
+    return Contract(**rules[0].values)  # type: ignore[arg-type] # as ContractRule.values promises
 
 
 def read_enum(kind: type[Any], text: str, where: str) -> Any:

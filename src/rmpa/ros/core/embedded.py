@@ -19,8 +19,8 @@ from rmpa.ros.core.notifier import Notifier
 from rmpa.ros.core.persistence import CorePersistence
 from rmpa.ros.core.rosout import NODE, Rosout
 from rmpa.ros.http.server import XmlRpcServer
-from rmpa.ros.master.api import MasterApi
 from rmpa.ros.master.effects import RegistrationKind
+from rmpa.ros.master.master_api import MasterApi
 from rmpa.ros.master.registrations import ANY_TYPE
 from rmpa.runtime.descriptors import Use
 from rmpa.runtime.event_loop import yield_to_data, yielding_to_data

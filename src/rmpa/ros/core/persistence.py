@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rmpa.core.counters import Counters
-    from rmpa.ros.master.api import MasterApi
+    from rmpa.ros.master.master_api import MasterApi
     from rmpa.ros.master.parameters import Tree
     from rmpa.ros.master.stored_rows import StoredRegistrations
 

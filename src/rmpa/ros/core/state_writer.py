@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from rmpa.core.counters import Counters
     from rmpa.ros.core.store import CoreStore
-    from rmpa.ros.master.api import MasterApi
+    from rmpa.ros.master.master_api import MasterApi
     from rmpa.ros.master.parameters import Tree
     from rmpa.ros.master.stored_rows import Key, Row, StoredRegistrations
 

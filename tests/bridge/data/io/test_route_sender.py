@@ -146,7 +146,7 @@ def test_held_messages_keep_to_the_depth(history: History, kept: int) -> None:
 
 
 def test_held_bytes_are_bounded(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mesh_limits, "LINK_QUEUE_BYTES", 1000)
+    monkeypatch.setattr(mesh_limits, "LANE_QUEUE_BYTES", 1000)
     link = Link()
     sender = best_effort(link, large=True)
     assert sender.message(0, bytes(400)) == 0

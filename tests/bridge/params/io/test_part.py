@@ -19,8 +19,8 @@ from rmpa.bridge.session.peer_rpc import PeerRpc
 from rmpa.config.settings import FollowRule, ParamSettings, Settings, TimeSettings
 from rmpa.core.counters import Counters
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
-from rmpa.ros.master.api import MasterApi
 from rmpa.ros.master.effects import ParamUpdate
+from rmpa.ros.master.master_api import MasterApi
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -204,7 +204,7 @@ class RouteSender:
         self._held_bytes += len(payload)
         dropped = 0
         while len(self._held) > 1 and (
-            len(self._held) > self._depth or self._held_bytes > mesh_limits.LINK_QUEUE_BYTES
+            len(self._held) > self._depth or self._held_bytes > mesh_limits.LANE_QUEUE_BYTES
         ):
             self._held_bytes -= len(self._held.popleft()[2])
             dropped += 1

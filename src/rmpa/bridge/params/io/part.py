@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from rmpa.bridge import limits
 from rmpa.bridge.params.io.core import ParamCore
 from rmpa.bridge.params.io.follower import ParamFollower
-from rmpa.bridge.params.io.param_server import ParamServer
+from rmpa.bridge.params.io.param_owner import ParamOwner
 from rmpa.bridge.params.rules import ParamPolicy, follow_rules
 from rmpa.bridge.session.part import Part
 from rmpa.config import limits as config_limits
@@ -57,7 +57,7 @@ class Params(Part):
         most: int = config_limits.FOLLOWED_MAX,
     ) -> None:
         self._core = ParamCore(core, node)
-        self._server = ParamServer(self._core, ParamPolicy(params, time), rpc, most)
+        self._server = ParamOwner(self._core, ParamPolicy(params, time), rpc, most)
         self._follower = ParamFollower(self._core, rpc, linked, follow_rules(params, time), counters)
         self._looking: asyncio.Task[None] | None = None
         self._run: XmlRpcValue = None

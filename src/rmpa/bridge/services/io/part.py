@@ -34,7 +34,7 @@ from rmpa.bridge.services.imports import (
     OpenedService,
     Provide,
     ServiceImports,
-    SessionState,
+    ServiceRouteState,
     Withdraw,
 )
 from rmpa.bridge.services.io.calls import Budgets, Caller, CallStats
@@ -129,11 +129,11 @@ class Services(Part):
         self._rpc = rpc
         self._relay = relay
         self.rules = rules
-        """What may cross, for the monitor too."""
+        """What may cross, also for snapshots."""
         self.exports = ServiceExports(rules, self._most)
-        """The outbound plan, for the monitor."""
+        """The outbound plan, for snapshots."""
         self.imports = ServiceImports(rules, self._most)
-        """The inbound plan, for the monitor."""
+        """The inbound plan, for snapshots."""
         self._budgets: dict[int, Budgets] = {}
         self._shown: dict[tuple[int, str], ShownService] = {}
         self._callers: dict[tuple[int, int], ShownService] = {}
@@ -413,7 +413,7 @@ class Services(Part):
         remote = self.imports.get(shown.peer, shown.service)
         if remote is None or not remote.shown:
             self._fail_waiting(shown, f"service [{shown.service}] of {shown.peer_name} has just gone")
-        elif remote.state is SessionState.IDLE and not self.imports.is_away(shown.peer):
+        elif remote.state is ServiceRouteState.IDLE and not self.imports.is_away(shown.peer):
             self._act(self.imports.want(shown.peer, shown.service, asyncio.get_running_loop().time()))
 
     def _opened(self, action: OpenedService) -> None:

@@ -84,7 +84,7 @@ class LocalSubscriptions:
 
     @property
     def flows(self) -> Mapping[Source, ExportFlow]:
-        """What flows, for the monitor."""
+        """What flows, for snapshots."""
         return self._flows
 
     @property

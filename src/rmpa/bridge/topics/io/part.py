@@ -147,7 +147,7 @@ class Topics(Part):
         self._claims_timer = MachineTimer(self._claims.next_timer, self._claims_over)
         self._mismatches = Mismatches()
         self.losses = LossReports(self.exports, sessions, self._peers, self._absent, rpc, counters, refusals)
-        """What does not reach its listeners, for the monitor."""
+        """What does not reach its listeners, for snapshots."""
         self._subscribers = RemoteSubscribers(self.exports, self.imports, sessions, self._peers, refusals)
         self._local = LocalSources(core, relay, lambda source: self.exports.description(source) is not None)
         self._ticker: asyncio.TimerHandle | None = None

@@ -5,12 +5,12 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
-from rmpa.bridge import limits
 from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import OWN_NODE, Policy, is_own
 from rmpa.bridge.services.rules import ServiceRules
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import RmpaError
+from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, Check
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.observe.why.io.topic_evidence import name_in
@@ -137,7 +137,7 @@ async def _probe(uri: str, service: str) -> tuple[str, str]:
     """A server's description of its service, and why there is none; asked as ``rospy.wait_for_service`` does."""
     try:
         found = await ServiceConnection.open(
-            uri, service, OWN_NODE, probe=True, persistent=False, timeout=limits.WHY_PROBE
+            uri, service, OWN_NODE, probe=True, persistent=False, timeout=observe_limits.WHY_PROBE
         )
     except RmpaError as error:
         return "", str(error)

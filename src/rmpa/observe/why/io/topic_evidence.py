@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
-from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import Policy, is_own
 from rmpa.config import limits as config_limits
@@ -13,6 +12,7 @@ from rmpa.config.values import did_you_mean
 from rmpa.core.contract import Reliability
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.names import is_global_name
+from rmpa.observe import limits as observe_limits
 from rmpa.observe.why.diagnosis import (
     ProxyState,
     PublisherReport,
@@ -141,10 +141,10 @@ class TopicEvidence:
         return TopicAtPublisher(
             path_problem=problem.text if problem is not None else "",
             path_remedy=problem.remedy if problem is not None else "",
-            sources=tuple(sources[: bridge_limits.WHY_SOURCES_MAX]),
-            subscribers=tuple(subscribers[: bridge_limits.WHY_SOURCES_MAX]),
+            sources=tuple(sources[: observe_limits.WHY_SOURCES_MAX]),
+            subscribers=tuple(subscribers[: observe_limits.WHY_SOURCES_MAX]),
             similar="" if sources else await self._similar(session.link.name, wire),
-            awaited=tuple(awaited[: bridge_limits.WHY_SOURCES_MAX]),
+            awaited=tuple(awaited[: observe_limits.WHY_SOURCES_MAX]),
         )
 
     async def _similar(self, asker: str, wire: str) -> str:

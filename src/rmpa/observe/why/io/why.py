@@ -11,6 +11,7 @@ from rmpa.bridge import limits
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
 from rmpa.core.names import is_global_name
+from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, Check
 from rmpa.observe.why.diagnosis import BothEnds, Diagnosis, TopicAtPublisher
 from rmpa.observe.why.io.service_evidence import ServiceEvidence
@@ -160,7 +161,7 @@ class WhyService:
         later = None
         if any(r.state in _MOVING for t in ends.here.snapshot.topics for r in t.routes if r.direction == "in"):
             # Only a second look shows whether messages move.
-            await asyncio.sleep(limits.WHY_WINDOW)
+            await asyncio.sleep(observe_limits.WHY_WINDOW)
             later = await self._both_ends(peer, topic)
         return diagnose_topic(ends, peer.guid, later, wire)
 
@@ -192,10 +193,10 @@ class WhyService:
             return (Diagnosis.of(stages, name=topic, peer=here, to=to),)
         question = {"topic": self._bridge.topics.names.wire_name(to, topic, self._core.type_of(topic))}
         try:
-            found = await self._ask(session, HERE, question, tuple[Diagnosis, ...], limits.WHY_TIMEOUT)
+            found = await self._ask(session, HERE, question, tuple[Diagnosis, ...], observe_limits.WHY_TIMEOUT)
             if not found:
                 raise RemoteProtocolError("it walked no way at all")
-            return found[: limits.WHY_SOURCES_MAX]
+            return found[: observe_limits.WHY_SOURCES_MAX]
         except RmpaError as error:
             remedy = f"run `rmpa why {here}:{topic}` there"
             silent = Check("link", FAIL, f"{to} does not tell: {error}", remedy)
@@ -203,7 +204,7 @@ class WhyService:
 
     async def _answer_here(self, session: PeerSession, args: dict[str, Any]) -> tuple[Diagnosis, ...]:
         topic = self._bridge.topics.names.local_name(session.link.name, name_in(args, "topic"))
-        return (await self._arrives(str(session.link.guid), topic))[: limits.WHY_SOURCES_MAX]
+        return (await self._arrives(str(session.link.guid), topic))[: observe_limits.WHY_SOURCES_MAX]
 
     # --- services ---------------------------------------------------------------------------------------------
 

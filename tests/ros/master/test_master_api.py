@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.ros import limits
-from rmpa.ros.master.api import MasterApi
 from rmpa.ros.master.effects import (
     Effect,
     GraphChange,
@@ -16,6 +15,7 @@ from rmpa.ros.master.effects import (
     RegistrationKind,
     Shutdown,
 )
+from rmpa.ros.master.master_api import MasterApi
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue, serialize_response
 
 if TYPE_CHECKING:

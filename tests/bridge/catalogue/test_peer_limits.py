@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.bridge.actions import Action, Publish, Retract, Send, Warn
-from rmpa.bridge.catalogue.bounds import Beyond, NodePlaces, Surplus, from_json, to_json
+from rmpa.bridge.catalogue.peer_limits import Beyond, NodePlaces, Surplus, from_json, to_json
 from rmpa.bridge.messages import Advertise, AdvertiseServices, ServiceOffer, Source, TopicOffer
 from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy

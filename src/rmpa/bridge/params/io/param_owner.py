@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
-class ParamServer:
+class ParamOwner:
     """The side that owns parameters.
 
     Args:

@@ -23,7 +23,7 @@ class ClockSample:
     taken: float
 
 
-class LinkClock:
+class RemoteClock:
     """The remote clock, by the exchange with the least error among the last ``limits.CLOCK_SAMPLES``.
 
     Queues only make round trips longer, so the shortest has the least error; the error grows with age, because the

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from rmpa.bridge import limits as bridge_limits
-from rmpa.bridge.io.node_shutdown import KILL
+from rmpa.bridge.io.proxy_kills import KILL
 from rmpa.bridge.policy import OWN_NODE, is_own
 from rmpa.bridge.proxy_names import proxied_node
 from rmpa.config import limits as config_limits

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.bridge.catalogue.bounds import Beyond, from_json, to_json
+from rmpa.bridge.catalogue.peer_limits import Beyond, from_json, to_json
 from rmpa.bridge.session.part import Part
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ HIDDEN: Final = "limits.hidden"
 """The news: what of the peer that gets it is hidden here, as ``Beyond`` in JSON; empty when nothing is."""
 
 
-class Bounds(Part):
+class LimitReports(Part):
     """The part of the bridge that is about limits.
 
     Args:

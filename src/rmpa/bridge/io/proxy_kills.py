@@ -24,7 +24,7 @@ KILL: Final = "node.kill"
 _REFUSED: Final = 0
 
 
-class RemoteKills:
+class ProxyKills:
     """Answers the calls of ``shutdown`` that proxies and the agent's own node get.
 
     ``rosnode kill -a`` asks every node of the graph in the order of their names, the agent's own node before the

@@ -188,7 +188,7 @@ class Surplus(Generic[_Thing]):
         self._forgotten = 0
 
 
-def setting(kind: str) -> str:
+def setting_name(kind: str) -> str:
     """What a limit is called in ``rmpa.toml``."""
     return f"limits.{kind}"
 
@@ -196,6 +196,6 @@ def setting(kind: str) -> str:
 def warning(peer: str, kind: str, limit: int) -> str:
     """The line of the log when the first thing is beyond a limit."""
     return (
-        f"{peer} has more than {setting(kind)} = {limit} of this module; the rest stays hidden until there is room: "
-        f"raise it in rmpa.toml and `rmpa reload`, or deny some; `rmpa peer info {peer}` counts them"
+        f"{peer} has more than {setting_name(kind)} = {limit} of this module; the rest stays hidden until there is "
+        f"room: raise it in rmpa.toml and `rmpa reload`, or deny some; `rmpa peer info {peer}` counts them"
     )
