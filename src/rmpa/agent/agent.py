@@ -82,7 +82,7 @@ class Agent:
             contracts=Contracts(settings.contracts),
             names=names,
             relay=settings.relay,
-            most=settings.limits,
+            limit_settings=settings.limits,
         )
         self.params = Params(
             self.core,

@@ -30,7 +30,9 @@ def offers(nodes: range, topics: int = 1) -> tuple[TopicOffer, ...]:
 
 
 def imports(*, nodes: int = 100, topics: int = 100) -> Imports:
-    made = Imports(Policy(PolicySettings(deny=("/secret",))), lambda: 1.0, most=LimitSettings(nodes, topics))
+    made = Imports(
+        Policy(PolicySettings(deny=("/secret",))), lambda: 1.0, limit_settings=LimitSettings(nodes, topics)
+    )
     made.link_up(1, "far")
     return made
 

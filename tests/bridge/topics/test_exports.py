@@ -181,7 +181,7 @@ def test_a_peer_gets_one_copy_of_a_source_however_often_it_asks(exports: Exports
 
 
 def bounded(topics: int) -> Exports:
-    return Exports(Policy(PolicySettings(deny=("/secret",))), most=LimitSettings(topics=topics))
+    return Exports(Policy(PolicySettings(deny=("/secret",))), limit_settings=LimitSettings(topics=topics))
 
 
 def test_the_number_of_routes_is_bounded() -> None:

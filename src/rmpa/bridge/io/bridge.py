@@ -45,7 +45,7 @@ class Bridge:
         contracts: What its topics need.
         names: How names read at the peers, and theirs here.
         relay: Whether what comes from one peer is offered to others.
-        most: How much of one peer is taken, and how much is offered.
+        limit_settings: How much of one peer is taken, and how much is offered.
         rng: Uniform numbers in [0, 1) for back-off jitter.
     """
 
@@ -58,7 +58,7 @@ class Bridge:
         contracts: Contracts | None = None,
         names: Names | None = None,
         relay: bool = False,
-        most: LimitSettings | None = None,
+        limit_settings: LimitSettings | None = None,
     ) -> None:
         self._core = core
         self.counters = Counters()
@@ -95,7 +95,7 @@ class Bridge:
             policy,
             contracts=contracts if contracts is not None else Contracts(),
             names=names if names is not None else Names(),
-            most=most if most is not None else LimitSettings(),
+            limit_settings=limit_settings if limit_settings is not None else LimitSettings(),
             rng=rng,
             counters=self.counters,
         )

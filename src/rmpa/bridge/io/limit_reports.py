@@ -30,17 +30,17 @@ class LimitReports(Part):
         rpc: Brings news to the peers, and from them.
         topics: The part with the topics' plans.
         services: The part with the services' plans.
-        most: The limits.
+        limit_settings: The limits.
     """
 
     def __init__(
-        self, sessions: PeerSessions, rpc: PeerRpc, topics: Topics, services: Services, most: LimitSettings
+        self, sessions: PeerSessions, rpc: PeerRpc, topics: Topics, services: Services, limit_settings: LimitSettings
     ) -> None:
         self._sessions = sessions
         self._rpc = rpc
         self._topics = topics
         self._services = services
-        self._most = most
+        self._limit_settings = limit_settings
         self._told: dict[int, tuple[Beyond, ...]] = {}
         self._there: dict[int, tuple[Beyond, ...]] = {}
         rpc.on_notification(HIDDEN, self._told_by_peer)
@@ -50,7 +50,7 @@ class LimitReports(Part):
         topics, services = self._topics.imports.crowded(peer), self._services.imports.crowded(peer)
         nodes = Beyond(
             "nodes",
-            self._most.nodes,
+            self._limit_settings.nodes,
             len(topics.keys() | services.keys()),
             sum(map(len, topics.values())),
             sum(map(len, services.values())),
@@ -68,7 +68,7 @@ class LimitReports(Part):
 
     def reload(self, settings: Settings) -> None:
         """Other limits hold from now on."""
-        self._most = settings.limits
+        self._limit_settings = settings.limits
 
     def reconcile(self) -> None:
         """Tell what has changed."""

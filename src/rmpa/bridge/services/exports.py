@@ -142,14 +142,14 @@ class ServiceExports:
 
     Args:
         rules: What may cross, and under which names.
-        most: How much is offered.
+        limit_settings: How much is offered.
     """
 
-    def __init__(self, rules: ServiceRules, most: LimitSettings = _DEFAULT_LIMITS) -> None:
+    def __init__(self, rules: ServiceRules, limit_settings: LimitSettings = _DEFAULT_LIMITS) -> None:
         self._rules = rules
         self._catalogue: OfferCatalogue[str, LocalService, ServiceOffer, str] = OfferCatalogue(
             "services",
-            most.services,
+            limit_settings.services,
             offer=self._offer,
             wire=lambda offer: offer.service,
             # Another server behind the same name: what peers know of it may no longer be true.
@@ -203,13 +203,15 @@ class ServiceExports:
             self._seen[service] = server
         return self._judge(service)
 
-    def apply_rules(self, rules: ServiceRules, most: LimitSettings = _DEFAULT_LIMITS) -> Iterator[list[ExportAction]]:
+    def apply_rules(
+        self, rules: ServiceRules, limit_settings: LimitSettings = _DEFAULT_LIMITS
+    ) -> Iterator[list[ExportAction]]:
         """Other rules hold from now on; what they do not touch goes on.
 
         Returns:
             What is to be done for one service after the other, looked at when it is asked for.
         """
-        self._rules, self._catalogue.limit = rules, most.services
+        self._rules, self._catalogue.limit = rules, limit_settings.services
         for known in self._catalogue.peers():
             self._catalogue.note_all(known)
         return (self._judge(service) for service in tuple(self._seen))

@@ -182,12 +182,12 @@ class ServiceImports:
 
     Args:
         rules: What may cross, and under which names; the receiving side judges too.
-        most: How much of one peer is taken.
+        limit_settings: How much of one peer is taken.
     """
 
-    def __init__(self, rules: ServiceRules, most: LimitSettings = _DEFAULT_LIMITS) -> None:
+    def __init__(self, rules: ServiceRules, limit_settings: LimitSettings = _DEFAULT_LIMITS) -> None:
         self._rules = rules
-        self._most = most
+        self._limit_settings = limit_settings
         self._peers: dict[int, _ServiceImportPeer] = {}
         self.ways = RelayPaths()
         """The path by which each relayed module is reached."""
@@ -218,7 +218,7 @@ class ServiceImports:
 
     def beyond(self, peer: int) -> peer_limits.Beyond:
         """What a peer offers beyond ``limits.services``."""
-        known, limit = self._peers.get(peer), self._most.services
+        known, limit = self._peers.get(peer), self._limit_settings.services
         return known.beyond("services", limit) if known is not None else Beyond("services", limit, 0)
 
     def crowded(self, peer: int) -> Mapping[str, Collection[str]]:
@@ -231,7 +231,7 @@ class ServiceImports:
         """A link is up, of a new peer or of one that was away."""
         known = self._peers.get(peer)
         if known is None:
-            self._peers[peer] = _ServiceImportPeer(name=name, nodes=NodePlaces(self._most.nodes), rank=rank)
+            self._peers[peer] = _ServiceImportPeer(name=name, nodes=NodePlaces(self._limit_settings.nodes), rank=rank)
         else:
             known.away = False
             known.serial = -1
@@ -304,7 +304,7 @@ class ServiceImports:
 
     def _admit(self, peer: int) -> Iterator[list[ImportAction]]:
         """Take in what was beyond ``limits.services`` while there is room, one after the other."""
-        while (known := self._peers.get(peer)) and (offer := known.admitted(self._most.services)):
+        while (known := self._peers.get(peer)) and (offer := known.admitted(self._limit_settings.services)):
             yield self._offer(peer, known, offer)
 
     def _offer(self, peer: int, known: _ServiceImportPeer, offer: ServiceOffer) -> list[ImportAction]:
@@ -316,9 +316,9 @@ class ServiceImports:
             return [ForgetAbout(peer, before.name)] if before.shown else []
         if before is not None:
             actions += self._remove(peer, offer.service, f"another node of {known.name} provides it now")
-        elif len(known.entries) >= self._most.services:
+        elif len(known.entries) >= self._limit_settings.services:
             known.surplus.add(offer.service, offer)
-            text = peer_limits.warning(known.name, "services", self._most.services)
+            text = peer_limits.warning(known.name, "services", self._limit_settings.services)
             return [Warn("services.too_many", known.name, text)]
         name = self._rules.local_name(offer.origin.name if offer.origin else known.name, offer.service)
         remote = known.entries[offer.service] = RemoteService(offer.service, offer.node, name, origin=offer.origin)
@@ -377,15 +377,17 @@ class ServiceImports:
             self._local[service] = node
         return self._choose(service) if service in self._claims else []
 
-    def apply_rules(self, rules: ServiceRules, most: LimitSettings = _DEFAULT_LIMITS) -> Iterator[list[ImportAction]]:
+    def apply_rules(
+        self, rules: ServiceRules, limit_settings: LimitSettings = _DEFAULT_LIMITS
+    ) -> Iterator[list[ImportAction]]:
         """Other rules hold from now on; what they do not touch goes on.
 
         Returns:
             What is to be done for one service after the other, looked at when it is asked for.
         """
-        self._rules, self._most = rules, most
+        self._rules, self._limit_settings = rules, limit_settings
         for known in self._peers.values():
-            known.nodes.bound(most.nodes)
+            known.nodes.bound(limit_settings.nodes)
         offers = [(number, wire) for number, known in self._peers.items() for wire in known.entries]
         # A second time, for those whose new name was still another one's old one.
         judged = (self._rejudge(number, wire, again=again) for again in (False, True) for number, wire in offers)

@@ -131,7 +131,7 @@ class Exports:
         policy: What may cross.
         contracts: What our side promises.
         names: How our names read at the peers.
-        most: How much is offered.
+        limit_settings: How much is offered.
         kept: Keeps the messages of reliable routes.
     """
 
@@ -140,14 +140,14 @@ class Exports:
         policy: Policy,
         contracts: Contracts | None = None,
         names: Names = _NO_NAMES,
-        most: LimitSettings = _DEFAULT_LIMITS,
+        limit_settings: LimitSettings = _DEFAULT_LIMITS,
         kept: KeptMessages = NOTHING_KEPT,
     ) -> None:
         self._kept = kept
         self._policy = policy
-        self._most = most
+        self._limit_settings = limit_settings
         self._catalogue: OfferCatalogue[Source, LocalSource, TopicOffer, Source] = OfferCatalogue(
-            "topics", most.topics, offer=self._offer, wire=lambda offer: offer.source
+            "topics", limit_settings.topics, offer=self._offer, wire=lambda offer: offer.source
         )
         self._contracts = contracts if contracts is not None else Contracts()
         self._names = names
@@ -227,15 +227,15 @@ class Exports:
         return self._catalogue.beginning(peer)
 
     def apply_rules(
-        self, policy: Policy, contracts: Contracts, names: Names, most: LimitSettings = _DEFAULT_LIMITS
+        self, policy: Policy, contracts: Contracts, names: Names, limit_settings: LimitSettings = _DEFAULT_LIMITS
     ) -> list[Action]:
         """Other rules hold from now on; what they leave as it is goes on untouched.
 
         The topics are judged by them when ``graph`` tells of each next, and the peers hear of it by ``advertise``.
         """
-        self._policy, self._contracts, self._names, self._most = policy, contracts, names, most
+        self._policy, self._contracts, self._names, self._limit_settings = policy, contracts, names, limit_settings
         self._rules += 1
-        self._catalogue.limit = most.topics
+        self._catalogue.limit = limit_settings.topics
         for known in self._catalogue.peers():
             before, known.judged = known.judged, self._is_judged(known.name)
             if before or known.judged:
@@ -419,8 +419,8 @@ class Exports:
             return [
                 Warn("route.doubled", str(peer), f"a peer opens route {message.route} twice; the second is ignored")
             ]
-        if len(routes) >= self._most.topics:
-            text = f"more topics are open on one link than limits.topics = {self._most.topics} over there"
+        if len(routes) >= self._limit_settings.topics:
+            text = f"more topics are open on one link than limits.topics = {self._limit_settings.topics} over there"
             return [Send(peer, RouteClosed(message.route, text))]
         source = self.local(peer, message.source)
         if source is None:

@@ -84,7 +84,7 @@ class Imports:
         contracts: What our side asks for.
         position: ``(peer, source)``: epoch and last message of a reliable route that outlived its link, or ``None``.
         names: How the peers' names read here.
-        most: How much of one peer is taken.
+        limit_settings: How much of one peer is taken.
     """
 
     def __init__(
@@ -94,10 +94,10 @@ class Imports:
         contracts: Contracts | None = None,
         position: Callable[[int, Source], tuple[int, int] | None] = _nothing,
         names: Names = _NO_NAMES,
-        most: LimitSettings = _DEFAULT_LIMITS,
+        limit_settings: LimitSettings = _DEFAULT_LIMITS,
     ) -> None:
         self._policy = policy
-        self._most = most
+        self._limit_settings = limit_settings
         self._names = names
         self._rng = rng
         self._contracts = contracts if contracts is not None else Contracts()
@@ -163,7 +163,7 @@ class Imports:
 
     def beyond(self, peer: int) -> peer_limits.Beyond:
         """What a peer offers beyond ``limits.topics``."""
-        known, limit = self._peers.get(peer), self._most.topics
+        known, limit = self._peers.get(peer), self._limit_settings.topics
         return known.beyond("topics", limit) if known is not None else Beyond("topics", limit, 0)
 
     def crowded(self, peer: int) -> Mapping[str, Collection[Source]]:
@@ -177,18 +177,23 @@ class Imports:
                 yield peer, self._names_of(known, offer.origin).local_name(offer.topic, offer.type), offer
 
     def apply_rules(
-        self, policy: Policy, contracts: Contracts, names: Names, now: float, most: LimitSettings = _DEFAULT_LIMITS
+        self,
+        policy: Policy,
+        contracts: Contracts,
+        names: Names,
+        now: float,
+        limit_settings: LimitSettings = _DEFAULT_LIMITS,
     ) -> Iterator[list[Action]]:
         """Other rules hold from now on; what they leave as it is goes on untouched.
 
         Returns:
             What to do, source by source, as it is taken.
         """
-        self._policy, self._contracts, self._names, self._most = policy, contracts, names, most
+        self._policy, self._contracts, self._names, self._limit_settings = policy, contracts, names, limit_settings
         self._routes.contracts = contracts
         for known in self._peers.values():
             known.names = names.of(known.name)
-            known.nodes.bound(most.nodes)
+            known.nodes.bound(limit_settings.nodes)
         return chain(
             (self._rejudge(peer, source, now) for peer, source, _ in self),
             (actions for peer in list(self._peers) for actions in self._admit(peer, now)),
@@ -196,7 +201,7 @@ class Imports:
 
     def _admit(self, peer: int, now: float) -> Iterator[list[Action]]:
         """Take in what was beyond ``limits.topics`` while there is room, one after the other."""
-        while (known := self._peers.get(peer)) and (offer := known.admitted(self._most.topics)):
+        while (known := self._peers.get(peer)) and (offer := known.admitted(self._limit_settings.topics)):
             yield self._add(peer, offer, now)
 
     def _rejudge(self, peer: int, source: Source, now: float) -> list[Action]:
@@ -225,7 +230,7 @@ class Imports:
             name: The peer's name, which its rules go by.
             who: The module that has the link: what relays offer of it is not needed any more.
         """
-        new = _ImportPeer(name=name, nodes=NodePlaces(self._most.nodes), names=self._names.of(name))
+        new = _ImportPeer(name=name, nodes=NodePlaces(self._limit_settings.nodes), names=self._names.of(name))
         known = self._peers.setdefault(peer, new)
         known.away = known.silent = False
         self._routes.link_up(peer)
@@ -380,10 +385,10 @@ class Imports:
                 waits = entry.state is RouteState.WAITING and entry.timer is None
                 return self._routes.open(peer, source, entry, now) if waits else []
             actions += self._forget(peer, source)
-        elif len(known) >= self._most.topics:
+        elif len(known) >= self._limit_settings.topics:
             name = self._peers[peer].name
             self._peers[peer].surplus.add(source, offer)
-            return [Warn("topics.too_many", name, peer_limits.warning(name, "topics", self._most.topics))]
+            return [Warn("topics.too_many", name, peer_limits.warning(name, "topics", self._limit_settings.topics))]
         backoff = Backoff(mesh_limits.BACKOFF_FIRST, mesh_limits.BACKOFF_MAX, self._rng)
         topic = self._names_of(self._peers[peer], offer.origin).local_name(source.topic, offer.type)
         entry = known[source] = RemoteTopic(offer.type, topic, backoff, origin=offer.origin)
@@ -395,7 +400,9 @@ class Imports:
         actions += self._show_or_hide(peer, source, entry)
         if entry.crowded:
             name = self._peers[peer].name
-            actions.append(Warn("nodes.too_many", name, peer_limits.warning(name, "nodes", self._most.nodes)))
+            actions.append(
+                Warn("nodes.too_many", name, peer_limits.warning(name, "nodes", self._limit_settings.nodes))
+            )
         return actions + self._report_conflict(peer, source, entry)
 
     def _show_or_hide(self, peer: int, source: Source, entry: RemoteTopic) -> list[Action]:

@@ -35,14 +35,14 @@ class ParamOwner:
         core: The local core.
         policy: What peers may do.
         rpc: Gets the handlers.
-        most: How many parameters one peer may follow.
+        followed_max: How many parameters one peer may follow.
     """
 
     def __init__(
-        self, core: ParamCore, policy: ParamPolicy, rpc: PeerRpc, most: int = config_limits.FOLLOWED_MAX
+        self, core: ParamCore, policy: ParamPolicy, rpc: PeerRpc, followed_max: int = config_limits.FOLLOWED_MAX
     ) -> None:
         self._core = core
-        self.most = most
+        self.followed_max = followed_max
         self.policy = policy
         self._rpc = rpc
         self._transfers: dict[int, transfer.Transfers] = defaultdict(transfer.Transfers)
@@ -160,8 +160,9 @@ class ParamOwner:
             problem = key_problem(given)
             key = str(given).rstrip("/") or "/"
             why = problem or self.policy.why_not_follow(key)
-            if not why and key not in wanted and len(wanted) >= self.most:
-                why = f"more parameters than limits.params = {self.most} over there; raise it, or follow a namespace"
+            if not why and key not in wanted and len(wanted) >= self.followed_max:
+                text = f"more parameters than limits.params = {self.followed_max} over there"
+                why = f"{text}; raise it, or follow a namespace"
             if why:
                 refused[str(given)[: config_limits.CROSSING_NAME_MAX]] = why
             else:

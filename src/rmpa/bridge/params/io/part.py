@@ -42,7 +42,7 @@ class Params(Part):
         counters: Counts ``param.put_back`` and ``param.refused``.
         params: What peers may do, and what is followed.
         time: Whether time is shared, and which peer's is followed.
-        most: How many parameters one peer may follow here.
+        followed_max: How many parameters one peer may follow here.
     """
 
     def __init__(
@@ -54,10 +54,10 @@ class Params(Part):
         counters: Counters,
         params: ParamSettings,
         time: TimeSettings,
-        most: int = config_limits.FOLLOWED_MAX,
+        followed_max: int = config_limits.FOLLOWED_MAX,
     ) -> None:
         self._core = ParamCore(core, node)
-        self._server = ParamOwner(self._core, ParamPolicy(params, time), rpc, most)
+        self._server = ParamOwner(self._core, ParamPolicy(params, time), rpc, followed_max)
         self._follower = ParamFollower(self._core, rpc, linked, follow_rules(params, time), counters)
         self._looking: asyncio.Task[None] | None = None
         self._run: XmlRpcValue = None
@@ -76,7 +76,7 @@ class Params(Part):
         """Other rules hold from now on; what they do not concern goes on untouched."""
         params, time = settings.params, settings.time
         self._server.policy = ParamPolicy(params, time)
-        self._server.most = settings.limits.params
+        self._server.followed_max = settings.limits.params
         self._server.judge_again()
         self._follower.change(follow_rules(params, time))
 

@@ -107,7 +107,7 @@ class Services(Part):
         rpc: Brings news to the peers, and from them.
         relay: Offers what comes from one peer to others.
         rules: What may cross, under which names, and for how long.
-        most: How much of one peer is taken, and how much is offered.
+        limit_settings: How much of one peer is taken, and how much is offered.
         counters: Counts what happens, by name.
     """
 
@@ -120,19 +120,19 @@ class Services(Part):
         rpc: PeerRpc,
         relay: Relay,
         rules: ServiceRules,
-        most: LimitSettings,
+        limit_settings: LimitSettings,
         counters: Counters,
     ) -> None:
-        self._most = most
+        self._limit_settings = limit_settings
         self._core = core
         self._sessions = sessions
         self._rpc = rpc
         self._relay = relay
         self.rules = rules
         """What may cross, also for snapshots."""
-        self.exports = ServiceExports(rules, self._most)
+        self.exports = ServiceExports(rules, self._limit_settings)
         """The outbound plan, for snapshots."""
-        self.imports = ServiceImports(rules, self._most)
+        self.imports = ServiceImports(rules, self._limit_settings)
         """The inbound plan, for snapshots."""
         self._budgets: dict[int, Budgets] = {}
         self._shown: dict[tuple[int, str], ShownService] = {}
@@ -172,14 +172,17 @@ class Services(Part):
     def reload(self, settings: Settings) -> None:
         """Other settings hold from now on."""
         policy, names = Policy(settings.policy, settings.peers, settings.time), Names(settings.peers)
-        self._most = settings.limits
+        self._limit_settings = settings.limits
         self.apply_rules(ServiceRules(settings.services, policy, names))
 
     def apply_rules(self, rules: ServiceRules) -> None:
         """Other rules hold from now on; what they do not touch goes on."""
         self.rules = rules
         self._driver.rejudge(
-            chain(self.exports.apply_rules(rules, self._most), self.imports.apply_rules(rules, self._most))
+            chain(
+                self.exports.apply_rules(rules, self._limit_settings),
+                self.imports.apply_rules(rules, self._limit_settings),
+            )
         )
         for shown in yielding_to_data(list(self._shown.values()), every=16):
             timeout, endpoint = rules.timeout(shown.service), shown.endpoint

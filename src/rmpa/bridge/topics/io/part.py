@@ -79,7 +79,7 @@ class Topics(Part):
         policy: What may cross.
         contracts: What the topics of this module need.
         names: How names read at the peers, and theirs here.
-        most: How much of one peer is taken, and how much is offered.
+        limit_settings: How much of one peer is taken, and how much is offered.
         rng: Uniform numbers in [0, 1) for back-off jitter.
         counters: Counts what happens, by name.
     """
@@ -97,7 +97,7 @@ class Topics(Part):
         *,
         contracts: Contracts,
         names: Names,
-        most: LimitSettings,
+        limit_settings: LimitSettings,
         rng: Callable[[], float],
         counters: Counters,
     ) -> None:
@@ -108,7 +108,7 @@ class Topics(Part):
         self.names = names
         """How names read at the peers, and theirs here; another one after ``reload``."""
         self._peers: dict[int, PeerTopics] = {}
-        self.imports = Imports(policy, rng, contracts, self._position, names, most)
+        self.imports = Imports(policy, rng, contracts, self._position, names, limit_settings)
         """The inbound plan."""
         self.outbound = LocalSubscriptions(
             core,
@@ -124,7 +124,7 @@ class Topics(Part):
             ),
         )
         """The subscriptions to local publishers, and the routes to the peers."""
-        self.exports = Exports(policy, contracts, names, most, self.outbound)
+        self.exports = Exports(policy, contracts, names, limit_settings, self.outbound)
         """The outbound plan."""
         refusals = RefusalLog(_log, counters)
         self._driver: GraphDriver[act.Action, Advertise] = GraphDriver(
@@ -186,9 +186,9 @@ class Topics(Part):
         """Other rules hold from now on; what they leave as it is goes on untouched."""
         policy, contracts = Policy(settings.policy, settings.peers, settings.time), Contracts(settings.contracts)
         self.names = Names(settings.peers)
-        most, now = settings.limits, asyncio.get_running_loop().time()
-        self._act(self.exports.apply_rules(policy, contracts, self.names, most))
-        self._driver.rejudge(self.imports.apply_rules(policy, contracts, self.names, now, most))
+        limit_settings, now = settings.limits, asyncio.get_running_loop().time()
+        self._act(self.exports.apply_rules(policy, contracts, self.names, limit_settings))
+        self._driver.rejudge(self.imports.apply_rules(policy, contracts, self.names, now, limit_settings))
         self._look_at_all()
 
     def remembered(self, identity: Identity) -> int | None:
