@@ -58,11 +58,11 @@ _LOGGERS: Final = {
 
 
 class Agent:
-    """One module's agent: core, bridge and network, and what is seen of them from outside.
+    """One module's agent: core, bridge and network, and the interfaces by which it is observed.
 
     Args:
         settings: Complete: the name is filled in.
-        requests: What came of each request of ``--realtime``.
+        requests: The outcome of each request of ``--realtime``.
         load: Reads the settings again, as they were read for this agent; it may block.
     """
 

@@ -63,7 +63,7 @@ class NetworkEndpoint:
         self.port: int = tcp.getsockname()[1]
         usable = choose(list_interfaces(), settings.interfaces)
         address = pick_address(usable)
-        # Seconds modulo 18 hours: later for each restart. The random instance id is what decides.
+        # Seconds modulo 18 hours, so that a restart gets a higher number; the random instance id decides in doubt.
         incarnation = clock.wall_ns() // 1_000_000_000 % _INCARNATIONS
         self.identity = Identity(
             Guid.of(address, self.port, incarnation),
@@ -115,7 +115,7 @@ class NetworkEndpoint:
                 _log.info("- %s %s", identity, reason.value)
                 self.mesh.peer_gone(identity.guid)
             case PeerConflict():
-                pass  # discovery has logged it, at a bounded rate
+                pass  # discovery has logged the error, at a bounded rate
 
     def _link_up(self, link: PeerLink) -> None:
         # Its beacons come from its mesh port; an accepted connection may come from any port.
@@ -128,7 +128,7 @@ class NetworkEndpoint:
             self.discovery.link_down(link.identity.guid, link.identity.instance)
 
     def _interfaces(self, everything: tuple[Interface, ...]) -> bool:
-        """The machine's interfaces have changed; returns whether the GUID still fits."""
+        """Handle a change of the machine's interfaces; return whether the GUID's address is still valid."""
         displaced = is_displaced(self.identity.guid.address, everything, self._settings.interfaces)
         if displaced:
             self._on_displaced()
@@ -195,8 +195,8 @@ class Network:
 def is_displaced(ours: IPv4Address, everything: tuple[Interface, ...], wanted: tuple[str, ...]) -> bool:
     """Whether the agent needs a GUID with another address.
 
-    An interface without its cable keeps its address, and links by other interfaces go on meanwhile. An address that
-    is gone may come back too (a lease is renewed), but not one in whose place there is another.
+    An interface without its cable keeps its address, and links over other interfaces go on meanwhile. A lost address
+    may return (a DHCP lease is renewed), so the GUID stays until the machine has another usable address.
 
     Args:
         ours: The address in the GUID.

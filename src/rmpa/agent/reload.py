@@ -27,7 +27,7 @@ _log = logging.getLogger(__name__)
 LIVE: Final = frozenset(setting.path[0] for setting in SETTINGS if setting.live)
 """The fields of ``Settings`` that a running agent takes; all others need a restart."""
 _VALUE_SHOWN: Final = 60
-"""Characters of a value that a text has."""
+"""The most characters of a value in a text for the user."""
 
 
 class Reloader:
@@ -47,13 +47,13 @@ class Reloader:
         self._apply = apply
         self._one = asyncio.Lock()
         self.waiting: tuple[str, ...] = ()
-        """The settings that wait for a restart, as of the last time that they were read."""
+        """The settings that need a restart to take effect, as of the last reload."""
 
     async def reload(self, *, check: bool = False) -> ReloadReply:
         """Read the settings and apply those of ``LIVE``. Settings with an error change nothing.
 
         Args:
-            check: Say only what would change.
+            check: Whether to report only what would change, and to apply nothing.
 
         Raises:
             ConfigError: This agent was started from a program, without a file to read again.
@@ -62,7 +62,7 @@ class Reloader:
             raise ConfigError("the settings", "this agent was given them by a program", "change them there")
         async with self._one:
             try:
-                # In a thread: a long file takes long to read, and longer to find an error's line in.
+                # In a thread: reading a long file takes long, and finding the line of an error takes longer.
                 loaded = await asyncio.to_thread(self._load)
             except ConfigError as error:
                 if not check:
@@ -122,7 +122,7 @@ class SighupHandler:
             asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self._on_signal)
 
     async def close(self) -> None:
-        """Handle the signal no more."""
+        """Stop handling the signal."""
         asyncio.get_running_loop().remove_signal_handler(signal.SIGHUP)
         for task in self._running:
             task.cancel()

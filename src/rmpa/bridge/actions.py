@@ -1,7 +1,7 @@
-"""What the bridge's machines ask their driver to do; frozen values, acted on elsewhere.
+"""The actions that the bridge's machines return to their driver, as frozen values.
 
-``peer`` is a number that the driver gave to one run of a peer. It stays the same when its link comes back,
-and is never used again for another one.
+``peer`` is the number of a peer's session. It stays the same when the peer's link comes back, and is never used for
+another run of a peer.
 """
 
 from __future__ import annotations
@@ -38,23 +38,23 @@ class Connect:
 
 @dataclass(frozen=True, slots=True)
 class Disconnect:
-    """Leave a local publisher."""
+    """Disconnect from a local publisher, and drop its routes."""
 
     source: Source
 
 
 @dataclass(frozen=True, slots=True)
 class AddRoute:
-    """Send a source's messages to a peer from now on; first its latched one, where there is one.
+    """Begin to send a source's messages to a peer; first the kept ones, if its contract or publisher keeps any.
 
     Args:
         source: Which.
         peer: The peer's number.
         route: The route's id.
-        contract: What holds for it.
-        epoch: Names the numbering of a reliable route.
-        after: The peer has all up to this message of the epoch already, and a suspended route goes on; ``None``: a
-            new one.
+        contract: The contract in force.
+        epoch: Identifies the numbering of a reliable route; 0 for best effort.
+        after: To continue a suspended route: the last message of the epoch that the peer has. ``None``: a new
+            numbering.
     """
 
     source: Source
@@ -67,14 +67,14 @@ class AddRoute:
 
 @dataclass(frozen=True, slots=True)
 class RemoveRoute:
-    """Send a source's messages to a peer no longer, and drop what waits.
+    """End a source's route to a peer, and drop its waiting messages.
 
     Args:
         source: Which.
         peer: The peer's number.
-        route: The route's id; 0: one that was suspended.
-        wished: Whether the peer wants no more of it; else it may ask what it missed.
-        over: Whether nothing more is published that it could miss until it asks again.
+        route: The route's id; 0 for a suspended route.
+        wished: Whether the peer closed it; if not, the peer may ask later what it missed.
+        over: Whether the publisher is gone, so that the peer misses no further messages.
     """
 
     source: Source
@@ -86,12 +86,12 @@ class RemoveRoute:
 
 @dataclass(frozen=True, slots=True)
 class SuspendRoute:
-    """The peer's link is gone; keep what it has not acknowledged, and what comes, until it is back.
+    """Keep the unacknowledged and all further messages of a route, until its peer has a link again.
 
     Args:
         source: Which.
         peer: The peer's number.
-        outage: Seconds for which it is kept; after them it is only counted.
+        outage: Seconds for which the messages are kept; after that they are only counted.
     """
 
     source: Source
@@ -104,14 +104,14 @@ class SuspendRoute:
 
 @dataclass(frozen=True, slots=True)
 class Publish:
-    """Let a peer's source appear in the local graph.
+    """Publish a peer's source in the local graph.
 
     Args:
         peer: The peer's number.
-        source: Which, by the name that its peer has for it.
+        source: The source, by its wire name.
         type: Its message type.
-        topic: What it is called here; empty: the same.
-        origin: Its module and node, if its peer only passes it on.
+        topic: Its topic in the local graph; empty: the same name.
+        origin: Its module and node, if its peer only relays it.
     """
 
     peer: int
@@ -123,7 +123,7 @@ class Publish:
 
 @dataclass(frozen=True, slots=True)
 class Retract:
-    """Let it disappear: unregister and close its sockets."""
+    """Remove a peer's source from the local graph: unregister it and close its sockets."""
 
     peer: int
     source: Source
@@ -131,19 +131,19 @@ class Retract:
 
 @dataclass(frozen=True, slots=True)
 class Describe:
-    """Tell the waiting local subscribers what the messages are; from now on data comes on ``route``.
+    """Prepare for data on a newly opened route, and answer the waiting local subscribers with its description.
 
     Args:
         peer: The peer's number.
         source: Which.
         route: The route's id.
-        description: What the messages are.
-        contract: What holds for the route.
-        epoch: Names the numbering of a reliable route.
-        first: Its first sequence.
-        following: The next message's sequence, where a numbering goes on; ``None``: the peer did not say.
-        lost: Messages of earlier numberings that never came, where one begins anew; ``None``: the peer does not know.
-        at_least: Whether more may be lost than that.
+        description: The header of the source's publisher.
+        contract: The contract of the route.
+        epoch: Identifies the numbering of a reliable route; 0 for best effort.
+        first: The numbering's first sequence.
+        following: If the numbering goes on: the next message's sequence; ``None``: the peer did not report it.
+        lost: If a numbering begins: lost messages of earlier ones; ``None``: the peer does not know the number.
+        at_least: Whether more than ``lost`` may be lost.
     """
 
     peer: int
@@ -160,14 +160,14 @@ class Describe:
 
 @dataclass(frozen=True, slots=True)
 class Detach:
-    """No more data comes on this route; forget the latched message (a new route brings it again).
+    """End a route's data; unless ``keep``, the latched message is forgotten (a new route brings it again).
 
     Args:
         peer: The peer's number.
         source: Which.
         route: The route's id.
-        keep: The link is gone, and a new one will go on behind the last message that came.
-        missed: Local nodes listen all the same: what is not received until a route is open again counts as lost.
+        keep: The link is gone, and the next one will continue after the last message that came.
+        missed: Local nodes still listen: messages that are published before a route is open again count as lost.
     """
 
     peer: int
@@ -179,7 +179,7 @@ class Detach:
 
 @dataclass(frozen=True, slots=True)
 class Warn:
-    """Tell the user; ``kind`` is the name of the count."""
+    """Log a warning about ``who``; ``kind`` is the counter's name."""
 
     kind: str
     who: str

@@ -1,7 +1,7 @@
-"""What two bridges say to each other: one JSON object a control frame, its kind in ``op``.
+"""The control messages between two bridges: one JSON object in each control frame, its kind in ``op``.
 
-JSON because it is rare (never on the data path), bounded by ``limits.CONTROL_PAYLOAD_MAX`` and readable in a
-packet capture. ``docs/design/protocol.md`` lists the messages with examples.
+They are JSON because they are rare (never on the data path), bounded by ``mesh.limits.CONTROL_PAYLOAD_MAX``, and
+readable in a packet capture. ``docs/design/protocol.md`` lists the messages with examples.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Origin(msgspec.Struct, frozen=True):
         guid: Its GUID as text.
         instance: The random id of its run, 32 hexadecimal digits.
         node: The publishing node, in that module's graph.
-        path: The instances of the relays on the way, the first one's first; the last one is the sender.
+        path: The instances of the relays on the path, the one nearest to the origin first; the last is the sender.
     """
 
     name: str
@@ -62,7 +62,7 @@ class TopicOffer(msgspec.Struct, frozen=True, omit_defaults=True):
 
     Args:
         topic: Its topic.
-        node: Its node; where it is relayed: what stands for it in the sender's graph.
+        node: Its node; for a relayed source, the proxy in the sender's graph.
         type: Its message type.
         origin: Its module and node, if it is not the sender's own.
     """
@@ -74,18 +74,18 @@ class TopicOffer(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def source(self) -> Source:
-        """The stream that is offered."""
+        """The offered source."""
         return Source(self.topic, self.node)
 
 
 class Description(msgspec.Struct, frozen=True):
-    """What the publisher's own connection header says; known only once a connection to it stands.
+    """The connection header of a publisher; known only once the agent is connected to it.
 
     Args:
         type: Message type.
         md5: Its MD5 sum, never ``*``.
         definition: The full text of its definition, byte for byte as the publisher sent it: one character a byte
-            (ISO 8859-1), for some definitions have comments that are not UTF-8.
+            (ISO 8859-1), because some definitions have comments that are not UTF-8.
         latching: Whether each new subscriber gets the last message.
     """
 
@@ -107,13 +107,13 @@ class Description(msgspec.Struct, frozen=True):
 
 
 class Advertise(msgspec.Struct, frozen=True, tag_field="op", tag="advertise"):
-    """What the sender's graph publishes: all of it, first on each link, or what changed.
+    """The sources that the sender offers: all of them, first on each link, or changes.
 
     Args:
-        added: New, or of another type.
-        removed: No longer there.
-        full: This begins all of it: what is not offered is not there.
-        more: Further messages go on with that.
+        added: Sources that are new or have another type or origin.
+        removed: Sources that are no longer offered.
+        full: Whether this begins a full advertisement: sources that it does not contain are no longer offered.
+        more: Whether the full advertisement continues in further messages.
     """
 
     added: tuple[TopicOffer, ...] = ()
@@ -123,15 +123,15 @@ class Advertise(msgspec.Struct, frozen=True, tag_field="op", tag="advertise"):
 
 
 class OpenRoute(msgspec.Struct, frozen=True, tag_field="op", tag="open"):
-    """Send me this source; its data frames shall bear this route's id, which I chose.
+    """Asks the receiver of this message to send a source, in data frames with this route's id.
 
     Args:
-        route: The id.
+        route: The route's id, chosen by the subscribing agent, which sends this message.
         topic: The source's topic.
         node: The source's node.
-        contract: What the receiver asks for.
-        epoch: The numbering that it has a part of, if a link fell in between; else 0.
-        after: The last message of that which it has.
+        contract: The contract that the subscribing agent asks for.
+        epoch: The last numbering of which it has messages, if an earlier route ended; else 0.
+        after: The last message of that numbering that it has.
     """
 
     route: int
@@ -143,7 +143,7 @@ class OpenRoute(msgspec.Struct, frozen=True, tag_field="op", tag="open"):
 
     @property
     def source(self) -> Source:
-        """The stream that is asked for."""
+        """The requested source."""
         return Source(self.topic, self.node)
 
 
@@ -151,15 +151,15 @@ class RouteOpened(msgspec.Struct, frozen=True, tag_field="op", tag="opened"):
     """The route is open; data follows.
 
     Args:
-        route: The id.
-        description: What the messages are.
-        contract: What holds for the route: the stronger of both sides' words.
-        epoch: Names the numbering of a reliable route, else 0.
+        route: The route's id.
+        description: The header of the publisher.
+        contract: The contract of the route: the stronger terms of both ends.
+        epoch: Identifies the numbering of a reliable route; 0 for best effort.
         first: The numbering's first sequence.
-        following: Where a reliable route goes on: the sequence of the next message that will come.
-        lost: Where it begins anew: messages of the numberings before this one that the receiver never got and does
-            not know of; left out where that is not known.
-        at_least: Whether more than these may be lost; left out: no.
+        following: If a reliable route continues: the sequence of the next message.
+        lost: If a numbering begins: messages of earlier numberings that the subscribing agent never got and does not
+            know of; left out if the number is unknown.
+        at_least: Whether more than ``lost`` may be lost; left out: no.
     """
 
     route: int
@@ -173,22 +173,22 @@ class RouteOpened(msgspec.Struct, frozen=True, tag_field="op", tag="opened"):
 
 
 class CloseRoute(msgspec.Struct, frozen=True, tag_field="op", tag="close"):
-    """I want no more of this route."""
+    """The subscribing agent closes a route."""
 
     route: int
 
 
 class RouteClosed(msgspec.Struct, frozen=True, tag_field="op", tag="closed"):
-    """The route is not, or no longer, open on my side; ``reason`` is for people."""
+    """The publishing agent refuses or ends a route; ``reason`` is text for the user."""
 
     route: int
     reason: str
 
 
 class Mismatch(msgspec.Struct, frozen=True, tag_field="op", tag="mismatch"):
-    """A node of mine wants your source with another definition; it was refused. For your log and users.
+    """A subscriber at the sender was refused because its definition of the receiver's source differs.
 
-    With an empty ``text`` that is over: the node has gone, or comes anew.
+    An empty ``text`` ends an earlier mismatch: the subscriber has gone or registers again.
     """
 
     topic: str
@@ -198,16 +198,16 @@ class Mismatch(msgspec.Struct, frozen=True, tag_field="op", tag="mismatch"):
 
     @property
     def source(self) -> Source:
-        """The stream that did not fit."""
+        """The source that did not fit."""
         return Source(self.topic, self.node)
 
 
 class Audience(msgspec.Struct, frozen=True, tag_field="op", tag="audience"):
-    """Which nodes of mine listen to a route of yours; sent where a publisher looks at its listeners' names (actions).
+    """The sender's nodes that listen to a route; sent if publishers check their listeners' names (actions).
 
     Args:
-        route: The id.
-        nodes: Their global names, in my graph.
+        route: The route's id.
+        nodes: The listeners' global names, in the sender's graph.
     """
 
     route: int
@@ -218,8 +218,8 @@ class ServiceOffer(msgspec.Struct, frozen=True, omit_defaults=True):
     """A service that the sender's graph has.
 
     Args:
-        service: Its global name, as the receiver is to see it unless it renames it.
-        node: The node that provides it; where it is relayed: what stands for it in the sender's graph.
+        service: Its global wire name; the receiver may rename it.
+        node: The node that provides it; for a relayed service, the proxy in the sender's graph.
         origin: Its module and node, if it is not the sender's own.
     """
 
@@ -229,7 +229,7 @@ class ServiceOffer(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class AdvertiseServices(msgspec.Struct, frozen=True, tag_field="op", tag="services"):
-    """What the sender's graph provides, as ``Advertise`` does for topics; ``removed`` are names of services."""
+    """The services that the sender offers, as ``Advertise`` for topics; ``removed`` has names of services."""
 
     added: tuple[ServiceOffer, ...] = ()
     removed: tuple[str, ...] = ()
@@ -238,13 +238,13 @@ class AdvertiseServices(msgspec.Struct, frozen=True, tag_field="op", tag="servic
 
 
 class OpenService(msgspec.Struct, frozen=True, tag_field="op", tag="service_open"):
-    """I want to call this service of yours; send replies on this route, which I chose.
+    """The calling agent opens a service; it gets the replies on this route, whose id it chose.
 
     Args:
         route: The id, from ``limits.SERVICE_ROUTES`` on. Each reply is one message on it, whose sequence is the
             call's; its body is TCPROS's reply: the byte ``ok``, then the response or the text of the error.
         service: Its name, as it was offered.
-        timeout: Seconds that I wait for the reply to a call.
+        timeout: Seconds that the calling agent waits for the reply to a call.
     """
 
     route: int
@@ -260,8 +260,8 @@ class ServiceOpened(msgspec.Struct, frozen=True, tag_field="op", tag="service_op
         requests: The route that calls go to: each is one message, whose sequence the caller chooses.
         type: The service's type, ``package/Name``.
         md5: Its MD5 sum, never ``*``.
-        request_type: The type of its requests, as the server says it; may be empty.
-        response_type: Likewise.
+        request_type: The type of its requests from the server's header; may be empty.
+        response_type: The type of its responses, likewise.
     """
 
     route: int
@@ -273,25 +273,25 @@ class ServiceOpened(msgspec.Struct, frozen=True, tag_field="op", tag="service_op
 
 
 class CloseService(msgspec.Struct, frozen=True, tag_field="op", tag="service_close"):
-    """I will not call it any more (by the caller's route)."""
+    """The calling agent closes a service; ``route`` is its own one."""
 
     route: int
 
 
 class ServiceClosed(msgspec.Struct, frozen=True, tag_field="op", tag="service_closed"):
-    """The service cannot be called, or no longer; calls on their way were not answered. ``reason`` is for people."""
+    """The service cannot be called (any more); pending calls get no reply. ``reason`` is text for the user."""
 
     route: int
     reason: str
 
 
 class Request(msgspec.Struct, frozen=True, tag_field="op", tag="ask"):
-    """A question of one agent to another; ``bridge.session.peer_rpc`` has those that are answered.
+    """A request of one agent to another; ``bridge.session.peer_rpc`` finds its handler.
 
     Args:
-        number: The asker's number for it.
-        what: A handler's name.
-        args: What that handler wants, by name.
+        number: Identifies the request at the requesting agent.
+        what: The handler's name.
+        args: The handler's arguments, by name.
     """
 
     number: int
@@ -300,14 +300,14 @@ class Request(msgspec.Struct, frozen=True, tag_field="op", tag="ask"):
 
 
 class Response(msgspec.Struct, frozen=True, tag_field="op", tag="answer"):
-    """What came of a question.
+    """The response to a request.
 
     Args:
-        number: The asker's number.
-        ok: Whether ``value`` is the answer; else ``error`` says why not and ``remedy`` what to do.
-        value: Anything that JSON can say.
-        error: What happened.
-        remedy: What to do; may be empty.
+        number: The number of the request.
+        ok: Whether the request succeeded and ``value`` is its result; else see ``error`` and ``remedy``.
+        value: Anything that JSON can represent.
+        error: Why it failed.
+        remedy: What the user can do; may be empty.
     """
 
     number: int
@@ -318,7 +318,7 @@ class Response(msgspec.Struct, frozen=True, tag_field="op", tag="answer"):
 
 
 class Notification(msgspec.Struct, frozen=True, tag_field="op", tag="tell"):
-    """News for another agent, without an answer; its handler is found by ``what``, as for ``Request``."""
+    """A message to another agent without a response; ``what`` selects the listener."""
 
     what: str
     args: dict[str, Any] = {}
@@ -341,24 +341,24 @@ _OP_MAX: Final = 32
 
 
 def is_crossing_name(name: str) -> bool:
-    """Whether a topic's or node's name may be in a message: a global one that is not too long."""
+    """Whether a name may be in a message: it is global and at most ``CROSSING_NAME_MAX`` characters long."""
     return len(name) <= config_limits.CROSSING_NAME_MAX and is_global_name(name)
 
 
 def is_crossing_type(name: str) -> bool:
-    """Whether a type's name may be in a message."""
+    """Whether a type may be in a message: its name is valid and at most ``CROSSING_NAME_MAX`` characters long."""
     return len(name) <= config_limits.CROSSING_NAME_MAX and is_type_name(name)
 
 
 def encode(message: Message) -> bytes:
-    """One message as the payload of a control frame."""
+    """Encode a message as the payload of a control frame."""
     return _ENCODER.encode(message)
 
 
 def op_of(payload: bytes | bytearray | memoryview) -> str:
-    """The kind of a control message, without parsing it; empty if its text does not begin with it.
+    """The kind of a control message, without parsing it; empty if its text does not begin with ``op``.
 
-    Those of our encoder do; others are parsed at once, which costs only time.
+    The messages of ``encode`` begin with it. Others are parsed at once, which only takes time.
     """
     head = bytes(payload[:_OP_MAX])
     return head[len(_OP) :].partition(b'"')[0].decode("ascii", "replace") if head.startswith(_OP) else ""
@@ -368,8 +368,8 @@ def decode(payload: bytes | bytearray | memoryview) -> Message:
     """Read and validate one message.
 
     Raises:
-        LimitExceeded: It is longer than ``limits.CONTROL_PAYLOAD_MAX``, or offers too many topics.
-        RemoteProtocolError: It is not a message of this version, or holds what is not a ROS name or type.
+        LimitExceeded: It is longer than ``mesh.limits.CONTROL_PAYLOAD_MAX``, or a list or text in it is too long.
+        RemoteProtocolError: It is not a message of this version, or has an invalid name, type or value.
     """
     if len(payload) > mesh_limits.CONTROL_PAYLOAD_MAX:
         raise LimitExceeded("control message", len(payload), mesh_limits.CONTROL_PAYLOAD_MAX)
@@ -486,7 +486,7 @@ def _validate_agent(message: AgentMessage) -> None:
 
 
 def _check_terms(message: OpenRoute | RouteOpened) -> None:
-    """A contract that a peer sends must be one that our own file could have."""
+    """Checks that a peer's contract has only values that ``rmpa.toml`` allows, and its numbers have 32 bits."""
     contract = message.contract
     numbers = [message.epoch, message.after if isinstance(message, OpenRoute) else message.first]
     if isinstance(message, RouteOpened):

@@ -1,4 +1,4 @@
-"""How the names of a peer's graph read in ours, and ours in theirs: pure functions of the ``[[peer]]`` rules.
+"""Translates names between a peer's graph and the local one: pure functions of the ``[[peer]]`` rules.
 
 *Wire* names are those that cross: topics and services as the module has them that publishes or provides them. ::
 
@@ -6,8 +6,8 @@
     /odom  ─────► /odom  ──in───► /robot1/odom      prefix = "/robot1"
     /cmd_vel ◄─── /cmd_vel ◄─out─ /robot1/cmd_vel
 
-The first rule that fits renames a name, once; its outcome is not looked at again. What stands here for a node of
-another module is not passed on but by a relay, and never back to where it came from: no rule sends a message round.
+The first rule that fits renames a name, once; the result is not renamed again. Only a relay offers the proxies of
+other modules, and never to the module that they came from, so no rule can make a message loop.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ class PeerNames:
     """The names of one peer.
 
     Args:
-        peer: Its name.
-        rules: All ``[[peer]]``, in the order of the file; those for other peers are passed over.
+        peer: The peer's name.
+        rules: All ``[[peer]]`` tables, in the order of the file; those for other peers are ignored.
     """
 
     def __init__(self, peer: str, rules: Iterable[PeerRule] = ()) -> None:
@@ -39,43 +39,43 @@ class PeerNames:
         self._in = [(remap, *_ends(remap, peer)) for rule in mine for remap in rule.remap_in]
         self._out = [(remap, *_ends(remap, peer)) for rule in mine for remap in rule.remap_out]
         self.prefix: Final = prefix
-        """What is put in front of the peer's names here, ``/robot1``, or empty."""
+        """The prefix of the peer's names in the local graph, such as ``/robot1``, or empty."""
 
     @property
     def plain(self) -> bool:
-        """Whether all names stay as they are."""
+        """Whether no rule renames anything of this peer."""
         return not (self.prefix or self._in or self._out)
 
     def local_name(self, wire: str, type_name: str = "") -> str:
-        """What a name of theirs is here.
+        """The local name of a peer's topic or service.
 
         Args:
-            wire: The name as the peer has it, of a topic or a service.
-            type_name: A topic's message type; rules with ``types`` fit nothing else.
+            wire: Its wire name.
+            type_name: The message type of a topic; rules with ``types`` fit only topics of these types.
         """
         return self._incoming(wire, type_name)[0]
 
     def wire_name(self, local: str, type_name: str = "") -> str:
-        """What a name of ours is over there; the other way round, but for names that no rule of that way fits."""
+        """The wire name, for this peer, of a local topic or service; see ``local_name`` for the arguments."""
         return self._outgoing(local, type_name)[0]
 
     def explain_in(self, wire: str, type_name: str = "") -> str:
-        """The rule that ``local_name`` goes by, ready to show; empty where the name stays."""
+        """The rule that ``local_name`` applies, as text; empty if the name stays the same."""
         return self._incoming(wire, type_name)[1]
 
     def explain_out(self, local: str, type_name: str = "") -> str:
-        """The rule that ``wire_name`` goes by."""
+        """The rule that ``wire_name`` applies, as text; empty if the name stays the same."""
         return self._outgoing(local, type_name)[1]
 
     def wires_of(self, local: str) -> tuple[str, ...]:
-        """The names of theirs that are this name here, best first, whatever rules with ``types`` make of them."""
+        """The wire names that may become this local name, best first; rules with ``types`` may not fit all."""
         names = [old for _, source, target in self._in if (old := _undone(local, source, target)) is not None]
         names.append(local if not self.prefix else local.removeprefix(self.prefix))
         typed = any(remap.types for remap, _, _ in self._in)
         return tuple(n for n in dict.fromkeys(names) if n and (typed or self.local_name(n) == local))
 
     def locals_of(self, wire: str) -> tuple[str, ...]:
-        """The names of ours that are this name over there, best first, likewise."""
+        """The local names that may become this wire name, best first; rules with ``types`` may not fit all."""
         names = [old for _, source, target in self._out if (old := _undone(wire, source, target)) is not None]
         names += [self.prefix + wire, wire]
         typed = any(remap.types for remap, _, _ in self._out)
@@ -83,7 +83,7 @@ class PeerNames:
 
     def _incoming(self, name: str, type_name: str) -> tuple[str, str]:
         if name == CLOCK:
-            return name, ""  # nodes look for time nowhere else
+            return name, ""  # nodes read the time from no other topic
         for remap, source, target in self._in:
             if (new := _renamed(name, type_name, remap, source, target)) is not None:
                 return new, f'remap_in has "{remap.source}" = "{remap.target}"'
@@ -101,10 +101,10 @@ class PeerNames:
 
 
 class Names:
-    """The names of every peer; one value for every room that renames, replaced when the rules change.
+    """The names of all peers; one immutable set of rules for all parts, replaced when the rules change.
 
     Args:
-        rules: All ``[[peer]]``, in the order of the file.
+        rules: All ``[[peer]]`` tables, in the order of the file.
     """
 
     def __init__(self, rules: tuple[PeerRule, ...] = ()) -> None:
@@ -112,7 +112,7 @@ class Names:
         self._known: dict[str, PeerNames] = {}
 
     def of(self, peer: str) -> PeerNames:
-        """Those of the peer of this name."""
+        """The names of one peer, by the peer's name."""
         known = self._known.get(peer)
         if known is None:
             if len(self._known) >= limits.NAMES_REMEMBERED:
@@ -121,16 +121,16 @@ class Names:
         return known
 
     def local_name(self, peer: str, wire: str, type_name: str = "") -> str:
-        """What a peer's name is here (``PeerNames.local_name``)."""
+        """The local name of a peer's topic or service; see ``PeerNames.local_name``."""
         return self.of(peer).local_name(wire, type_name)
 
     def wire_name(self, peer: str, local: str, type_name: str = "") -> str:
-        """What a name of ours is at a peer (``PeerNames.wire_name``)."""
+        """The wire name of a local topic or service for a peer; see ``PeerNames.wire_name``."""
         return self.of(peer).wire_name(local, type_name)
 
 
 def _undone(name: str, source: str, target: str) -> str | None:
-    """The name that a rule makes ``name`` of, or ``None`` where it makes no such name."""
+    """The name that a rule turns into ``name``; ``None`` if there is none."""
     if not target.endswith("/**"):
         return source if name == target and not source.endswith("/**") else None
     stem = target[:-3]
@@ -144,7 +144,7 @@ def _ends(remap: Remap, peer: str) -> tuple[str, str]:
 
 
 def _renamed(name: str, type_name: str, remap: Remap, source: str, target: str) -> str | None:
-    """A name by one rule, or ``None`` where it does not fit."""
+    """The name as one rule renames it; ``None`` if the rule does not fit."""
     if remap.types and not any(matches(glob, type_name) for glob in remap.types):
         return None
     if not source.endswith("/**"):

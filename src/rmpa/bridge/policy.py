@@ -1,4 +1,4 @@
-"""What may cross the mesh: a pure table of rules that can say which of them decided."""
+"""Decides what may cross the mesh, by a pure table of rules, and names the rule that decided."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from rmpa.config.settings import PeerRule, PolicySettings
 
 OWN_NODE: Final = "/rmpa"
-"""The agent's own node; what it stands for lives below: ``/rmpa/<peer>/<node>``."""
+"""The agent's own node; proxies have names below it: ``/rmpa/<peer>/<node>``."""
 
 BUILT_IN_DENY: Final = NEVER_CROSSING
-"""Topics that never cross, and why."""
+"""Topics that never cross, each with the reason."""
 
 
 _NO_TIME: Final = TimeSettings()
@@ -26,14 +26,14 @@ _NO_TIME: Final = TimeSettings()
 
 @dataclass(frozen=True, slots=True)
 class PolicyDecision:
-    """Whether a source may cross, and the rule that says so, ready to show."""
+    """Whether a source may cross, and the rule that decided, as text."""
 
     allowed: bool
     rule: str
 
 
 def is_own(node: str) -> bool:
-    """Whether a local node is the agent itself or stands for a node of another module."""
+    """Whether a local node is the agent's own or a proxy."""
     return node == OWN_NODE or node.startswith(OWN_NODE + "/")
 
 
@@ -42,8 +42,8 @@ class Policy:
 
     Args:
         settings: The user's globs for all peers.
-        peers: And those for single ones, on top.
-        time: Whether ``/clock`` crosses, and from which peer: nothing else decides about that.
+        peers: Additional globs for single peers.
+        time: Whether ``/clock`` crosses, and from which peer it is taken.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class Policy:
         self._known: dict[str, list[tuple[str, PolicySettings]]] = {}
 
     def judge(self, topic: str, type_name: str, node: str) -> PolicyDecision:
-        """Decide about one source; the first "no" wins, in the order of the table below."""
+        """Decide about one source by the rules for all peers; a refusal wins over an ``allow``."""
         if is_own(node):
             return PolicyDecision(False, f"{node} stands for a node of another module, or is the agent itself")
         if topic == CLOCK and self._time.share:
@@ -73,11 +73,11 @@ class Policy:
         return PolicyDecision(True, f'time.follow = "{peer}"')
 
     def has_rules_for(self, peer: str) -> bool:
-        """Whether ``judge_for`` has anything to say about a peer."""
+        """Whether there are globs for this peer."""
         return bool(self._rules_for(peer))
 
     def _rules_for(self, peer: str) -> list[tuple[str, PolicySettings]]:
-        """What is said about a peer: its place in the file, to show, and the globs with its name filled in."""
+        """The rules for a peer: the place of each in the file, as text, and its globs with the name filled in."""
         known = self._known.get(peer)
         if known is None:
             if len(self._known) >= limits.NAMES_REMEMBERED:
@@ -90,13 +90,13 @@ class Policy:
         return known
 
     def judge_for(self, peer: str, name: str, type_name: str | None = None, wire: str = "") -> PolicyDecision:
-        """Decide whether what ``judge`` lets cross may do so between us and one peer.
+        """Decide whether a source that ``judge`` allows may cross between this module and one peer.
 
         Args:
             peer: The peer's name.
-            name: What it is here: a topic or a service.
-            type_name: A topic's message type; ``None`` where there is none to judge by.
-            wire: What it is called on its way, where that is another name.
+            name: The local name of the topic or service.
+            type_name: A topic's message type; ``None`` for a service, or if the type is unknown.
+            wire: The wire name, if it differs.
         """
         decision = PolicyDecision(True, "")
         if wire and wire != name and (why := never_crosses(wire)):
@@ -109,7 +109,7 @@ class Policy:
 
 
 def never_crosses(topic: str) -> str:
-    """Why a topic never crosses, or empty."""
+    """The reason why a topic never crosses, or empty."""
     return next((why for pattern, why in BUILT_IN_DENY.items() if matches(pattern, topic)), "")
 
 
@@ -119,7 +119,7 @@ def _filled(settings: PolicySettings, peer: str) -> PolicySettings:
 
 
 def _judge(settings: PolicySettings, where: str, name: str, type_name: str | None) -> PolicyDecision:
-    """Decide by one set of globs; ``where`` is its place in the file, to show."""
+    """Decides by one set of globs; ``where`` is its place in the file, as text."""
     for pattern in settings.deny:
         if matches(pattern, name):
             return PolicyDecision(False, f"{where}.deny has {pattern!r}")

@@ -1,4 +1,4 @@
-"""Under which names the nodes of other modules stand in the local graph."""
+"""The names of proxies in the local graph."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ def proxy_prefix(peer: Identity, taken: Collection[str]) -> str:
 
     Args:
         peer: The peer.
-        taken: Prefixes of the other links; two peers of one name must not share one, or their nodes would push
-            each other out of the graph.
+        taken: Prefixes of other modules. Two modules of one name must not share a prefix, or their proxies would
+            replace each other in the graph.
     """
     prefix = f"{OWN_NODE}/{peer.name}"
     if prefix in taken:
@@ -28,12 +28,12 @@ def proxy_prefix(peer: Identity, taken: Collection[str]) -> str:
 
 
 def proxy_name(prefix: str, node: str) -> str:
-    """The proxy of a remote node: ``/rmpa/joystick`` and ``/joy_node`` give ``/rmpa/joystick/joy_node``."""
+    """The name of a node's proxy: ``/rmpa/joystick`` and ``/joy_node`` give ``/rmpa/joystick/joy_node``."""
     return prefix + node
 
 
 def proxied_node(name: str) -> tuple[str, str] | None:
-    """What a proxy's name stands for: ``(peer's name, its node)``, or ``None`` for a node of this module."""
+    """The peer's name and the node that a proxy stands for; ``None`` for a node of this module."""
     if not name.startswith(OWN_NODE + "/"):
         return None
     peer, slash, node = name[len(OWN_NODE) + 1 :].partition("/")

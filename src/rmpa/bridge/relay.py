@@ -1,13 +1,13 @@
-"""Relaying: what a module with a cable in two networks passes on between them, as the paper's proxies do. Pure.
+"""Relaying between two networks by a module that is in both, as the paper's proxies do. Pure.
 
 ::
 
     network 0                                      network 1
     a ──── /cmd ───► r (relay) ──── /cmd, origin a, path r ───► b     shown there as /rmpa/a/…
 
-The relay offers what stands for another module's nodes in its own graph, with the *origin* beside it; that lists
-every relay on the way, so nothing goes round: it is not offered to its origin, nor to the relay it came from, and a
-relay on its list does not show it. A module that reaches the origin itself, or by a better relay, keeps it hidden.
+The relay offers the proxies in its own graph, each with its *origin*. The origin lists every relay on the path, which
+prevents loops: a source is not offered to its own module nor to a relay on its path, and a relay on its path does not
+show it. A module that is linked to the origin, or reaches it by a better relay, hides the source.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
 
 Place = tuple[str, str]
-"""A topic and the proxy that publishes it, as they are in the local graph."""
+"""A topic and the proxy that publishes it, by their local names."""
 
 
 class Relay:
-    """The passing side: which proxies of the local graph are offered on, and with which origin.
+    """The relaying side: which proxies of the local graph are offered to other peers, with which origin.
 
     Args:
         enabled: Whether this module relays at all.
@@ -46,44 +46,44 @@ class Relay:
         self._places: dict[tuple[int, Source], Place] = {}
 
     def pass_on(self, peer: int, relay: Identity, source: Source, place: Place, origin: Origin | None) -> None:
-        """Offer what a peer brings to others, if this module relays.
+        """Offer a peer's source to other peers, if this module relays.
 
         Args:
-            peer: The peer whose link it came by.
-            relay: That peer.
-            source: As that peer knows it.
-            place: What it is here.
-            origin: Its module and node; ``None``: that peer's own.
+            peer: The number of the peer that offers it.
+            relay: The identity of that peer.
+            source: The source, by its wire name.
+            place: Its topic and proxy here.
+            origin: Its module and node; ``None``: the peer's own.
         """
         if self.enabled:
             own = Origin(relay.name, str(relay.guid), relay.instance.hex(), source.node)
             self.shown(peer, source, place, origin or own)
 
     def shown(self, peer: int, source: Source, place: Place, origin: Origin) -> None:
-        """A peer's source is about to appear in the local graph.
+        """Register a peer's source that is about to appear in the local graph.
 
         Args:
-            peer: The peer whose link it came by.
-            source: As that peer knows it.
-            place: What it is here.
-            origin: Its module and node; its path does not name this one.
+            peer: The number of the peer that offers it.
+            source: The source, by its wire name.
+            place: Its topic and proxy here.
+            origin: Its module and node; the path does not include this module.
         """
         self._places[peer, source] = place
         self._origins[place] = (peer, source, origin)
 
     def gone(self, peer: int, source: Source) -> None:
-        """It leaves the local graph; another peer may have taken its place already."""
+        """Forget a source that leaves the local graph; another peer's source may have its place already."""
         place = self._places.pop((peer, source), None)
         if place is not None and self._origins[place][:2] == (peer, source):
             del self._origins[place]
 
     def peer_gone(self, peer: int) -> None:
-        """All that came by a peer leaves."""
+        """Forget all sources that a peer offered."""
         for owner, source in [key for key in self._places if key[0] == peer]:
             self.gone(owner, source)
 
     def origin(self, place: Place) -> Origin | None:
-        """What to offer of a proxy's topic, our own hop included; ``None`` where nothing is to be passed on."""
+        """The origin to offer a proxy's topic with, this relay in its path; ``None`` if it is not relayed."""
         if not self.enabled or place not in self._origins:
             return None
         origin = self._origins[place][2]
@@ -93,7 +93,7 @@ class Relay:
 
 
 def may_have(instance: str, origin: Origin) -> bool:
-    """Whether a relayed source may be offered to a peer: not back to where it came from."""
+    """Whether a relayed source may be offered to the peer of this instance: not to one that it came from."""
     return instance != origin.instance and instance not in origin.path
 
 
@@ -104,7 +104,7 @@ class LinkedPeer:
     Args:
         name: Its name.
         instance: Its run, as 32 hexadecimal digits.
-        guid: Its GUID.
+        guid: Its GUID, which ranks it among relays.
     """
 
     name: str
@@ -117,8 +117,8 @@ class _Origin:
     """One module that relays offer.
 
     Args:
-        origin: As it was last offered.
-        ways: By relay: how many sources of it are offered that way, and how many hops away it is.
+        origin: Its origin in the last offer.
+        ways: By relay: the number of its sources that the relay offers, and the length of the path in relays.
     """
 
     origin: Origin
@@ -126,9 +126,9 @@ class _Origin:
 
 
 class RelayPaths:
-    """The receiving side: by which of its ways a module is reached. Its own link goes first, then the best relay.
+    """The receiving side: selects the path to each module, its own link first, else the best relay.
 
-    The best relay has the shortest path; of several the lowest GUID's. All sources of a module come the same way.
+    The best relay has the shortest path; among equal ones, the lowest GUID. All sources of a module use one path.
     """
 
     def __init__(self) -> None:
@@ -148,12 +148,12 @@ class RelayPaths:
         return instance in self._origins
 
     def linked(self, peer: int, who: LinkedPeer) -> set[str]:
-        """A peer has a link; return the modules whose way may be another one now."""
+        """Register a linked peer; return the instances whose path may have changed."""
         self._linked[peer] = who
         return {who.instance}
 
     def unlinked(self, peer: int) -> set[str]:
-        """A peer is gone for good, and all ways through it; return the modules whose way may be another one now."""
+        """Forget a peer and all paths through it; return the instances whose path may have changed."""
         gone = self._linked.pop(peer, None)
         changed = {gone.instance} if gone is not None else set()
         for instance, known in list(self._origins.items()):
@@ -164,7 +164,7 @@ class RelayPaths:
         return changed
 
     def add(self, peer: int, origin: Origin) -> bool:
-        """A peer offers one more source of a module; whether that is now reached another way."""
+        """Count a source of a module that a peer offers; return whether the best relay has changed."""
         if self._ours(origin) or peer not in self._linked:
             return False
         before = self._best(origin.instance)
@@ -175,7 +175,7 @@ class RelayPaths:
         return self._best(origin.instance) != before
 
     def remove(self, peer: int, origin: Origin) -> bool:
-        """A peer offers one source of a module less; whether that is now reached another way."""
+        """Count off a source that a peer offers no longer; return whether the best relay has changed."""
         known = self._origins.get(origin.instance)
         if known is None or self._ours(origin) or peer not in known.ways:
             return False
@@ -188,7 +188,7 @@ class RelayPaths:
         return self._best(origin.instance) != before
 
     def why_not(self, peer: int, origin: Origin) -> str:
-        """Why a source does not appear by this way, or empty."""
+        """Why a relayed source of a peer is hidden, or empty."""
         if origin.instance == self.instance:
             return "it is ours, and came back by a relay"
         if self.instance in origin.path:

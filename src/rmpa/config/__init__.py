@@ -1,1 +1,1 @@
-"""TODO room."""
+"""The settings: one declaration each, read from file, environment and options."""

@@ -11,7 +11,7 @@ from rmpa.core.sizes import KIB
 
 # --- settings ---------------------------------------------------------------------------------------------------
 CONFIG_FILE_MAX: Final = 256 * KIB
-"""A settings file; ours is some 4 KB, and finding a line in a huge one takes long."""
+"""Bytes of a settings file; a usual one has some 4 KB, and finding a line in a huge one takes long."""
 NAMES_REMEMBERED: Final = 256
 """Peers whose result of the naming rules is cached: as many as a large network has."""
 REMAPS_MAX: Final = 256
@@ -40,7 +40,7 @@ CPU_MAX: Final = 1023
 MULTICAST_GROUP: Final = "239.255.82.77"
 """Administratively scoped (RFC 2365), so routers keep it on site; 82.77 is "RM"."""
 MULTICAST_PORT: Final = 11411
-"""Of domain 0; domain n uses this plus n."""
+"""The discovery port of domain 0; domain n uses this port plus n."""
 
 # --- mesh -------------------------------------------------------------------------------------------------------
 OUTAGE_MIN: Final = 1.0

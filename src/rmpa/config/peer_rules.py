@@ -209,7 +209,7 @@ def _placed(source: str, target: object, types: tuple[str, ...] = ()) -> _Placed
 
 
 def _read_end(raw: object) -> str:
-    """One end of a renaming: a name, or a namespace with ``/**`` behind it."""
+    """One end of a renaming: a name, or a namespace followed by ``/**``."""
     end = read_text(raw).strip()
     stem = end.removesuffix("/**")
     if re.search(r"[*?]", stem):

@@ -23,9 +23,9 @@ def value_at(table: object, place: Place) -> object:
 def line_of(text: str, place: Place) -> int | None:
     """The line, from 1, on which the key or element at a place begins in a valid TOML text; ``None`` if it has none.
 
-    A prefix of whole lines parses exactly where no statement is open, so the first
-    prefix that has the place ends with its statement, and the one before that shows where it begins. An element of
-    a list is looked for within its statement.
+    A prefix of whole lines is valid TOML only if no statement is left open. So the first valid prefix that contains
+    the place ends with its statement, and the last valid prefix before that ends where the statement begins. An
+    element of a list is searched within its statement.
     """
     lines = text.split("\n")
     begin = 0

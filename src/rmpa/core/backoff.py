@@ -1,4 +1,4 @@
-"""Exponential back-off with a cap and jitter: retries go on for ever, and not in step with those of other agents."""
+"""Exponential back-off with a cap and jitter: retries go on forever, and not in step with those of other agents."""
 
 from __future__ import annotations
 

@@ -64,12 +64,12 @@ class Contract:
         durability: Whether a late subscriber gets the last message.
         history: What a full queue keeps.
         depth: Messages that wait for one slow receiver, at least 1.
-        deadline: Seconds from one message to the next at the most; ``None``: no bound.
+        deadline: The longest time from one message to the next, in seconds; ``None``: no bound.
         lifespan: Seconds after which a message is dropped; ``None``: never.
         liveliness: What shows that a source is alive.
-        liveliness_lease: Seconds without that after which it counts as dead; ``None``: never.
+        liveliness_lease: Seconds without a sign of life after which a source counts as dead; ``None``: never.
         priority: The lane.
-        max_rate: Messages a second at the most, of which the newest are kept; ``None``: as they come.
+        max_rate: The most messages a second; above it the newest ones are sent. ``None``: no bound.
         outage: Seconds for which a reliable route keeps its messages when its link is lost.
     """
 

@@ -43,7 +43,7 @@ class RefusalLog:
         self._logger = logger
         self._counters = counters
         self._last: OrderedDict[tuple[str, str], tuple[float, int]] = OrderedDict()
-        # By name: the begin of the interval, the lines written in it, and the lines suppressed in it.
+        # By name: the start of the interval, the lines written in it, and the lines suppressed in it.
         self._lines: dict[str, tuple[float, int, int]] = {}
 
     def refuse(self, now: float, name: str, who: str, text: str) -> None:
@@ -52,7 +52,7 @@ class RefusalLog:
         Args:
             now: Monotonic seconds.
             name: The counter's name; with ``who`` it makes the kind.
-            who: The address it came from, without the port (a port scanner has many).
+            who: The source address of the refused item, without the port (a port scanner has many).
             text: What happened and what to do, for the user.
         """
         self._counters.add(name)

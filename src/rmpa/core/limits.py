@@ -29,7 +29,7 @@ CONTRACTS_REMEMBERED: Final = 4096
 PEER_LEASE: Final = 16.0
 """A peer without a link is gone when it was silent for three heartbeats and a second."""
 PEERS_MAX: Final = 512
-"""Peers that are known: a hostile sender of forged GUIDs cannot fill the memory."""
+"""Peers that may be known at one time: a hostile sender of forged GUIDs cannot fill the memory."""
 
 # --- mesh -------------------------------------------------------------------------------------------------------
 FRAGMENT_BYTES: Final = 128 * KIB
@@ -38,9 +38,9 @@ are sent in several data frames."""
 COMMIT_BYTES: Final = 64 * KIB
 """Waiting bytes that are committed for one write: nothing overtakes them, and they are not dropped."""
 ROUTE_QUEUE_MESSAGES: Final = 1000
-"""Messages of one topic that wait for one slow link."""
+"""Messages of one topic that may wait for one slow link."""
 CUT_THROUGH_BYTES: Final = 96 * KIB
-"""Messages above this are forwarded while they still arrive."""
+"""Messages with more bytes than this are forwarded while they are still being received."""
 RESUME_WINDOW: Final = 30.0
 """How long a reliable route's messages are kept after its link was lost, unless a contract sets ``outage``: a
 robot drives through a shadow, an access point restarts. Longer is left to contracts: a module that is off
@@ -51,6 +51,6 @@ that fell silent stay as long."""
 LOG_INTERVAL: Final = 5.0
 """A refusal of one kind from one address is logged at most once in this time; the rest are counted."""
 LOG_LINES_MAX: Final = 20
-"""Lines about one kind of refusal in this time, whatever the addresses: those of packets can be forged."""
+"""Log lines about one kind of refusal in this time, over all addresses, because source addresses can be forged."""
 LOG_KINDS_MAX: Final = 1024
-"""Kinds of refusal remembered for that; the oldest is forgotten first."""
+"""Kinds of refusal remembered to bound the log; the oldest is forgotten first."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
-# Looked up now: its module is a file, which could not be opened to log that no file descriptors are left.
+# Looked up at import: without a free file descriptor the codec's file could not be opened to log the shortage.
 _ESCAPE: Final = codecs.getencoder("unicode_escape")
 
 
@@ -29,7 +29,7 @@ def _one_line(text: str) -> str:
 
 
 class TextFormatter(logging.Formatter):
-    """``12:00:01.250 warning mesh       ! text``; local time, a traceback on the lines behind it."""
+    """``12:00:01.250 warning mesh       ! text``; local time, a traceback on the following lines."""
 
     def format(self, record: logging.LogRecord) -> str:
         """One record."""
@@ -59,7 +59,7 @@ class JsonFormatter(logging.Formatter):
 
 
 def configure_logging(level: str, stream: SupportsWrite[str], *, as_json: bool) -> None:
-    """Send every record of ``level`` and above to ``stream``, in place of whatever was set up before.
+    """Send every record of ``level`` and above to ``stream``, replacing the earlier configuration.
 
     Args:
         level: As in ``Settings.log_level``.

@@ -64,7 +64,7 @@ def resolve_name(name: str, namespace: str = "/", node: str = "") -> str:
 
 @lru_cache(maxsize=4096)
 def _compile_glob(pattern: str) -> re.Pattern[str]:
-    # "/**/" may also be one slash: any number of parts between, none too.
+    # "/**/" also fits a single slash: any number of parts in between, or none.
     wild = {"/**/": "/(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
     pieces = re.split(r"(/\*\*/|\*\*|\*|\?)", pattern)
     return re.compile("".join(wild.get(piece) or re.escape(piece) for piece in pieces))

@@ -1,11 +1,12 @@
 """Send queues for a slow socket: bounded, round robin between keys, with drops counted by reason. Sans-I/O.
 
-A driver pushes what it could not send at once, takes ``head()`` when the socket is writable again, and reports how
-much of it was ``consumed()``.
+A driver pushes the bytes that the socket did not take at once. When the socket is writable again, the driver takes
+``head()``, sends it, and reports with ``consumed()`` how many bytes the socket took.
 
-There are two kinds of entries. A *pushed* one is sent as it is, in one piece. An *opened* one is a ``QueuedMessage``
-whose bytes follow while its first ones may already be sent (cut-through); where the outbox has a framer, it is sent
-in fragments, each with a header of its own, and the fragments of several keys take turns.
+There are two kinds of entries. A *pushed* entry is complete and is sent in one piece. An *opened* entry is a
+``QueuedMessage``: its first bytes may be sent before its last bytes are there (cut-through). If the outbox has a
+framer, an opened entry is sent in fragments, each with a header of its own, and the fragments of several keys take
+turns.
 """
 
 from __future__ import annotations
@@ -30,13 +31,13 @@ ABORT: Final = 4
 
 
 class QueuedMessage:
-    """One message that waits; of an opened one, bytes may still be missing.
+    """One waiting message; an opened message may not have all its bytes yet.
 
     Args:
         key: The queue that it belongs to.
-        size: All its bytes.
-        sequence: For the framer.
-        stamp_ns: For the framer.
+        size: Its total length in bytes.
+        sequence: Its sequence number, for the framer.
+        stamp_ns: Its time stamp in nanoseconds, for the framer.
         born: When it was pushed, monotonic seconds.
     """
 
@@ -64,14 +65,14 @@ class QueuedMessage:
         self.pinned = False
         self.chunks: deque[memoryview] = deque()
         self.held = 0
-        """Bytes of ``chunks``."""
+        """The number of bytes in ``chunks``."""
         self.sent = 0
-        """Bytes that were given to the socket, or are committed: with any of them it can no longer be dropped."""
+        """Bytes that the socket took or that are committed. A message with any such byte is never dropped."""
         self.dropped = False
 
 
 Framer = Callable[[QueuedMessage, int, int], bytes]
-"""``(message, length, flags)``: the header of a fragment."""
+"""Maps ``(message, length, flags)`` to the header of a fragment; ``length`` is the fragment's payload in bytes."""
 
 
 @dataclass(slots=True)
@@ -94,18 +95,19 @@ class _KeyQueue:
 
 
 class Outbox:
-    """Bounded queues of byte strings, one a key, that take turns; beyond a bound the oldest entry is dropped.
+    """Bounded queues of byte strings, one for each key, that take turns; beyond a bound the oldest entry is dropped.
 
-    Too many entries of one key: the oldest of that key is dropped. Too many bytes: the oldest of the key that holds
-    the most, so that a flood of images does not push commands out. An entry that was sent in part is never dropped
-    (half a message must not stay on the wire) and does not count. One message always fits, however large: at most
-    ``max(max_bytes, the newest entry)`` bytes plus the entries half sent are held.
+    If one key has too many entries, its oldest entry is dropped. If all keys together hold too many bytes, the oldest
+    entry of the key with the most bytes is dropped, so that a flood of images does not push commands out. An entry
+    that was sent in part is never dropped (half a message must not stay on the wire) and does not count against the
+    bounds. The newest entry always fits, however large: the outbox holds at most ``max(max_bytes, newest entry)``
+    bytes, plus the entries that were sent in part.
 
     Args:
         max_entries: Entries of one key that may wait, at least 1.
-        max_bytes: Bytes that may wait over all keys but ``URGENT``.
-        frame: Makes the headers of fragments; without it an opened message's bytes go out as they are.
-        fragment: Bytes of a message that are sent in one turn.
+        max_bytes: Bytes that may wait, over all keys except ``URGENT``.
+        frame: Makes the headers of fragments; without it an opened message is sent without headers.
+        fragment: Bytes of one opened message that are sent in one turn.
     """
 
     def __init__(
@@ -139,7 +141,7 @@ class Outbox:
         return bool(self._committed or self._urgent or self._round_robin)
 
     def set_bounds(self, max_entries: int, max_bytes: int) -> None:
-        """Change the bounds, from the next ``push()`` on: those of a subscriber are only known with its topic."""
+        """Change the bounds from the next ``push()`` on, for an owner that learns them after construction."""
         self._bounds.entries = max_entries
         self._max_bytes = max_bytes
 
@@ -152,8 +154,9 @@ class Outbox:
             key: The key.
             max_entries: Entries that may wait.
             max_age: Seconds that an entry may wait; ``None``: no bound.
-            strict: Drop also the newest entry when it is too old (a lifespan); otherwise the newest is always sent.
-            spared: Drop none of its entries because of ``max_bytes``: its owner bounds it.
+            strict: Whether the newest entry is dropped too when it is too old (a lifespan); otherwise the newest
+                entry is always sent.
+            spared: Whether ``max_bytes`` never drops an entry of this key, because its owner bounds the bytes.
         """
         bounds = self._own_bounds[key] = _KeyBounds(max_entries, max_age, strict, spared)
         if key in self._queues:
@@ -161,42 +164,42 @@ class Outbox:
 
     @property
     def urgent_bytes(self) -> int:
-        """Bytes of whole urgent entries that wait. They have no bound here: the owner must watch this."""
+        """Bytes of the uncommitted urgent entries. The outbox does not bound them; its owner must."""
         return self._urgent_bytes
 
     @property
     def pending_bytes(self) -> int:
-        """Bytes that still wait, urgent ones and those of the entry half sent included."""
+        """All waiting bytes, including urgent entries and the rest of entries that were sent in part."""
         return self._committed_bytes + self._urgent_bytes + self._data_bytes + self._begun_bytes
 
     @property
     def pending_entries(self) -> int:
-        """Entries that wait, urgent ones and committed parts included."""
+        """The number of waiting entries, including urgent entries and committed parts."""
         return len(self._committed) + len(self._urgent) + sum(len(f.messages) for f in self._queues.values())
 
     @property
     def waiting_entries(self) -> int:
-        """Entries of all keys that wait, without marks and committed parts."""
+        """The number of waiting entries of all keys, without urgent entries, marks and committed parts."""
         return sum(len(queue.messages) - queue.marks for queue in self._queues.values())
 
     def waiting(self, key: int) -> int:
-        """Entries of one key that wait."""
+        """The number of waiting entries of one key, marks included."""
         queue = self._queues.get(key)
         return len(queue.messages) if queue is not None else 0
 
     # --- input ----------------------------------------------------------------------------------------------
 
     def push_urgent(self, data: bytes) -> None:
-        """Queue control bytes: in front of all data, but behind what is committed."""
+        """Queue control bytes: before all data, but after the bytes that are already committed."""
         if data:
             self._urgent.append(data)
             self._urgent_bytes += len(data)
 
     def push_rest(self, data: bytes, key: int) -> None:  # noqa: ARG002 - the entry's key, for the caller's reader
-        """Queue the rest of an entry whose first part the driver has sent: it goes first and is never dropped.
+        """Queue the rest of an entry whose first bytes the driver has sent; it goes first and is never dropped.
 
         Raises:
-            LocalProtocolError: Something waits already; the driver sent out of turn.
+            LocalProtocolError: The outbox was not empty, so the driver sent an entry out of turn.
         """
         if self:
             raise LocalProtocolError("a message was begun while others wait")
@@ -204,20 +207,21 @@ class Outbox:
             self._commit_bytes(memoryview(data))
 
     def commit(self, data: bytes) -> None:
-        """Queue a part of a message whose former parts are sent or committed: it goes first and is never dropped."""
+        """Commit a part of a message whose earlier parts are sent or committed; it is never dropped."""
         if data:
             self._commit_bytes(memoryview(data))
 
     def prepend(self, data: bytes) -> None:
-        """Queue bytes in front of everything: the rest of what a connection sent before it had this outbox."""
+        """Queue bytes before everything else: those that the connection had not sent when it got this outbox."""
         if data:
             self._committed.appendleft(memoryview(data))
             self._committed_bytes += len(data)
 
     def push(self, data: bytes, key: int, now: float = 0.0, *, pinned: bool = False) -> int:
-        """Queue one whole entry; return how many older ones, of any key, were dropped for it.
+        """Queue one whole entry; return how many older entries, of any key, were dropped to make room.
 
-        An empty entry is not queued. A pinned one (a mark between messages) is never dropped and does not count.
+        An empty entry is not queued. A pinned entry (a mark between messages) is never dropped and does not count
+        against the bounds.
         """
         if not data:
             return 0
@@ -227,7 +231,7 @@ class Outbox:
         return self._enqueue(message, memoryview(data))
 
     def extend(self, message: QueuedMessage, data: bytes) -> int:
-        """Queue more bytes of a message, its first or further ones; return as for ``push``.
+        """Queue the first or further bytes of an opened message; return the number of dropped entries, as ``push``.
 
         Bytes of a message that was dropped are ignored.
 
@@ -239,7 +243,7 @@ class Outbox:
         if message.sent + message.held + len(data) > message.size:
             raise LocalProtocolError(f"more than the {message.size} bytes that a message was said to have")
         queue = self._queues.get(message.key)
-        # All bytes of a message come before the next one of its key: if it waits at all, it is the last one.
+        # The bytes of a message all arrive before its key's next message begins: a waiting message is the last one.
         if queue is None or not queue.messages or queue.messages[-1] is not message:
             return self._enqueue(message, memoryview(data))
         message.chunks.append(memoryview(data))
@@ -253,10 +257,12 @@ class Outbox:
         return self._enforce_max_bytes(message)
 
     def abandon(self, message: QueuedMessage) -> bool:
-        """The rest of a message will never come: drop it, and abort it at the other side if that has a part of it.
+        """Drop an opened message whose rest will never come.
+
+        If a part of it was sent, an abort fragment tells the remote side to discard that part.
 
         Returns:
-            Whether the other side holds half a message that cannot be aborted: there is no framer.
+            Whether the remote side keeps an incomplete message, because without a framer there is no abort fragment.
         """
         if message.dropped:
             return False
@@ -275,9 +281,9 @@ class Outbox:
         return False
 
     def discard(self, key: int) -> int:
-        """Drop all entries of one key (its route closed), without counting them; return their number.
+        """Drop all entries of one key, and its own bounds; return the number of entries.
 
-        A message that was begun is aborted.
+        The drops are not added to ``dropped``. A message that was sent in part is aborted.
         """
         queue = self._queues.pop(key, None)
         self._own_bounds.pop(key, None)
@@ -296,9 +302,13 @@ class Outbox:
         return count
 
     def reset(self) -> int:
-        """The connection is gone: drop entries that were begun, keep the others; return how many were dropped.
+        """Prepare for the next connection, because the present one is gone.
 
-        Urgent entries are dropped too: they belong to the connection, and the next one must not begin with its bye.
+        Committed bytes, and messages that were sent in part, are dropped; the other messages stay. Urgent entries are
+        dropped too, because they belong to the old connection (a bye must not open the next one).
+
+        Returns:
+            How many messages that were sent in part were dropped.
         """
         torn = 0
         self._committed.clear()
@@ -318,7 +328,7 @@ class Outbox:
         return torn
 
     def clear(self) -> None:
-        """Drop everything that waits; the counters stay."""
+        """Drop all waiting entries; the counters stay."""
         for queue in self._queues.values():
             for message in queue.messages:
                 message.dropped = True
@@ -331,9 +341,13 @@ class Outbox:
     # --- output ---------------------------------------------------------------------------------------------
 
     def head(self, max_parts: int = 64, now: float = 0.0) -> list[memoryview]:
-        """The next bytes to send, in order, as parts for ``sendmsg``; they stay until ``consumed``.
+        """The next bytes to send, in order, as parts for ``sendmsg``; they stay queued until ``consumed``.
 
-        They are committed: entries of which a part was returned here are not dropped any more.
+        The returned bytes are committed: an entry with any committed byte is no longer dropped.
+
+        Args:
+            max_parts: The most parts to return.
+            now: Monotonic seconds, against which ages are judged; 0: no entry is dropped for its age.
         """
         while len(self._committed) < max_parts and self._committed_bytes < limits.COMMIT_BYTES:
             if not self._commit(now):
@@ -344,10 +358,10 @@ class Outbox:
         return [committed[i] for i in range(max_parts)]
 
     def consumed(self, count: int) -> None:
-        """Remove the first ``count`` bytes of what ``head()`` returned.
+        """Remove the first ``count`` bytes that ``head()`` returned.
 
         Raises:
-            LocalProtocolError: Fewer bytes wait.
+            LocalProtocolError: ``count`` is greater than the number of waiting bytes.
         """
         while count > 0:
             if not self._committed and not self._commit(0.0):
@@ -368,7 +382,7 @@ class Outbox:
         self._committed_bytes += len(data)
 
     def _commit(self, now: float) -> bool:
-        """Commit the next entry or fragment in turn; ``False`` if there is none."""
+        """Commit the next entry or fragment in turn; return ``False`` if there is none."""
         if self._urgent:
             data = self._urgent.popleft()
             self._urgent_bytes -= len(data)
@@ -385,7 +399,7 @@ class Outbox:
                 continue
             message = queue.messages[0]
             if not message.chunks:
-                continue  # scheduled again with its next bytes
+                continue  # ``extend`` schedules the queue again with the next bytes
             self._commit_fragment(queue, message)
             if message.sent == message.size:
                 queue.messages.popleft()
@@ -398,9 +412,9 @@ class Outbox:
         return False
 
     def _commit_fragment(self, queue: _KeyQueue, message: QueuedMessage) -> None:
-        """Commit one fragment of a message that has bytes."""
+        """Commit one fragment of a message that has at least one waiting byte."""
         flags = 0 if message.sent else FIRST
-        if not message.sent and not message.pinned:  # begun from here on: no longer counted against the bound
+        if not message.sent and not message.pinned:  # from now on its bytes do not count against the bounds
             queue.size -= message.held
             self._data_bytes -= message.held
             self._begun_bytes += message.held
@@ -425,7 +439,7 @@ class Outbox:
             self._commit_bytes(part)
 
     def _enqueue(self, message: QueuedMessage, data: memoryview) -> int:
-        """Append a message, with its first bytes, to its queue; return how many entries were dropped."""
+        """Append a message, with its first bytes, to its key's queue; return how many entries were dropped."""
         queue = self._queues.get(message.key)
         if queue is None:
             queue = self._queues[message.key] = _KeyQueue(self._own_bounds.get(message.key, self._bounds))
@@ -461,7 +475,7 @@ class Outbox:
         return dropped
 
     def _release(self, queue: _KeyQueue, message: QueuedMessage) -> None:
-        """Drop a message's bytes, and subtract them from the sums."""
+        """Drop a message's waiting bytes, and subtract them from the sums."""
         if message.sent or message.pinned:
             self._begun_bytes -= message.held
         else:
@@ -476,7 +490,7 @@ class Outbox:
             self._round_robin.remove(key)
 
     def _drop_oldest(self, queue: _KeyQueue, newest: QueuedMessage) -> bool:
-        """Drop a queue's oldest message that was not begun and is not ``newest``; return whether there was one."""
+        """Drop a queue's oldest message that is unsent, not pinned and not ``newest``; return whether one was."""
         index = 0
         while index < len(queue.messages) and (queue.messages[index].sent or queue.messages[index].pinned):
             index += 1
@@ -490,10 +504,10 @@ class Outbox:
         return True
 
     def _drop_largest(self, newest: QueuedMessage) -> int:
-        """Drop the oldest entries of the key that holds the most bytes, but never the entry just pushed.
+        """Drop the oldest entries of the key that holds the most bytes, but never ``newest``; return their number.
 
-        Up to half of the key's bytes are dropped at once: otherwise room for one large entry would take a search
-        over all keys for each of a thousand small drops.
+        One call drops up to half of the key's bytes. With one entry a call, room for one large entry could take a
+        search over all keys for each of a thousand small entries.
         """
         own = 0 if newest.sent else newest.held
         sizes = [
@@ -516,7 +530,7 @@ class Outbox:
         return dropped
 
     def _expire(self, queue: _KeyQueue, key: int, now: float) -> None:
-        """Drop entries that waited for too long; never the newest, unless the key is ``strict``."""
+        """Drop a key's entries older than its ``max_age``; the newest entry only if the key is ``strict``."""
         bounds = queue.bounds
         if bounds.max_age is None:
             return

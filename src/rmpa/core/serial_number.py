@@ -13,11 +13,11 @@ from rmpa.core.sizes import UINT32_MAX
 SERIAL_MASK: Final = UINT32_MAX
 """``number & SERIAL_MASK`` wraps a number."""
 SERIAL_HALF: Final = 1 << 31
-"""A number that is this far ahead of another one, or farther, is an earlier one."""
+"""A number that is this far or farther ahead of another number counts as the earlier one of the two."""
 
 
 def serial_add(number: int, count: int) -> int:
-    """The number ``count`` places behind ``number``; ``count`` may be negative."""
+    """The number ``count`` places after ``number``; ``count`` may be negative."""
     return number + count & SERIAL_MASK
 
 
@@ -27,7 +27,7 @@ def serial_distance(start: int, end: int) -> int:
 
 
 def is_later(number: int, than: int) -> bool:
-    """Whether ``number`` comes behind ``than``; false for equal numbers."""
+    """Whether ``number`` comes after ``than``; false for equal numbers."""
     return 0 < number - than & SERIAL_MASK < SERIAL_HALF
 
 

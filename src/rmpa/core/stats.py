@@ -31,7 +31,7 @@ class SampleSummary:
         if not data:
             return cls(0, *[math.nan] * 7)
         mean = math.fsum(data) / len(data)
-        # As a distance between two points: summed in C, ten times as fast as in a loop.
+        # Computed as the distance between two points: ``math.dist`` sums in C, ten times as fast as a loop.
         sd = math.dist(data, [mean] * len(data)) / math.sqrt(len(data))
         return cls(
             len(data),
@@ -71,7 +71,7 @@ class SampleRing:
         self._data = array("d", bytes(8 * size))
         self._next = 0
         self.total = 0
-        """Samples ever added."""
+        """The number of samples ever added."""
 
     def add(self, sample: float) -> None:
         """Add one sample; it replaces the oldest when the ring is full."""
@@ -125,7 +125,7 @@ class ArrivalStats:
 
     @property
     def last(self) -> float | None:
-        """When the last message came, or ``None``."""
+        """When the last message arrived, in monotonic seconds; ``None`` before the first."""
         return self._last
 
     def periods(self) -> SampleSummary:

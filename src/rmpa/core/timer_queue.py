@@ -6,7 +6,7 @@ from heapq import heapify, heappop, heappush
 from typing import Final, Generic, Protocol, Self, TypeVar
 
 _SPARE: Final = 64
-"""Stale heap entries (moved or cancelled) that are kept before the heap is rebuilt, beside twice the live ones."""
+"""The heap, which also holds moved and cancelled entries, is rebuilt above this plus twice the live entries."""
 
 
 class _Key(Protocol):
@@ -35,7 +35,7 @@ class TimerQueue(Generic[_K]):
         return len(self._at)
 
     def set(self, key: _K, at: float | None) -> None:
-        """Let ``key`` be due at ``at`` instead of any former time; ``None``: never."""
+        """Set the due time of ``key`` to ``at``, in place of any former time; ``None``: never."""
         if at is None:
             self._at.pop(key, None)
         elif self._at.get(key) != at:

@@ -41,11 +41,11 @@ class BeaconKind(IntEnum):
     """Why a beacon was sent."""
 
     ANNOUNCE = 1
-    """The sender has just started, or contacts an address that it was told of; it asks for an answer."""
+    """The sender has just started, or contacts an address that it learnt (seed, gossip); it asks for an answer."""
     HEARTBEAT = 2
     """The sender is still there."""
     ANSWER = 3
-    """By unicast, to a peer that announced itself; it is not answered."""
+    """The unicast reply to a peer that announced itself; it is not answered."""
     GOODBYE = 4
     """The sender leaves."""
 
@@ -129,7 +129,7 @@ class Beacon:
         """Read one packet.
 
         Args:
-            data: The whole packet; bytes behind the beacon are for later versions and ignored.
+            data: The whole packet; bytes after the beacon are for later versions and ignored.
             domain: The reader's domain id.
 
         Raises:
@@ -149,7 +149,7 @@ class Beacon:
         if count[0] > limits.BEACON_GOSSIP_MAX:
             raise BeaconMalformed(f"{count[0]} gossiped peers")
         gossip, offset = _take(data, offset, 8 * count[0], "gossip")
-        number = data[offset] if offset < len(data) else 0  # a beacon without it ends here
+        number = data[offset] if offset < len(data) else 0  # a beacon without observed addresses ends here
         if number > limits.BEACON_GOSSIP_MAX:
             raise BeaconMalformed(f"{number} further addresses of gossiped peers")
         observed, _ = _take(data, offset + 1, _ENDPOINT.size * number, "gossiped addresses") if number else (b"", 0)

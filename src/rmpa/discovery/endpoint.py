@@ -1,4 +1,4 @@
-"""One (address, port): which of the runs that claim it is the live one (restart, late packet or conflict)."""
+"""One (address, port): decides which run that claims it is the live one (restart, late packet or conflict)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _NEVER: Final = float("-inf")
 
 
 class EndpointChange(Enum):
-    """The change of an endpoint by a beacon, or by a link that came or was lost."""
+    """The change of an endpoint by a beacon, or by a link that came up or fell."""
 
     NEW = auto()
     """The endpoint had no current run; it has one now."""
@@ -35,7 +35,7 @@ class EndpointChange(Enum):
     STALE = auto()
     """A late or repeated packet; ignored."""
     WAITING = auto()
-    """Another run was heard: perhaps by a late packet, perhaps it is the next one."""
+    """Another run was heard: by a late packet, or because it is the next run."""
     CONFLICT = auto()
     """Another run is certainly alive, and so is the current one."""
 
@@ -107,7 +107,7 @@ class Endpoint:
         others: By instance id: runs that were current, that said goodbye, or that claim the endpoint too.
         conflict: Whether two live runs were seen.
         present: Whether ``current`` is a member: reported as found and not yet as lost.
-        own: Whether this is this agent's own endpoint, which no other run gets.
+        own: Whether this is this agent's own endpoint, at which no other run becomes current.
     """
 
     current: PeerInstance | None = None
@@ -137,7 +137,7 @@ class Endpoint:
         return EndpointChange.KNOWN if peer.identity == previous else EndpointChange.CHANGED
 
     def link_up(self, identity: Identity, now: float) -> EndpointChange:
-        """A link's handshake proves that this run is alive: it becomes the current one."""
+        """Make the run of a link's handshake the current one, because the handshake proves that it is alive."""
         peer = self._find(identity.instance)
         if peer is None:
             peer = PeerInstance(identity, now, now, core_limits.PEER_LEASE, HeardBy.LINK, HeardBy.LINK)
@@ -154,7 +154,7 @@ class Endpoint:
         return self._promote(peer, now, EndpointChange.RESTARTED)
 
     def link_down(self, now: float) -> EndpointChange:
-        """The link of the current run fell; a run that was heard meanwhile becomes current."""
+        """Handle the end of the current run's link; a newer run that was heard lately becomes current."""
         current = self.current
         if current is None or not current.linked:
             return EndpointChange.STALE
@@ -175,7 +175,7 @@ class Endpoint:
         return [v for v in self.others.values() if not v.leaving]
 
     def remove_current(self) -> None:
-        """The current run is gone; in a conflict the rival that was heard last becomes current."""
+        """Remove the current run; in a conflict the rival that was heard last becomes current."""
         if self.current is not None and self.current.leaving:
             self._supersede(self.current, self.current.heard)
         self.current = None
@@ -202,7 +202,7 @@ class Endpoint:
         return self.others.get(instance)
 
     def _new_run(self, peer: PeerInstance, now: float) -> EndpointChange:
-        """A run that was not known, or had said goodbye, was heard."""
+        """Take in a run that was not known, or had said goodbye."""
         if self.current is None:
             self.current = peer
             return EndpointChange.NEW
@@ -212,7 +212,7 @@ class Endpoint:
         return self._promote(peer, now, EndpointChange.RESTARTED)
 
     def _other_run(self, peer: PeerInstance, now: float, *, departed: bool) -> EndpointChange:
-        """A known run that is not current was heard, by a packet that is not a late one by its number."""
+        """Take in a new packet, by its sequence number, of a known run that is not the current one."""
         if peer.leaving:
             return EndpointChange.WAITING
         if departed:
@@ -226,7 +226,7 @@ class Endpoint:
         if self.current.linked or now - self.current.heard <= limits.HEARTBEAT_LATE:
             self.conflict = True
             return EndpointChange.CONFLICT
-        # The current run missed its heartbeat: its packets were the late ones.
+        # The current run missed its heartbeat, so its packets, and not the other run's, were the late ones.
         return self._promote(peer, now, EndpointChange.RESTARTED)
 
     def _promote(self, peer: PeerInstance, now: float, change: EndpointChange) -> EndpointChange:

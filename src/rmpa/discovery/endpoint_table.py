@@ -56,13 +56,13 @@ class EndpointTable:
         self._clear_indexes()
 
     def heard(self, place: int) -> None:
-        """The endpoint's timer has changed, and nothing else of it."""
+        """Update the endpoint's timer, the only part of it that has changed."""
         endpoint = self._all.get(place)
         if endpoint is not None:
             self._timers.set(place, endpoint.next_timer())
 
     def changed(self, place: int) -> None:
-        """Anything of the endpoint has changed: its peer, its name, whether it is present."""
+        """Update all indexes after any change of the endpoint: its peer, its name, whether it is present."""
         self.heard(place)
         self._clear_indexes()
 
@@ -70,7 +70,7 @@ class EndpointTable:
         self._present = self._by_name = None
 
     def next_timer(self) -> float | None:
-        """When ``take_expired`` has something."""
+        """When the next lease is over, on the clock of ``take_expired``; ``None``: never."""
         return self._timers.next()
 
     def take_expired(self, now: float) -> list[int]:
@@ -93,7 +93,7 @@ class EndpointTable:
         return list(self._by_name.get(name, ()))
 
     def oldest_unlinked(self) -> tuple[float, int] | None:
-        """Of the endpoints without a linked peer the one that was heard the longest ago: when, and its place."""
+        """``(heard, place)`` of the endpoint without a linked peer that has been silent the longest."""
         never = float("-inf")
         return min(
             (
@@ -105,7 +105,7 @@ class EndpointTable:
         )
 
     def same_name(self, endpoint: Endpoint) -> list[tuple[PeerInstance, PeerInstance]]:
-        """This endpoint's peer with each other live peer of its name, the newer of both first."""
+        """Pairs of this endpoint's peer and each other live peer with its name, the newer peer first."""
         mine = endpoint.current
         if mine is None:
             return []

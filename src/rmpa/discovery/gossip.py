@@ -34,7 +34,7 @@ class GossipSelector:
 
         Args:
             peers: Those that are known.
-            to: The receiver, if the beacon is a unicast; it is not told of itself.
+            to: The receiver, if the beacon is a unicast; its own GUID is left out.
             now: Monotonic seconds.
             loopback: Whether the receivers can reach loopback addresses.
         """
@@ -96,7 +96,7 @@ class GossipCandidates:
         return True
 
     def answered(self, address: Address) -> bool:
-        """A packet came from ``address``: it is no candidate any more. Return whether it was one."""
+        """Remove an address from which a packet arrived; return whether it was a candidate."""
         self._due.set(address, None)
         return self._all.pop(address, None) is not None
 
@@ -116,6 +116,6 @@ class GossipCandidates:
         return due
 
     def next_timer(self) -> float | None:
-        """When ``take_due`` has something to do."""
+        """When the next announcement is due; ``None``: never."""
         due = self._due.next()
         return None if due is None else max(due, self._resume)

@@ -144,7 +144,7 @@ class MembershipProtocol:
         self._remove_if_empty(key)
 
     def link_up(self, identity: Identity, now: float, source: Address | None = None) -> None:
-        """A link to this peer is up: it is a member for as long as the link is up, however silent.
+        """Take in a peer whose link is up: it is a member for as long as the link is up, even if it is silent.
 
         Args:
             identity: As in the link's handshake.
@@ -172,7 +172,7 @@ class MembershipProtocol:
             self._peer_found(endpoint, now)
 
     def link_down(self, guid: Guid, now: float, instance: bytes | None = None) -> None:
-        """The link to this peer fell: its lease begins now.
+        """Handle the end of the link to a peer, whose lease begins now.
 
         Args:
             guid: The peer's.
@@ -198,7 +198,7 @@ class MembershipProtocol:
         self._remove_if_empty(key)
 
     def interfaces_changed(self, now: float, addresses: tuple[IPv4Address, ...] | None = None) -> None:
-        """Interfaces came or went: announce this agent again, with its present addresses if they are given."""
+        """Announce this agent again after a change of interfaces, with its present addresses if they are given."""
         if self._closed:
             return
         if addresses is not None:
@@ -217,7 +217,7 @@ class MembershipProtocol:
                     self._send(BeaconKind.ANNOUNCE, address)
 
     def goodbye(self, now: float) -> None:
-        """Tell the peers that this agent ends; nothing is sent or taken in afterwards."""
+        """Send a goodbye to the peers; afterwards nothing is sent, and beacons are ignored."""
         if self._closed or self._heartbeat_at is None:
             return
         if self._multicast:
@@ -284,7 +284,7 @@ class MembershipProtocol:
         return self._endpoints.views()
 
     def silent_seeds(self) -> list[Address]:
-        """Seeds at whose address no member is."""
+        """The seeds at whose address there is no member."""
         met = {host for peer in self._endpoints.present() for host, _ in peer.addresses}
         return [seed for seed in self._seeds if seed[0] not in met]
 
@@ -394,7 +394,7 @@ class MembershipProtocol:
                 return
 
     def _clear_conflict(self, endpoint: Endpoint, now: float) -> None:
-        """After a run of this endpoint fell silent or left: report a conflict that is over."""
+        """Report that a conflict is over, after a run of this endpoint fell silent or left."""
         endpoint.expire_others(now)
         if endpoint.conflict and endpoint.current is not None and not endpoint.rivals():
             endpoint.conflict = False
@@ -407,7 +407,7 @@ class MembershipProtocol:
 
     def _expire_leases(self, now: float) -> None:
         for key in self._endpoints.take_expired(now):
-            endpoint = self._endpoints.get(key)  # one that came back may have removed another
+            endpoint = self._endpoints.get(key)  # handling an earlier one may have removed it
             if endpoint is None:
                 continue
             peer = endpoint.current
@@ -415,7 +415,7 @@ class MembershipProtocol:
                 self._peer_lost(endpoint, LossReason.SILENCE)
                 endpoint.remove_current()
                 if peer.multicast_at + limits.MULTICAST_SILENCE < now:
-                    # No multicast will bring it back once the network heals: announcements must.
+                    # Multicast does not reach this peer, so after a network failure announcements must find it again.
                     self._candidates.add(peer.identity.guid.endpoint, now)
             self._clear_conflict(endpoint, now)
             self._endpoints.changed(key)
@@ -427,16 +427,16 @@ class MembershipProtocol:
             self._endpoints.remove(key)
 
     def _evict(self) -> bool:
-        """Make room for a linked peer: remove the unlinked one that is silent for longest."""
+        """Make room for a linked peer: remove the unlinked peer that has been silent for longest."""
         oldest = self._endpoints.oldest_unlinked()
         if oldest is not None:
             self._remove(oldest[1])
         return oldest is not None
 
     def _evict_silent(self, now: float) -> bool:
-        """Make room for a peer that was heard: remove an unlinked one that missed a heartbeat, for it may be forged.
+        """Make room for a newly heard peer: remove an unlinked one that missed a heartbeat, as it may be forged.
 
-        The rate is limited, for the one that was heard may be forged too.
+        The rate is limited, because the newly heard peer may be forged too.
         """
         if now < self._no_eviction_until:
             return False
@@ -461,7 +461,7 @@ class MembershipProtocol:
         return Beacon(kind, self._own, self._lease_ms, self._sequence, gossip, self._observed_addresses(gossip))
 
     def _observed_addresses(self, gossip: tuple[Guid, ...]) -> tuple[Address, ...]:
-        """Source addresses of gossiped peers whose GUID has another address; receivers may only reach the former."""
+        """Source addresses of gossiped peers that differ from the GUID's address, which may not be reachable."""
         found = []
         for guid in gossip:
             endpoint = self._endpoints.get(guid.place)
@@ -486,7 +486,7 @@ class MembershipProtocol:
             self.counters.add("beacon.whisper_limited")
 
     def _disseminate(self, now: float) -> None:
-        """Send heartbeats early, because of what their gossip says about newly found peers."""
+        """Send heartbeats early, so that their gossip reports newly found peers."""
         self._disseminate_at = None
         self._disseminated_at = now
         self._plan_unicast_heartbeats(now)
@@ -494,7 +494,7 @@ class MembershipProtocol:
             self._send_multicast(BeaconKind.HEARTBEAT, now)
 
     def _schedule_dissemination(self, now: float) -> None:
-        """A peer was found: soon tell the peers that cannot hear it themselves."""
+        """Schedule gossip about a found peer for the peers that multicast does not reach."""
         if self._disseminate_at is None and self._heartbeat_at is not None and len(self._endpoints.present()) > 1:
             self._disseminate_at = max(now, self._disseminated_at + limits.DISSEMINATION_INTERVAL)
 
@@ -506,8 +506,8 @@ class MembershipProtocol:
         if peer is None or peer.linked or endpoint.conflict or beacon.kind is BeaconKind.ANSWER:
             return
         unknown = change in {EndpointChange.NEW, EndpointChange.RESTARTED}
-        # A unicast heartbeat means that its sender hears none of our multicasts. If we hear none of its either, our
-        # own heartbeats go there by unicast anyway.
+        # A unicast heartbeat means that its sender receives none of this agent's multicasts. If this agent receives
+        # none of the sender's either, its own heartbeats go there by unicast anyway.
         deaf = not multicast and now - peer.multicast_at <= limits.MULTICAST_SILENCE
         if unknown or deaf or beacon.kind is BeaconKind.ANNOUNCE:
             self._send_answer(peer, now)
@@ -526,8 +526,8 @@ class MembershipProtocol:
     ) -> None:
         """Infer how a peer was found whose first beacon came by unicast.
 
-        A candidate was found by gossip. One that answers unasked has heard a multicast of ours; its own multicasts
-        are expected to be heard here too, for a while.
+        A gossip candidate was found by gossip. A peer that answers without being asked has received a multicast of
+        this agent; for a while its own multicasts are expected here too.
         """
         if was_candidate:
             peer.found_by = HeardBy.GOSSIP
@@ -548,7 +548,7 @@ class MembershipProtocol:
             self._send(BeaconKind.ANNOUNCE, address)
 
     def _unknown_addresses(self, addresses: tuple[Address, ...]) -> list[Address]:
-        """Of these addresses the ones that belong to no member and not to this agent."""
+        """Those of the addresses that belong neither to a member nor to this agent."""
         if not addresses:
             return []
         met = {*self._own.endpoints}

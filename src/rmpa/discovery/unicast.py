@@ -24,7 +24,7 @@ class AnswerLimit:
         self._count = 0
 
     def allows(self, address: Address, now: float) -> bool:
-        """Whether an answer may go there now; if so it counts as sent."""
+        """Whether an answer may be sent to an address now; if so, it is counted as sent."""
         if now - self._last.get(address, float("-inf")) < limits.ANSWER_INTERVAL:
             return False
         if now - self._second >= 1.0:
@@ -49,10 +49,10 @@ class UnicastHeartbeats:
         self._allowed = TokenBucket(rate, rate * limits.HEARTBEAT_INTERVAL)
         self._waiting: deque[PeerInstance] = deque()
         self.at: float | None = None
-        """When ``take_some`` has something; ``None``: nothing waits."""
+        """When ``take_some`` has peers to return; ``None``: the queue is empty."""
 
     def choose(self, peers: Sequence[PeerInstance], now: float) -> tuple[list[PeerInstance], bool]:
-        """The peers that get one now, unlinked ones in turn from call to call; and whether that is all of them."""
+        """The peers that get a heartbeat now, unlinked ones in turn from call to call; and whether these are all."""
         chosen = [peer for peer in peers if peer.linked]
         others = [peer for peer in peers if not peer.linked]
         start = self._turn % len(others) if others else 0
@@ -64,7 +64,7 @@ class UnicastHeartbeats:
         return chosen, True
 
     def plan(self, peers: Sequence[PeerInstance], now: float) -> bool:
-        """Queue heartbeats for the peers that ``choose`` selects; return whether that is all of them."""
+        """Queue heartbeats for the peers that ``choose`` selects; return whether these are all of ``peers``."""
         chosen, complete = self.choose(peers, now)
         waiting = set(map(id, self._waiting))
         self._waiting += [peer for peer in chosen if id(peer) not in waiting]
@@ -72,7 +72,7 @@ class UnicastHeartbeats:
         return complete
 
     def take_some(self) -> list[PeerInstance]:
-        """The next peers of the queue, so few that sending to them delays nothing else."""
+        """Take the next peers out of the queue, so few that sending to them does not delay other work."""
         few = [self._waiting.popleft() for _ in range(min(limits.UNICAST_HEARTBEATS_AT_ONCE, len(self._waiting)))]
         if not self._waiting:
             self.at = None

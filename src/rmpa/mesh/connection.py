@@ -1,7 +1,7 @@
 """The protocol machine of one connection: handshake, frames, keepalive, bye.
 
-Sans-I/O: bytes and ``now`` in, events and bytes out. A link with a peer has one connection for each of its lanes;
-each runs this machine, and ``mesh.io.link`` joins them.
+Sans-I/O: bytes and ``now`` go in, events and bytes come out. A link with a peer has one connection for each of its
+lanes; each connection runs this machine, and ``mesh.io.link`` joins them.
 
 ::
 
@@ -9,9 +9,9 @@ each runs this machine, and ``mesh.io.link`` joins them.
          ├─ refuse or bye sent: CLOSING         └─ bye received, lease over, protocol error: CLOSED
          └─ refused, time out, error: CLOSED
 
-The driver passes what it reads to ``receive``, sends what ``take_output`` returns, calls ``handle_timer`` when
-``next_timer`` is due and closes the socket at ``ConnectionClosed``. Events and data come in the order of the bytes,
-from within ``receive``.
+The driver passes received bytes to ``receive``, sends the bytes that ``take_output`` returns, calls ``handle_timer``
+when ``next_timer`` is due, and closes the socket at ``ConnectionClosed``. Events and data are reported in the order
+of the received bytes, from within ``receive``.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _HEADER: Final = limits.FRAME_HEADER_BYTES
 _DATA: Final = int(FrameKind.DATA)
 _WHOLE: Final = frames.WHOLE
 _FIRST_PART: Final = 4
-"""Bytes that the first part of a message must have: the message's length."""
+"""Bytes that the first part of a message must have, because they contain the message's length."""
 
 
 class ConnectionRole(Enum):
@@ -54,7 +54,7 @@ class ConnectionRole(Enum):
 
 
 class ConnectionState(Enum):
-    """Where a connection is in its life."""
+    """The state of a connection, from handshake to end."""
 
     HANDSHAKING = auto()
     UP = auto()
@@ -107,7 +107,7 @@ _ALLOWED: Final[Mapping[tuple[ConnectionRole, ConnectionState], frozenset[int]]]
 
 @dataclass(frozen=True, slots=True)
 class HelloReceived:
-    """Acceptor: the dialler said hello; the driver answers by ``accept`` or ``refuse``."""
+    """Acceptor: a hello was received; the driver answers it with ``accept`` or ``refuse``."""
 
     hello: Hello
 
@@ -121,10 +121,10 @@ class HandshakeDone:
 
 @dataclass(frozen=True, slots=True)
 class ControlReceived:
-    """A control frame came.
+    """A control frame was received.
 
     Args:
-        payload: Its bytes, a copy.
+        payload: A copy of its bytes.
     """
 
     payload: bytes
@@ -132,11 +132,11 @@ class ControlReceived:
 
 @dataclass(frozen=True, slots=True)
 class PongReceived:
-    """A ping was answered.
+    """The answer to a ping was received.
 
     Args:
-        stamp: What identifies the ping: its time stamp.
-        rtt: Seconds on the wire, the time that the remote side took to answer not included.
+        stamp: The time stamp of the ping, which identifies it.
+        rtt: Round trip on the wire in seconds, without the time that the remote side took to answer.
     """
 
     stamp: int
@@ -158,11 +158,11 @@ class Refused:
 
 @dataclass(frozen=True, slots=True)
 class ConnectionClosed:
-    """The connection is over: the driver sends what is left and closes the socket.
+    """The connection is over: the driver sends the remaining output and closes the socket.
 
     Args:
         reason: Why, for people.
-        orderly: Whether one of the sides ended it by a frame (bye, refuse), rather than an error or silence.
+        orderly: Whether one side ended the connection by a frame (bye, refuse), and not an error or silence.
     """
 
     reason: str
@@ -171,12 +171,12 @@ class ConnectionClosed:
 
 @dataclass(frozen=True, slots=True)
 class MarkReceived:
-    """An acknowledgement, a fence or its answer came.
+    """An acknowledgement, a fence or the answer to a fence was received.
 
     Args:
         kind: ``ACK``, ``FENCE`` or ``FENCED``.
         route: The id of the route.
-        sequence: ``ACK``: the last message that arrived; else the fence's number.
+        sequence: For ``ACK`` the last message that arrived; otherwise the fence's number.
     """
 
     kind: FrameKind
@@ -199,13 +199,13 @@ class ConnectionProtocol:
         role: Which side.
         ours: The identity of this agent.
         now: Monotonic seconds at which the connection was established.
-        wall_ns: The wall clock; only called where a stamp is needed.
-        on_event: Called from within the methods below; it may call any of them but ``receive``.
+        wall_ns: Returns the wall clock in nanoseconds; only called where a stamp is needed.
+        on_event: Called from within the methods below; it may call any of them except ``receive``.
         on_data: Called with ``(route, sequence, stamp_ns, payload)`` for each message in one frame; the payload is a
             view of the bytes given to ``receive`` and only valid during the call. The attribute may be assigned
-            later: only the handshake tells which peer this is, and what receives its data.
-        on_part: Called with ``(route, sequence, stamp_ns, flags, part)`` for each part of a longer message; parts of
-            one message come in order, those of other routes in between. Otherwise as ``on_data``.
+            later, because the peer, and so the receiver of its data, is only known after the handshake.
+        on_part: Called with ``(route, sequence, stamp_ns, flags, part)`` for each part of a longer message; the parts
+            of one message are in order, with parts of other routes in between. Otherwise as ``on_data``.
         expected: Dialler: the GUID that was dialled; ``None`` if only the address is known.
         lane: Dialler: what the connection is for.
         lease: Seconds after which the silence of this side means that it is dead.
@@ -230,14 +230,14 @@ class ConnectionProtocol:
         self.role = role
         self.clock = RemoteClock()
         self.remote: Hello | None = None
-        """What the remote side said of itself, as soon as it did."""
+        """The remote side's hello or welcome; ``None`` before it is received."""
         self.on_event = on_event
         self.on_data = on_data
         self.on_part = on_part if on_part is not None else _no_parts
         self._ours = ours
         self._wall_ns = wall_ns
         self._missing = 0
-        """Bytes of a data frame that was handed on in part, and whose rest is still to come."""
+        """Bytes that are still missing of a data frame whose first bytes were handed on."""
         self._begun = (0, 0, 0, 0)
         """Route, sequence, stamp and LAST flag of that frame."""
         self._expected = expected
@@ -253,35 +253,34 @@ class ConnectionProtocol:
 
     @property
     def state(self) -> ConnectionState:
-        """Where the connection is in its life."""
+        """The present state."""
         return self._state
 
     @property
     def heard_at(self) -> float:
-        """Monotonic seconds at which bytes last came."""
+        """Monotonic seconds at which bytes were last received."""
         return self._keepalive.heard
 
     @property
     def has_output(self) -> bool:
-        """Whether ``take_output`` has something."""
+        """Whether there are bytes for ``take_output``."""
         return bool(self._output)
 
     def take_output(self) -> bytes:
-        """Bytes to send, before all data that is sent later."""
+        """Return the bytes to send now, before any data that is sent later."""
         output = bytes(self._output)
         self._output.clear()
         return output
 
     def heard(self, now: float) -> None:
-        """Bytes came at ``now``, though perhaps no whole frame: a large message renews the lease as it arrives."""
+        """Renew the lease: bytes were received at ``now``, even if they do not complete a frame."""
         self._keepalive.heard = max(self._keepalive.heard, now)
 
     def receive(self, view: memoryview, now: float) -> tuple[int, int]:
         """Take whole frames from the start of ``view``.
 
         Returns:
-            How many bytes were taken, and how many bytes there must be behind those for the next frame (0: a
-            header, or nothing more).
+            How many bytes were taken, and how many further bytes the next frame needs (0: a header, or nothing more).
 
         Raises:
             RemoteProtocolError: The remote side broke the protocol; the connection is ``CLOSED``.
@@ -296,7 +295,7 @@ class ConnectionProtocol:
                 length, kind, flags, _, route, sequence, stamp_ns = frames.unpack_header(view, offset)
                 if (kind != _DATA or self._state is not ConnectionState.UP) and not self._admit(kind):
                     return size, 0
-                # One comparison each on the data path; check_header says what is wrong.
+                # One comparison for each frame of the data path; check_header finds what is wrong.
                 if kind != _DATA or length > limits.DATA_PAYLOAD_MAX or flags != _WHOLE:
                     frames.check_header(length, kind, flags)
                 start = offset + _HEADER
@@ -304,7 +303,7 @@ class ConnectionProtocol:
                 if end > size:
                     if kind != _DATA or length <= core_limits.CUT_THROUGH_BYTES or size - start < _FIRST_PART:
                         return offset, end - offset
-                    # Handed on as it comes: a large frame is not awaited, and not moved within the buffer.
+                    # Handed on as it arrives, so that a large frame is neither awaited nor moved within the buffer.
                     self._missing = end - size
                     self._begun = (route, sequence, stamp_ns, flags & LAST)
                     self.on_part(route, sequence, stamp_ns, flags & FIRST, view[start:])
@@ -322,10 +321,10 @@ class ConnectionProtocol:
         return (size if self._state is ConnectionState.CLOSED else offset), 0
 
     def accept(self, now: float) -> None:
-        """Acceptor, after ``HelloReceived``: welcome the remote side; the connection is up.
+        """Acceptor, after ``HelloReceived``: send the welcome; the connection is up.
 
         Raises:
-            LocalProtocolError: There was no hello, or it was answered.
+            LocalProtocolError: No hello was received, or it was answered already.
         """
         hello = self._unanswered()
         if hello.lane == Lane.BULK:
@@ -338,7 +337,7 @@ class ConnectionProtocol:
         """Acceptor, after ``HelloReceived``: refuse the connection, and close it.
 
         Raises:
-            LocalProtocolError: There was no hello, or it was answered.
+            LocalProtocolError: No hello was received, or it was answered already.
         """
         self._unanswered()
         self._refuse(refuse, now)
@@ -352,7 +351,7 @@ class ConnectionProtocol:
         return Frame(FrameKind.CONTROL, payload, stamp_ns=self._wall_ns()).serialize()
 
     def close(self, reason: str, now: float) -> None:
-        """Say bye; ``ConnectionClosed`` comes from ``lost`` or the timer. Without effect once closing."""
+        """Send a bye; ``lost`` or the timer then reports ``ConnectionClosed``. Without effect once closing."""
         if self._state in (ConnectionState.CLOSING, ConnectionState.CLOSED):
             return
         if self._state is ConnectionState.UP:
@@ -360,12 +359,12 @@ class ConnectionProtocol:
         self._close(_Step.LEAVING, reason, now)
 
     def lost(self, reason: str) -> None:
-        """The TCP connection is gone, which is the orderly end of ``CLOSING``; without effect once closed."""
+        """Handle the end of the TCP connection (in ``CLOSING`` an orderly end); without effect once closed."""
         if self._state is not ConnectionState.CLOSED:
             self._end(self._reason or reason, orderly=self._state is ConnectionState.CLOSING)
 
     def ping(self, now: float) -> int:
-        """Measure a round trip on demand; the answer is a ``PongReceived`` with the stamp that this returns.
+        """Send a ping, and return its stamp; the answer is reported as a ``PongReceived`` with this stamp.
 
         Raises:
             LocalProtocolError: The connection is not up.
@@ -381,7 +380,7 @@ class ConnectionProtocol:
         return self._keepalive.due if self._state is ConnectionState.UP else self._deadline
 
     def handle_timer(self, now: float) -> None:
-        """Do what is due: keepalive, end of the lease, end of the time for the handshake or for closing."""
+        """Do what is due: send a keepalive, or end the connection by its lease or a time-out (handshake, closing)."""
         due = self.next_timer()
         if due is None or now < due:
             return
@@ -406,10 +405,10 @@ class ConnectionProtocol:
         return self.remote.name if self.remote is not None else self._label
 
     def _admit(self, kind: int) -> bool:
-        """Whether a frame of this kind is read now; false while closing, when nothing more is read.
+        """Whether a frame of this kind is handled now; false while closing, when all frames are ignored.
 
         Raises:
-            RemoteProtocolError: Such a frame may not come in this state.
+            RemoteProtocolError: The remote side may not send such a frame in this state.
         """
         if self._state in (ConnectionState.CLOSING, ConnectionState.CLOSED):
             return False
@@ -421,7 +420,7 @@ class ConnectionProtocol:
         return True
 
     def _take_rest(self, view: memoryview) -> int:
-        """Hand on what has come of a data frame that was begun; return how many bytes that were."""
+        """Hand on the received bytes of a data frame that was begun; return their number."""
         count = min(self._missing, len(view))
         self._missing -= count
         if self._state is ConnectionState.UP:
@@ -524,4 +523,4 @@ class ConnectionProtocol:
 
 
 def _no_parts(_route: int, _sequence: int, _stamp_ns: int, _flags: int, _part: memoryview) -> None:
-    """Ignores parts of messages, where the owner of the machine takes none."""
+    """Ignores parts of messages, for an owner of the machine that does not handle them."""

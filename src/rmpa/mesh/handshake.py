@@ -1,7 +1,7 @@
-"""The handshake: each side says what it is, and accepts or refuses (docs/design/protocol.md, "Handshake").
+"""The handshake: each side sends its identity, and accepts or refuses (docs/design/protocol.md, "Handshake").
 
-``judge`` decides on a hello, ``judge_welcome`` on the answer; both are pure functions, the machines act on the
-result.
+``judge`` decides on a hello, ``judge_welcome`` on the answer. Both are pure functions; the machines act on their
+results.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def _malformed(text: str) -> HandshakeError:
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """What each side says of itself: the payload of hello and welcome frames.
+    """The identity and the terms of one side: the payload of hello and welcome frames.
 
     Args:
         guid: The sender's.
@@ -141,10 +141,10 @@ class Hello:
 
     @classmethod
     def parse(cls, payload: Buffer) -> Hello:
-        """Read a hello or welcome; bytes behind the name are left for later versions and ignored.
+        """Read a hello or welcome; bytes after the name are for later versions and ignored.
 
         Raises:
-            HandshakeError: It is of another version, or malformed.
+            HandshakeError: The payload is of another version, or malformed.
         """
         if len(payload) < _PREFIX.size:
             raise _malformed(f"{len(payload)} bytes")
@@ -166,7 +166,7 @@ class Hello:
         if lease_ms == 0:
             raise _malformed("a lease of 0")
         if not Guid(guid).dialable:
-            # Discovery would gossip about it, and no beacon may carry such a GUID.
+            # Discovery would gossip about this GUID, and no beacon may carry such a one.
             raise _malformed(f"no peer can be reached at {Guid(guid)}")
         return cls(Guid(guid), instance, name, domain, lease_ms, Guid(expected) if expected else None, lane, features)
 
@@ -195,7 +195,7 @@ class Hello:
 
     @property
     def identity(self) -> Identity:
-        """The sender as an identity; only valid once its domain was checked."""
+        """The sender's identity; only valid after its domain was checked."""
         return Identity(self.guid, self.instance, self.name, self.domain)
 
     def __str__(self) -> str:
@@ -204,7 +204,7 @@ class Hello:
 
 
 def same_place(one: Guid, other: Guid) -> bool:
-    """Whether two GUIDs are one address and port: incarnations of one peer, or two peers in conflict."""
+    """Whether two GUIDs have the same address and port: incarnations of one peer, or two peers in conflict."""
     return one.place == other.place
 
 
@@ -216,7 +216,7 @@ class KnownLink:
         guid: The peer's.
         instance: The peer's.
         dialled: Whether this side dialled.
-        alive: Whether bytes came within ``limits.GHOST_QUIET``; else the peer may be dead.
+        alive: Whether bytes were received within ``limits.GHOST_QUIET``; otherwise the peer may be dead.
     """
 
     guid: Guid
@@ -229,7 +229,7 @@ def judge(hello: Hello, ours: Identity, links: Iterable[KnownLink], *, busy: boo
     """Decide on a hello: ``None`` accepts the connection.
 
     Args:
-        hello: What the dialler says.
+        hello: The dialler's hello.
         ours: The identity of this agent.
         links: The links that are up, or at least those with a peer of the hello's address and port.
         busy: Whether there is no room for one more peer.
@@ -261,7 +261,7 @@ def judge_welcome(welcome: Hello, ours: Identity, expected: Guid | None) -> Refu
     """Decide on the answer to a hello of this side: ``None`` accepts the connection.
 
     Args:
-        welcome: What the acceptor says.
+        welcome: The acceptor's welcome.
         ours: The identity of this agent.
         expected: The GUID that was dialled; ``None`` if only the address is known.
     """

@@ -12,177 +12,185 @@ from rmpa.core.sizes import KIB, MIB, UINT32_MAX
 
 # --- mesh -------------------------------------------------------------------------------------------------------
 EXPRESS_LEASE: Final = 1.0
-"""A link on which nothing arrived for this long is dead (TCP alone would take two hours)."""
+"""A link on which no byte arrived for this long is dead (TCP alone would take two hours to notice)."""
 PAUSE_NOTICED: Final = 0.1
-"""A timer that fires later than this shows that the process did not run: such time is not counted as a peer's
+"""A timer that fires later than this shows that the process did not run. That time does not count as a peer's
 silence."""
 KEEPALIVE_INTERVAL: Final = 0.25
-"""A quarter of the lease: three keepalives may be late before the link falls."""
+"""Interval of the keepalives, a quarter of the lease: three of them may be late before the link falls."""
 ACCEPTOR_KEEPALIVE_FACTOR: Final = 1.2
-"""The acceptor's interval in those of the dialler: the dialler pings, and the pong counts as a sign of life."""
+"""The acceptor's keepalive interval, as a multiple of the dialler's: on an idle link only the dialler pings, and each
+ping and pong is a sign of life."""
 HANDSHAKE_TIMEOUT: Final = 3.0
-"""From connect to welcome; a connection that takes longer is a port scanner's, or stuck."""
+"""The longest time from connect to welcome; a connection that takes longer is a port scanner's, or stuck."""
 DIAL_ATTEMPTS: Final = (0.3, 0.5, 1.2)
 """Time-outs of the successive TCP connects of one dial."""
 DIAL_TIMEOUT: Final = 2.0
-"""For all of them together."""
+"""Time-out of all TCP connects of one dial together."""
 DIAL_STAGGER: Final = 0.1
-"""Before the next address of a peer is tried beside those that have not answered: the least that RFC 8305 allows,
-because robots are near each other."""
+"""Delay before the next address of a peer is tried in parallel to those that have not answered: the shortest that
+RFC 8305 allows, because robots are near each other."""
 DIAL_FALLBACK: Final = 2.0
 """The higher GUID waits this long for the lower one's dial, then dials itself (NAT, firewall)."""
 BACKOFF_FIRST: Final = 0.1
-"""Before the second attempt to dial."""
+"""Delay before the second attempt to dial."""
 BACKOFF_MAX: Final = 2.0
-"""Between attempts at the most: a peer that comes back is linked within this time."""
+"""The longest delay between two attempts to dial: a peer that returns is linked within this time."""
 DIAL_STRANGERS_RATE: Final = 10.0
-"""Dials a second to all peers that were never linked: beacons can be forged, and a dial that fails takes half a
-millisecond. The cap of their back-off grows with their number; up to 20 of them are not slowed down."""
+"""Dials a second to all peers that were never linked: beacons can be forged, and a failed dial takes half a
+millisecond. The cap of these peers' back-off grows with their number; up to 20 peers are not slowed down."""
 DIAL_STRANGERS_BURST: Final = 64
-"""Such dials at once. One that ends in a link is not counted, so a network that starts up is not slowed down."""
+"""Dials of never linked peers that may happen at once. A dial that ends in a link is not counted, so the start of a
+network is not slowed down."""
 FRAME_HEADER_BYTES: Final = 24
-"""See docs/design/protocol.md."""
+"""The protocol's value; see docs/design/protocol.md."""
 DATA_PAYLOAD_MAX: Final = 256 * KIB
-"""Data frames longer than this are refused: agents do not send them, and one would delay all others of its lane."""
+"""Data frames with a longer payload are refused: agents do not send them, and one would delay its whole lane."""
 CONTROL_PAYLOAD_MAX: Final = 16 * MIB
-"""A control frame: the graph of a peer with a few thousand topics and their message definitions."""
+"""Longest payload of a control frame: the graph of a peer with a few thousand topics and their definitions."""
 HELLO_PAYLOAD_MAX: Final = 4 * KIB
-"""Before the handshake nothing larger is read from a peer."""
+"""Longest payload of a frame that is accepted before the handshake is done."""
 PENDING_CONNECTIONS_MAX: Final = 64
-"""Accepted connections that have not finished their handshake."""
+"""Accepted connections that may be without a finished handshake at one time."""
 LANE_QUEUE_BYTES: Final = 64 * MIB
-"""Data that waits for one lane of a slow link, over all topics; beyond it the oldest message is dropped."""
+"""Bytes of data that may wait for one lane of a slow link, over all topics; beyond it the oldest message is
+dropped."""
 EXPRESS_MESSAGE_MAX: Final = 8 * KIB
-"""Messages up to this size are small: they go by the express lane unless their contract says otherwise. A full one
-takes 0.7 ms on 100 Mbit/s."""
+"""Messages up to this size are small: they use the express lane unless their contract says otherwise. A message of
+this size takes 0.7 ms at 100 Mbit/s."""
 EXPRESS_AGAIN_MESSAGES: Final = 200
-"""Small messages in a row before a topic that had a large one returns to the express lane."""
+"""Consecutive small messages after which a topic that had a large message returns to the express lane."""
 EXPRESS_AGAIN_AFTER: Final = 5.0
-"""Seconds since its last large message, likewise: a topic that mixes both sizes must not change lanes all the
-time."""
+"""Seconds since its last large message before a topic returns to the express lane, so that a topic with both sizes
+does not change lanes all the time."""
 STALE_TICK: Final = 0.04
-"""Between two wake-ups of an agent that receives data: what has come since the last one was not delayed by an
-outage."""
+"""The longest time between two wake-ups of an agent that receives data: data that arrived since the last one was not
+delayed by an outage."""
 STALE_HOLD: Final = 0.03
-"""How long a stale message waits for a newer one; the last one of a burst is delivered after this."""
+"""How long a stale message waits for a newer one; if none arrives, it is delivered after this time."""
 BULK_LEASE: Final = 4.0
-"""A bulk lane on which nothing arrived for this long is dead; the express lane shows much sooner that a peer is."""
+"""A bulk lane on which no byte arrived for this long is dead; a dead peer shows much sooner by the express lane."""
 BULK_UNSENT_BYTES: Final = 16 * KIB
-"""Bytes that the kernel keeps of the bulk lane before they can leave (TCP_NOTSENT_LOWAT): with SO_PRIORITY this is
-what keeps a command's p99 beside images at 0.4 ms instead of 79 ms on 100 Mbit/s."""
+"""Unsent bytes of the bulk lane that the kernel may hold (TCP_NOTSENT_LOWAT). Together with SO_PRIORITY it holds the
+p99 latency of commands during image transfers at 0.4 ms instead of 79 ms on 100 Mbit/s."""
 RELIABLE_WINDOW_MESSAGES: Final = 512
-"""Reliable messages of one route on their way to a peer and not yet acknowledged."""
+"""Reliable messages of one route that may be sent and not yet acknowledged."""
 RELIABLE_WINDOW_BYTES: Final = 4 * MIB
-"""The same in bytes; one message always fits."""
+"""Bytes of reliable messages of one route that may be sent and not yet acknowledged; one message always fits."""
 REDIAL_TIMEOUT: Final = 0.2
-"""For one attempt to reach a silent peer anew: a lost SYN is repeated by a new attempt, not by TCP a second later."""
+"""Time-out of one attempt to reconnect to a silent peer: after a lost SYN a new attempt follows sooner than TCP's own
+repetition, which takes a second."""
 REDIAL_PAUSE: Final = 0.05
-"""Between such attempts, where the system reports at once that there is no route."""
+"""Pause between attempts to reconnect to a silent peer, where the kernel reports at once that there is no route."""
 AWAY_GRACE: Final = 0.5
-"""A peer whose link fell silent keeps its proxies in the local graph for this long: after a loose contact of a
-second the next link is up within it, and no node needs to connect anew."""
+"""A peer whose link fell silent keeps its proxies in the local graph for this long. After an interruption of a second
+the next link is up within this time, and no node has to connect again."""
 KEEP_ALL_MESSAGES: Final = 1_000_000
-"""What "all" means for a contract's history: bytes bound it first."""
+"""The number of messages that "all" means for a contract's history; the bound in bytes is reached first."""
 BULK_STALE_AGE: Final = 0.5
-"""Age at which a best-effort message on the bulk lane is dropped for a newer one of its topic
-(``runtime.limits.STALE_AGE`` on the express lane): of a topic that a slow link cannot carry, the newest message is
-sent."""
+"""Age at which a best-effort message on the bulk lane is dropped in favour of a newer one of its topic (on the
+express lane it is ``runtime.limits.STALE_AGE``). If a link is too slow for a topic, the newest message is sent."""
 REPLAY_BYTES: Final = 64 * MIB
-"""Reliable messages of one route that are kept for a peer; beyond it the oldest is dropped."""
+"""Bytes of reliable messages of one route that are kept for a peer; beyond it the oldest message is dropped."""
 PING_TIMEOUT: Final = 2.0
-"""For the answer to a ping on request (``rmpa peer ping``)."""
+"""Time-out of a ping on request (``rmpa peer ping``)."""
 LINK_LEASE_MIN: Final = 0.1
-"""A peer that claims a shorter lease is held to this one: no network keeps less."""
+"""The shortest lease; a shorter one that a peer claims is raised to it, because no network can keep it."""
 LINK_LEASE_MAX: Final = 60.0
-"""A peer that claims a longer lease is held to this one."""
+"""The longest lease; a longer one that a peer claims is lowered to it."""
 GHOST_QUIET: Final = 0.5
-"""Two keepalives: a link that was silent for this long does not keep out a new run of its peer."""
+"""A link that was silent for this long (two keepalive intervals) does not prevent a link to a new run of its peer."""
 LINKS_MAX: Final = 512
-"""Peers that are linked at once; as many as a roster holds."""
+"""Peers that may be linked at one time; as many as the membership holds."""
 LINK_STABLE: Final = 5.0
-"""A link that was up for this long was stable: after its loss the back-off begins at the shortest delay."""
+"""After the loss of a link that was up for at least this long, the back-off begins at the shortest delay."""
 REFUSED_RETRY: Final = 5.0
-"""Before a peer is dialled again that refused for a reason which waiting seldom mends (version, domain)."""
+"""Delay before another dial to a peer that refused for a reason that seldom passes by itself (version, domain)."""
 FORGET_UNANNOUNCED: Final = PEER_LEASE
-"""A peer that discovery does not know is dialled again for this long after its link ended."""
+"""A peer unknown to discovery is dialled for this long after its link ended."""
 LINK_UNACKED: Final = 2.0
-"""Sent bytes that were not acknowledged for this long end a connection (TCP_USER_TIMEOUT): two leases, so that the
-lease, which can report the reason, ends first."""
+"""Sent bytes without an acknowledgement for this long end a connection (TCP_USER_TIMEOUT). It is two leases, so that
+the lease, which can report the reason, ends first."""
 SEGMENT_BYTES: Final = (1200, 512)
-"""Payload of one packet on a path that drops larger ones, in the order of trials: with TCP_HEADERS 1252 bytes, below
-the MTU of all usual tunnels (IPv6 requires 1280), then 564, below IPv4's minimum of 576."""
+"""Payloads of one packet that are tried, in this order, on a path that drops larger packets. With TCP_HEADERS they
+make 1252 bytes, below the MTU of all usual tunnels (IPv6 requires 1280), and 564, below IPv4's minimum of 576."""
 TCP_HEADERS: Final = 52
 """Bytes of a packet around its payload: IPv4 (20), TCP (20), time stamps (12)."""
 EXPRESS_SEGMENT: Final = 1220
-"""Payload of one packet of an express lane that leaves this machine (TCP_MAXSEG), 1272 bytes with TCP_HEADERS:
-commands, keepalives and the graph fit through usual tunnels from the first packet on."""
+"""Payload of one packet of an express lane to another machine (TCP_MAXSEG), 1272 bytes with TCP_HEADERS: commands,
+keepalives and the graph fit through usual tunnels from the first packet on."""
 STALL_LOOK: Final = 0.1
-"""Between two samples of a connection whose data is retransmitted."""
+"""Interval of the samples of a connection whose data is being retransmitted."""
 STALL_SUSPECTED: Final = 0.3
-"""Seconds without progress, with retransmissions, before a small packet tests the path; TCP retransmits after 0.2
-s."""
+"""Seconds without progress, but with retransmissions, after which a small packet tests the path. TCP's first
+retransmission is due after 0.2 s."""
 STALL_ANSWER: Final = 0.08
-"""Seconds, or 1.5 round trips if that is more, for the acknowledgement of what was retransmitted after the small
-packet's answer; then the path is taken for a black hole. On a LAN 0.8 s after the stall began, within the express
-lease."""
+"""Seconds (or 1.5 round trips, if that is more) in which data retransmitted after the small packet's answer must be
+acknowledged; otherwise the path counts as a black hole. On a LAN that is 0.8 s after the stall began, within the
+lease of the express lane."""
 PATH_REMEMBERED: Final = 600.0
-"""A black hole is remembered for an address this long; the next connection then tries large packets again. The value
-of RFC 4821."""
+"""How long a black hole is remembered for an address (the value of RFC 4821); the next connection after that tries
+large packets again."""
 PATH_NO_HELP: Final = 60.0
-"""Where smaller packets did not help, they are not tried again for this long."""
+"""How long smaller packets are not tried again for an address where they did not help."""
 PATH_PROVEN_SEGMENTS: Final = 2
-"""Full segments of the smaller size that must be acknowledged before the size is known to have been the problem."""
+"""Full segments of the smaller size that must be acknowledged before the packet size counts as the cause."""
 PATHS_MAX: Final = 512
 """Addresses remembered as black holes, as many as there are links; the oldest is forgotten first."""
 EXPRESS_UNSENT_BYTES: Final = 64 * KIB
-"""Bytes that the kernel queues for one link before they can be sent (TCP_NOTSENT_LOWAT): control frames cannot
-overtake what waits there, and no rule can drop it. A pong on 5 Mbit/s was 1.2 s late without it, 0.3 s with it."""
+"""Unsent bytes of one link that the kernel may hold (TCP_NOTSENT_LOWAT): control frames cannot overtake them, and the
+drop policy does not reach them. On 5 Mbit/s a pong was 1.2 s late without this bound, 0.3 s with it."""
 CONNECTION_URGENT_BYTES: Final = 32 * MIB
-"""Control frames that wait for one link: two of the longest. Beyond it the link is closed: they are never dropped."""
+"""Bytes of control frames that may wait for one link: two of the longest. They are never dropped, so beyond this the
+link is closed."""
 CLOCK_SAMPLES: Final = 16
-"""Exchanges remembered for a peer's clock: 4 to 16 s of keepalives; older ones have a large error (CLOCK_DRIFT)."""
+"""Exchanges of ping and pong kept for a peer's clock, 4 to 16 s of keepalives; older ones have a large error
+(CLOCK_DRIFT)."""
 CLOCK_DRIFT: Final = 15e-6
-"""Seconds a second that clocks drift apart (PHI of RFC 5905)."""
+"""How far two clocks may drift apart, in seconds per second (PHI of RFC 5905)."""
 CLOCK_STEP: Final = 0.05
-"""Seconds by which our wall clock must disagree with the monotonic one to count as set; less shows as a
-contradiction between two exchanges."""
+"""Seconds by which the local wall clock must deviate from the monotonic one to count as set. A smaller step shows as
+a contradiction between two exchanges."""
 CLOCK_INTERVAL: Final = 1.0
-"""Between pings on a link whose pongs alone keep it alive."""
+"""Interval of the pings on a link whose pongs alone keep it alive."""
 PENDING_PER_ADDRESS: Final = 8
-"""Of the connections without a handshake, those from one address: one scanner must not shut the others out."""
+"""Connections without a handshake that one address may have, so that one port scanner does not take all places."""
 JOIN_RETRY: Final = 1.0
-"""Before an agent whose addresses have changed tries again to listen at the new one."""
+"""Delay before an agent whose addresses have changed tries again to listen at the new address."""
 ACK_MESSAGES: Final = 32
-"""Messages of a reliable route that one acknowledgement covers: it costs as much as a message of 64 bytes."""
+"""Messages of a reliable route after which an acknowledgement is due; it costs as much as a message of 64 bytes."""
 ACK_BYTES: Final = 1 * MIB
-"""The same in bytes: with large messages the sender's window is soon full."""
+"""Bytes of a reliable route after which an acknowledgement is due: with large messages the sender's window is soon
+full."""
 ACK_DELAY: Final = 0.010
-"""After the first unacknowledged message; a route with few messages keeps them in memory for this much longer."""
+"""The longest delay of an acknowledgement after the first message that it covers. The sender of few messages keeps
+them in memory for this much longer."""
 OUTAGE_COUNTED: Final = 86_400.0
-"""Messages of a reliable route are counted for this long after its link ended, though they are not kept any more; for
-that the agent stays connected to the publisher. After it, the loss is reported as "more may be lost"."""
+"""How long after the end of its link the messages of a reliable route are still counted, though no longer kept. The
+agent stays connected to the publisher to count them. After this time, the loss is reported as "more may be lost"."""
 RESUME_CLAIM: Final = 10.0
-"""Seconds for a peer to reopen a route that waited, after all topics were advertised over its new link: it has read
-the last advertisement by then. A route that it has not reopened has no subscriber any more."""
+"""Seconds in which a peer must reopen a waiting route after all topics were advertised over its new link; by then it
+has read the last advertisement. A route that is not reopened has no subscriber any more."""
 RESUME_CLAIM_MAX: Final = 300.0
-"""The same in seconds after its new link, if not all topics could be advertised: 32,768 topics take 51 s on a lane
-that is never free (TELL_PATIENCE), and a link that carries nothing ends long before."""
+"""Seconds in which a peer must reopen a waiting route after its new link came up, if not all topics could be
+advertised: 32,768 topics take 51 s on a lane that is always busy (TELL_PATIENCE), and a link without any traffic ends
+long before."""
 RESUMES_MAX: Final = 1024
-"""Reliable routes without a link whose messages are kept: those of one peer with a thousand topics."""
+"""Reliable routes without a link whose messages may be kept: those of one peer with a thousand topics."""
 RESUME_BYTES_MAX: Final = 256 * MIB
-"""Bytes of messages kept for all of them; those of the route that waited longest are dropped first, and only
-counted."""
+"""Bytes of messages kept for all reliable routes without a link. Beyond it the route that has waited longest drops
+its messages and only counts new ones."""
 RESUMES_COUNTED_MAX: Final = 4096
-"""Reliable routes without a link whose messages are only counted, 3 KB each."""
+"""Reliable routes without a link whose messages may be only counted, 3 KB each."""
 LOST_TOLD_MAX: Final = UINT32_MAX
-"""Lost messages that one ``opened`` can report."""
+"""The highest number of lost messages that one ``opened`` message can report."""
 LOSSES_REMEMBERED: Final = 8192
-"""(peer, source) pairs of reliable routes that are not open, whose losses are remembered."""
+"""(peer, source) pairs of closed reliable routes whose losses are remembered."""
 ABSENT_PEERS_MAX: Final = 128
-"""Peers without a link for longer than their routes wait, whose losses in both directions are remembered; the one
-that has been away longest is forgotten first."""
+"""Peers whose losses, in both directions, are remembered although they have had no link for longer than their routes
+wait. The peer that has been away longest is forgotten first."""
 
 # --- bridge -----------------------------------------------------------------------------------------------------
 TELL_BACKLOG: Final = 8 * KIB
-"""Bytes in flight to a peer above which the next portion of the graph waits: a portion has some 6 KB, so data waits
-for at most 12 ms behind both on 10 Mbit/s. Sending all of 10,000 topics at once delayed it by 0.8 s."""
+"""Bytes in flight to a peer above which the next portion of the catalogue waits. A portion has some 6 KB, so data
+waits for at most 12 ms on 10 Mbit/s. Sending all of 10,000 topics at once delayed data by 0.8 s."""

@@ -1,12 +1,12 @@
 """Finds path-MTU black holes, which are paths that drop large packets silently (RFC 2923), and remembers them.
 
-Where a tunnel or a firewall drops packets that are too large for it, and the ICMP message that should report this is
+If a tunnel or a firewall drops packets that are too large for it, and the ICMP message that should report this is
 lost, a TCP connection stalls at its first large segment, while small ones still get through. The remedy of Linux
 (``net.ipv4.tcp_mtu_probing``, RFC 4821) is off by default, and a socket cannot switch it on for itself. Therefore
-both lanes of a link are watched. Data that stalls while the other lane carries a small packet there and back is the
-evidence; from then on messages to that address are sent in smaller segments.
+both lanes of a link are watched. If the data of one lane stalls while a small packet on the other lane is answered,
+there is a black hole: from then on messages to that address are sent in smaller segments.
 
-Pure: samples of TCP_INFO and ``now`` in, judgements out.
+Pure: samples of TCP_INFO and ``now`` go in, judgements come out.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class TcpSample:
 
     Args:
         queued: Bytes written and not acknowledged, those that have not been sent yet included.
-        retransmits: Retransmission time-outs of the oldest segment in a row.
+        retransmits: Consecutive retransmission time-outs of the oldest segment.
         acked: Bytes acknowledged since the connection began.
         delivered: Segments that arrived since then.
         rtt: Round-trip time as the kernel estimates it, seconds.
@@ -46,13 +46,13 @@ class Progress(Enum):
     """Whether the data of a connection gets through."""
 
     FLOWING = auto()
-    """Nothing waits, or what waits is being acknowledged."""
+    """No data waits, or the waiting data is being acknowledged."""
     WAITING = auto()
-    """Something was retransmitted and has not been acknowledged yet: worth another look soon."""
+    """Retransmitted data has not been acknowledged yet: sample again soon."""
     STALLED = auto()
     """Large segments are retransmitted in vain; a small packet by another connection shows whether size matters."""
     BLACK_HOLE = auto()
-    """A small packet was answered, and what was retransmitted after it was lost all the same."""
+    """A small packet was answered, but the large segments retransmitted after the answer were lost again."""
 
 
 class StallWatch:
@@ -61,22 +61,22 @@ class StallWatch:
     Args:
         segment: Bytes of the largest segment, or ``None`` for as many as the kernel chooses.
         now: Monotonic seconds.
-        before: The watch of the same connection until now, while its segments had another size.
+        before: The former watch of the same connection, from before its segment size changed.
     """
 
     def __init__(self, segment: int | None, now: float, before: StallWatch | None = None) -> None:
         self.segment = segment
         self._least = smaller(segment) or segment or 0
-        """Bytes of the next smaller segment size; of the smallest size itself."""
+        """Bytes of the next smaller segment size; for the smallest size that size itself."""
         self._since = now
         self._acked, self._delivered = before.counted if before is not None else (0, 0)
         self._begun = self._acked
         self._passed = False
         self._retransmits = 0
         self._proof: int | None = None
-        """Time-outs of the present stall at the moment when a small packet had been answered."""
+        """The number of time-outs in the present stall when the small packet was answered."""
         self._repeated: float | None = None
-        """When something had been retransmitted after that."""
+        """When data was first seen to be retransmitted after that answer."""
 
     @property
     def counted(self) -> tuple[int, int]:
@@ -90,11 +90,11 @@ class StallWatch:
 
     @property
     def waiting(self) -> bool:
-        """Whether something was retransmitted, and has not been acknowledged."""
+        """Whether retransmitted data has not been acknowledged."""
         return self._retransmits > 0
 
     def idle(self, now: float) -> None:
-        """Nothing waits to be acknowledged."""
+        """Record that no data waits to be acknowledged."""
         self._since = now
         self._retransmits = 0
         self._proof = self._repeated = None
@@ -102,11 +102,11 @@ class StallWatch:
     def look(self, sample: TcpSample, now: float) -> Progress:
         """Judge the next sample.
 
-        If segments larger than the next smaller size were acknowledged before, the path's MTU is not what stops the
-        rest. Such a connection ends by its time-out, and the next one is judged anew.
+        If segments larger than the next smaller size were acknowledged before, the path's MTU is not the cause of the
+        stall. Such a connection ends by its time-out, and the next connection is judged anew.
 
-        A cable that is plugged in again passes a small packet before TCP retransmits the large ones, ever more
-        rarely. So only what was retransmitted after the small packet's answer counts.
+        After a cable is plugged in again, a small packet gets through before TCP retransmits the large segments,
+        because its retransmissions become rarer. Therefore only those after the small packet's answer count.
         """
         acked, delivered = sample.acked - self._acked, sample.delivered - self._delivered
         self._acked, self._delivered = sample.acked, sample.delivered
@@ -128,7 +128,7 @@ class StallWatch:
         return Progress.BLACK_HOLE if late else Progress.WAITING
 
     def small_passed(self) -> None:
-        """A small packet that was sent during the stall was answered by the peer."""
+        """Record that the peer answered a small packet that was sent during the stall."""
         if self.waiting and self._proof is None:
             self._proof = self._retransmits
 
@@ -171,7 +171,7 @@ class PathState(Enum):
     BLACK_HOLE = auto()
     """Large packets are lost, and smaller ones arrive."""
     NO_HELP = auto()
-    """Smaller ones did not arrive either: something else is wrong."""
+    """Smaller packets did not arrive either: the packet size is not the cause."""
 
 
 @dataclass(slots=True)
@@ -188,7 +188,7 @@ class PathTable:
         self._paths: dict[str, _Path] = {}
 
     def segment(self, address: str, now: float) -> int | None:
-        """Bytes that a segment to an address may have; ``None`` for as many as the kernel likes."""
+        """Bytes that a segment to an address may have; ``None``: the kernel decides."""
         path = self._paths.get(address)
         if path is not None and now >= path.until:
             del self._paths[address]
@@ -196,11 +196,11 @@ class PathTable:
         return path.segment if path is not None else None
 
     def black_hole(self, address: str, segment: int | None, now: float) -> PathState | None:
-        """A connection with segments of at most ``segment`` bytes has met a black hole.
+        """Record that a connection with segments of at most ``segment`` bytes has met a black hole.
 
         Returns:
-            ``TRYING`` if the next connection takes smaller ones, ``NO_HELP`` if there are none, and ``None`` if that
-            was known.
+            ``TRYING`` if the next connection uses smaller segments, ``NO_HELP`` if there are none, and ``None`` if
+            that was known.
         """
         known = self.segment(address, now)
         path = self._paths.get(address)
@@ -218,10 +218,10 @@ class PathTable:
         return state
 
     def flowed(self, address: str, segment: int | None, acked: int) -> bool:
-        """A connection with segments of at most ``segment`` bytes has had ``acked`` bytes acknowledged.
+        """Record that ``acked`` bytes of a connection with segments of at most ``segment`` bytes were acknowledged.
 
         Returns:
-            Whether that is news: the smaller segments are what it took.
+            Whether this shows for the first time that the smaller segments solved the problem.
         """
         path = self._paths.get(address)
         if path is None or path.state is not PathState.TRYING or segment is None or path.segment != segment:
@@ -236,7 +236,7 @@ class PathTable:
 
         Args:
             address: Numeric.
-            segment: That of a connection which stands, and outlives what is remembered.
+            segment: The segment size of the present connection, which may last longer than this table remembers.
             now: Monotonic seconds.
         """
         self.segment(address, now)

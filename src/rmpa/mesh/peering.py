@@ -1,11 +1,11 @@
 """Decides which side dials, when, and which of two links with one peer stays: one machine over all peers.
 
-A peer's place is its address and port; its runs (incarnations) follow each other there. Outputs are collected and
-taken with ``take``: ``Dial`` and ``CloseLink`` are orders to the driver, ``LinkUp`` and ``LinkDown`` are events for
+A peer's place is its address and port; its runs (incarnations) follow each other there. Outputs are collected, and
+returned by ``take``: ``Dial`` and ``CloseLink`` are orders to the driver, ``LinkUp`` and ``LinkDown`` are events for
 the rooms above. Each ``Dial`` is answered by exactly one of ``link_up``, ``dial_refused`` or ``dial_failed``.
 
-Beacons can be forged. Therefore peers that were never linked, *unverified* ones, wait in a queue for their dials,
-whose rate is bounded over all of them. Peers that were linked before are dialled at once.
+Beacons can be forged. Therefore *unverified* peers, which were never linked, are dialled from a queue, at a rate that
+is bounded over all of them. Peers that were linked before are dialled at once.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ SocketAddress = tuple[str, int]
 _SELDOM_MENDED: Final = frozenset(
     {Refusal.VERSION, Refusal.DOMAIN, Refusal.DUPLICATE, Refusal.MALFORMED, Refusal.LANE}
 )
-"""Refusals that waiting seldom mends."""
+"""Refusals for reasons that seldom pass by themselves."""
 _OTHER_PEER: Final = frozenset({Refusal.MYSELF, Refusal.WRONG_PEER})
-"""Refusals that concern one endpoint: another agent, or this one, answered there."""
+"""Refusals that concern one endpoint only, because another agent, or this agent itself, answered there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class Dial:
 
 @dataclass(frozen=True, slots=True)
 class CloseLink:
-    """Say bye on this link and close it."""
+    """Send a bye on this link and close it."""
 
     link_id: int
     reason: str
@@ -71,10 +71,10 @@ class LinkUp:
 
 
 class LinkDownCause(Enum):
-    """Why a link is not used any more; the value is the text for people."""
+    """Why a link is no longer used; the value is the text for users."""
 
     REPLACED = "replaced by a newer link"
-    """The same run of the peer has another link in the same moment."""
+    """The same run of the peer has another link from the same moment on."""
     RESTARTED = "the peer restarted"
     """Another run of the peer has taken its place."""
     ENDED = "the connection ended"
@@ -83,12 +83,12 @@ class LinkDownCause(Enum):
 
 @dataclass(frozen=True, slots=True)
 class LinkDown:
-    """The link that was used with this peer is not used any more.
+    """The link that was used with this peer is no longer used.
 
     Args:
         link_id: Its number.
         identity: The peer.
-        cause: What kind of end it was.
+        cause: The kind of its end.
         reason: Why, for people.
     """
 
@@ -100,7 +100,7 @@ class LinkDown:
 
 @dataclass(frozen=True, slots=True)
 class LinkRefused:
-    """A peer refuses links, for the first time for this reason; ``refuse`` says what to do."""
+    """A peer refuses links for a reason that was not reported before; ``refuse`` says what to do."""
 
     identity: Identity
     refuse: Refuse
@@ -115,14 +115,14 @@ class PeerStatus:
 
     Args:
         identity: The peer.
-        state: ``refused`` is a wait after a refusal that waiting seldom mends.
+        state: ``refused``: waiting after a refusal for a reason that seldom passes by itself.
         link_id: Its link, if linked.
         lower: Whether this agent has the lower GUID of the two, and dials first.
-        since: When the link came up, or the last one fell, monotonic seconds; ``None`` before the first.
+        since: When the link came up, or the last link fell, monotonic seconds; ``None`` before the first link.
         attempts: Dials since the last link.
-        last_error: Why there is no link, as far as is known; for a linked peer, why the last one ended.
+        last_error: Why there is no link, as far as is known; for a linked peer, why its previous link ended.
         next_attempt: When it is dialled next, monotonic seconds.
-        endpoint: Where it is dialled, or was dialled last.
+        endpoint: The endpoint that is dialled, or was dialled last.
     """
 
     identity: Identity
@@ -149,12 +149,12 @@ class _Peer:
     identity: Identity
     lower: bool
     backoff: Backoff
-    announced: bool = False  # discovery knows it
-    verified: bool = False  # it was linked before
-    token_taken: bool = False  # its present dial counts against the rate of unverified peers
-    gone: bool = False  # it is forgotten when its link or dial ends
+    announced: bool = False  # discovery knows the peer
+    verified: bool = False  # the peer was linked before
+    token_taken: bool = False  # the present dial counts against the rate of unverified peers
+    gone: bool = False  # the peer is forgotten when its link or dial ends
     source: str | None = None
-    good: SocketAddress | None = None  # where it was reached last
+    good: SocketAddress | None = None  # the endpoint where the peer was reached last
     link: _LinkInfo | None = None
     fell: float | None = None
     dialling: tuple[SocketAddress, ...] = ()
@@ -168,7 +168,7 @@ class _Peer:
     reported: set[int] = field(default_factory=set)  # refusals that were reported
 
     def endpoints(self) -> list[SocketAddress]:
-        """Where to dial, best first: where it was reached last, its beacon's source, the addresses it announces."""
+        """The endpoints to dial, best first: the last one that worked, the beacon's source, the announced ones."""
         candidates = [self.good] if self.good is not None else []
         if self.source is not None:
             candidates.append((self.source, self.identity.guid.port))
@@ -181,7 +181,7 @@ class Peering:
     Args:
         ours: The identity of this agent.
         rng: Uniform numbers in [0, 1), for the jitter.
-        alive: Whether something came on a link, by its id, in the last ``limits.GHOST_QUIET`` seconds.
+        alive: Returns whether bytes arrived on a link, given by its id, in the last ``limits.GHOST_QUIET`` seconds.
     """
 
     def __init__(self, ours: Identity, *, rng: Callable[[], float], alive: Callable[[int], bool]) -> None:
@@ -194,9 +194,9 @@ class Peering:
         self._timers: TimerQueue[int] = TimerQueue()
         self._unverified: set[int] = set()
         self._dial_queue: dict[int, None] = {}
-        """Unverified peers whose dials are due, in the order in which they became so."""
+        """Unverified peers whose dials are due, the one that has been due longest first."""
         self._never_dialled: dict[int, None] = {}
-        """Those of the queue that were never dialled."""
+        """The peers of the queue that were never dialled."""
         self._newest_next = True
         self._queue_at: float | None = None
         self._dial_rate = TokenBucket(limits.DIAL_STRANGERS_RATE, limits.DIAL_STRANGERS_BURST)
@@ -204,12 +204,12 @@ class Peering:
     # --- events of discovery --------------------------------------------------------------------------------
 
     def peer_found(self, identity: Identity, now: float, source: str | None = None) -> None:
-        """Discovery found a peer, or has news of it (new addresses, a restart).
+        """Take in a peer that discovery found, or news of it (new addresses, a restart).
 
         Args:
             identity: The peer.
             now: Monotonic seconds.
-            source: The address that its beacon came from, if it was the peer's own beacon.
+            source: The source address of the peer's own beacon; ``None`` if it was found in another way.
         """
         if identity.instance == self._ours.instance or identity.guid.place == self._ours.guid.place:
             return
@@ -219,7 +219,7 @@ class Peering:
         restarted = peer.identity.instance != identity.instance
         fresh = not peer.announced or restarted
         if restarted and identity.guid < peer.identity.guid and peer.link is not None:
-            return  # outdated: the link is with a newer run
+            return  # an outdated report: the link is with a newer run
         peer.announced, peer.gone, peer.forget_at = True, False, None
         self._set_timer(peer)
         peer.source = source or peer.source
@@ -231,8 +231,8 @@ class Peering:
             self._dial_at(peer, now if peer.lower else now + limits.DIAL_FALLBACK)
         self._dial_due(peer, now)
 
-    def peer_gone(self, guid: Guid, now: float) -> None:  # noqa: ARG002 - all machines are told the time
-        """Discovery gave a peer up: do not dial it any more. A link that is up stays until it ends by itself."""
+    def peer_gone(self, guid: Guid, now: float) -> None:  # noqa: ARG002 - all machines get the time
+        """Stop dialling a peer that discovery has given up. A link that is up stays until it ends by itself."""
         peer = self._peers.get(guid.place)
         if peer is None or peer.identity.guid != guid:
             return
@@ -242,7 +242,7 @@ class Peering:
     # --- events of the driver -------------------------------------------------------------------------------
 
     def judge(self, hello: Hello) -> Refuse | None:
-        """Decide on the hello of a dialler; ``None`` accepts it, and ``link_up`` follows."""
+        """Decide on a received hello; ``None`` accepts it, and the driver then calls ``link_up``."""
         peer = self._peers.get(hello.guid.place)
         known = []
         if peer is not None and peer.link is not None:
@@ -253,14 +253,14 @@ class Peering:
     def link_up(
         self, link_id: int, identity: Identity, now: float, *, dialled: bool, endpoint: SocketAddress | None = None
     ) -> None:
-        """A handshake succeeded.
+        """Take in a link whose handshake succeeded.
 
         Args:
             link_id: The driver's number for the link, never used twice.
-            identity: What the remote side says it is; discovery need not have found it.
+            identity: The remote side's identity from the handshake; discovery need not have found it.
             now: Monotonic seconds.
             dialled: Whether this side dialled.
-            endpoint: Where it dialled.
+            endpoint: The endpoint that this side dialled.
         """
         peer = self._peers.get(identity.guid.place) or self._add(identity)
         if dialled:
@@ -290,13 +290,13 @@ class Peering:
         self._outputs.append(LinkUp(link_id, identity))
 
     def link_down(self, link_id: int, reason: str, now: float, *, silent: bool = False) -> None:
-        """A link ended, for whatever reason; without effect for one that was replaced or never up.
+        """Handle the end of a link; without effect for a link that was replaced or never up.
 
         Args:
             link_id: Its number.
             reason: Why, for people.
             now: Monotonic seconds.
-            silent: Whether it fell silent: the path to the peer failed, and may be back at once.
+            silent: Whether the link ended by silence: the path to the peer failed, and may work again at once.
         """
         peer = self._by_link.get(link_id)
         if peer is None or peer.link is None:
@@ -319,7 +319,7 @@ class Peering:
             self._dial_at(peer, now + self._pause(peer) + (0.0 if peer.lower else limits.DIAL_FALLBACK))
 
     def dial_failed(self, guid: Guid, error: str, now: float, endpoint: SocketAddress | None = None) -> None:
-        """A ``Dial`` was not answered, or its connection ended before the handshake did.
+        """Handle a ``Dial`` without an answer, or whose connection ended before its handshake was done.
 
         Args:
             guid: The peer that was dialled.
@@ -334,13 +334,13 @@ class Peering:
             self._retry(peer, now)
 
     def dial_refused(self, guid: Guid, refuse: Refuse, now: float, endpoint: SocketAddress | None = None) -> None:
-        """The handshake of a ``Dial`` was refused at this endpoint, by either side."""
+        """Handle a ``Dial`` whose handshake was refused at this endpoint, by either side."""
         peer = self._dial_ended(guid, endpoint)
         if peer is None:
             return
         peer.last_error = str(refuse)
         if refuse.code == Refusal.ALREADY_LINKED:
-            # The peer has a link that was lost or is about to be accepted here: it ends within the lease.
+            # The peer has a link that was lost here (it ends within the lease), or that is about to be accepted here.
             if peer.link is None:
                 self._dial_at(peer, now + max(limits.EXPRESS_LEASE, self._pause(peer)))
             return
@@ -361,7 +361,7 @@ class Peering:
         return earliest(self._timers.next(), self._queue_at)
 
     def handle_timer(self, now: float) -> None:
-        """Dial and forget what is due."""
+        """Dial and forget the peers whose time has come."""
         for place in self._timers.take(now):
             peer = self._peers[place]
             if peer.forget_at is not None and now >= peer.forget_at:
@@ -373,12 +373,12 @@ class Peering:
         self._dial_unverified(now)
 
     def take(self) -> list[PeeringOutput]:
-        """Return what was decided since the last call, in order."""
+        """Return the outputs since the last call, in order."""
         outputs, self._outputs = self._outputs, []
         return outputs
 
     def endpoints(self, guid: Guid) -> list[SocketAddress]:
-        """Where a peer may be reached, best first; empty for one that is not known."""
+        """The endpoints at which a peer may be reached, best first; empty for an unknown peer."""
         peer = self._peers.get(guid.place)
         return peer.endpoints() if peer is not None else []
 
@@ -396,7 +396,7 @@ class Peering:
         return peer
 
     def _verify(self, peer: _Peer, now: float) -> None:
-        """A peer is linked: it exists, and the dial that led there does not count against the rate."""
+        """Mark a linked peer as verified; a dial that led to the link does not count against the rate."""
         peer.verified = True
         self._unverified.discard(peer.identity.guid.place)
         if peer.token_taken:
@@ -405,7 +405,7 @@ class Peering:
             self._dial_unverified(now)
 
     def _forget_if_idle(self, peer: _Peer) -> None:
-        """Forget a peer that is gone; one that is being dialled only when the dial was answered."""
+        """Forget a peer that is gone, unless it has a link or an unanswered dial."""
         peer.forget_at = None
         self._dial_at(peer, None)
         if peer.link is None and not peer.dialling:
@@ -413,7 +413,7 @@ class Peering:
             self._unverified.discard(peer.identity.guid.place)
 
     def _restart(self, peer: _Peer, now: float) -> None:
-        """A new run of a peer announced itself: forget errors and refusals of the run before."""
+        """Forget the errors and refusals of a peer's former run, because a new run announced itself."""
         peer.backoff.reset()
         peer.tried.clear()
         peer.reported.clear()
@@ -426,16 +426,16 @@ class Peering:
             self._dial_at(peer, now if peer.lower else now + limits.DIAL_FALLBACK)
 
     def _keeps(self, old: _LinkInfo, new: _LinkInfo) -> bool:
-        """Whether ``old`` stays, of two links with one run of a peer.
+        """Whether the old one of two links with one run of a peer stays.
 
-        The one stays that the lower GUID dialled; of two that the same side dialled, the newer one.
+        The link that the agent with the lower GUID dialled stays; if the same side dialled both, the newer one stays.
         """
         if old.identity.instance != new.identity.instance or old.dialled == new.dialled:
             return False
         return old.dialled == (self._ours.guid < old.identity.guid)
 
     def _replace(self, peer: _Peer, link: _LinkInfo, cause: LinkDownCause) -> None:
-        """Close a link that another one, or another run of the peer, takes the place of."""
+        """Close a link that is replaced by another link, or whose run of the peer is replaced."""
         self._outputs.append(CloseLink(link.id, cause.value))
         self._drop(peer, link, cause, cause.value)
 
@@ -445,7 +445,11 @@ class Peering:
         self._outputs.append(LinkDown(link.id, link.identity, cause, reason))
 
     def _dial_ended(self, guid: Guid, endpoint: SocketAddress | None) -> _Peer | None:
-        """The peer whose dial has ended. What happened at one endpoint tells nothing about the others."""
+        """End a peer's dial, and mark the endpoint (``None``: all dialled ones) as tried.
+
+        Returns:
+            The peer; ``None`` if it was not being dialled, or is gone.
+        """
         peer = self._peers.get(guid.place)
         if peer is None or not peer.dialling:
             return None
@@ -490,7 +494,7 @@ class Peering:
         self._timers.set(place, earliest(attempt, peer.forget_at))
 
     def _dial_at(self, peer: _Peer, when: float | None) -> None:
-        """Set when the next dial is due; ``None``: never."""
+        """Set the time of the next dial; ``None``: never."""
         place = peer.identity.guid.place
         peer.next_attempt = when
         self._dial_queue.pop(place, None)
@@ -498,7 +502,7 @@ class Peering:
         self._set_timer(peer)
 
     def _dial_due(self, peer: _Peer, now: float) -> None:
-        """Dial a peer if it is time; an unverified one joins the queue."""
+        """Dial a peer whose dial is due; an unverified one joins the queue instead."""
         due = peer.next_attempt
         if due is None or now < due or peer.link is not None or peer.dialling:
             return
@@ -515,8 +519,8 @@ class Peering:
     def _dial_unverified(self, now: float) -> None:
         """Dial unverified peers of the queue as far as the rate allows.
 
-        In turn the newest that was never dialled, because a real peer must not wait behind many forged ones, and the
-        one that waits longest, because it must not wait for ever.
+        It takes in turn the newest peer that was never dialled, so that a real peer does not wait for many forged
+        ones, and the peer that has waited longest, so that no peer waits forever.
         """
         while self._dial_queue and self._dial_rate.take(now):
             newest = self._newest_next and self._never_dialled

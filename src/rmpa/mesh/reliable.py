@@ -1,20 +1,21 @@
 """Reliable delivery of one source's messages to one peer, over links that fall and come back.
 
-Sans-I/O. TCP loses nothing while it lasts, so nothing is sent twice on one link and no timer repeats anything. What
-was on its way when a link fell is lost. Therefore the sender keeps each message until the receiver has acknowledged
-it, and the next link begins behind the last message that the receiver has (its ``position``)::
+Sans-I/O. A TCP connection loses nothing while it lasts, so nothing is sent twice on one link and no timer repeats
+anything. The bytes in flight are lost when a link falls. Therefore the sender keeps each message until the receiver
+has acknowledged it, and the next link begins after the last message that the receiver has (its ``position``)::
 
     offer ──► unsent ──take──► sent ──acknowledged──► gone
                  ▲               │
-                 └────suspend────┘        resume(after): what is not behind ``after`` is gone too
+                 └────suspend────┘        resume(after): messages up to ``after`` are gone too
 
-A message is received when its last fragment is; one cut in the middle is sent again whole. Messages that the sender
-dropped because its bounds were reached show as a gap in the sequence, so the receiver knows exactly how many messages
-will never come. That holds for a sender that keeps nothing any more, too (``stop_keeping``): it goes on numbering.
+A message counts as received when its last fragment is received; a message that was cut off is sent again from its
+start. Messages that the sender dropped at its bounds show as a gap in the sequence, so the receiver knows exactly how
+many messages will never arrive. This also holds for a sender that no longer keeps messages (``stop_keeping``),
+because it goes on numbering them.
 
-Sequence numbers have 32 bits and wrap (``core.serial_number``). An *epoch* names one run of a numbering: a sender
-that was given up is followed by one of another epoch. Methods that run for each message write the serial arithmetic
-out.
+Sequence numbers have 32 bits and wrap (``core.serial_number``). An *epoch* identifies one run of a numbering: after a
+sender was given up, the next one has another epoch. Methods that run for each message contain the serial arithmetic
+inline, for speed.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ from rmpa.mesh import limits
 
 
 class Outgoing(NamedTuple):
-    """A message to be sent (a named tuple, which is the fastest to make: there is one for each message).
+    """A message to be sent. One is made for each message, so it is a named tuple, which is the fastest to make.
 
     Args:
         sequence: Its number, 32 bits.
-        stamp_ns: When it came from its publisher, wall clock.
+        stamp_ns: When it was received from its publisher, wall clock, nanoseconds.
         payload: Its bytes.
     """
 
@@ -44,15 +45,16 @@ class Outgoing(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class EndedNumbering:
-    """What is known of a sender that was given up: how much its receiver misses, once its position is known.
+    """The record of a sender that was given up, from which the receiver's losses follow once its position is known.
 
     Args:
-        epoch: Names the numbering.
-        confirmed: The receiver has everything up to this message, as far as it has acknowledged.
+        epoch: The epoch of the numbering.
+        confirmed: The last message that the receiver has acknowledged, with all messages before it.
         highest: The highest sequence that was sent.
         following: The sequence that the next message would have had.
         gaps: Messages lost before ``confirmed``; the receiver has seen these as gaps.
-        dropped: (last sequence, count) of gaps between ``confirmed`` and ``highest``, in order: mostly none.
+        dropped: ``(last sequence, count)`` of each gap after ``confirmed`` and up to ``highest``, in order; usually
+            empty.
     """
 
     epoch: int
@@ -64,14 +66,15 @@ class EndedNumbering:
 
     @property
     def seen_as_gaps(self) -> int:
-        """Lost messages that the receiver has seen as gaps, or would have seen as such."""
+        """The number of lost messages that the receiver has seen as gaps, or would have seen as gaps."""
         return self.gaps + sum(count for _, count in self.dropped)
 
     def unseen(self, after: int | None = None) -> int:
-        """Messages that the receiver misses and does not know of.
+        """The number of messages that the receiver misses without knowing it.
 
         Args:
-            after: The last message that it has; ``None``, or one that was never sent: as far as it has acknowledged.
+            after: The last message that the receiver has. ``None``, or a sequence that was never sent, stands for the
+                last message that it acknowledged.
         """
         return serial_distance(self._position(after), self.following - 1)
 
@@ -94,17 +97,17 @@ class EndedNumbering:
 class ReliableSender:
     """The sending half: numbers the messages and keeps each until it is acknowledged, within bounds.
 
-    It begins with a link. Beyond a bound the oldest message is dropped; the newest always fits, however large, so at
-    most ``max(max_bytes, the newest message)`` is held. A message larger than the window is sent when nothing else is
-    in flight.
+    A new sender has a link. Beyond a bound the oldest message is dropped; the newest always fits, however large, so
+    at most ``max(max_bytes, newest message)`` bytes are kept. A message larger than the window is sent when nothing
+    else is in flight.
 
     Args:
         depth: Messages kept, at least 1.
         max_bytes: Bytes kept.
-        window_messages: Messages that may be sent and not acknowledged, at least 1; two or more times
-            ``limits.ACK_MESSAGES``, or the sender waits for delayed acknowledgements.
-        window_bytes: The same in bytes; two or more times ``limits.ACK_BYTES``.
-        epoch: Names this numbering; no other sender of the source to this peer may have had it.
+        window_messages: Messages that may be sent and not acknowledged, at least 1. It should be at least twice
+            ``limits.ACK_MESSAGES``; otherwise the sender waits for delayed acknowledgements.
+        window_bytes: Bytes that may be sent and not acknowledged; it should be at least twice ``limits.ACK_BYTES``.
+        epoch: The epoch of this numbering; no other sender of this source to this peer may have had it.
         first: The first message's sequence.
     """
 
@@ -121,12 +124,13 @@ class ReliableSender:
         self.first: Final = first & SERIAL_MASK
         """The first message's sequence, for the receiver's ``begin``."""
         self.overflowed = 0
-        """Messages dropped that the receiver did not get; of one that was in flight that is known at ``resume``."""
+        """The number of dropped messages that the receiver did not get. A message that was dropped in flight is added
+        at ``resume``, if it did not arrive."""
         self._unsent: deque[Outgoing] = deque()
         self._sent: deque[Outgoing] = deque()
         self._dropped_in_flight: deque[tuple[int, int]] = deque()
-        """(sequence, size) of messages dropped after they were sent: it is not known yet whether they arrived. All of
-        them are older than those kept, and there are no more than the window allows."""
+        """``(sequence, size)`` of the messages that were dropped after they were sent, and may have arrived. All of
+        them are older than the kept messages, and the window bounds their number."""
         self._bytes = 0
         self._in_flight_bytes = 0
         self._linked = True
@@ -134,36 +138,36 @@ class ReliableSender:
         self._next = self.first
         self._acknowledged = serial_add(first, -1)
         self._highest = self._acknowledged
-        """The highest sequence sent over any link, or said to be lost."""
+        """The highest sequence that was sent over any link, or reported as lost."""
 
     @property
     def next_sequence(self) -> int:
-        """The number that the next message offered will get."""
+        """The sequence that the next offered message will get."""
         return self._next
 
     @property
     def confirmed(self) -> int:
-        """The receiver has everything up to this message, as far as is known."""
+        """The last message that is known to have arrived, with all messages before it."""
         return self._acknowledged
 
     @property
     def pending(self) -> int:
-        """Messages kept."""
+        """The number of messages kept."""
         return len(self._sent) + len(self._unsent)
 
     @property
     def pending_bytes(self) -> int:
-        """Bytes kept."""
+        """The number of bytes kept."""
         return self._bytes
 
     @property
     def in_flight(self) -> int:
-        """Messages sent over the present link and not acknowledged."""
+        """The number of messages that were sent over the present link and are not acknowledged."""
         return len(self._dropped_in_flight) + len(self._sent) if self._linked else 0
 
     @property
     def idle(self) -> bool:
-        """Whether all that was offered has arrived or is lost for good."""
+        """Whether every offered message has arrived or is lost for good."""
         return not (self._unsent or self._sent or self._dropped_in_flight)
 
     @property
@@ -173,16 +177,19 @@ class ReliableSender:
 
     @property
     def following(self) -> int:
-        """The sequence of the message that is sent next: the oldest one that waits, else the next one offered."""
+        """The sequence of the message that is sent next: of the oldest waiting one, or of the next one offered."""
         return self._unsent[0].sequence if self._unsent else self._next
 
     @property
     def lost(self) -> int:
-        """Messages that the receiver will never get; without a link those that may have arrived count too."""
+        """The number of messages that the receiver will never get.
+
+        Without a link, messages that were dropped in flight count too, although they may have arrived.
+        """
         return self.overflowed if self._linked else self.overflowed + len(self._dropped_in_flight)
 
     def offer(self, payload: bytes, stamp_ns: int) -> None:
-        """Take one more message; it is kept, so it must not be a view of a buffer."""
+        """Queue one more message. The payload is kept, so it must not be a view of a buffer that changes."""
         if self._counting:
             self._count()
             return
@@ -195,10 +202,10 @@ class ReliableSender:
             count -= 1
 
     def take(self, most: int | None = None) -> list[Outgoing]:
-        """Return the messages that may be sent now, in order; they count as sent. Without a link there are none.
+        """Return the messages that may be sent now, in order, and count them as sent; without a link there are none.
 
         Args:
-            most: How many at most.
+            most: The most messages to return; ``None``: all that the window allows.
         """
         taken: list[Outgoing] = []
         if not self._linked:
@@ -219,10 +226,10 @@ class ReliableSender:
         return taken
 
     def put_back(self) -> None:
-        """The last message taken cannot be sent now after all: it is the next one again.
+        """Undo the ``take`` of the last message, which could not be sent: it is the next one again.
 
         Raises:
-            LocalProtocolError: None is in flight.
+            LocalProtocolError: No message is in flight.
         """
         if not self._sent:
             raise LocalProtocolError("no message is under way that could be taken back")
@@ -231,10 +238,10 @@ class ReliableSender:
         self._unsent.appendleft(message)
 
     def acknowledged(self, sequence: int) -> None:
-        """The receiver has everything up to ``sequence``; an old acknowledgement, or one without a link, is ignored.
+        """Handle an acknowledgement of all messages up to ``sequence``; ignored if it is old or there is no link.
 
         Raises:
-            RemoteProtocolError: No message so late was ever sent.
+            RemoteProtocolError: ``sequence`` was never sent.
         """
         ahead = sequence - self._acknowledged & SERIAL_MASK
         if not self._linked or not 0 < ahead < SERIAL_HALF:
@@ -243,17 +250,17 @@ class ReliableSender:
         self._forget(ahead)
 
     def suspend(self) -> None:
-        """The link is gone: what was not acknowledged will be sent again. Without effect if repeated."""
+        """Handle the end of the link: unacknowledged messages will be sent again. Without effect if repeated."""
         self._unsent.extendleft(reversed(self._sent))
         self._sent.clear()
         self._in_flight_bytes = 0
         self._linked = False
 
     def stop_keeping(self) -> None:
-        """The link has been gone for too long: drop all messages and only count new ones, until ``resume``.
+        """Drop all messages and only count new ones until ``resume``, because the link has been gone for too long.
 
         Raises:
-            LocalProtocolError: There is a link.
+            LocalProtocolError: The sender has a link.
         """
         if self._linked:
             raise LocalProtocolError("a sender with a link keeps what its receiver has not acknowledged")
@@ -262,7 +269,7 @@ class ReliableSender:
         self._counting = True
 
     def ended(self) -> EndedNumbering:
-        """What stays known of this sender when it is given up."""
+        """The record of this sender, for the time after it is given up."""
         kept = sorted(
             serial_distance(self._acknowledged, sequence)
             for sequence in (
@@ -282,10 +289,13 @@ class ReliableSender:
         return EndedNumbering(self.epoch, self._acknowledged, self._highest, self._next, gaps, tuple(dropped))
 
     def resume(self, after: int) -> None:
-        """There is a new link, and the receiver has everything up to ``after``: go on from there.
+        """Continue over a new link after the last message that the receiver has.
+
+        Args:
+            after: The receiver's position: it has all messages up to this sequence.
 
         Raises:
-            RemoteProtocolError: It claims what was never sent, or less than it acknowledged; nothing has changed.
+            RemoteProtocolError: ``after`` was never sent, or is before the last acknowledgement; nothing has changed.
         """
         ahead = serial_distance(self._acknowledged, after)
         self._check(ahead, after, "resumes")
@@ -296,13 +306,14 @@ class ReliableSender:
         self._in_flight_bytes = 0
         self._linked = True
         self._counting = False
-        # The receiver learns which message follows, and then has all before it, be it as a gap.
+        # The receiver is told which message follows; all messages before it have arrived or show as a gap.
         self._sent_up_to(self.following - 1)
 
     def rewind(self) -> None:
-        """The link lost an unknown part of what is in flight: all of it will be sent again.
+        """Send all messages in flight again, because the link lost an unknown part of them.
 
-        The receiver leaves out what it has. What was dropped in flight counts as lost, though it may have arrived.
+        The receiver ignores the messages that it has. Messages that were dropped in flight count as lost, although
+        they may have arrived.
         """
         if self._linked:
             self.resume(self._acknowledged)
@@ -317,9 +328,9 @@ class ReliableSender:
             raise RemoteProtocolError(f"a receiver {verb} message {sequence}, of those {known}")
 
     def _forget(self, ahead: int) -> None:
-        """The next ``ahead`` sequences have arrived: drop their messages.
+        """Drop the messages of the next ``ahead`` sequences, which have arrived.
 
-        Unsent ones may be among them: what an old link still delivered behind the position given to ``resume``.
+        They may include unsent messages that the old link delivered after the receiver had reported its position.
         """
         base = self._acknowledged
         while self._dropped_in_flight and self._dropped_in_flight[0][0] - base & SERIAL_MASK <= ahead:
@@ -333,13 +344,13 @@ class ReliableSender:
         self._acknowledged = base + ahead & SERIAL_MASK
 
     def _count(self) -> None:
-        """Count a message that will not be sent; number it unless its number would look like an old one."""
+        """Count a message that will not be sent, and use up its sequence while the sequences stay comparable."""
         self.overflowed += 1
         if serial_distance(self._acknowledged, self._next) < SERIAL_HALF - 1:
             self._next = serial_add(self._next, 1)
 
     def _drop_oldest(self) -> None:
-        """Drop the oldest kept message; one in flight stays in the window until it is acknowledged."""
+        """Drop the oldest kept message; if it is in flight, it counts against the window until it is acknowledged."""
         was_sent = True
         if self._sent:
             message = self._sent.popleft()
@@ -356,11 +367,11 @@ class ReliableSender:
 
 @dataclass(frozen=True, slots=True)
 class ReceiveResult:
-    """What to do with a message that came.
+    """What to do with a received message.
 
     Args:
-        deliver: Whether to deliver it; else it was delivered before, or came too late.
-        gap: Messages directly before it that will never come.
+        deliver: Whether to deliver it; if not, it was delivered before, or arrived too late.
+        gap: The number of messages directly before it that will never arrive.
     """
 
     deliver: bool
@@ -374,10 +385,11 @@ DUPLICATE: Final = ReceiveResult(deliver=False)
 
 
 class ReliableReceiver:
-    """The receiving half: each message once, in order, with the exact number of those that never come.
+    """The receiving half: accepts each message once, in order, and counts exactly the messages that never arrive.
 
-    It outlives links. Only ``begin`` changes its epoch: a message of another epoch, over a link that is about to be
-    closed, is a duplicate. Without the sender's first sequence no gap is reported before the first message.
+    It outlives links. Only ``begin`` changes its epoch: a message of another epoch, received over a link that is
+    about to be closed, counts as a duplicate. If the sender's first sequence is not known, no gap is reported before
+    the first message.
 
     Args:
         epoch: The sender's, if known; else the first message's is taken.
@@ -391,23 +403,24 @@ class ReliableReceiver:
         self._unacknowledged_bytes = 0
         self._unacknowledged_since = 0.0
         self.gap_total = 0
-        """Messages that will never come, of all epochs."""
+        """The number of messages that will never arrive, over all epochs."""
         self.duplicates = 0
-        """Messages that came again or too late, and were not delivered."""
+        """The number of messages that arrived again or too late, and were not delivered."""
         self.breaks = 0
-        """Times that an epoch followed another one: how many messages were lost in between is unknown."""
+        """How often one epoch followed another; the number of messages lost in between is unknown."""
 
     def position(self) -> tuple[int, int] | None:
-        """Epoch and last sequence that came, for the sender's ``resume``; ``None`` if there is nothing to resume."""
+        """``(epoch, last received sequence)`` for the sender's ``resume``; ``None`` if there is nothing to resume."""
         if self._epoch is None or self._next is None:
             return None
         return self._epoch, serial_add(self._next, -1)
 
     def begin(self, epoch: int, first: int | None = None) -> bool:
-        """A sender announces its epoch, and its first sequence.
+        """Handle a sender's announcement of its epoch and first sequence.
 
         Returns:
-            Whether no messages are lost uncounted: it goes on with the present epoch, or is the first one at all.
+            Whether every loss is counted: the sender continues the present epoch, or is the first one. ``False``: an
+            unknown number of messages was lost between the two epochs.
         """
         if epoch == self._epoch:
             if self._next is None:
@@ -420,7 +433,7 @@ class ReliableReceiver:
         return not known
 
     def skip(self, following: int) -> int:
-        """The sender announces which message comes next; return how many before it will never come."""
+        """Handle a sender's announcement of its next message; return how many before it will never arrive."""
         if self._next is None or not is_later(following, self._next):
             return 0
         gap = serial_distance(self._next, following)
@@ -429,7 +442,7 @@ class ReliableReceiver:
         return gap
 
     def judge(self, sequence: int, epoch: int) -> ReceiveResult:
-        """What ``accept`` would return, for a message's first fragment; nothing changes before its last one."""
+        """Return what ``accept`` would, without changing anything: for the first fragment of a message."""
         if epoch != self._epoch:
             return DELIVER if self._epoch is None else DUPLICATE
         gap = 0 if self._next is None else sequence - self._next & SERIAL_MASK
@@ -438,7 +451,7 @@ class ReliableReceiver:
         return DUPLICATE if gap >= SERIAL_HALF else ReceiveResult(deliver=True, gap=gap)
 
     def accept(self, sequence: int, epoch: int, now: float, size: int = 0) -> ReceiveResult:
-        """A whole message of ``size`` bytes has come at ``now``, in monotonic seconds."""
+        """Take in a complete message of ``size`` bytes, received at ``now`` (monotonic seconds)."""
         if epoch != self._epoch:
             if self._epoch is not None:
                 self.duplicates += 1
@@ -459,7 +472,10 @@ class ReliableReceiver:
         return ReceiveResult(deliver=True, gap=gap)
 
     def due_ack(self, now: float) -> int | None:
-        """The sequence to acknowledge now, up to which all has come; it counts as acknowledged. ``None``: not yet."""
+        """The sequence to acknowledge now, which then counts as acknowledged; ``None`` if no acknowledgement is due.
+
+        All messages up to this sequence have arrived or are known to be lost.
+        """
         due = self.next_timer()
         if due is None or now < due or self._next is None:
             return None
@@ -467,7 +483,7 @@ class ReliableReceiver:
         return self._next - 1 & SERIAL_MASK
 
     def next_timer(self) -> float | None:
-        """When ``due_ack`` will have something, in monotonic seconds."""
+        """When the next acknowledgement is due, in monotonic seconds; ``None``: nothing is to be acknowledged."""
         if not self._unacknowledged:
             return None
         if self._unacknowledged >= limits.ACK_MESSAGES or self._unacknowledged_bytes >= limits.ACK_BYTES:

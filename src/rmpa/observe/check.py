@@ -16,15 +16,15 @@ class CheckLevel(StrEnum):
 
     OK = "ok"
     WARN = "warn"
-    """It works, or may work: the first place to look at when something does not."""
+    """It works, or may work: the first thing to check when something fails."""
     FAIL = "fail"
     """Something cannot work like this. ERROR on ``/diagnostics``."""
     SKIPPED = "skipped"
-    """It could not be looked at."""
+    """It could not be checked."""
     UNKNOWN = "unknown"
-    """The agent that knows it did not answer; a walk along a path goes on."""
+    """The agent that knows the answer did not reply; the walk along a path goes on."""
     STALE = "stale"
-    """It was there, and is no more (REP 107)."""
+    """It existed before, and is gone (REP 107)."""
 
 
 OK, WARN, FAIL = CheckLevel.OK, CheckLevel.WARN, CheckLevel.FAIL
@@ -55,7 +55,7 @@ class Check(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @classmethod
     def from_message(cls, name: str, level: CheckLevel, message: str, remedy: str = "", where: str = "") -> Self:
-        """The opposite of ``message``: what stands behind the first "; " is the remedy, in place of the one given."""
+        """Split a message as ``message`` joins it: text after the first "; " replaces the given remedy."""
         text, _, told = message.partition("; ")
         return cls(name, level, text, told or remedy, where)
 

@@ -1,6 +1,6 @@
 """Judges snapshots: how the agent, its links and the topics that cross them are.
 
-Levels are those of REP 107: STALE is what was there and is not any more, as a peer that is gone and its topics.
+Levels are those of REP 107. STALE marks what existed before and is gone, such as a lost peer and its topics.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class Health:
             yield Check(name, level, text, evidence=route_values(route))
         for name, route in _outgoing(snapshot.topics):
             counts[name] = Counter(lost=route.lost, oversized=route.oversized)
-            # A check that the last snapshot had none of: nothing was missed then.
+            # The last snapshot did not have this check, so no messages were missed before.
             before = self._counts.get(name, Counter()) if self._counts else counts[name]
             yield _sent(name, route, counts[name] - before)
         yield from _refused(snapshot)
@@ -103,7 +103,7 @@ class Health:
         self._counts = counts
 
     def _new(self, name: str, counts: Counter[str]) -> Counter[str]:
-        """What was counted since the last snapshot; nothing if that had no such check."""
+        """The counts since the last snapshot; empty if that snapshot did not have this check."""
         return counts - self._counts.get(name, counts)
 
     def _stale(self, peers: Mapping[str, PeerInfo], now: float) -> Iterator[Check]:
@@ -136,7 +136,7 @@ def _by_name(peers: tuple[PeerInfo, ...]) -> dict[str, PeerInfo]:
 
 
 class _UniqueNames:
-    """Numbers names that were there before: ``x``, ``x #2``, ``x #3``."""
+    """Numbers repeated names: ``x``, ``x #2``, ``x #3``."""
 
     def __init__(self) -> None:
         self._taken: Counter[str] = Counter()
@@ -167,7 +167,7 @@ def _outgoing(topics: tuple[TopicInfo, ...]) -> Iterator[tuple[str, RouteInfo]]:
 
 
 def _sent(name: str, route: RouteInfo, new: Counter[str]) -> Check:
-    """What a peer misses: a warning while it is away, and when it has become more."""
+    """The messages that a peer misses: a warning if a count has grown, or if the peer is away and some are lost."""
     texts = [route.problem] if route.problem else []
     texts += [f"{count} {_MISSES[kind]}" for kind, count in new.items()]
     if route.lost and not new["lost"]:
@@ -184,7 +184,7 @@ def _refused(snapshot: Snapshot) -> Iterator[Check]:
 
 
 def _service(name: str, info: ServiceInfo, new: Counter[str]) -> Check:
-    """A service that was called. Failures are a warning once, for they may be what its server means to say."""
+    """A service that was called. New failures are one warning, because a server may fail calls on purpose."""
     if new["failed"]:
         level, text = WARN, f"{new['failed']} of {new['calls']} calls failed: {info.problem}"
     else:
@@ -220,7 +220,7 @@ def _peer(name: str, info: PeerInfo, new: Counter[str], *, was_linked: bool) -> 
 
 
 def _judge_peer(info: PeerInfo, dropped: int, *, was_linked: bool) -> tuple[CheckLevel, str]:
-    """The worst that is true of a peer now; ``dropped`` messages since the last snapshot."""
+    """The worst present state of a peer; ``dropped`` is the number of messages dropped since the last snapshot."""
     link = info.link
     if info.state == _LINKED and link is not None:
         if dropped:
@@ -236,7 +236,7 @@ def _judge_peer(info: PeerInfo, dropped: int, *, was_linked: bool) -> tuple[Chec
 
 
 def _judge_route(topic: TopicInfo, route: RouteInfo, new: Counter[str]) -> tuple[CheckLevel, str]:
-    """The worst that is true of a route now; ``new`` counts what it missed since the last snapshot."""
+    """The worst present state of a route; ``new`` counts the messages that it missed since the last snapshot."""
     if route.limit:
         return WARN, route.problem  # the peer's own check says it for all of them
     if route.state == "hidden":

@@ -54,7 +54,7 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
         addresses: Its numeric IPv4 addresses, best first.
         interfaces: The interfaces that beacons go out on.
         config_file: Where its settings were read, or empty.
-        realtime: What came of each request of ``--realtime``, ready to read; empty without it.
+        realtime: The outcome of each request of ``--realtime``, ready to read; empty without it.
         files: Its file descriptors.
         proxies: The number of proxies of peers' nodes in the local graph.
         proxy_sockets: Listening sockets of all of them together.
@@ -262,15 +262,15 @@ class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):
             peer has no link, and reliable messages are kept or counted for it).
         type: The message type that the source has.
         md5: Of that type; empty before it is known.
-        messages: That crossed since the route was opened.
+        messages: Messages that crossed since the route was opened.
         bytes: Of these, without TCPROS's length fields.
         dropped: Messages dropped because a receiver was slow.
         lost: Messages that never arrived, by the gaps in their numbers and by the sender's reports; of outgoing
             reliable routes: messages that were given up.
         kept: Of outgoing reliable routes: messages that wait for the peer.
         oversized: Messages that the publisher's agent left out because they are too long to cross.
-        oversized_bytes: The last one's.
-        late: Messages left out because newer ones, or an outage, came before them.
+        oversized_bytes: The length of the last of these, in bytes.
+        late: Messages left out because a newer one had arrived, or because an outage delayed them.
         expired: Messages dropped beyond their lifespan.
         age: Seconds since the last message.
         rate: Messages a second.
@@ -414,7 +414,7 @@ class UnreachableInfo(msgspec.Struct, kw_only=True, frozen=True):
     withdrawn: bool = False
 
     def __str__(self) -> str:
-        """What is wrong, for people."""
+        """The problem as a text for users."""
         text = f"{self.node} cannot be reached at {self.uri} ({self.problem})"
         return f"{text}, so peers are not offered it" if self.withdrawn else text
 

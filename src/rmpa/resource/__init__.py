@@ -1,6 +1,6 @@
-"""Smart Resources: modules that offer services with a quality, and adapt (paper, section 3).
+"""Smart Resources: nodes that offer a service with a quality, and adapt (paper, section 3).
 
-This is the public interface; everything below it may move::
+This package is the public interface; the modules below it may be moved::
 
     from rmpa.resource import Resource, at_least
 
@@ -41,15 +41,15 @@ __all__ = [
     "exactly",
 ]
 _LAZY: Final = {"ResourceClient": "rmpa.resource.run.client", "Node": "rmpa.ros.node.node"}
-"""Imported at their first use: they bring asyncio and sockets."""
+"""Names that are imported at their first use, because their modules import asyncio and sockets."""
 _RENAMED: Final = {"Wish": QoSRequest, "Answer": RequirementAnswer}
 
 
 def __getattr__(name: str) -> object:
-    """Find names that are imported late, and those of earlier releases.
+    """Find names that are imported at their first use, and deprecated names of earlier releases.
 
     Raises:
-        AttributeError: There is no such name.
+        AttributeError: The package has no such name.
     """
     if (module := _LAZY.get(name)) is not None:
         return getattr(importlib.import_module(module), name)

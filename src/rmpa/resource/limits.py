@@ -13,24 +13,24 @@ REQUIREMENT_TEXT_MAX: Final = 1024
 TASK_QUEUE_MESSAGES: Final = 10
 """Input messages that wait for a task; drop-oldest, because control acts on the newest."""
 TASK_PAUSE_TIMEOUT: Final = 1.0
-"""A profile change waits so long for the runs under way; a run that takes longer is stuck or slow."""
+"""A change of profile waits so long for the runs under way; a run that takes longer is stuck or slow."""
 PRECONDITION_TIMEOUT: Final = 1.0
-"""While a call does not return, the last result of a precondition is valid so long; then the profile is excluded."""
+"""While a call does not return, the precondition's last result is valid so long; then the profile is excluded."""
 RESOURCE_HELD_MAX: Final = 64 * 1024 * 1024
-"""Messages that a resource queues while a profile is applied; drop-oldest."""
+"""Bytes of the messages that a resource queues while a profile or context is applied; drop-oldest."""
 TASK_END_TIMEOUT: Final = 2.0
 """An ending resource waits so long for the last run of a task; a stuck thread is left behind."""
 RESOURCE_ANSWER_TIMEOUT: Final = 10.0
-"""For the answer to a requirement: the resource may be in another module, to which a route has to be opened."""
+"""A client waits so long for the answer to a requirement: a route to another module may have to be opened first."""
 REQUIREMENT_BOUNDS_MAX: Final = 256
 """Attributes in the requirement of one client."""
 RESOURCE_CLIENT_GRACE: Final = 30.0
 """A restarted resource keeps the requirement of a client so long until the client connects again: master, agent and
 links may have to start first."""
 RESOURCE_REPORT_WINDOWS: Final = 3
-"""Quality windows for which the report of a client counts."""
+"""Number of quality windows for which the report of a client counts."""
 RESOURCE_STAMPS_MAX: Final = 1024
-"""Stamps of requests with an expiry that are kept, so that a latched one that arrives again does not begin anew."""
+"""Number of stamps of expiring requests that are kept, so that a latched one that arrives again keeps its expiry."""
 STORE_WINDOWS_MAX: Final = 3600
 """Quality windows in a resource's history: an hour, about 2 MB."""
 STORE_EVENTS_MAX: Final = 2000
@@ -38,17 +38,17 @@ STORE_EVENTS_MAX: Final = 2000
 STORE_DESCRIPTORS_MAX: Final = 20
 """Different descriptors in the history: one more for each change of the resource's file."""
 KNOWN_MAX: Final = 256
-"""Resources in a module's registry; the least recently seen is removed."""
+"""Resources in a module's registry; of more, the least recently seen is removed."""
 KNOWN_TEXT_MAX: Final = 16 * MIB
-"""Characters of all their descriptors."""
+"""Characters of the descriptors of all resources in a module's registry."""
 KNOWN_LOOK: Final = 10.0
-"""Between scans of the graph for resources."""
+"""Seconds between scans of the graph for resources."""
 KNOWN_WRITE: Final = 60.0
-"""Between writes of the time when a present resource was last seen, to spare flash memory."""
+"""Seconds between writes of the time when a present resource was last seen, to spare flash memory."""
 STORE_BYTES_MAX: Final = 64 * MIB
-"""Size of a store's file."""
+"""Largest size of a store's file."""
 STORE_INTERVAL: Final = 10.0
-"""Between writes of the history, to spare flash memory; state that must survive a crash is written at once."""
+"""Seconds between writes of the history, to spare flash memory; state that must survive a crash is not delayed."""
 STORE_PENDING_MAX: Final = 600
 """Rows of history that wait while the disk fails; drop-oldest."""
 STORE_OPEN_TIMEOUT: Final = 5.0
@@ -56,7 +56,7 @@ STORE_OPEN_TIMEOUT: Final = 5.0
 STORE_LOCK_TIMEOUT: Final = 1.0
 """A store waits so long for its lock: the previous process may still be ending."""
 STORE_CLOSE_TIMEOUT: Final = 5.0
-"""An ending resource waits so long until everything is written; a disk that hangs is left behind."""
+"""An ending resource waits so long for its store to write all pending changes; a hanging disk does not hold it up."""
 CONTEXT_RULE_MAX: Final = 1024
 """Characters of the rule of a context."""
 CONTEXT_RULE_DEPTH: Final = 20
@@ -64,8 +64,8 @@ CONTEXT_RULE_DEPTH: Final = 20
 CONTEXT_DWELL: Final = 1.0
 """A context that a rule has selected stays at least so long: a value at a threshold must not cause oscillation."""
 CONTEXT_ENTER_TIMEOUT: Final = 5.0
-"""For the function of a context; tasks are paused meanwhile."""
+"""The function of a context may take so long; tasks are paused meanwhile."""
 CONTEXT_RETRY: Final = 5.0
-"""After a failed switch, before the rules are evaluated again."""
+"""Seconds from a failed switch until the rules are evaluated again; also the longest between searches for topics."""
 CONTEXT_LOOK: Final = 0.5
-"""Between searches for the topics of rules: one call of the module's own master."""
+"""Seconds between the first searches for the topics of rules; a search is one call of the module's own master."""

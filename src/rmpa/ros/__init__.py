@@ -1,7 +1,7 @@
 """The ROS 1 side: master, parameter server, slave API, TCPROS and message types.
 
-For users: ``Node`` and the classes in ``__all__``. Each is imported when it is first used: the agent starts without
-numpy.
+Users' programs import ``Node`` and the other classes in ``__all__`` from here. Each is imported when it is first
+used, so that the agent starts without numpy.
 """
 
 from __future__ import annotations

@@ -32,7 +32,8 @@ class RosEnvironment:
     Args:
         master_uri: The master's URI.
         host: The address to register.
-        host_given: Whether a variable or argument sets it; else it is the first that is not a loopback address.
+        host_given: Whether a variable or argument sets ``host``. Otherwise it is the machine's first address that is
+            not a loopback address, or 127.0.0.1.
         namespace: A global name, in which names are resolved.
         name: Replaces the node's own name; empty for none.
         remappings: From name to name, both as they were written.
@@ -53,7 +54,7 @@ class RosEnvironment:
     def read(
         cls, variables: Mapping[str, str], arguments: Sequence[str] = (), addresses: Sequence[str] = ()
     ) -> RosEnvironment:
-        """Read the variables and the arguments behind the program's name.
+        """Read the variables and the arguments after the program's name.
 
         Args:
             variables: As in ``os.environ``.
@@ -87,7 +88,7 @@ class RosEnvironment:
         """The global name of a node that calls itself ``name``.
 
         Raises:
-            ValueError: It is not a legal name.
+            ValueError: The name is not a legal one.
         """
         return resolve_name(self.name or name, self.namespace)
 
@@ -95,11 +96,11 @@ class RosEnvironment:
         """Resolve and remap a name that a node uses.
 
         Args:
-            name: As the node writes it.
+            name: The name, as the node writes it.
             node: The node's global name.
 
         Raises:
-            ValueError: It is not a legal name.
+            ValueError: The name is not a legal one.
         """
         resolved = resolve_name(name, self.namespace, node)
         for source, target in self.remappings.items():
@@ -120,9 +121,9 @@ def host_of(uri: str) -> str:
 
 
 def parse_value(text: str) -> XmlRpcValue:
-    """A parameter's value from the command line: a number, a boolean, a JSON list or object, else the text.
+    """Parse a parameter's value from the command line: a number, boolean, JSON list, object or string, else the text.
 
-    rosparam reads YAML here; this is the usual part of it.
+    rosparam reads YAML here; this covers its usual part.
     """
     lowered = text.strip().lower()
     if lowered in ("true", "false"):

@@ -18,9 +18,9 @@ TCPROS_LENGTH_MAX: Final = 1_000_000_000
 """A length above this means that the stream is out of step: the connection is closed. roscpp has the same bound. A
 message between the two limits is read and dropped."""
 TCPROS_HANDSHAKE_TIMEOUT: Final = 10.0
-"""Until the other side's header must have come; rospy and roscpp wait without a limit."""
+"""Time within which the other side's header must arrive; rospy and roscpp wait without a limit."""
 TCPROS_CONNECT_TIMEOUT: Final = 3.0
-"""For the TCP connect to a local node."""
+"""Time-out of a TCP connect to a node."""
 TCPROS_CONNECTIONS_MAX: Final = 1024
 """Accepted connections of one node: its subscribers, with room for those that reconnect."""
 TCPROS_HANDSHAKES_MAX: Final = 128
@@ -28,18 +28,18 @@ TCPROS_HANDSHAKES_MAX: Final = 128
 TCPROS_BACKLOG: Final = 128
 """Length of the listen queue: all subscribers of a restarted node connect at once."""
 TCPROS_RETRY_FIRST: Final = 0.1
-"""Before the second attempt to reach a publisher; roscpp's own value."""
+"""Pause before the second attempt to reach a publisher; roscpp's own value."""
 TCPROS_RETRY_MAX: Final = 2.0
 """The longest pause between attempts, while the graph lists the publisher."""
 SHARED_BACKLOG: Final = 4096
 """Length of the listen queue of the one socket of all proxies: all subscribers of a restarted agent connect at once.
 The kernel lowers it to ``net.core.somaxconn``."""
 SHARED_PROBE_TIMEOUT: Final = 1.0
-"""For the test whether addresses of 127/8 other than 127.0.0.1 work here; where they do it takes a millisecond."""
+"""Time-out of the test whether addresses of 127/8 other than 127.0.0.1 work here; if so, it takes a millisecond."""
 LOOPBACK_REST: Final = 60.0
-"""Before a freed loopback address is used again: three times the 20 s for which roscpp dials an old one."""
+"""Time before a freed loopback address is used again: three times the 20 s for which roscpp dials an old one."""
 LOOPBACK_RESTING_MAX: Final = 16_384
-"""Freed addresses that are held back: all nodes of some large modules that come and go within that minute."""
+"""Freed addresses that are held back: room for all nodes of some large modules that start and end in that minute."""
 TCP_KEEPALIVE_IDLE: Final = 60
 """Seconds of silence before the first keepalive probe; this and the next two are roscpp's values."""
 TCP_KEEPALIVE_INTERVAL: Final = 10
@@ -49,15 +49,16 @@ TCP_KEEPALIVE_COUNT: Final = 9
 SERVICE_MESSAGE_MAX: Final = 64 * MIB
 """One request or response of a service, which is held in memory: maps and point clouds reach some 10 MB."""
 SERVICE_OPEN_TIMEOUT: Final = 5.0
-"""For the connection to a server and its header."""
+"""Time-out of the connection to a service's server and the exchange of headers together."""
 SERVICE_STALL: Final = 30.0
-"""Until the next bytes of a request must come, or the first ones of a client that is not persistent."""
+"""Time within which the next bytes of a service request must arrive; for a client that is not persistent, also the
+first ones."""
 SUBSCRIBER_QUEUE_MESSAGES: Final = 1000
 """Messages queued for one slow local subscriber; above it the oldest is dropped."""
 LATCHED_MAX: Final = 100
-"""Messages of one source kept for late subscribers (durability transient_local), whatever depth is asked for."""
+"""Messages of one source kept for late subscribers (durability transient_local), whatever the contract's depth."""
 SUBSCRIBER_QUEUE_BYTES: Final = 32 * MIB
-"""The same in bytes; one message always fits."""
+"""Bytes queued for one slow local subscriber; one message always fits."""
 
 # --- message types ------------------------------------------------------------------------------------------------
 DEFINITION_MAX: Final = 1 * MIB
@@ -71,16 +72,16 @@ RECEIVED_TYPES_MAX: Final = 256
 PACKAGE_DEPTH_MAX: Final = 32
 """Folders within folders below an entry of ROS_PACKAGE_PATH that are searched for packages; usual are four."""
 PACKAGE_FOLDERS_MAX: Final = 20_000
-"""Folders searched below one entry, nearer ones first: takes up to 3 s; a workspace has a thousand, 40 ms."""
+"""Folders searched below one entry, nearer ones first, in up to 3 s; a workspace has a thousand, which take 40 ms."""
 PACKAGE_ENTRIES_MAX: Final = 200_000
-"""Directory entries of all these folders: a folder of recordings must not take minutes."""
+"""Directory entries of all searched folders together: a folder of recordings must not take minutes."""
 PACKAGE_FILE_MAX: Final = 256 * KIB
 """A package.xml; usual ones have 2 KB."""
 TYPES_FOUND_MAX: Final = 256
 """Types found on this machine in the cache of a process; the least recently used is dropped."""
 TYPE_MISSING: Final = 10.0
-"""Before an unknown type of a publisher's header is searched for again: each message asks for it, and a search goes
-through the whole workspace, some 50 ms."""
+"""Time before an unknown type of a publisher's header is searched for again: each message asks for it, and a search
+goes through the whole workspace, which takes some 50 ms."""
 TYPES_MISSING_MAX: Final = 64
 """Unknown types in the cache of a process; the oldest is dropped."""
 SEARCHED_SHOWN: Final = 4
@@ -88,15 +89,15 @@ SEARCHED_SHOWN: Final = 4
 FETCH_TYPE_PUBLISHERS: Final = 8
 """Publishers of a type that are asked for its definition, one after the other."""
 FETCH_TYPE_TIMEOUT: Final = 3.0
-"""For the header of one of them; a peer's publisher answers when its route is open."""
+"""Time-out for the header of one such publisher; a peer's publisher answers when its route is open."""
 TYPE_LOOK: Final = 1.0
-"""Between two checks of a resource whether a publisher of a type that it needs has come."""
+"""Time between two checks of a resource whether a publisher of a type that it needs has appeared."""
 
-# --- our nodes ----------------------------------------------------------------------------------------------------
+# --- nodes of this process ----------------------------------------------------------------------------------------
 NODE_MASTER_CHECK: Final = 0.5
-"""Between a node's checks whether its master still knows it: a restarted core has its nodes back within a second."""
+"""Time between a node's checks whether its master knows it: a restarted core has the node back within a second."""
 NODE_UNREGISTER_TIMEOUT: Final = 3.0
-"""For an ending node to unregister everything; a master that hangs must not delay it."""
+"""Time in which an ending node unregisters everything; a master that hangs must not delay it longer."""
 NODE_UNREGISTER_AT_ONCE: Final = 16
 """Concurrent calls to unregister, each on a connection of its own."""
 RECEIVED_QUEUE: Final = 1000
@@ -109,33 +110,33 @@ in one call."""
 HTTP_BODIES_MAX: Final = 256 * MIB
 """All large calls of one server together: four of the largest."""
 HTTP_DISCARDED_MAX: Final = 1024 * MIB
-"""A call that is too large is read to its end, because its caller reads no answer before; above this it is cut
-off."""
+"""A call that is too large is read to its end, because its client reads no answer before it has sent all; a call
+above this limit is cut off."""
 HTTP_PACE_MIN: Final = 64 * KIB
 """Bytes a second: the connection of a slower call is closed where room is short; loopback carries 1 GB/s."""
 HTTP_SLOW_AFTER: Final = 1.0
-"""Before the pace of a call is judged."""
+"""Time before the pace of a call is judged."""
 HTTP_BODY_INLINE: Final = 64 * KIB
 """Longer bodies are read and written over several turns of the event loop: 8 MiB of numbers would hold up keepalives
-for seconds. Shorter ones take some 5 ms, in which only pending data goes first."""
+for seconds. Shorter ones take some 5 ms, during which only pending data is served."""
 XMLRPC_SLICE: Final = 2 * KIB
-"""Bytes of XML parsed at once, some 100 microseconds; then pending data goes first."""
+"""Bytes of XML parsed at once, some 100 microseconds; then pending data is served."""
 HTTP_ACCEPTS: Final = 4
 """Connections accepted in one turn of the event loop, 40 microseconds each."""
 HTTP_HEADERS_MAX: Final = 64 * KIB
 """All headers of one request."""
 HTTP_BACKLOG: Final = 1024
-"""Length of the listen queue: all nodes of a robot register at once. A SYN that finds it full is sent again after 1
-s."""
+"""Length of the listen queue: all nodes of a robot register at once. A SYN that finds it full is sent again after
+1 s."""
 HTTP_CONNECTIONS_MAX: Final = 512
-"""Open connections to one XML-RPC server: rospy keeps one per thread alive. For a new one the longest idle is closed,
-else the slowest (``ros.http.eviction``)."""
+"""Open connections to one XML-RPC server: rospy keeps one per thread alive. Beyond it ``ros.http.eviction`` chooses
+the one to close for a new one."""
 HTTP_IDLE_TIMEOUT: Final = 60.0
-"""A kept-alive connection without a call; rospy and roscpp reconnect by themselves."""
+"""Time after which a kept-alive connection without a call is closed; rospy and roscpp reconnect by themselves."""
 HTTP_IDLE_MIN: Final = 0.25
 """Idle time before a kept-alive connection may be closed for one that waits for a file descriptor."""
 HTTP_REQUEST_TIMEOUT: Final = 10.0
-"""From a request's first byte to its last."""
+"""Time from a request's first byte to its last."""
 XMLRPC_DEPTH_MAX: Final = 256
 """Nested XML elements: some eighty arrays in arrays, more than any real parameter."""
 XMLRPC_ELEMENTS_MAX: Final = 4_000_000
@@ -143,51 +144,53 @@ XMLRPC_ELEMENTS_MAX: Final = 4_000_000
 PARAM_DEPTH_MAX: Final = 64
 """Nested namespaces in one parameter's name; more is an attack on the recursion."""
 SLAVE_CALL_TIMEOUT: Final = 3.0
-"""For one XML-RPC call to a node; a stopped node must not hold the others up."""
+"""Time-out of one XML-RPC call to a node; a stopped node must not hold the others up."""
 
 # --- a roscore in place of the embedded core ----------------------------------------------------------------------
 MASTER_LOOK_FIRST: Final = 0.1
-"""Between two polls of a roscore whose graph has just changed: nodes register one thing after the other. A poll of a
-graph of 50 nodes costs it some milliseconds."""
+"""Time between two polls of a roscore whose graph has just changed: nodes register one thing after the other. A poll
+of a graph of 50 nodes costs the roscore some milliseconds."""
 MASTER_LOOK_IDLE: Final = 0.5
-"""Between two polls while nothing changes."""
+"""Time between two polls while nothing changes."""
 MASTER_LOOK_MAX: Final = 0.8
 """The longest pause between two polls, so that a change is seen within a second."""
 MASTER_LOOK_SHARE: Final = 20
-"""The pause is at least this many times what the poll took: a twentieth of the master's time is ours."""
+"""The pause is at least this many times the duration of the poll, so that polls take at most a twentieth of the
+master's time."""
 MASTER_LOOK_SOON: Final = 0.02
-"""Before a poll out of turn, which a suspicion causes: one change is seldom alone."""
+"""Delay of a poll out of turn, after a node is suspected to be dead or moved: one change is seldom alone."""
 MASTER_RETRY: Final = 0.5
-"""Between two polls of a roscore that does not answer: a restarted one has our registrations within a second."""
+"""Time between two polls of a roscore that does not answer, so that a restarted one has the agent's registrations
+within a second."""
 MASTER_TIMEOUT: Final = 3.0
-"""For one poll or write; a roscore on a busy board has answered in 0.3 s."""
+"""Time-out of one poll of or write to a roscore; one on a busy board answered in 0.3 s."""
 MASTER_ASK_TIMEOUT: Final = 10.0
-"""For an answer that may be megabytes of parameters."""
+"""Time-out for calls of a roscore with parameters, which may be megabytes."""
 MASTER_WRITES_AT_ONCE: Final = 64
 """Registrations in one call to a roscore, some 10 ms of its work."""
 MASTER_WRITES_MAX: Final = 20_000
-"""Registrations queued for a roscore: more than a peer may advertise; above it the next poll finds what is
-missing."""
+"""Registrations queued for a roscore, more than a peer may advertise. Above it the queue is dropped, and the next
+poll finds what is missing."""
 MASTER_FAREWELL: Final = 2.0
-"""For an ending agent to unregister at a roscore."""
+"""Time in which an ending agent unregisters at a roscore."""
 
 # --- cores --------------------------------------------------------------------------------------------------------
 NODE_CHECK_INTERVAL: Final = 5.0
 """Period in which each registered node is checked: whether it still listens."""
 NODE_RECHECK_DELAY: Final = 0.2
-"""Between the two refused connects that prove a node dead: it may be restarting its server."""
+"""Time between the two refused connects that prove a node dead: it may be restarting its server."""
 NODE_UNREACHABLE_AFTER: Final = 15.0
 """Seconds for which connections to a registered node fail until peers are no longer offered it: a cable that is
 pulled and put back, or a change of the access point, takes less."""
 NODE_UNREACHABLE_CHECKS: Final = 4
 """Concurrent attempts to reach unreachable nodes: each may hold a thread of the resolver for seconds."""
 NOTIFY_QUEUE_MAX: Final = 4096
-"""Updates of topics and parameters queued for one slow node; of one topic only the latest is queued."""
+"""Updates of topics and parameters queued for one slow node; for each topic only the latest is queued."""
 NOTIFY_COALESCE: Final = 64
-"""Above this many, only the latest update of one parameter is queued too; below, a node gets each, as from
-rosmaster."""
+"""With this many updates queued for a node, only the latest update of each parameter is queued; with fewer, the node
+gets each update, as from rosmaster."""
 NOTIFY_RETRY_FIRST: Final = 0.2
-"""Before an update is sent again to a node that did not answer."""
+"""Pause before an update is sent again to a node that did not answer."""
 NOTIFY_RETRY_MAX: Final = 3.0
 """The longest pause between attempts, while the node is registered."""
 ROSOUT_QUEUE: Final = 1000
@@ -204,28 +207,28 @@ CORE_STATE_GATHER: Final = 0.3
 """Changes of the graph are gathered this long before they are written; with the write, a kill -9 loses up to 0.5 s. A
 starting node registers a dozen things."""
 CORE_STATE_RETRY: Final = 5.0
-"""Before a failed write is tried again: the disk is full, or not mounted yet."""
+"""Pause before a failed write is tried again: the disk is full, or not mounted yet."""
 CORE_STATE_LOCKED: Final = 1.0
-"""For the lock of the state file: the previous process may still be ending."""
+"""Time for which a locked state file is waited for: the previous process may still be ending."""
 CORE_STATE_OPEN: Final = 3.0
-"""For reading the state file at the start; a disk that hangs must not delay the core."""
+"""Time-out for opening and reading the state file at the start; a disk that hangs must not delay the core longer."""
 CORE_STATE_WRITE: Final = 10.0
-"""For one write; then the disk is reported as not answering. The first one after a start may be 64 MiB on a slow
-card."""
+"""Time-out of one write, after which the disk is reported as not answering. The first write after a start may be
+64 MiB on a slow card."""
 CORE_STATE_CLOSE: Final = 3.0
-"""For the last write of an ending core, even if the disk hangs."""
+"""Time-out of the last write of an ending core, whose disk may hang."""
 CORE_STATE_UNFIT_SHOWN: Final = 3
 """Names of rows that did not fit, in a text for the user."""
 VERIFY_AT_ONCE: Final = 32
-"""Restored nodes that are verified concurrently, each on a connection of its own: calls to the core queue behind
-these."""
+"""Restored nodes that are verified concurrently, each on a connection of its own: calls to the core have to wait
+for these."""
 VERIFY_PROMPT: Final = 0.25
-"""A node that has not answered after this long no longer counts among these, so that one that hangs delays no
-other."""
+"""A node that has not answered after this time no longer counts in ``VERIFY_AT_ONCE``, so that a node that hangs
+delays no other."""
 VERIFY_RETRY_FIRST: Final = 0.5
-"""Before a node that did not answer is verified again."""
+"""Pause before a node that did not answer is verified again."""
 VERIFY_RETRY_MAX: Final = 10.0
-"""The longest pause between two attempts."""
+"""The longest pause between two attempts to verify a node."""
 VERIFY_PATIENCE: Final = 600.0
 """A node that did not answer for this long is discarded: one that a debugger stopped may have continued by then."""
 VERIFY_LISTS: Final = 8
@@ -233,9 +236,9 @@ VERIFY_LISTS: Final = 8
 VERIFY_COMPARED: Final = 3
 """Attempts to compare a node's lists; a node that registers something during each registers everything by itself."""
 VERIFY_ANNOUNCE: Final = 3.0
-"""Subscribers are notified of verified publishers when all nodes have answered or hang, or after this long. To verify
-500 nodes takes a second, and connections that follow from each would slow the rest."""
+"""Subscribers are notified of verified publishers when all nodes have answered or hang, or after this time. Verifying
+500 nodes takes a second, and the connections that follow from each notification would slow the rest."""
 NODE_KILL_WAIT: Final = 3.0
 """Seconds for a node to end after it was asked to; one with much to save takes a second or two."""
 NODE_KILL_LOOK: Final = 0.2
-"""Seconds between two checks whether it has ended."""
+"""Seconds between two checks whether a node that was asked to end has ended."""

@@ -82,7 +82,7 @@ class PeerNodes(msgspec.Struct, kw_only=True, frozen=True):
     Attributes:
         peer: The peer's name.
         nodes: Its own nodes.
-        problem: Why it did not answer, for people; then ``nodes`` are its proxies in this graph.
+        problem: Why the peer did not answer, for people; then ``nodes`` are its proxies in this graph.
     """
 
     peer: str
@@ -98,7 +98,7 @@ def list_nodes(
     problems: Mapping[str, str],
     yielder: Callable[[Iterable[Collection[str]]], Iterable[Collection[str]]] = iter,
 ) -> tuple[NodeLine, ...]:
-    """Every node of a graph, by name.
+    """List every node of a graph, sorted by name.
 
     Args:
         publishers: Nodes by topic.
@@ -106,7 +106,7 @@ def list_nodes(
         services: Nodes by service.
         uris: Known slave APIs by node.
         problems: By node: why connecting to it fails.
-        yielder: Lets pending data go first in graphs of thousands of topics.
+        yielder: Iterates, and serves pending data in between, in graphs of thousands of topics.
     """
     counts: dict[str, list[int]] = {}
     for index, table in enumerate((publishers, subscribers, services)):

@@ -1,7 +1,7 @@
 """Accepts the connections of a listening socket, for every server of this process.
 
-A listening socket stays readable as long as a connection waits. A server without a file descriptor for it would be
-called again at once, for ever: an ``Acceptor`` stops reading then, and tries again after a pause.
+A listening socket stays readable as long as a connection waits. Without a free file descriptor the loop would call
+the server again and again. An ``Acceptor`` stops watching the socket instead, and tries again after a pause.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _GONE: Final = frozenset(
         errno.EPROTO,
     }
 )
-"""Errors of one waiting connection (accept(2)); the next connection may be fine."""
+"""Errors of accept(2) that concern one waiting connection only; the next one may succeed."""
 
 
 class Acceptor:
@@ -49,7 +49,7 @@ class Acceptor:
         name: The server, for log messages: ``XML-RPC of /talker``.
         use: The purpose of the connections, which decides whether they may take the last descriptors.
         at_once: Connections that are accepted in one callback of the loop.
-        descriptors: The process's.
+        descriptors: The file descriptors of this process.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Acceptor:
 
     @property
     def paused(self) -> bool:
-        """Whether a connection waits for a descriptor."""
+        """Whether accepting is paused because a connection waits for a descriptor."""
         return self._timer is not None
 
     def start(self) -> None:
@@ -108,7 +108,7 @@ class Acceptor:
     def _acceptable(self) -> None:
         for _ in range(self._at_once):
             if self._closed:
-                return  # by what was accepted just now
+                return  # ``on_accept`` closed this acceptor
             if not self._has_room():
                 self._wait_for_room(None)
                 return
@@ -129,7 +129,7 @@ class Acceptor:
                 raise
 
     def _has_room(self) -> bool:
-        """Whether these connections may take the lowest free descriptor, which is the number of a duplicate."""
+        """Whether these connections may take the lowest free descriptor, whose number a duplicate shows."""
         try:
             lowest = os.dup(self._sock.fileno())
         except OSError:
@@ -138,7 +138,7 @@ class Acceptor:
         return self._descriptors.has_room(self._use, lowest)
 
     def _has_connection(self) -> bool:
-        """Whether a connection waits: without a free descriptor accept(2) fails even when none does."""
+        """Whether a connection waits; without a free descriptor accept(2) fails in either case."""
         look = select.poll()
         look.register(self._sock.fileno(), select.POLLIN)
         return bool(look.poll(0))
@@ -157,7 +157,7 @@ class Acceptor:
             return
         full = error is None or error.errno == errno.EMFILE
         if full and self._descriptors.make_room():
-            return  # called again in the loop's next round
+            return  # the loop calls again in its next iteration
         self._descriptors.refuse(self._use, self._name, error)
         self._pause()
 

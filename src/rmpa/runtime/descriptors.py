@@ -41,13 +41,13 @@ class Use(enum.Enum):
     """The purpose of a descriptor; the value is the number of reserves that it must leave free."""
 
     PROXY = 2.0
-    """Listening sockets of proxies of remote nodes: they leave room for the connections to them."""
+    """Listening sockets of the proxies of remote nodes; they must leave room for the connections to those sockets."""
     DATA = 1.0
     """Connections of topics and services, and to the slave APIs of nodes: they must leave the whole reserve."""
     CORE = 0.5
     """The ROS core's XML-RPC."""
     LINK = 0.0
-    """Links to peers and the control socket: they may take the last one."""
+    """Links to peers and the control socket: they may take the last descriptor."""
 
 
 @dataclass(slots=True)
@@ -55,12 +55,13 @@ class DescriptorShortage:
     """A period in which descriptors were refused.
 
     Attributes:
-        last: When the last one was refused, by the loop's clock.
-        began: When the first one was refused.
-        least: The refused use that must leave the largest reserve; the shortage is over when it has room again.
-        most: The refused use that must leave the smallest reserve.
+        last: When a descriptor was last refused, in seconds of the loop's clock.
+        began: When a descriptor was first refused, on the same clock.
+        least: Of the refused uses, the one that must leave the largest reserve; the shortage is over when this use
+            has room again.
+        most: Of the refused uses, the one that must leave the smallest reserve.
         problem: What happened and what to do, as a text for the user.
-        told: Whether it was logged.
+        told: Whether the shortage was logged.
     """
 
     last: float
@@ -76,7 +77,8 @@ class Descriptors:
 
     Attributes:
         counters: ``descriptors.refused.data`` (and ``.proxy``, ``.core``, ``.link``): attempts to accept or to dial
-            that found none, repetitions among them; ``descriptors.idle_closed``; ``descriptors.shortages``.
+            without a free descriptor, repeated attempts included; ``descriptors.idle_closed``;
+            ``descriptors.shortages``.
     """
 
     def __init__(self) -> None:
@@ -112,13 +114,13 @@ class Descriptors:
         now = time.monotonic()
         if now >= self._count_until:
             self._count = _count_open(self.limit)
-            # Older kernels list them, which takes 20 ms for 60,000.
+            # On older kernels the descriptors must be listed, which takes 20 ms for 60,000 of them.
             self._count_until = now + max(1.0, (time.monotonic() - now) * limits.DESCRIPTORS_COUNT_SHARE)
         return self._count
 
     @property
     def shortage(self) -> DescriptorShortage | None:
-        """The present shortage, or ``None``; it ends with the loop in which it began."""
+        """The present shortage, or ``None``; a shortage ends with the event loop in which it began."""
         if self._loop is not None and self._loop.is_closed():
             self._loop = self._shortage = None
         return self._shortage
@@ -142,10 +144,10 @@ class Descriptors:
         kind: int = socket.SOCK_STREAM,
         what: str = "a new connection",
     ) -> socket.socket:
-        """A new socket, non-blocking, if there is a descriptor left for ``use``.
+        """A new non-blocking socket, if there is a descriptor left for ``use``.
 
         Raises:
-            OSError: There is none (``EMFILE``), or another error; a refusal is counted and logged.
+            OSError: There is no descriptor left (``EMFILE``; counted and logged), or another error.
         """
         try:
             sock = socket.socket(family, kind | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
@@ -166,7 +168,7 @@ class Descriptors:
         Args:
             use: What the descriptor was for.
             what: What needed it, for the log: ``node /talker``.
-            error: The system's error; ``None`` where the reserve was left free.
+            error: The system's error; ``None`` if there was a descriptor, but it belongs to the reserve.
         """
         self.counters.add(f"descriptors.refused.{use.name.lower()}")
         loop = asyncio.get_running_loop()
@@ -180,7 +182,7 @@ class Descriptors:
         if not short.problem or use.value < short.most.value:
             short.most, short.problem = use, self._problem(use, what, error)
             self._tell(short, now)
-        if self._loop is not loop:  # the first refusal, or the loop of the one before has ended
+        if self._loop is not loop:  # the first refusal, or the first one in a new loop
             self._loop = loop
             loop.call_later(limits.DESCRIPTORS_QUIET, self._look)
 
@@ -206,7 +208,7 @@ class Descriptors:
         return f"{text}; {remedy(os.getpid())}"
 
     def _look(self) -> None:
-        """End the shortage when nothing was refused for a while and there is room; else check again later."""
+        """End the shortage if nothing was refused for a while and there is room; else check again later."""
         self._loop = None
         loop = asyncio.get_running_loop()
         short = self.shortage
@@ -230,11 +232,11 @@ class Descriptors:
     # --- closing idle connections -----------------------------------------------------------------------------
 
     def offer(self, owner: object, close_one: Callable[[], bool] | None) -> None:
-        """Let ``close_one`` be called when descriptors run out: it closes an idle connection, if ``owner`` has one.
+        """Register a function that closes an idle connection of ``owner`` when descriptors run out.
 
         Args:
-            owner: Identifies the offer; a later one of the same owner replaces it.
-            close_one: Returns whether it closed one; ``None`` withdraws the offer.
+            owner: Identifies the offer; a later offer of the same owner replaces it.
+            close_one: Closes one idle connection, and returns whether there was one; ``None`` withdraws the offer.
         """
         if close_one is None:
             self._idle.pop(owner, None)
@@ -270,9 +272,9 @@ def _count_open(limit: int) -> int:
         if count := Path("/proc/self/fd").stat().st_size:
             return count
     try:
-        return sum(1 for _ in os.scandir("/proc/self/fd")) - 1  # less the one that lists them
+        return sum(1 for _ in os.scandir("/proc/self/fd")) - 1  # without the descriptor of this listing
     except OSError:
-        return limit  # none is left to list them
+        return limit  # no descriptor is left for the listing: all are open
 
 
 def _reserve(soft: int) -> int:
@@ -285,7 +287,7 @@ def raise_file_limit() -> int:
     wanted = limits.OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, limits.OPEN_FILES)
     if soft == resource.RLIM_INFINITY or soft >= wanted:
         return soft
-    with contextlib.suppress(OSError, ValueError):  # some sandboxes forbid it; then the agent runs with what it has
+    with contextlib.suppress(OSError, ValueError):  # some sandboxes forbid it; then the old limit stays
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
         return wanted
     return soft

@@ -1,14 +1,14 @@
 """The event loop of an agent: asyncio's, with direct callbacks for the sockets of the data path.
 
 asyncio takes an event from the selector, finds its handle, queues it, checks its timers, and runs the handle in its
-context. For a message that is handed on at once this is a fifth of the interpreter's work. Here the selector itself
+context. For a message that is forwarded at once this is a fifth of the interpreter's work. Here the selector itself
 calls the readers and writers of the data path as soon as ``epoll`` reports them (*direct* readers and writers), and
 returns all other events to asyncio as usual.
 
-Data also goes before control work that has begun: the loop polls the data path's sockets before each ordinary
-callback, and long work calls ``yield_to_data()`` between its slices. A poll costs a quarter of a microsecond.
-So a direct reader, and what it calls, may run in the middle of any code that yields: where code yields, its data must
-be consistent. docs/design/isolation.md has the measurements.
+Data also interrupts control work: the loop polls the data path's sockets before each ordinary callback, and long work
+calls ``yield_to_data()`` between its slices. A poll costs a quarter of a microsecond. Therefore a direct reader, and
+the code that it calls, may run in the middle of any code that yields, whose data must be consistent at each yield.
+docs/design/isolation.md has the measurements.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ _log = logging.getLogger(__name__)
 _EPOLL_RESOLUTION: Final = 1e-3
 _MAX_EVENTS: Final = 64
 _YIELDS_PER_HOOK: Final = 8
-"""Yields for one call of the hook: it is cheap, but too expensive for each callback."""
+"""Yields from one call of the hook to the next; a call at each yield would be too expensive."""
 _ITEMS_PER_YIELD: Final = 64
-"""Steps of long work between two yields, of a microsecond or less each."""
+"""Steps of long work between two yields; a step takes a microsecond or less."""
 _SORTED_RUN: Final = 256
-"""Items that are sorted without a yield, some 50 microseconds."""
+"""Items that are sorted without a yield; it takes some 50 microseconds."""
 _T = TypeVar("_T")
 _Ts = TypeVarTuple("_Ts")
 _NOT_WRITABLE: Final = ~select.EPOLLOUT
@@ -51,7 +51,7 @@ class DirectSelector(selectors.BaseSelector):
 
     def __init__(self) -> None:
         self._epoll = select.epoll()
-        # The direct descriptors once more, so that polling them costs the same however many others there are.
+        # A second epoll for the direct descriptors alone: the cost of polling them does not depend on all others.
         self._data = select.epoll()
         self._poll_direct = self._data.poll
         self._keys: dict[int, selectors.SelectorKey] = {}
@@ -78,7 +78,7 @@ class DirectSelector(selectors.BaseSelector):
             self._writers.pop(fd, None)
 
     def poll_data(self) -> None:
-        """Call the direct readers and writers that are ready now; no effect from within one of them."""
+        """Call the direct readers and writers that are ready now; without effect when called from one of them."""
         if not self.in_direct_call and (events := self._poll_direct(0, _MAX_EVENTS)):
             self._call(events)
 
@@ -136,13 +136,13 @@ class DirectSelector(selectors.BaseSelector):
         return key
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        """Wait; call the direct readers and writers that are ready, and return the other events."""
+        """Wait up to ``timeout`` seconds; call the ready direct readers and writers, and return the other events."""
         if timeout is None:
             wait = -1.0
         elif timeout <= 0:
             wait = 0.0
         else:
-            # Rounded up, as asyncio's own selector does: else a timer would be early, and the loop would spin.
+            # Rounded up, as asyncio's own selector does: else the loop would wake too early for a timer, and spin.
             wait = math.ceil(timeout / _EPOLL_RESOLUTION) * _EPOLL_RESOLUTION
         try:
             happened = self._epoll.poll(wait, max(len(self._keys), 1))
@@ -181,7 +181,7 @@ class DirectSelector(selectors.BaseSelector):
     def _remove_direct(self, fd: int) -> None:
         self._writers.pop(fd, None)
         if self._readers.pop(fd, None) is not None:
-            with contextlib.suppress(OSError):  # closed before
+            with contextlib.suppress(OSError):  # the descriptor is closed already
                 self._data.unregister(fd)
 
     def get_map(self) -> Mapping[FileDescriptorLike, selectors.SelectorKey]:
@@ -219,14 +219,14 @@ class AgentLoop(asyncio.SelectorEventLoop):
 
     @property
     def previous_poll_at(self) -> float:
-        """When the selector was polled before the poll that brought the present events, in monotonic seconds.
+        """Monotonic seconds of the poll before the one that reported the present events.
 
-        Data that was not there then has waited in this process since then at the longest.
+        The data of the present events arrived after that time, so it has waited in this process no longer.
         """
         return self._direct_selector.previous_poll_at
 
     def yield_to_data(self) -> None:
-        """Handle data that has arrived, now. Code that has no loop calls the function ``yield_to_data``."""
+        """Handle the data that has arrived. Code without a reference to the loop calls ``yield_to_data()``."""
         self._poll_data()
         if self._yield_hook is not None and not self._direct_selector.in_direct_call:
             self._yields += 1
@@ -235,17 +235,18 @@ class AgentLoop(asyncio.SelectorEventLoop):
                 self._yield_hook()
 
     def set_yield_hook(self, hook: Callable[[], None] | None) -> None:
-        """Call ``hook`` at every few yields; ``None``: no longer. Without work to do it must return in microseconds.
+        """Call ``hook`` at every few yields; ``None`` ends this.
 
-        For work that cannot wait until long control work ends, but that data need not wait for.
+        It is for work that must not wait for the end of long control work, but may wait for data. A call without work
+        to do must return within microseconds.
         """
         self._yield_hook = hook
 
     def add_direct_reader(self, fd: int, callback: Callable[[], None]) -> None:
         """Like ``add_reader``, but called by the selector itself; ``remove_reader`` ends it.
 
-        ``callback`` must be quick. It may run in the middle of any work that yields: see the module's docstring. Its
-        exceptions go to the loop's exception handler. A writer that is added afterwards is called in the same way.
+        ``callback`` must be quick. It may run in the middle of any code that yields: see the module's docstring. Its
+        exceptions go to the loop's exception handler. A writer added afterwards for ``fd`` is called directly too.
         """
         self.add_reader(fd, callback)
         self._direct_selector.call_directly(fd, self._guarded(fd, "reader", callback))
@@ -272,9 +273,9 @@ class AgentLoop(asyncio.SelectorEventLoop):
 
 
 def yield_to_data() -> None:
-    """Handle data that has arrived, now: for code on the event loop's thread, between two slices of long work.
+    """Handle the data that has arrived: for the event loop's thread, between two slices of long work.
 
-    No effect on other loops than ``AgentLoop``, or without a running loop.
+    Without effect without a running loop, or on another loop than ``AgentLoop``.
     """
     loop = asyncio._get_running_loop()  # noqa: SLF001 - the public one raises where there is none
     if isinstance(loop, AgentLoop):
@@ -282,7 +283,7 @@ def yield_to_data() -> None:
 
 
 def yielding_to_data(items: Iterable[_T], /, every: int = _ITEMS_PER_YIELD) -> Iterator[_T]:
-    """The same items; data is handled before each one out of ``every`` (a ``core.yielding.Yielder``)."""
+    """Yield the items unchanged, and handle data before one item in ``every`` (a ``core.yielding.Yielder``)."""
     for number, item in enumerate(items):
         if number % every == 0:
             yield_to_data()
@@ -290,7 +291,7 @@ def yielding_to_data(items: Iterable[_T], /, every: int = _ITEMS_PER_YIELD) -> I
 
 
 def sorted_yielding(items: Iterable[str]) -> Iterator[str]:
-    """The items as ``sorted`` gives them; data is handled in between, for thousands take milliseconds."""
+    """The items in the order of ``sorted``; data is handled in between, as thousands of items take milliseconds."""
     rest = iter(items)
     runs = []
     while run := sorted(islice(rest, _SORTED_RUN)):

@@ -2,16 +2,16 @@
 
 The interpreter collects when allocations exceed a threshold: in the middle of a burst of messages, and sometimes
 over all objects. Here automatic collection is off once the agent has started, and the objects of the start are frozen
-(``gc.freeze``). The data path makes no cycles, so in steady state nothing needs collecting. Control work does: each
-closed asyncio connection is a cycle. So a timer checks how many objects survived, and collects the young ones. At
+(``gc.freeze``). The data path makes no cycles, so in steady state nothing needs collecting. Control work makes some:
+each closed asyncio connection is a cycle. A timer counts the surviving objects, and collects the young ones. At
 0.3 µs an object a pause is some 0.1 ms.
 
-Two things were measured and rejected. Waiting until the loop is idle: 1000 XML-RPC calls a second left garbage for
-a pause of 6 ms. The timer alone: a thousand topics that register at once leave garbage for 10 ms within 20 ms, so the
-check also runs during work, at its yields.
+Two alternatives were measured and rejected. If collection waits until the loop is idle, 1000 XML-RPC calls a second
+leave garbage for a pause of 6 ms. If only the timer collects, a thousand topics that register at once leave, within
+20 ms, garbage for a pause of 10 ms; therefore the check also runs at the yields of long work.
 
-Objects that became garbage only when they were old are found by full collections, which scan all objects made since
-the start. They wait until no data flows, for as long as the growth of the heap allows.
+Old objects that become garbage are only found by a full collection, which scans all objects made since the start. It
+waits until no data flows, unless the heap has grown too much.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ def choose_collection(young: int, grown: int, *, quiet: bool) -> Collection:
     """Choose the collection that is due.
 
     Args:
-        young: Objects made and not freed since the last collection, which bounds the garbage among them. The smaller
-            number of the last two checks: messages that pass are objects too, but are soon freed.
+        young: Objects made and not freed since the last collection, the smaller number of the last two checks. It is
+            an upper bound of the garbage. One check alone would count messages in transit, which are soon freed.
         grown: Memory blocks by which the heap has grown since the last full collection.
-        quiet: Whether the links carried next to nothing since the last check.
+        quiet: Whether the links carried almost no data since the last check.
     """
     if grown >= limits.COLLECT_GROWTH_MAX or (quiet and grown >= limits.COLLECT_GROWTH):
         return Collection.FULL
@@ -61,7 +61,7 @@ class GarbageCollector:
     """Replaces automatic garbage collection, from ``start`` to ``close``.
 
     Args:
-        traffic: Returns the bytes that all links have carried, in and out; it shrinks when a link falls.
+        traffic: Returns the bytes that all present links have carried, in and out; so it shrinks when a link falls.
         counters: Gets ``collector.young`` and ``collector.full``.
     """
 
@@ -79,7 +79,7 @@ class GarbageCollector:
     def start(self) -> None:
         """Turn automatic collection off, freeze all objects, and check regularly from now on.
 
-        Nothing is collected first: that would take 20 ms of the start and find next to nothing.
+        Nothing is collected first: that would delay the start by 20 ms and find almost nothing.
         """
         self._enabled = gc.isenabled()
         gc.disable()
@@ -110,7 +110,7 @@ class GarbageCollector:
         return time.monotonic(), self._traffic()
 
     def _check(self) -> None:
-        # The loop has handled all that was ready before it called this timer, so nothing waits for the collection.
+        # The loop handled all ready events before it called this timer, so the collection delays none of them.
         checked_at, traffic = self._last_check
         now, traffic_now = self._last_check = self._now()
         before, self._young = self._young, gc.get_count()[0]
@@ -124,7 +124,7 @@ class GarbageCollector:
         self._schedule(limits.COLLECT_LOOK if self._young < limits.COLLECT_YOUNG else limits.COLLECT_LOOK_AGAIN)
 
     def _check_during_work(self) -> None:
-        """Collect in the middle of long work, if it has made many objects."""
+        """Collect at a yield of long work, if the work has made many objects."""
         if gc.get_count()[0] >= limits.COLLECT_BURST:
             self._collect(Collection.YOUNG)
 

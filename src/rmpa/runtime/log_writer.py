@@ -1,4 +1,4 @@
-"""Writes an agent's log lines in a thread, so that a reader that stops does not block the agent."""
+"""Writes an agent's log lines in a thread, so that a log that is not read does not block the agent."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ _log = logging.getLogger(__name__)
 class LogWriter:
     """The text stream of a log handler.
 
-    A pipe that is not read (a stopped pager, a hanging journal) blocks its writer. The queue of lines is bounded: the
-    newest lines are lost, and their number is logged when the reader goes on.
+    A pipe that is not read (a stopped pager, a hanging journal) blocks its writer. The queue of lines is bounded:
+    when it is full, new lines are lost, and their number is logged once the pipe is read again.
 
     Args:
         fd: The file descriptor for the lines; not closed here.
@@ -29,12 +29,12 @@ class LogWriter:
         self._wake = threading.Event()
         self._closed = False
         self.lost = 0
-        """Lines that were lost and are not reported yet."""
+        """The number of lost lines that is not logged yet."""
         self._thread = threading.Thread(target=self._work, name="log", daemon=True)
         self._thread.start()
 
     def write(self, text: str) -> int:
-        """Take a line or more; never blocks."""
+        """Queue one or more lines; never blocks."""
         if len(self._waiting) >= limits.LOG_WAITING:
             self.lost += 1
         else:
@@ -46,7 +46,7 @@ class LogWriter:
         """Do nothing: the thread writes as soon as it can."""
 
     def close(self) -> None:
-        """Wait until all is written, but no longer than ``limits.DRAIN_TIMEOUT``."""
+        """Wait until all lines are written, but no longer than ``limits.DRAIN_TIMEOUT``."""
         self._closed = True
         self._wake.set()
         self._thread.join(limits.DRAIN_TIMEOUT)
@@ -55,7 +55,7 @@ class LogWriter:
         while not self._closed or self._waiting:
             self._wake.wait()
             if not self._closed:
-                time.sleep(limits.LOG_GATHER)  # one call for the lines of a burst
+                time.sleep(limits.LOG_GATHER)  # so that the lines of a burst are written in one call
             self._wake.clear()
             while self._waiting:
                 self._write()
@@ -70,6 +70,6 @@ class LogWriter:
             try:
                 rest = rest[os.write(self._fd, rest) :]
             except BlockingIOError:
-                time.sleep(limits.LOG_GATHER)  # another process has made the pipe non-blocking
+                time.sleep(limits.LOG_GATHER)  # the pipe is full, and another process has made it non-blocking
             except OSError:
                 return  # the pipe is closed

@@ -1,6 +1,6 @@
 """Runs the timer of a protocol machine in the event loop.
 
-A machine has no clock: it says by ``next_timer()`` when it wants to be called next, and is called with the time.
+A machine has no clock: its ``next_timer()`` returns when it must be called next, and the call passes the time.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ class MachineTimer:
     """One pending timer for one machine, moved whenever the machine's ``next_timer()`` has changed.
 
     Args:
-        next_timer: When the machine wants to be called, in seconds of ``now``; ``None``: not at all.
-        on_due: Called with the time, which is never before the moment that was asked for: the event loop may call a
-            moment early, because it rounds to its clock's resolution. The timer is armed again behind it.
+        next_timer: Returns when the machine must be called, in seconds of ``now``; ``None``: not at all.
+        on_due: Called with the time, which is never before the requested time, although the event loop may call early
+            by its clock's resolution. Afterwards the timer is armed again.
         now: The clock of the machine; by default the event loop's ``time()``.
     """
 
@@ -37,7 +37,7 @@ class MachineTimer:
         self._closed = False
 
     def arm(self) -> None:
-        """Ask the machine when it is due, and wait for that moment instead of another one."""
+        """Read ``next_timer()``, and move the pending timer to that time."""
         due = None if self._closed else self._next_timer()
         if due == self._due:
             return
@@ -51,7 +51,7 @@ class MachineTimer:
                 self._handle = loop.call_later(max(0.0, due - self._now()), self._fire)
 
     def close(self) -> None:
-        """Never call again, and let go of the machine: its owner may hold this timer, which would be a cycle."""
+        """Cancel the timer, and drop the references to the machine, whose owner may hold this timer (a cycle)."""
         self._closed = True
         self._cancel()
         self._next_timer, self._on_due = _never, _nothing

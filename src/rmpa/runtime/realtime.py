@@ -1,12 +1,12 @@
 """``--realtime``: requests real-time scheduling and locked memory from the kernel, with a remedy for each refusal.
 
-The loop's thread gets SCHED_FIFO, worker threads one priority less. With the usual scheduling a worker thread that
-holds the interpreter's lock could be kept from the CPU by a busy process, and the loop would wait with it (measured
-beside two such processes: 4 ms late at p99, and 0.2 ms with a real-time priority). SCHED_RESET_ON_FORK keeps all
-other threads and every child process at the usual scheduling.
+The loop's thread gets SCHED_FIFO, and worker threads get it with one priority less. With default scheduling a busy
+process could keep a worker thread that holds the interpreter's lock from the CPU, and the loop would wait for that
+lock (measured with two busy processes: 4 ms late at p99; with a real-time priority 0.2 ms). SCHED_RESET_ON_FORK
+leaves all other threads and every child process at default scheduling.
 
-Memory that is mapped at the start is read in and locked; later mappings are locked page by page as they are used
-(MCL_ONFAULT): otherwise each thread's stack and heap would be filled with zeros, 10 MB apiece.
+Memory that is mapped at the start is read in and locked. Later mappings are locked page by page as they are used
+(MCL_ONFAULT): otherwise the kernel would fill each new thread's stack and heap with zeros, 10 MB for each thread.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ class SchedulingRequest:
 
     Args:
         name: What was requested, in a word or two.
-        granted: Whether it was granted, at least in part.
-        text: How much was granted, or why it was refused.
-        remedy: What would grant (all of) it, as a text for the user; may be empty.
+        granted: Whether the request was granted, at least in part.
+        text: How much was granted, or why the request was refused.
+        remedy: What the user must change for the full request to be granted; may be empty.
     """
 
     name: str
@@ -72,11 +72,11 @@ class SchedulingRequest:
 def apply(settings: RealtimeSettings) -> tuple[SchedulingRequest, ...]:
     """Request everything that the settings ask for, for the calling thread and the process; never raises.
 
-    Each outcome is logged: at INFO if granted, else at WARNING with what would grant it. To be called from the
-    loop's thread, before there are others: those inherit its CPU affinity.
+    Each outcome is logged: at INFO if granted, else at WARNING with the remedy. Must be called from the loop's thread
+    before other threads start, because they inherit its CPU affinity.
 
     Returns:
-        The outcomes; empty where real time is not enabled.
+        The outcomes; empty if real time is not enabled.
     """
     if not settings.enabled:
         return ()
@@ -95,7 +95,7 @@ def apply(settings: RealtimeSettings) -> tuple[SchedulingRequest, ...]:
 
 
 def refused(requests: Iterable[SchedulingRequest]) -> str:
-    """One sentence about what was not granted, or an empty string."""
+    """One sentence about the requests that were refused, or an empty string."""
     names = [request.name for request in requests if not request.granted]
     return f"realtime: no {', no '.join(names)}; the agent's log says what would grant it" if names else ""
 
@@ -103,7 +103,7 @@ def refused(requests: Iterable[SchedulingRequest]) -> str:
 def worker_pool() -> ThreadPoolExecutor:
     """Threads for blocking work, with one real-time priority less than the calling thread.
 
-    If that is refused, a thread has the usual scheduling.
+    If the kernel refuses that, the threads have default scheduling.
     """
     policy = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
     if policy != os.SCHED_FIFO:
@@ -171,7 +171,7 @@ def _forbidden(name: str, error: OSError) -> SchedulingRequest:
 
 
 def _killing_limit() -> int:
-    """Milliseconds after which the kernel kills a real-time thread that never sleeps; 0: it does not."""
+    """Milliseconds of uninterrupted work after which the kernel kills a real-time thread; 0: never."""
     soft, _ = resource.getrlimit(resource.RLIMIT_RTTIME)
     if soft == resource.RLIM_INFINITY:
         return 0
@@ -182,7 +182,7 @@ def _killing_limit() -> int:
 
 
 def _timer_slack() -> SchedulingRequest:
-    """Ask the kernel not to delay timers in order to coalesce them; those of a real-time thread never are."""
+    """Ask the kernel not to delay timers in order to coalesce them; it never delays those of a real-time thread."""
     libc = _libc()
     libc.prctl(_PR_SET_TIMERSLACK, 1)
     slack = libc.prctl(_PR_GET_TIMERSLACK)
@@ -195,9 +195,9 @@ def _timer_slack() -> SchedulingRequest:
 def _lock_memory() -> SchedulingRequest:
     """Lock present and future mappings.
 
-    Only without a limit, or with CAP_IPC_LOCK: an agent that reached RLIMIT_MEMLOCK would be refused memory, or
-    killed when its stack grows. The limit counts address space, which is ten times the memory that is used. A trial
-    with a limit of 0 shows whether the capability is there.
+    Memory is only locked without a limit, or with CAP_IPC_LOCK: an agent that reaches RLIMIT_MEMLOCK is refused
+    memory, or killed when its stack grows. The limit counts address space, which is ten times the used memory. A
+    trial with a limit of 0 shows whether the process has the capability.
     """
     name = "memory lock"
     soft, hard = resource.getrlimit(resource.RLIMIT_MEMLOCK)
@@ -275,10 +275,10 @@ def _cpu_ways() -> str:
 
 
 def _keep_awake() -> SchedulingRequest:
-    """Keep all CPUs in idle states that they leave at once, for as long as this process lives.
+    """Restrict all CPUs to idle states without wake-up delay, for as long as this process lives.
 
-    The kernel's PM QoS (Documentation/power/pm_qos_interface): the request holds while the file is open, so it is
-    never closed. Between two processes on two CPUs of a virtual machine a wake-up took 11 µs with it, 21 µs without.
+    Uses the kernel's PM QoS (Documentation/power/pm_qos_interface). The request holds while the file is open, so the
+    file is never closed. A wake-up between two CPUs of a virtual machine took 11 µs with it, 21 µs without.
     """
     name = "wakefulness"
     try:
@@ -313,7 +313,7 @@ def _priority_ways(priority: int) -> str:
 
 
 def _ways(unit: str, *, login: str = "", container: str = "", capability: str = "") -> str:
-    """Name what would grant a request; in a container its options first, since nothing else has an effect there."""
+    """Name the ways to have a request granted; in a container its options come first, as only they have an effect."""
     ways = [f"start the container with {container}"] if container and _in_container() else []
     ways.append(f"put {unit} into the systemd unit")
     if login:

@@ -14,9 +14,9 @@ Buffer = bytes | bytearray | memoryview
 class SegmentedSocket:
     """Sends in pieces that the kernel neither joins nor sends as one large packet (MSG_EOR).
 
-    TCP_MAXSEG cannot do this: it has no effect on a connected socket, and where the interface is to segment by itself
-    (a virtual network never does) several segments still leave the machine as one packet. It costs a system call for
-    each segment, so it is for connections that need it.
+    TCP_MAXSEG cannot do this: it has no effect on a connected socket, and where the network interface is expected to
+    segment by itself (a virtual one never does), several segments still leave the machine as one packet. This class
+    makes one system call for each segment, so it is only for connections that need it.
 
     Args:
         sock: Connected, non-blocking.
@@ -27,7 +27,7 @@ class SegmentedSocket:
         self._sock = sock
         self.size = size
         self._begun = 0
-        """Bytes of a piece that the socket took in part: the kernel appends the next bytes to that packet."""
+        """Bytes that the socket took of a piece, if it took only a part: the next bytes join the same packet."""
 
     def sendmsg(self, parts: Sequence[Buffer]) -> int:
         """Send as much as the socket takes now; return the number of bytes.
@@ -42,7 +42,7 @@ class SegmentedSocket:
                 took = self._sock.sendmsg(piece, (), socket.MSG_EOR)
             except OSError:
                 if sent:
-                    return sent  # an error comes again with the next call
+                    return sent  # the next call raises the error again
                 raise
             sent += took
             if took < size:
@@ -52,8 +52,8 @@ class SegmentedSocket:
         return sent
 
     def _pieces(self, parts: Sequence[Buffer]) -> Iterator[tuple[list[Buffer], int]]:
-        """The bytes in pieces, as lists of views; the first one completes the piece that was sent in part before."""
-        if self._begun >= self.size:  # the size has shrunk below what was taken: no more is joined to that packet
+        """The pieces, each a list of views and its size; the first completes a piece that was sent in part."""
+        if self._begun >= self.size:  # the size was reduced below the bytes taken: that packet takes no more bytes
             self._begun = 0
         room = self.size - self._begun
         piece: list[Buffer] = []

@@ -19,14 +19,14 @@ def open_mesh_port(port: int = 0) -> tuple[socket.socket, socket.socket]:
         The listening TCP socket and the UDP socket, both non-blocking.
 
     Raises:
-        StartError: The port is taken, or not for this user.
+        StartError: The port is taken, or this user may not bind it.
     """
     for attempt in range(limits.MESH_PORT_ATTEMPTS):
         tcp = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
-            # A restarted agent gets its port back although old connections are in TIME_WAIT. Never on the UDP
-            # socket: two of those would share a port without a word, and each would miss half of its beacons.
+            # A restarted agent gets its port back although old connections are in TIME_WAIT. Never set it on the UDP
+            # socket: two agents could then bind one port without an error, and each would miss half of its beacons.
             tcp.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             tcp.bind(("", port))
             udp.bind(("", tcp.getsockname()[1]))
@@ -35,7 +35,7 @@ def open_mesh_port(port: int = 0) -> tuple[socket.socket, socket.socket]:
             tcp.close()
             udp.close()
             if port == 0 and error.errno == errno.EADDRINUSE and attempt + 1 < limits.MESH_PORT_ATTEMPTS:
-                continue  # the TCP port was free, the UDP port of that number was not
+                continue  # the number was free for TCP but not for UDP
             raise _refused(port, error) from error
         tcp.setblocking(False)
         udp.setblocking(False)

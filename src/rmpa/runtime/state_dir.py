@@ -11,13 +11,13 @@ if TYPE_CHECKING:
 
 
 def state_dir(environ: Mapping[str, str], setting: str | None = None) -> Path | None:
-    """The directory of all kept files; it need not exist yet.
+    """The directory of all files that survive a run; it need not exist yet.
 
     The first of: the setting, RMPA_STATE_DIR, STATE_DIRECTORY (systemd's, for a unit with ``StateDirectory=``),
     ``rmpa`` below XDG_STATE_HOME, ``~/.local/state/rmpa``.
 
     Returns:
-        ``None`` if none of them is set and there is no home.
+        ``None`` if none of these is set and the user has no home directory.
     """
     if setting or environ.get("RMPA_STATE_DIR"):
         return Path(setting or environ["RMPA_STATE_DIR"])
@@ -36,11 +36,11 @@ def module_dir(directory: Path, module: str) -> Path:
 
 
 def core_file(environ: Mapping[str, str], port: int, module: str = "", setting: str = "") -> Path | None:
-    """The file of a ROS core: by its module's name and its port, so that two on one machine do not mix.
+    """The file of a ROS core, named by module and port, so that two cores on one machine do not share a file.
 
     Args:
         environ: As for ``state_dir``.
-        port: The core's; 0 (chosen by the system) keeps nothing, because the next run would have another port.
+        port: The core's port; with 0 (chosen by the system) there is no file, because the next run has another port.
         module: Empty for a core without an agent.
         setting: As for ``state_dir``.
     """

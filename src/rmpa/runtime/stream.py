@@ -1,9 +1,9 @@
 """A connected TCP socket on the data path: one growing read buffer, one ``sendmsg`` a write, a bounded outbox.
 
-asyncio's transports join or copy what cannot be sent at once, and have no bound with a drop policy. A ``Stream``
-queues in a ``core.outbox.Outbox``, and costs one system call a message each way. A large message can be sent in parts
-while it still arrives (``open`` and ``extend``); messages that one read brings leave in one write (*corking*, as
-TCP_CORK does).
+asyncio's transports join or copy the bytes that cannot be sent at once, and have no bound with a drop policy. A
+``Stream`` queues them in a ``core.outbox.Outbox``, and needs one system call for each message in each direction. A
+large message can be sent in parts while it is still being received (``open`` and ``extend``). Messages that arrived
+in one read are sent in one write (*corking*, as TCP_CORK does).
 """
 
 from __future__ import annotations
@@ -43,23 +43,23 @@ OnBytes = Callable[[memoryview], tuple[int, int]]
 OnClose = Callable[[Exception | None], None]
 
 _corked: list[Stream] | None = None
-"""While the bytes of a read are handled: the streams that collect messages for one write; see ``Stream.send``."""
+"""The streams that collect messages for one write while the bytes of a read are handled; see ``Stream.send``."""
 
 
 class Stream:
     """Reads and writes one socket by the loop's readiness callbacks.
 
     Args:
-        sock: Connected, non-blocking; owned by the stream from here on.
-        on_bytes: Called with all bytes not yet consumed; returns ``(consumed, wanted)``: how many it took, and
-            how many it needs behind those before it can take more (0: unknown). The view is only valid during the
-            call. A ``RemoteProtocolError`` raised here closes the stream with it; any other
+        sock: Connected, non-blocking; the stream owns and closes it.
+        on_bytes: Called with all received bytes that are not consumed yet; returns ``(consumed, wanted)``: how many
+            bytes it took, and how many further bytes it needs before it can take more (0: unknown). The view is only
+            valid during the call. A ``RemoteProtocolError`` raised by it closes the stream with that error; any other
             exception is a bug, is logged, and closes the stream too.
-        on_close: Called once, from the loop and never from within a method, when the socket is gone: with
-            ``None`` after an orderly end, with the error otherwise. Not called after ``close()``.
-        outbox: The queue of what the socket does not take; entries that are in it already are sent first.
-        frame: Makes the header of each fragment of an opened message, the same as the outbox's; without it the bytes
-            are sent without headers.
+        on_close: Called once when the socket is gone, from the loop and never from within a method: with ``None``
+            after an orderly end, with the error otherwise. Not called after ``close()``.
+        outbox: The queue of the bytes that the socket does not take; entries that are in it already are sent first.
+        frame: Makes the header of each fragment of an opened message; must be the outbox's own. Without it opened
+            messages are sent without headers.
         keep: Whether entries stay in the outbox when the socket is gone, for the next stream.
         segment: Bytes that one packet may carry; ``None``: the kernel decides; see ``segments``.
     """
@@ -96,11 +96,11 @@ class Stream:
         self.bytes_in = 0
         self.bytes_out = 0
         self.last_in = self._loop.time()
-        """When bytes last came (``loop.time()``), whether or not ``on_bytes`` was called for them."""
+        """When bytes were last received (``loop.time()``), even if ``on_bytes`` was not called for them yet."""
         self.resumed_at = -math.inf
-        """When the socket was last polled without result, before bytes ended a silence of more than
-        ``limits.STALE_AGE`` (``loop.time()``): bytes sent before that were held up on the network, later ones may
-        have waited here."""
+        """When the last silence of more than ``limits.STALE_AGE`` was about to end: the time of the last poll that
+        found no bytes (``loop.time()``). Bytes that the remote side sent before that time were delayed by the
+        network; later ones may have waited in this process."""
         self._fd = sock.fileno()
         # An agent's loop calls readers of the data path directly; other loops (tools, tests) have no such method.
         add_reader = getattr(self._loop, "add_direct_reader", self._loop.add_reader)
@@ -115,19 +115,19 @@ class Stream:
 
     @property
     def pending_bytes(self) -> int:
-        """Bytes that wait for the socket."""
+        """Bytes in the outbox, which the socket has not taken yet."""
         return self._outbox.pending_bytes
 
     @property
     def unacknowledged(self) -> int:
-        """Bytes in the kernel's send queue: not sent yet, or not acknowledged by the other side."""
+        """Bytes in the kernel's send queue: not sent yet, or not acknowledged by the remote side."""
         if self._closed:
             return 0
         return int.from_bytes(fcntl.ioctl(self._fd, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
 
     @property
     def outbox(self) -> Outbox:
-        """The queue of what waits, with counts of what was dropped."""
+        """The queue of the waiting bytes, with the counts of dropped entries."""
         return self._outbox
 
     def segment(self, size: int) -> None:
@@ -148,13 +148,13 @@ class Stream:
         self._deliver()
 
     def send(self, parts: Sequence[Buffer], key: int) -> int:
-        """Send one message made of ``parts``, or queue what the socket does not take.
+        """Send one message made of ``parts``, or queue the bytes that the socket does not take.
 
         Args:
-            parts: In order, views of single bytes. From within ``on_bytes`` they may be views of what was read:
-                the messages of one read for one stream are sent together when all of the read is handled. Outside of
+            parts: In order; views must have items of one byte. Within ``on_bytes`` they may be views of the bytes
+                being handled: such messages are sent together after the whole read is handled. Outside of
                 ``on_bytes`` they are not referenced after the call.
-            key: The flow that it belongs to, for the overflow policy; ``URGENT`` is never dropped.
+            key: The flow that the message belongs to, for the drop policy; ``URGENT`` is never dropped.
 
         Returns:
             How many older messages, of any key, were dropped to make room.
@@ -169,7 +169,7 @@ class Stream:
         return self._send_now(parts, key)
 
     def send_mark(self, data: bytes, key: int) -> None:
-        """Send a mark behind the messages of a key; unlike a message, a mark is never dropped."""
+        """Send a mark after all present messages of a key; unlike a message, a mark is never dropped."""
         if self._closed or self._finishing:
             return
         if self._kept:
@@ -215,10 +215,12 @@ class Stream:
         return 0
 
     def _send_rest(self, parts: Sequence[Buffer], sent: int, size: int) -> int:
-        """Send the rest of what the socket took in part: it often has room again at once, and queueing means copying.
+        """Try once more to send a message that the socket took in part, because queueing its rest means copying it.
+
+        The socket often has room again at once.
 
         Returns:
-            How many bytes were sent in all.
+            How many bytes of the message were sent in total.
         """
         while sent < size:
             try:
@@ -239,13 +241,16 @@ class Stream:
     # --- messages in parts ----------------------------------------------------------------------------------
 
     def open(self, key: int, size: int, sequence: int = 0, stamp_ns: int = 0) -> QueuedMessage:
-        """Begin a message of ``size`` bytes; ``extend`` gives its bytes, before another message of its key begins."""
+        """Begin a message of ``size`` bytes, which ``extend`` adds before another message of its key begins."""
         return QueuedMessage(key, size, sequence, stamp_ns, self._loop.time())
 
     def extend(self, parcel: QueuedMessage, data: Buffer) -> int:
-        """Send further bytes of a message, or queue what the socket does not take; return as for ``send``.
+        """Send further bytes of an opened message, or queue those that the socket does not take.
 
-        ``data`` is not kept after the call. Bytes of a message that was dropped are ignored.
+        ``data`` is not referenced after the call. Bytes of a message that was dropped are ignored.
+
+        Returns:
+            How many older messages, of any key, were dropped to make room.
         """
         if self._closed or self._finishing or parcel.dropped:
             return 0
@@ -260,7 +265,7 @@ class Stream:
         if self._writing:
             return self._outbox.extend(parcel, bytes(view))
         if self._outbox.waiting(parcel.key):
-            # Its first bytes had to wait, and the outbox counts them.
+            # The first bytes had to wait, so the outbox keeps this message's counts.
             if self._kept:
                 self._uncork()
             dropped = self._outbox.extend(parcel, bytes(view))
@@ -275,10 +280,11 @@ class Stream:
         return self._send_now(parts, parcel.key, part=True)
 
     def abandon(self, parcel: QueuedMessage) -> bool:
-        """The rest of a message will never come.
+        """Give up an opened message whose rest will never come.
 
         Returns:
-            Whether the other side holds half of it and cannot be told: the connection must be closed.
+            Whether the remote side has an incomplete message that cannot be aborted, so that the connection must be
+            closed.
         """
         if self._closed or parcel.sent == parcel.size:
             return False
@@ -294,14 +300,14 @@ class Stream:
         return torn
 
     def pump(self) -> None:
-        """Send entries that other code has put into the outbox."""
+        """Send the entries that other code has put into the outbox."""
         if self._kept:
             self._uncork()
         if self._outbox and not self._writing and not self._closed:
             self._wait_for_room()
 
     def _framed(self, parcel: QueuedMessage, view: memoryview) -> list[Buffer]:
-        """The bytes with a header in front of each fragment."""
+        """The bytes of ``view`` as parts, with a header before each fragment."""
         frame = cast("Framer", self._frame)
         parts: list[Buffer] = []
         size = len(view)
@@ -315,7 +321,7 @@ class Stream:
     # --- corking --------------------------------------------------------------------------------------------
 
     def _cork(self, parts: Sequence[Buffer], key: int, *, part: bool = False) -> None:
-        """Keep a message until the read that it came from is handled; all kept messages are sent in one call."""
+        """Keep a message until the present read is handled; all kept messages are then sent in one system call."""
         cast("list[Stream]", _corked).append(self)
         self._kept.append((parts, key, part))
         for buffer in parts:
@@ -329,7 +335,7 @@ class Stream:
         if self._closed or not kept:
             return
         if self._writing or self._outbox:
-            self._keep_rest(kept, 0)  # behind what the outbox is sending
+            self._keep_rest(kept, 0)  # after the entries that the outbox is sending
             return
         if len(kept) == 1:
             self._send_now(*kept[0])
@@ -348,9 +354,10 @@ class Stream:
             self._keep_rest(kept, sent)
 
     def _keep_rest(self, kept: list[tuple[Sequence[Buffer], int, bool]], sent: int) -> None:
-        """Queue what ``sendmsg`` did not take of a batch: perhaps the rest of one message, then whole ones.
+        """Queue the part of a batch that ``sendmsg`` did not take: the rest of one message, if any, then whole ones.
 
-        Entries in front of a part of a message are committed too: the part has its header and cannot take turns.
+        Entries before a fragment are committed too, because the fragment already has its header and cannot take
+        turns.
         """
         self._wait_for_room()
         last_part = max((index for index, (_, _, part) in enumerate(kept) if part), default=-1)
@@ -367,7 +374,7 @@ class Stream:
                 self._queue(b"".join(parts), key)
 
     def close(self) -> None:
-        """Close at once; entries that wait are lost. ``on_close`` is not called."""
+        """Close at once, without sending the waiting bytes. ``on_close`` is not called."""
         self._uncork()
         if self._report is not None:
             self._report.cancel()
@@ -375,9 +382,9 @@ class Stream:
         self._shut()
 
     def finish(self) -> None:
-        """Send no more: half-close when all that waits has been sent. Reading goes on.
+        """Half-close the socket once all waiting bytes are sent. Reading goes on.
 
-        Not for ROS connections: rospy and roscpp take a half-closed socket for dead.
+        Not for ROS connections: rospy and roscpp treat a half-closed socket as dead.
         """
         if not self._finishing:
             self._uncork()
@@ -386,7 +393,7 @@ class Stream:
                 self._shut_write()
 
     async def drained(self, within: float = limits.DRAIN_TIMEOUT) -> None:
-        """Wait until nothing waits any more, the stream is closed, or ``within`` seconds are over."""
+        """Return when the outbox is empty, the stream is closed, or ``within`` seconds have passed."""
         if self._closed or not self._writing:
             return
         if self._drained is None or self._drained.done():
@@ -407,7 +414,7 @@ class Stream:
         if self._writing:
             self._loop.remove_writer(self._fd)
         self._sock.close()
-        # No callback is called any more; dropping them breaks the reference cycle between the stream and its owner.
+        # No callback is called from now on; dropping them breaks the reference cycle of the stream and its owner.
         self._on_bytes, self._on_close = _no_bytes, _no_close
         self._view = memoryview(b"")
         self._buffer = bytearray()
@@ -417,7 +424,7 @@ class Stream:
 
     def _shut_write(self) -> None:
         if not self._closed:
-            with contextlib.suppress(OSError):  # the other side may be gone; the reader will notice
+            with contextlib.suppress(OSError):  # the remote side may be gone; the reader will notice
                 self._sock.shutdown(socket.SHUT_WR)
 
     def _done_draining(self) -> None:
@@ -428,7 +435,7 @@ class Stream:
         if not self._closed:
             on_close = self._on_close
             self._shut()
-            # Not now: this may be a ``send`` in the middle of the owner's loop over its streams.
+            # Later, not from here: this may be a ``send`` within the owner's loop over its streams.
             self._report = self._loop.call_soon(self._report_end, on_close, error)
 
     def _report_end(self, on_close: OnClose, error: Exception | None) -> None:
@@ -463,14 +470,14 @@ class Stream:
         self.bytes_in += count
         self._filled += count
         if self._filled == _FIRST_BUFFER == len(self._buffer):
-            self._reserve(_BUSY_BUFFER)  # more is waiting: large messages, in fewer reads from now on
+            self._reserve(_BUSY_BUFFER)  # more bytes wait, so messages are large: read more at once from now on
         if self._filled >= self._wanted or self._filled == len(self._buffer):
             self._deliver()
 
     def _deliver(self) -> None:
         global _corked  # noqa: PLW0603 - one loop, one thread: one read at a time
         outer = _corked
-        # A few bytes are one or two messages, which are sent at once, unless an outer read has corked.
+        # A few bytes are one or two messages, which are sent at once unless an outer read collects messages.
         corked: list[Stream] = []
         _corked = corked if self._filled > _CORK_ABOVE or outer is not None else None
         try:
@@ -483,7 +490,7 @@ class Stream:
             self._lost(error)
             return
         finally:
-            # Before anything moves in the buffer that the messages are views of.
+            # Sent before anything moves in the buffer, because the collected messages are views of it.
             for stream in corked:
                 stream._uncork()  # noqa: SLF001 - its own class
             _corked = outer
@@ -505,9 +512,9 @@ class Stream:
             self._view[:rest] = view[:rest]
 
     def _writable(self) -> None:
-        """Send queued entries until the socket takes no more, or ``_WRITES`` writes were made."""
+        """Send queued entries until the socket takes no more, or ``_WRITES`` system calls were made."""
         for _ in range(_WRITES):
-            # No parts: all entries were too old, and were dropped.
+            # Without parts: all entries were too old, and were dropped.
             parts = self._outbox.head(_IOV, self._loop.time())
             try:
                 sent = self._sock.sendmsg(parts) if parts else 0

@@ -1,4 +1,4 @@
-"""Runs a user's function in a thread of its own, where it may hang for ever without blocking anything else."""
+"""Runs a user's function in a thread of its own, where it may hang forever without blocking anything else."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _T = TypeVar("_T")
 
 
 async def in_thread(function: Callable[[], _T], name: str) -> _T:
-    """Call ``function`` in a new daemon thread, and return its result. If cancelled, the thread goes on by itself.
+    """Call ``function`` in a new daemon thread, and return its result. Cancellation does not stop the thread.
 
-    ``asyncio.to_thread`` would take a place in a pool: with a few hanging functions the pool would be exhausted. And
-    a daemon thread does not keep the process from ending.
+    ``asyncio.to_thread`` uses a pool, which a few hanging functions would exhaust. A daemon thread does not keep the
+    process from ending.
 
     Args:
         function: Its exceptions are raised here; ``SystemExit`` and the like as ``RuntimeError``.
@@ -45,7 +45,7 @@ async def in_thread(function: Callable[[], _T], name: str) -> _T:
                 else:
                     result.set_result(value)  # type: ignore[arg-type] # a value, for there is no error
 
-        with contextlib.suppress(RuntimeError):  # the loop has ended before us
+        with contextlib.suppress(RuntimeError):  # the loop ended before this thread
             loop.call_soon_threadsafe(settle)
 
     context = contextvars.copy_context()

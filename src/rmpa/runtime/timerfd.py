@@ -1,7 +1,7 @@
 """A timer as a file descriptor (timerfd_create(2)): due at an absolute time, to the microsecond.
 
-The event loop's own timers are rounded to milliseconds, and a thread that sleeps is late by the timer slack of 50 µs;
-a timerfd is neither. Python has it since 3.13; before, the C library is called.
+The event loop's own timers are rounded to milliseconds, and a sleeping thread wakes up late by the timer slack of
+50 µs. A timerfd has neither fault. Python supports it since 3.13; with older versions the C library is called.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ class TimerFd:
             self._fd = _check(_libc().timerfd_create(_CLOCK_MONOTONIC, flags))
 
     def fileno(self) -> int:
-        """The descriptor, readable from when the timer is due until ``wait`` or ``set``; -1 once closed."""
+        """The descriptor, which is readable from the due time until ``wait`` or ``set``; -1 once closed."""
         return self._fd
 
     def set(self, due: float) -> None:
-        """Let the timer be due at this time of the monotonic clock, in seconds; a time that is past is due now.
+        """Set the due time, in seconds of the monotonic clock; a time in the past is due at once.
 
         Raises:
-            OSError: It is closed.
+            OSError: The timer is closed.
         """
         nanoseconds = max(1, round(due * _NANO))
         if sys.version_info >= (3, 13):
@@ -59,10 +59,10 @@ class TimerFd:
             _check(_libc().timerfd_settime(self._fd, _ABSTIME, spec, None))
 
     def wait(self) -> bool:
-        """Reset a timer that is due; a blocking one sleeps until then.
+        """Reset a timer that is due; a blocking timer first sleeps until its due time.
 
         Returns:
-            Whether it was due; always true for a blocking one.
+            Whether the timer was due; always true for a blocking one.
         """
         try:
             os.read(self._fd, 8)

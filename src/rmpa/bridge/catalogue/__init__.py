@@ -1,1 +1,1 @@
-"""What modules offer each other: told in portions, under each peer's names, within limits; all kinds alike."""
+"""What modules offer each other: advertised in portions, under names that fit each peer, and within limits."""

@@ -1,8 +1,8 @@
-"""What this module offers its peers, and what each of them was told of it. Pure.
+"""What this module offers to its peers, and what each of them has been sent of it. Pure.
 
-The entries of a catalogue are the topics or services of the local graph that may cross. What peers are to be told is
-gathered for each of them, and told a bounded number of entries at a time, so a change costs what changed, however
-large the graph is.
+The entries of a catalogue are the topics or services of the local graph that may cross. Changes are gathered for each
+peer and sent a bounded number of entries at a time, so the work depends on the size of a change and not on that of
+the graph.
 """
 
 from __future__ import annotations
@@ -27,17 +27,18 @@ WireT = TypeVar("WireT", bound="Hashable")
 
 @dataclass(slots=True)
 class CataloguePeer(Generic[KeyT, LocalT, OfferT, WireT]):
-    """One linked peer.
+    """One linked peer, and what it has been sent.
 
     Args:
-        name: The peer's name, which its rules go by.
-        instance: The peer's run, as 32 hexadecimal digits; nothing that came from there is relayed back to it.
-        judged: Whether each entry is judged or renamed for it, which takes long: one such peer is told at a time.
-        news: Entries that it is perhaps to be told of (a dict, for its order).
-        told: Those that it knows: what it was told, and of which local entry.
-        by_wire: The same by the names that it knows them by.
-        behind: Entries whose name on the wire another one has, by that name.
-        beginning: Whether it was not told everything once yet.
+        name: The peer's name, by which the rules for it are found.
+        instance: The peer's run, as 32 hexadecimal digits; nothing that came from this run is relayed back to it.
+        judged: Whether each entry is judged or renamed for this peer. That takes long, so ``portions`` serves only
+            one such peer at a time.
+        news: Keys of the entries to examine for this peer; the entry may have changed (a dict, for its order).
+        told: By key: the offer that the peer was sent, and the local entry that it was made of.
+        by_wire: The keys of ``told``, by name on the wire.
+        behind: By name on the wire: keys of entries that are not sent because an entry in ``by_wire`` has that name.
+        beginning: Whether the peer has not been sent the complete catalogue yet.
     """
 
     name: str
@@ -52,15 +53,16 @@ class CataloguePeer(Generic[KeyT, LocalT, OfferT, WireT]):
 
 @dataclass(slots=True)
 class Portion(Generic[KeyT, OfferT, WireT]):
-    """What one peer is to be told now.
+    """What one peer is to be sent now.
 
     Args:
-        added: New offers, or offers once more.
-        removed: Names on the wire that are offered no more.
-        more: Whether the first complete account goes on with the next portion.
-        complete: Whether it ends with this one.
-        ended: Entries that the peer may not have any more, or has by another name.
-        taken: Entries that are not told because another one has their name: their offer, and that one.
+        added: New or changed offers, and offers that are repeated.
+        removed: Names on the wire that are no longer offered.
+        more: Whether the first complete catalogue goes on with the next portion.
+        complete: Whether the first complete catalogue ends with this portion.
+        ended: Keys of entries that the peer may no longer have, or now has under another name.
+        taken: Entries that are not sent because another entry has their name on the wire: key, offer, key of the
+            other.
     """
 
     added: list[OfferT] = field(default_factory=list)
@@ -77,14 +79,14 @@ class Portion(Generic[KeyT, OfferT, WireT]):
 
 
 class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
-    """The entries that are offered, within a limit, and the portions in which peers are told of them.
+    """The entries that are offered, up to a limit, and the portions in which peers are sent them.
 
     Args:
-        kind: The setting that limits it: ``topics`` or ``services``.
+        kind: The setting that limits the entries: ``topics`` or ``services``.
         limit: How many entries are offered.
-        offer: ``(peer, key, local)``: what a peer is to be told of an entry; ``None``: it may not know it.
-        wire: The name on the wire of an offer.
-        renewed: ``(before, now)``: whether an entry is told once more though its offer has not changed.
+        offer: ``(peer, key, local)``: the offer of an entry to this peer; ``None``: the peer may not know of it.
+        wire: ``(offer)``: the offer's name on the wire.
+        renewed: ``(before, now)``: whether a changed entry is sent again although its offer is the same.
     """
 
     def __init__(
@@ -109,20 +111,23 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
 
     @property
     def offered(self) -> Mapping[KeyT, LocalT]:
-        """The entries that peers are told of."""
+        """The entries within the limit, by key; which of them a peer is sent is decided by ``offer``."""
         return self._offered
 
     @property
     def beyond(self) -> Beyond:
-        """How many entries are offered to no peer because there are too many."""
+        """The count of entries that are offered to no peer because there are more than the limit."""
         return Beyond(self._kind, self.limit, len(self._beyond))
 
     def is_beyond(self, key: KeyT) -> bool:
-        """Whether an entry is one of these."""
+        """Whether an entry is offered to no peer because the limit is reached."""
         return key in self._beyond
 
     def put(self, key: KeyT, local: LocalT) -> bool:
-        """Offer an entry, or a changed one; return whether there was room for it."""
+        """Offer an entry, or a changed one; return whether there was room for it.
+
+        Without room the entry waits until ``next_beyond`` returns it. Peers are not notified: call ``note``.
+        """
         if key not in self._offered and len(self._offered) >= self.limit:
             self._beyond[key] = local
             return False
@@ -131,7 +136,11 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
         return True
 
     def warning(self, what: str) -> Warn:
-        """What the user is told when there was no room; ``what`` names the count."""
+        """The warning to the user that there was no room for an entry.
+
+        Args:
+            what: The name of the counter.
+        """
         text = (
             f"this module has more {self._kind} than limits.{self._kind} = {self.limit}; the rest is offered to no "
             "peer: raise it in rmpa.toml and `rmpa reload`, or deny some"
@@ -139,27 +148,38 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
         return Warn(what, "local", text)
 
     def remove(self, key: KeyT) -> bool:
-        """Offer an entry no more; return whether it was offered, and not only beyond the limit."""
+        """Offer an entry no more; return whether it was within the limit."""
         self._beyond.pop(key, None)
         return self._offered.pop(key, None) is not None
 
     def next_beyond(self) -> tuple[KeyT, LocalT] | None:
-        """The entry beyond the limit that waits for longest, which waits no longer; ``None``: there is no room."""
+        """Take the entry beyond the limit that has waited longest; it waits no longer.
+
+        Returns:
+            Its key and value; ``None`` if none waits, or there is no room.
+        """
         return self._beyond.popitem(last=False) if self._beyond and len(self._offered) < self.limit else None
 
     # --- peers -------------------------------------------------------------------------------------------------
 
     def link_up(self, peer: int, name: str, instance: str, *, judged: bool) -> Portion[KeyT, OfferT, WireT]:
-        """A link is up: return the first portion of all there is; ``portions`` goes on with it."""
+        """Add a linked peer; return the first portion of the complete catalogue. ``portions`` yields the rest.
+
+        Args:
+            peer: The peer's number.
+            name: The peer's name.
+            instance: The peer's run, as 32 hexadecimal digits.
+            judged: Whether each entry is judged or renamed for this peer.
+        """
         self._peers[peer] = CataloguePeer(name, instance, judged, dict.fromkeys(self._offered))
         return self._portion(self._peers[peer])
 
     def link_down(self, peer: int) -> None:
-        """A link is gone."""
+        """Forget a peer and what it has been sent."""
         self._peers.pop(peer, None)
 
     def peer(self, peer: int) -> CataloguePeer[KeyT, LocalT, OfferT, WireT] | None:
-        """What is known of a linked peer."""
+        """The state of a linked peer; ``None`` if it is not linked."""
         return self._peers.get(peer)
 
     def peers(self) -> Iterator[CataloguePeer[KeyT, LocalT, OfferT, WireT]]:
@@ -167,32 +187,36 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
         return iter(self._peers.values())
 
     def told(self, peer: int, key: KeyT) -> OfferT | None:
-        """What a peer was told of an entry, by the name that it has over there."""
+        """The offer that a peer was last sent of an entry; ``None`` if it does not know the entry."""
         known = self._peers.get(peer)
         return known.told[key][0] if known is not None and key in known.told else None
 
     def note(self, key: KeyT) -> None:
-        """An entry has changed: peers are perhaps to be told."""
+        """Have an entry examined for every peer: it was put, changed or removed."""
         for known in self._peers.values():
             known.news.setdefault(key)
 
     def note_all(self, known: CataloguePeer[KeyT, LocalT, OfferT, WireT]) -> None:
-        """The rules for a peer have changed."""
+        """Have all entries examined for one peer: its rules have changed."""
         known.news.update(dict.fromkeys(self._offered))
 
     @property
     def pending(self) -> bool:
-        """Whether there is something to tell."""
+        """Whether entries are to be examined for any peer; ``portions`` does it."""
         return any(known.news for known in self._peers.values())
 
     def beginning(self, peer: int) -> bool:
-        """Whether a peer has not been told everything once since its link is up."""
+        """Whether a linked peer has not been sent the complete catalogue yet."""
         return known.beginning if (known := self._peers.get(peer)) is not None else False
 
     def portions(self, ready: Callable[[int], bool]) -> Iterator[tuple[int, Portion[KeyT, OfferT, WireT]]]:
-        """The next portion for each peer that is to be told something and is ready.
+        """Yield the number and next portion of each peer with entries to examine that is ready.
 
-        Of the peers for which each entry is judged only one is told, in turn: the loop must not wait for all.
+        Of the peers for which each entry is judged only one is served in a call, in turn, so that the event loop does
+        not wait for all of them.
+
+        Args:
+            ready: ``(peer)``: whether a portion may be sent to this peer now.
         """
         judged = False
         for number, known in list(self._peers.items()):

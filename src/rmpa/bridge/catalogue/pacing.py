@@ -1,4 +1,7 @@
-"""When a peer gets the next portion of a graph: commands share its lane, and must not wait behind all of it."""
+"""When the next portion of a catalogue is sent to a peer.
+
+Commands share the lane with advertisements, and must not wait until a whole catalogue has been sent.
+"""
 
 from __future__ import annotations
 
@@ -8,18 +11,20 @@ from rmpa.bridge import limits
 
 
 class Pacing:
-    """One for each direction of telling (topics, services)."""
+    """The time of the last portion for each peer. Topics and services have one instance each."""
 
     def __init__(self) -> None:
         self._told: dict[int, float] = {}
 
     def ready(self, peer: int, now: float, *, busy: bool) -> bool:
-        """Whether a portion may go to a peer now; it does then.
+        """Return whether a portion may be sent to a peer now; if so, remember ``now`` as the time of its last one.
+
+        On a busy lane a portion waits, but no longer than ``limits.TELL_PATIENCE`` after the one before.
 
         Args:
-            peer: Which.
+            peer: The peer's number.
             now: Monotonic seconds.
-            busy: Whether it would wait on its lane.
+            busy: Whether the portion would have to wait on the lane.
         """
         if busy and now - self._told.get(peer, -math.inf) < limits.TELL_PATIENCE:
             return False
@@ -27,5 +32,5 @@ class Pacing:
         return True
 
     def forget(self, peer: int) -> None:
-        """A peer is gone."""
+        """Drop what is remembered of a peer whose session has ended."""
         self._told.pop(peer, None)

@@ -1,6 +1,6 @@
-"""What of a peer is beyond this module's ``[limits]``: how much, and how it is told to that peer.
+"""What a peer offers beyond this module's ``[limits]``: the counts, and their form as a notification to that peer.
 
-Nothing that is beyond a limit vanishes: it is counted, it takes the place of what leaves, and both agents say so.
+Nothing vanishes because of a limit: it is counted, it is shown when there is room, and both agents report it.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ _Thing = TypeVar("_Thing")
 
 @dataclass(frozen=True, slots=True)
 class Beyond:
-    """What is hidden by one limit.
+    """What one limit hides.
 
     Args:
         kind: The limit: ``nodes``, ``topics`` or ``services``.
         limit: Its value.
-        hidden: How many of these are beyond it.
-        topics: Of hidden nodes: the topics that are hidden with them.
-        services: Of hidden nodes: the services.
+        hidden: How many nodes, topics or services are beyond it.
+        topics: With ``nodes``: how many topics are hidden because of their nodes.
+        services: With ``nodes``: how many services are hidden because of their nodes.
     """
 
     kind: str
@@ -39,7 +39,7 @@ class Beyond:
 
     @property
     def what(self) -> str:
-        """``744 nodes with 3720 topics and 744 services``."""
+        """The counts as text: ``744 nodes with 3720 topics and 744 services``."""
         own = f"{self.hidden} {self.kind if self.hidden > 1 else self.kind[:-1]}"
         counts = (("topics", self.topics), ("services", self.services))
         further = [f"{count} {kind}" for kind, count in counts if count]
@@ -47,12 +47,15 @@ class Beyond:
 
 
 def to_json(found: tuple[Beyond, ...]) -> dict[str, Any]:
-    """As the news that a peer gets: ``{"nodes": [limit, hidden, topics, services]}``."""
+    """The arguments of the notification to a peer: ``{"nodes": [limit, hidden, topics, services]}``."""
     return {one.kind: [one.limit, one.hidden, one.topics, one.services] for one in found}
 
 
 def from_json(args: Mapping[str, Any]) -> tuple[Beyond, ...]:
-    """Read such news; what is no list of whole numbers is passed over."""
+    """Read the arguments of such a notification.
+
+    A kind without four whole numbers, or with none hidden, is left out.
+    """
     found = []
     for kind in _KINDS:
         counts = args.get(kind)
@@ -66,11 +69,12 @@ def _is_count(value: object) -> bool:
 
 
 class NodePlaces(Generic[_Thing]):
-    """Which nodes of one peer stand in the local graph, and what waits for a place there.
+    """Which nodes of one peer are in the local graph, and what waits because its node is not.
 
-    A node has a place as long as one thing of it (a topic, a service) is shown. Under a lower limit the nodes in
-    surplus leave thing by thing; as many nodes as the limit allows are never in surplus, so when one of these leaves,
-    the first one in surplus keeps its place, and what of it waits already comes back.
+    A node takes a place as long as one thing of it (a topic, a service) is shown. After the limit was lowered, the
+    nodes that were shown last are in surplus: they keep what is shown, get nothing new, and their things are hidden
+    as they are judged again. When a node that is not in surplus leaves, the first node in surplus takes over its
+    place, and what waits of that node is the next to be shown.
 
     Args:
         limit: How many places there are.
@@ -82,31 +86,31 @@ class NodePlaces(Generic[_Thing]):
         self.limit = limit
         self._shown: Counter[str] = Counter()
         self._surplus: OrderedDict[str, None] = OrderedDict()
-        # Ordered: to take the first of a plain dict passes over all that were taken before it.
+        # Ordered: taking the first item of a plain dict passes over all that were taken before it.
         self._waiting: OrderedDict[str, dict[_Thing, None]] = OrderedDict()
 
     @property
     def waiting(self) -> Mapping[str, Mapping[_Thing, None]]:
-        """Nodes without a place, and their things."""
+        """The nodes without a place, and the things of each that wait."""
         return self._waiting
 
     def bound(self, limit: int) -> None:
-        """Another limit holds; the nodes that came last are in surplus if it is a lower one."""
+        """Set another limit; if it is lower, the nodes that were shown last are in surplus."""
         self.limit = limit
         self._surplus = OrderedDict.fromkeys(islice(self._shown, limit, None))
 
     def free(self, node: str) -> bool:
-        """Whether a node has a place, or there is one for it."""
+        """Whether a node may show a thing: it has a place and is not in surplus, or a place is free."""
         if node in self._shown:
             return node not in self._surplus
         return len(self._shown) < self.limit
 
     def wait(self, node: str, thing: _Thing) -> None:
-        """A thing is hidden because its node has no place."""
+        """Note that a thing is hidden because its node has no place."""
         self._waiting.setdefault(node, {})[thing] = None
 
     def leave(self, node: str, thing: _Thing) -> None:
-        """A thing is shown, hidden for another reason, or gone: it waits no longer."""
+        """Note that a thing no longer waits: it is shown, hidden for another reason, or gone."""
         things = self._waiting.get(node)
         if things is not None:
             things.pop(thing, None)
@@ -114,11 +118,14 @@ class NodePlaces(Generic[_Thing]):
                 del self._waiting[node]
 
     def show(self, node: str) -> None:
-        """One more thing of a node is shown."""
+        """Count one more thing of a node that is shown."""
         self._shown[node] += 1
 
     def hide(self, node: str) -> None:
-        """One thing of a node is shown no more."""
+        """Count one thing less of a node that is shown; the last one frees the node's place.
+
+        The first node in surplus, if any, takes over a place that a node outside the surplus frees.
+        """
         self._shown[node] -= 1
         if self._shown[node]:
             return
@@ -131,23 +138,24 @@ class NodePlaces(Generic[_Thing]):
                 self._waiting.move_to_end(stays, last=False)
 
     def next_in(self) -> Iterator[tuple[_Thing, ...]]:
-        """Behind each ``hide``, while there is a place: the things of the node that is next, which wait no longer.
+        """Yield the things that may be shown now, one node's at a time; they wait no longer. Call after ``hide``.
 
-        That is the one that waits for longest; before it, one that was in surplus and keeps its place.
+        The node that has waited longest is the next; before it comes a node in surplus that took over a place. The
+        caller shows the things before it asks for the next node, or the place still counts as free.
         """
         while self._waiting and self.free(next(iter(self._waiting))):
             yield tuple(self._waiting.popitem(last=False)[1])
 
     def give_up(self) -> None:
-        """Nothing waits any more: the peer is away."""
+        """Drop all that waits: the peer is away."""
         self._waiting.clear()
 
 
 class Surplus(Generic[_Thing]):
-    """Things of one peer beyond the number that is taken of it: they wait for a place, first come, first served.
+    """Offers of one peer beyond the number that is taken of it; they wait for room, first come, first served.
 
     Args:
-        limit: How many are remembered; further ones are only counted, and come with the next link.
+        limit: How many are remembered. Further ones are only counted, and can be shown after the peer's next link-up.
     """
 
     __slots__ = ("_forgotten", "_known", "limit")
@@ -167,34 +175,34 @@ class Surplus(Generic[_Thing]):
         return iter(self._known.values())
 
     def add(self, key: object, thing: _Thing) -> None:
-        """One more is beyond."""
+        """Remember one more offer, or only count it beyond ``limit``; a known key gets the new value."""
         if key in self._known or len(self._known) < self.limit:
             self._known[key] = thing
         else:
             self._forgotten += 1
 
     def discard(self, key: object) -> None:
-        """One is not there any more."""
+        """Drop an offer that the peer has removed; an unknown key lowers the count of those not remembered."""
         if self._known.pop(key, None) is None and self._forgotten:
             self._forgotten -= 1
 
     def pop(self) -> _Thing | None:
-        """The one that waits for longest."""
+        """Take the offer that has waited longest; ``None`` if none is remembered."""
         return self._known.popitem(last=False)[1] if self._known else None
 
     def clear(self) -> None:
-        """The peer begins to tell all anew."""
+        """Drop all: the peer advertises its catalogue anew, or is away."""
         self._known.clear()
         self._forgotten = 0
 
 
 def setting_name(kind: str) -> str:
-    """What a limit is called in ``rmpa.toml``."""
+    """The name of a limit in ``rmpa.toml``."""
     return f"limits.{kind}"
 
 
 def warning(peer: str, kind: str, limit: int) -> str:
-    """The line of the log when the first thing is beyond a limit."""
+    """The text of the log when a peer first exceeds a limit."""
     return (
         f"{peer} has more than {setting_name(kind)} = {limit} of this module; the rest stays hidden until there is "
         f"room: raise it in rmpa.toml and `rmpa reload`, or deny some; `rmpa peer info {peer}` counts them"

@@ -1,4 +1,4 @@
-"""What one peer offers, as far as it is taken: within limits, and confirmed over its present link. Pure."""
+"""What one peer offers, as far as it is taken: within limits, and confirmed over the present link. Pure."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ WireT = TypeVar("WireT")
 
 @dataclass(frozen=True, slots=True)
 class Change(Generic[OfferT, WireT]):
-    """A portion of an advertisement, small enough to be dealt with at once.
+    """A portion of an advertisement, small enough to be applied in one turn of the event loop.
 
     Args:
-        added: What is offered.
-        removed: Names on the wire of what is offered no more.
+        added: New or changed offers.
+        removed: Names on the wire that are no longer offered.
     """
 
     added: tuple[OfferT, ...] = ()
@@ -35,11 +35,12 @@ class PeerOffers(Generic[WireT, EntryT, OfferT]):
 
     Args:
         name: The peer's name.
-        nodes: Which of its nodes stand here, and what waits for a place; what it names there is up to its owner.
-        entries: What is taken of its offers, by the name on the wire.
-        surplus: Its offers beyond the limit.
-        doubtful: What it offered over its last link and has not offered again since.
-        away: Whether it has no link, and may come back.
+        nodes: Which of its nodes have a place in the local graph, and what waits for one. The owner decides whether
+            the things in it go by their names on the wire or by their local names.
+        entries: The offers that are taken, by name on the wire.
+        surplus: The offers beyond the limit.
+        doubtful: Names on the wire that were offered over the last link and are not confirmed over the present one.
+        away: Whether the peer has no link but may come back.
     """
 
     name: str
@@ -58,14 +59,15 @@ class PeerOffers(Generic[WireT, EntryT, OfferT]):
         full: bool,
         more: bool,
     ) -> Iterator[Change[OfferT, WireT]]:
-        """Split an advertisement into portions; what is offered no more goes first.
+        """Split an advertisement into portions; removals go first.
 
         Args:
-            added: What it offers.
-            removed: What it offers no more.
-            wire: The name on the wire of an offer.
-            full: Whether it begins a complete account: what that does not mention is offered no more.
-            more: Whether the account goes on with the next advertisement.
+            added: The offers that the advertisement adds.
+            removed: The names on the wire that it removes.
+            wire: ``(offer)``: the offer's name on the wire.
+            full: Whether it begins a complete catalogue: entries that the catalogue does not contain are removed at
+                its end.
+            more: Whether the complete catalogue goes on with the next advertisement.
         """
         if full:
             self.doubtful = set(self.entries)
@@ -81,7 +83,11 @@ class PeerOffers(Generic[WireT, EntryT, OfferT]):
             yield Change(added=added[begin : begin + step])
 
     def admitted(self, limit: int) -> OfferT | None:
-        """The offer beyond the limit that waits for longest, if there is room now; the caller takes it."""
+        """Take the offer in surplus that has waited longest.
+
+        Returns:
+            The offer; ``None`` if none waits, or ``limit`` entries are taken already.
+        """
         return self.surplus.pop() if len(self.entries) < limit else None
 
     def beyond(self, kind: str, limit: int) -> Beyond:
@@ -89,6 +95,6 @@ class PeerOffers(Generic[WireT, EntryT, OfferT]):
         return Beyond(kind, limit, len(self.surplus))
 
     def give_up(self) -> None:
-        """The peer does not come back soon: nothing of it waits for a place any more."""
+        """Drop all that waits for a place: the peer does not come back soon."""
         self.nodes.give_up()
         self.surplus.clear()

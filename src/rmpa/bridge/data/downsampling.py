@@ -16,7 +16,7 @@ class Downsampler:
         self._period = 1 / rate
         self._due = 0.0
         self.skipped = 0
-        """Messages left out for newer ones; counted by the sender."""
+        """Messages left out for newer ones; the sender counts them here."""
 
     @property
     def due(self) -> float:
@@ -24,11 +24,11 @@ class Downsampler:
         return self._due
 
     def admit(self, now: float) -> bool:
-        """Whether a message may be sent now; if so, the next one may a period later."""
+        """Whether a message may be sent now; if so, the next one is due a period later."""
         # A tenth of the period early is on time: two clocks at the same rate must not lose every other message.
         if now < self._due - self._period / 10:
             return False
-        # Keep the phase where messages come faster than the rate; begin anew after a pause.
+        # Keep the phase while messages come faster than the rate; restart it after a pause.
         self._due = max(self._due + self._period, now)
         if self._due < now + self._period / 2:
             self._due = now + self._period

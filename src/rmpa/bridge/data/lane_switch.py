@@ -2,14 +2,14 @@
 
 Sans-I/O. A contract's priority decides, else the size of the messages: one large message moves a topic to the bulk
 lane, a long series of small ones brings it back. Two connections have no common order. Therefore a *fence* is sent
-behind the last message on the present lane, and messages are held until the peer has answered it; then the other lane
+after the last message on the present lane, and messages are held until the peer has answered it; then the other lane
 is used::
 
     ON(express) ──large──► FENCING(express → bulk) ──fenced──► ON(bulk)
          ▲                                                        │ small, for long
          └────fenced──── FENCING(bulk → express) ◄────────────────┘
 
-A new route begins on the express lane, behind the control frame that opens it.
+A new route begins on the express lane, after the control frame that opens it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class LaneSwitch:
     """The lane of one route.
 
     Args:
-        contract: What holds for the route; only its priority is used.
+        contract: The contract of the route; only its priority is used.
         large: Whether the source is known to have large messages.
     """
 
@@ -44,9 +44,9 @@ class LaneSwitch:
         self._numbers = 0
         self._fence = 0
         self.lane = EXPRESS
-        """The lane of messages now; while fencing, that of the last ones."""
+        """The present lane; while fencing, the lane of the last messages."""
         self.target = BULK if self._fixed is BULK or (large and self._fixed is None) else EXPRESS
-        """The lane that they shall use."""
+        """The lane that messages should use."""
 
     @property
     def fencing(self) -> bool:
@@ -91,6 +91,6 @@ class LaneSwitch:
         return False
 
     def restart(self) -> None:
-        """A new link is used: its routes begin on the express lane."""
+        """Go back to the express lane, on which the routes of a new link begin."""
         self._fence = 0
         self.lane = EXPRESS

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Missed:
-    """Messages of a reliable source that a peer missed before a new numbering, and does not know of.
+    """Messages of a reliable source that a peer missed before a new numbering, unknown to the peer.
 
     Args:
         count: How many.
@@ -43,7 +43,7 @@ class KeptMessages(Protocol):
         ...
 
     def settle(self, source: Source, peer: int, epoch: int, after: int) -> Missed | None:
-        """A peer opens a route of a source again: what it missed until now, reported once; ``None`` if unknown.
+        """Return, once, what a peer that opens a source's route again has missed; ``None`` if unknown.
 
         Args:
             source: The source.
@@ -90,7 +90,7 @@ class _Record:
         settled: Missed messages of numberings that are accounted for.
         ended: The last numbering that ended, if it is not accounted for yet.
         wished: Whether the peer itself ended it.
-        at_least: Whether messages were published since that no agent counts.
+        at_least: Whether further messages were published since then, which no agent counts.
     """
 
     settled: int = 0
@@ -100,7 +100,7 @@ class _Record:
 
     @property
     def provisional(self) -> int:
-        """Missed messages of the ended numbering, as far as is known."""
+        """Missed messages of the ended numbering, as far as they are known before it is settled."""
         if self.ended is None:
             return 0
         return self.ended.seen_as_gaps if self.wished else self.ended.lost()
@@ -124,14 +124,14 @@ class LossRecords:
         return record.settled + record.provisional if record is not None else 0
 
     def end(self, source: Source, peer: int, ended: EndedNumbering, *, wished: bool, at_least: bool) -> None:
-        """A numbering has ended.
+        """Record a numbering that has ended.
 
         Args:
             source: The source.
             peer: The peer's number.
-            ended: What is known of it.
-            wished: Whether the peer ended it.
-            at_least: Whether its publisher goes on and its messages are not counted.
+            ended: The state of the numbering at its end.
+            wished: Whether the peer itself closed the route.
+            at_least: Whether the publisher goes on, so that further messages are missed and not counted.
         """
         record = self._records.pop((peer, source), None) or _Record()
         record.settled += record.provisional
@@ -139,14 +139,14 @@ class LossRecords:
         self._put(peer, source, record)
 
     def settle(self, source: Source, peer: int, epoch: int, after: int, *, inherited: bool = False) -> Missed | None:
-        """A peer opens a route of a source again; see ``KeptMessages``.
+        """Settle the ended numbering of a source that a peer opens again; see ``KeptMessages``.
 
         Args:
             source: The source.
             peer: The peer's number.
             epoch: The last numbering of which it has messages; 0 if it has none.
             after: The last message of that numbering that it has.
-            inherited: Whether it follows another run of its module, which may have missed something.
+            inherited: Whether the peer follows an earlier run of its module, which may have missed messages.
         """
         record = self._records.get((peer, source))
         if record is None or record.ended is None:
@@ -158,19 +158,19 @@ class LossRecords:
         if inherited and not epoch and not record.wished:
             record.settled += ended.lost()
             return Missed(ended.unseen(), record.at_least)
-        # The peer did not want what it misses, or it has forgotten what it had.
+        # The peer had closed the route itself, or it no longer knows its last message.
         record.settled += ended.seen_as_gaps if record.wished or not epoch else ended.lost()
         if not record.settled:
             del self._records[peer, source]
         return None
 
     def inherit(self, old: int, new: int) -> None:
-        """A module has another run: count for it what the old run missed."""
+        """Move the records of a module's old run to its new run."""
         for peer, source in [key for key in self._records if key[0] == old]:
             self._put(new, source, self._records.pop((peer, source)))
 
     def unclaimed(self, peer: int) -> None:
-        """A peer that was away has not asked for what it missed: no subscriber there needs it."""
+        """Settle the records of a peer that is back and has not opened its routes again in time."""
         for (owner, source), record in list(self._records.items()):
             if owner == peer and record.ended is not None:
                 record.settled += record.ended.seen_as_gaps
@@ -179,7 +179,7 @@ class LossRecords:
                     del self._records[owner, source]
 
     def forget(self, peer: int) -> None:
-        """A peer will not come back: drop its records."""
+        """Drop the records of a peer that will not come back."""
         for key in [key for key in self._records if key[0] == peer]:
             del self._records[key]
 
@@ -194,8 +194,8 @@ class ReceptionHistory:
     """What is known of a reliable source from before its present route.
 
     Args:
-        topic: Its topic here.
-        receiver: Its position in the numbering; ``None``: a new route cannot go on from there.
+        topic: Its topic in the local graph.
+        receiver: The position in its numbering; ``None``: a new route begins anew.
         missed: Whether there were subscribers when the route ended, so that later messages are missed.
         lost: Messages that never came.
         counts: Events of its contract, by kind.
@@ -210,6 +210,6 @@ class ReceptionHistory:
     recent: tuple[QosEvent, ...]
 
     def forget_position(self, *, missed: bool) -> None:
-        """A new route cannot go on from the last position any more."""
+        """Forget the position, so that a new route begins anew; ``missed`` as in the class."""
         self.receiver = None
         self.missed = missed

@@ -1,4 +1,4 @@
-"""The offset of a peer's clock over the last minute: latencies are corrected by what was known at their time."""
+"""The offset of a peer's clock over the last minute; each latency is corrected with an estimate of its time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ClockEstimate:
-    """What was known of the peer's clock at one moment.
+    """An estimate of the peer's clock at one moment.
 
     Args:
         now: The moment, monotonic seconds.
@@ -39,7 +39,7 @@ class PeerClockHistory:
     def __init__(self) -> None:
         self._estimates: deque[ClockEstimate] = deque(maxlen=limits.QUALITY_CLOCKS)
         self.trusted_from = -math.inf
-        """Latencies of messages from before this time (monotonic seconds) are not known."""
+        """Latencies of messages that came before this time (monotonic seconds) are unknown."""
 
     def __iter__(self) -> Iterator[ClockEstimate]:
         """Oldest first."""

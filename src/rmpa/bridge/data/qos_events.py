@@ -1,8 +1,8 @@
 """Watches whether the messages of one remote source keep their contract: deadline, lifespan, liveliness, loss.
 
 The data path only assigns the time of the last message to ``QosWatch.last``; all else happens when the timer is due.
-It is due one deadline after the last message that it knew of, so a message that came since was in time, and no gap
-is overlooked.
+The timer is due one deadline after the last message that it has seen. A message that came since then was in time, so
+no gap is overlooked.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class QosEventKind(StrEnum):
-    """What can happen to a contract, by the names of ROS 2's QoS events."""
+    """The kinds of events of a contract, named after ROS 2's QoS events."""
 
     DEADLINE_MISSED = "deadline_missed"
     LIFESPAN_EXPIRED = "lifespan_expired"
@@ -39,9 +39,9 @@ class QosEvent:
 
     Args:
         kind: What happened.
-        count: How often, or to how many messages.
-        text: The event for people.
-        now: When it happened, of several when the last one did; monotonic seconds.
+        count: How often it happened, or how many messages it concerns.
+        text: The event, to show to a user.
+        now: When it happened, or the last of several did; monotonic seconds.
     """
 
     kind: QosEventKind
@@ -56,7 +56,7 @@ class QosWatch:
     The deadline, and the lease of ``manual_by_topic``, count from the start: a source that never sends misses both.
 
     Args:
-        contract: What holds for the route.
+        contract: The contract of the route.
         now: Monotonic seconds, as in all calls.
     """
 
@@ -77,9 +77,9 @@ class QosWatch:
     def __init__(self, contract: Contract, now: float) -> None:
         self._contract = contract
         self.last = now
-        """When the last message came, before the first one the start; assigned by the data path."""
+        """When the last message came (before the first one: the start), monotonic seconds; set by the data path."""
         self.counts: Counter[QosEventKind] = Counter()
-        """How often each kind of event came since the start."""
+        """The sum of the counts of each kind of event since the start."""
         self.recent: deque[QosEvent] = deque(maxlen=limits.WATCH_RECENT)
         """The last events, oldest first; an event that repeats is kept once, with the sum of its counts."""
         self._seen = now  # the message from which the present deadline counts
@@ -96,17 +96,17 @@ class QosWatch:
         return self._lost_since is None
 
     def lost(self, count: int, now: float) -> QosEvent:
-        """``count`` messages (at least one) never came, as the gap in the sequence shows."""
+        """Record ``count`` messages (at least one) that never came, as a gap in the sequence or the peer shows."""
         return self._happened(QosEventKind.MESSAGES_LOST, count, lambda sum_: f"{_messages(sum_)} lost", now)
 
     def lost_unknown(self, why: str, now: float) -> QosEvent:
-        """Messages may have been lost, and no agent knows how many."""
+        """Record that an unknown number of messages may be lost; ``why`` is the reason."""
         return self._happened(
             QosEventKind.LOSS_UNKNOWN, 1, lambda _: f"messages may be lost, not counted: {why}", now
         )
 
     def expired(self, count: int, now: float) -> QosEvent:
-        """``count`` messages (at least one) were dropped beyond their lifespan."""
+        """Record ``count`` messages (at least one) that were dropped after their lifespan."""
         lifespan = self._contract.lifespan
         beyond = "beyond the lifespan" + ("" if lifespan is None else f" of {shown_seconds(lifespan)}")
         return self._happened(QosEventKind.LIFESPAN_EXPIRED, count, lambda sum_: f"{_messages(sum_)} {beyond}", now)
@@ -122,7 +122,7 @@ class QosWatch:
         self._look = now
 
     def link_gone(self, now: float) -> list[QosEvent]:
-        """The source leaves the graph: if its link is down, its liveliness is lost now, before the lease is over."""
+        """End the watch of a source that leaves the graph: if its link is down, its liveliness is lost at once."""
         lease = self._contract.liveliness_lease
         if self._down_since is None or lease is None:
             return []
@@ -165,7 +165,7 @@ class QosWatch:
         return self._happened(QosEventKind.DEADLINE_MISSED, count, lambda _: text, now, goes_on=goes_on)
 
     def _silent_since(self) -> float | None:
-        """Since when no sign of life came, or ``None`` where the link itself is one."""
+        """When the last sign of life came; ``None`` while the link itself is one."""
         return self.last if self._contract.liveliness is Liveliness.MANUAL_BY_TOPIC else self._down_since
 
     def _liveliness_due(self) -> float | None:
@@ -175,7 +175,7 @@ class QosWatch:
         if self._lost_since is None:
             return None if silent is None else silent + lease
         if self._contract.liveliness is Liveliness.AUTOMATIC and silent == self._silent_at_loss:
-            return None  # link_up will say so
+            return None  # only link_up can change that
         return self._look
 
     def _judge_life(self, now: float) -> QosEvent | None:
@@ -224,7 +224,7 @@ def _messages(count: int) -> str:
 
 
 def shown_seconds(seconds: float) -> str:
-    """A duration for people: ``200 ms``, ``12.5 s``."""
+    """A duration as text: ``200 ms``, ``12.5 s``."""
     if seconds < 1:
         return f"{round(seconds * 1e3, 1):g} ms"
     return f"{round(seconds, 2):.10g} s"

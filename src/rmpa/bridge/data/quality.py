@@ -1,8 +1,8 @@
-"""How the messages of one remote source arrive: periods, one-way latencies and sizes, from rings of fixed size.
+"""Statistics of one remote source's arrivals: periods, one-way latencies and sizes, from rings of fixed size.
 
-The data path only stores three numbers a message; everything else is computed on request. At thousands of messages a
-second a ring holds some milliseconds, which show the rate of one burst and not of the source. Therefore each turn of
-the ring leaves a mark (time, messages, bytes), and rate and bandwidth are counted from a mark a second ago.
+The data path stores only three numbers for each message; everything else is computed on request. At thousands of
+messages a second, a ring holds only some milliseconds: the rate of one burst, not of the source. Therefore each turn
+of the ring leaves a mark (time, messages, bytes), and rate and bandwidth are counted from a mark a second ago.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _Number = TypeVar("_Number", int, float)
 
 
 class _Mark(NamedTuple):
-    """When a message came, and how many messages and bytes had come with it."""
+    """When a message came, and how many messages and bytes had come up to it."""
 
     time: float
     messages: int
@@ -43,7 +43,7 @@ class QualitySummary:
     Args:
         latency: From the arrival of a message at the publisher's agent to its delivery here; ``None`` where the
             peer's clock is unknown, or nothing came.
-        latency_last: That of the last message.
+        latency_last: The latency of the last message.
         latency_error: The true latencies lie within ± this.
         period: Between messages.
         jitter: The period's 99th percentile less its median; ``nan`` before the third message.
@@ -52,7 +52,7 @@ class QualitySummary:
         bandwidth: Bytes a second, over the same time.
         age: Since the last message; ``None`` if none came.
         messages: Since the route was opened.
-        bytes: Since then.
+        bytes: Since the route was opened.
     """
 
     latency: SampleSummary | None
@@ -84,7 +84,7 @@ class Quality:
             raise ValueError(f"the window must be a power of two from 2 on, not {window}")
         self._slot = 0
         self._before = 0  # messages of all turns of the ring before this one
-        # Where turns began, oldest first, at most one in a part of the span that they are for.
+        # The ends of turns, oldest first, at most one in each of the ``_MARKS`` parts of the span.
         self._marks: deque[_Mark] = deque(maxlen=_MARKS + 2)
         self._times = array("d", bytes(8 * window))
         self._delays = array("d", bytes(8 * window))
@@ -123,7 +123,7 @@ class Quality:
             self._marks.append(_Mark(self._times[0], 1, self._sizes[0]))  # the very first message
         self._before += window
         if now - self._marks[-1].time >= limits.QUALITY_RATE_SPAN / _MARKS:
-            # Of the last message of the turn, whose size is in the count.
+            # The last message of the turn; its size is already in ``bytes``.
             self._marks.append(_Mark(self._times[-1], self._before, self.bytes))
         self._times[0] = now
         self._slot = 0

@@ -1,4 +1,4 @@
-"""The bridge of one agent: joins the local core and the links of the mesh by its parts."""
+"""The bridge of one agent: its parts connect the local core with the links of the mesh."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ class Bridge:
 
     Args:
         core: The local core, started.
-        policy: What may cross.
-        contracts: What its topics need.
-        names: How names read at the peers, and theirs here.
-        relay: Whether what comes from one peer is offered to others.
-        limit_settings: How much of one peer is taken, and how much is offered.
+        policy: Decides what may cross.
+        contracts: The contracts of the module's topics.
+        names: Translates names between this module and its peers.
+        relay: Whether this module offers the sources of one peer to others.
+        limit_settings: Bounds what is taken from one peer, and what is offered.
         rng: Uniform numbers in [0, 1) for back-off jitter.
     """
 
@@ -63,7 +63,7 @@ class Bridge:
         self._core = core
         self.counters = Counters()
         self.rpc = PeerRpc(self.counters)
-        """Requests to the peers, and theirs."""
+        """The requests and notifications to and from the peers."""
         kills = ProxyKills(self.rpc)
         self.node = SlaveNode(
             OWN_NODE,
@@ -83,9 +83,9 @@ class Bridge:
         self._parts: list[Part] = [self.rpc]
         self._by_op: dict[str, Part] = {}
         self.sessions = PeerSessions(self._parts, self.proxy_nodes, self.receiver, kills.proxy)
-        """The peers."""
+        """The sessions of the peers."""
         self.relay = Relay(enabled=relay)
-        """What is passed on between peers."""
+        """Which sources of one peer are offered to others."""
         self.topics = Topics(
             core,
             self.node,
@@ -109,16 +109,16 @@ class Bridge:
             self._by_op[part.advertisement] = part
 
     def place(self, identity: Identity) -> None:
-        """Set this agent's identity: what relays bring back here is recognized by it. There are no links yet."""
+        """Set this agent's identity, before the first link; its own sources that a relay brings back are hidden."""
         self.relay.instance = identity.instance.hex()
 
     def reload(self, settings: Settings) -> None:
-        """Other rules hold from now on; what they leave as it is goes on untouched, the rest follows in a moment."""
+        """Take new settings; unchanged sources and routes go on, changes follow in later turns of the loop."""
         for part in self._parts:
             part.reload(settings)
 
     async def start(self) -> None:
-        """Follow the local graph."""
+        """Start the agent's node, the parts and the following of the local graph."""
         await self.node.start()
         await self.proxy_nodes.start()
         self._core.on_change(self._graph_changed)
@@ -127,7 +127,7 @@ class Bridge:
             part.start()
 
     async def close(self) -> None:
-        """Retract all that came from elsewhere and leave all local publishers."""
+        """Retract everything that came from peers, and disconnect all local publishers."""
         if self._reconciler is not None:
             self._reconciler.cancel()
         await self.sessions.close()
@@ -139,17 +139,17 @@ class Bridge:
     # --- the mesh's side ---------------------------------------------------------------------------------------
 
     def control(self, link: PeerLink, payload: bytes | bytearray | memoryview) -> None:
-        """A control frame came.
+        """Pass a control frame of a link to the part that it belongs to.
 
         Raises:
-            RemoteProtocolError: It is not a message that belongs here; the link is to be closed.
+            RemoteProtocolError: It is no valid message, or belongs to no part; the caller closes the link.
         """
         session = self.sessions.of(link)
         if session is None:
             return
         part = self._by_op.get(op_of(payload))
         if part is not None:
-            # It takes long to parse, and no data waits for it: this is called by a reader of data, so not now.
+            # Parsing takes long, and this is called from a reader of data: so it is done later.
             part.advertised(session, bytes(payload))
             return
         message = decode(payload)
@@ -166,7 +166,7 @@ class Bridge:
             part.graph_changed(change)
 
     def _param_update(self, key: str, _value: XmlRpcValue) -> bool:
-        return sum(part.param_update(key) for part in self._parts) > 0  # each of them is told
+        return sum(part.param_update(key) for part in self._parts) > 0  # a sum, because every part must be called
 
     def _reconcile_later(self) -> None:
         self._reconciler = asyncio.get_running_loop().call_later(limits.RECONCILE_INTERVAL, self._reconcile)

@@ -1,4 +1,4 @@
-"""Tells each peer how much of it is beyond this module's ``[limits]``, and keeps what peers say of ours.
+"""Reports to each peer how much of it this module's ``[limits]`` hide, and keeps the peers' reports.
 
 So a user learns on either machine that something is hidden, and by which setting of which module.
 """
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
     from rmpa.config.settings import LimitSettings, Settings
 
 HIDDEN: Final = "limits.hidden"
-"""The news: what of the peer that gets it is hidden here, as ``Beyond`` in JSON; empty when nothing is."""
+"""The notification of what the sender hides of the receiver: ``Beyond`` in JSON; empty if nothing is hidden."""
 
 
 class LimitReports(Part):
-    """The part of the bridge that is about limits.
+    """The part of the bridge that sends and receives reports about limits.
 
     Args:
         sessions: The peers.
-        rpc: Brings news to the peers, and from them.
+        rpc: Sends and receives the notifications.
         topics: The part with the topics' plans.
         services: The part with the services' plans.
-        limit_settings: The limits.
+        limit_settings: The limits of this module.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class LimitReports(Part):
         rpc.on_notification(HIDDEN, self._told_by_peer)
 
     def here(self, peer: int) -> tuple[Beyond, ...]:
-        """What of a peer is hidden here."""
+        """How much of a peer is hidden here, by each limit."""
         topics, services = self._topics.imports.crowded(peer), self._services.imports.crowded(peer)
         nodes = Beyond(
             "nodes",
@@ -59,19 +59,19 @@ class LimitReports(Part):
         return tuple(one for one in found if one.hidden)
 
     def there(self, peer: int) -> tuple[Beyond, ...]:
-        """What of ours is hidden at a peer, as it says."""
+        """How much of this module a peer hides, as it last reported."""
         return self._there.get(peer, ())
 
     def own(self) -> tuple[Beyond, ...]:
-        """What of ours is offered to no peer."""
+        """How much of this module is offered to no peer, by each limit."""
         return tuple(one for one in (self._topics.exports.beyond, self._services.exports.beyond) if one.hidden)
 
     def reload(self, settings: Settings) -> None:
-        """Other limits hold from now on."""
+        """Take the limits of new settings."""
         self._limit_settings = settings.limits
 
     def reconcile(self) -> None:
-        """Tell what has changed."""
+        """Notify the peers for which the hidden amount has changed."""
         for session in self._sessions.linked():
             found = self.here(session.peer)
             if found != self._told.get(session.peer, ()):
@@ -79,12 +79,12 @@ class LimitReports(Part):
                 self._rpc.notify(session, HIDDEN, to_json(found))
 
     def link_up(self, session: PeerSession) -> None:
-        """The peer may be another run; what is hidden is told anew."""
+        """Forget earlier reports, so that the peer is notified anew."""
         self._told.pop(session.peer, None)
         self._there.pop(session.peer, None)
 
     def gone(self, session: PeerSession) -> None:
-        """The peer will not come back."""
+        """Forget the reports about a peer that will not come back."""
         self.link_up(session)
 
     def _told_by_peer(self, session: PeerSession, args: dict[str, Any]) -> None:

@@ -30,20 +30,20 @@ _log = logging.getLogger(__name__)
 LIST: Final = "node.list"
 """The request for a module's own nodes."""
 INFO: Final = "node.info"
-"""The request for what is known of a ``node``."""
+"""The request for the facts about a ``node``: ``NodeFacts``."""
 PING: Final = "node.ping"
 """The request to ping a ``node``."""
 REPLIES: Final[dict[str, object]] = {LIST: tuple[NodeLine, ...], INFO: NodeFacts, PING: NodePing, KILL: NodeEnd}
-"""What each request is replied by; ``KILL`` ends a ``node``, where ``nodes.kill`` allows it."""
+"""The type of each response; ``KILL`` ends a ``node``, where ``nodes.kill`` allows it."""
 
 
 class NodeRequests:
     """Answers the peers' requests about this module's nodes.
 
     Args:
-        settings: The agent's.
-        core: Its ROS core.
-        asks: Brings the requests.
+        settings: The agent's settings.
+        core: The local core.
+        asks: Receives the requests.
     """
 
     def __init__(self, settings: Settings, core: Core, asks: PeerRpc) -> None:
@@ -55,7 +55,7 @@ class NodeRequests:
         asks.on_request(KILL, self._kill)
 
     def reload(self, settings: Settings) -> None:
-        """Other settings hold from now on."""
+        """Take new settings."""
         self._settings = settings
 
     def _list(self, _asker: PeerSession, _args: dict[str, Any]) -> tuple[NodeLine, ...]:
@@ -88,7 +88,7 @@ class NodeRequests:
             raise RmpaError(f"no glob of nodes.kill in the rmpa.toml of {here} fits {node}; allow it there")
         _log.warning("= %s ends %s", who, node)
         gone = await end_node(node, uri, OWN_NODE, f"killed by {who}")
-        self._core.suspect(node)  # roscpp leaves its registrations behind when it ends in a hurry
+        self._core.suspect(node)  # roscpp does not unregister when it ends in a hurry
         return NodeEnd(gone=gone)
 
     def _own(self, args: dict[str, Any]) -> tuple[str, str]:

@@ -19,19 +19,21 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 KILL: Final = "node.kill"
-"""The question to a node's agent: end it. ``node``, ``by`` (the caller's node) and ``reason``; the answer is a
-``NodeEnd``."""
+"""The request to a node's agent to end the node, with ``node``, ``by`` (the caller's node) and ``reason``.
+
+The response is a ``NodeEnd``.
+"""
 _REFUSED: Final = 0
 
 
 class ProxyKills:
-    """Answers the calls of ``shutdown`` that proxies and the agent's own node get.
+    """Answers the ``shutdown`` calls to proxies and to the agent's own node.
 
-    ``rosnode kill -a`` asks every node of the graph in the order of their names, the agent's own node before the
-    proxies. It ends the nodes of this module, and those of other modules live on: a module stands alone.
+    ``rosnode kill -a`` calls every node of the graph in the order of their names, so the agent's own node comes
+    before the proxies. It ends only the nodes of this module; nodes of other modules live on.
 
     Args:
-        rpc: Carries the question.
+        rpc: Sends the requests.
     """
 
     def __init__(self, rpc: PeerRpc) -> None:
@@ -40,7 +42,7 @@ class ProxyKills:
         self._under_way = 0
 
     async def own(self, caller: str, reason: str) -> RosReply:
-        """The agent's own node was asked to end: it stays."""
+        """Refuse to end the agent's own node, and remember the caller for ``limits.NODE_KILL_ALL`` seconds."""
         now = asyncio.get_running_loop().time()
         self._all = {other: until for other, until in self._all.items() if until > now}
         if len(self._all) < limits.NODE_KILLS_AT_ONCE:
@@ -49,17 +51,17 @@ class ProxyKills:
         return RosReply(_REFUSED, "this node is the agent; it ends with `rmpa up`", 0)
 
     async def proxy(self, session: PeerSession, node: str, caller: str, reason: str) -> RosReply:
-        """A proxy was asked to end: let the node that it stands for do so.
+        """End the node that a proxy stands for, because the proxy was asked to end.
 
         Args:
-            session: The peer whose node it is.
-            node: Its name in the peer's graph.
+            session: The peer that has the node.
+            node: The node's name in the peer's graph.
             caller: The caller's node.
-            reason: What it says.
+            reason: The caller's reason, as text.
         """
         whose = f"{session.link.name}:{node}"
         if caller == MASTER_ID:
-            # Another node took the proxy's name here. That is nothing to the node over there.
+            # Another local node took the proxy's name. That does not concern the node at the peer.
             _log.warning("! another node has the name of the proxy of %s", whose)
             return RosReply(1, "shutdown", 0)
         problem = await self._ask(session, node, caller, reason)
@@ -70,7 +72,7 @@ class ProxyKills:
         return RosReply(1, "shutdown", 0)
 
     async def _ask(self, session: PeerSession, node: str, caller: str, reason: str) -> str:
-        """Have it ended; why it is not, or empty."""
+        """Asks the peer to end the node; returns why it is not ended, or empty."""
         loop = asyncio.get_running_loop()
         if self._all.get(caller, 0.0) > loop.time():
             self._all[caller] = loop.time() + limits.NODE_KILL_ALL

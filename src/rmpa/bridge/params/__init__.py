@@ -1,1 +1,1 @@
-"""Parameters across modules: what may be read, set and followed, and how it crosses."""
+"""Parameters across modules: which may be read, set and followed, and how they cross."""

@@ -1,4 +1,4 @@
-"""Which parameters another module may read, set and follow, and what this one follows: tables without I/O."""
+"""Which parameters peers may read, set and follow, and the parameters that this module follows. Without I/O."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _OF_OTHERS: Final = "it is followed from {owner} ([[param]]); ask or set it ther
 
 
 def leaves(key: str, value: XmlRpcValue) -> Iterator[tuple[str, XmlRpcValue]]:
-    """The parameters that a value at a key makes: itself, or each member of a namespace, at any depth."""
+    """Yield the parameters that a value at a key consists of: itself, or each member of a namespace, at any depth."""
     waiting: list[tuple[str, XmlRpcValue]] = [(key, value)]
     while waiting:
         at, part = waiting.pop()
@@ -31,12 +31,12 @@ def leaves(key: str, value: XmlRpcValue) -> Iterator[tuple[str, XmlRpcValue]]:
 
 
 def key_problem(key: object) -> str:
-    """Why a peer's word is no parameter's name, or empty."""
+    """Why a key from a peer is not a parameter's global name; empty if it is one."""
     if not isinstance(key, str) or not key.startswith("/"):
         return f"{str(key)[:100]!r} is not the global name of a parameter"
     if len(key) > config_limits.CROSSING_NAME_MAX or key.count("/") > ros_limits.PARAM_DEPTH_MAX:
         return f"the name of a parameter has {len(key)} characters, or too many namespaces"
-    # Masters take any characters, and parameters have been called joint-1 for long.
+    # Masters accept any characters, and names such as joint-1 have long been in use.
     if "//" in key or not key.isprintable() or any(c.isspace() for c in key):
         return f"{key[:100]!r} is not a parameter's name"
     return ""
@@ -46,8 +46,8 @@ class ParamPolicy:
     """What peers may do with this module's parameters.
 
     Args:
-        params: The user's globs, and what this module follows.
-        time: Whether it shares its time.
+        params: The globs of ``[params]``, and what this module follows.
+        time: Whether this module shares its time, and whose time it follows.
     """
 
     def __init__(self, params: ParamSettings, time: TimeSettings) -> None:
@@ -56,17 +56,17 @@ class ParamPolicy:
 
     @property
     def all_get(self) -> bool:
-        """Whether peers may read everything."""
+        """Whether peers may read every parameter."""
         return "/**" in self._params.remote_get or "**" in self._params.remote_get
 
     def why_not_get(self, key: str) -> str:
-        """Why peers may not read a parameter, or empty."""
+        """Why peers may not read a parameter; empty if they may."""
         if any(matches(glob, key) for glob in self._params.remote_get):
             return ""
         return f"{key} may not be read by peers: no glob of params.remote_get fits"
 
     def why_not_set(self, key: str) -> str:
-        """Why peers may not set or delete a parameter, or empty."""
+        """Why peers may not set or delete a parameter; empty if they may."""
         if key == "/":
             return "the root holds every parameter: name those that you mean"
         if why := untouchable(key):
@@ -79,7 +79,7 @@ class ParamPolicy:
         return f"{key} may not be set by peers: no glob of params.remote_set fits"
 
     def why_not_follow(self, key: str) -> str:
-        """Why peers may not follow a parameter, or empty."""
+        """Why peers may not follow a parameter; empty if they may."""
         if key == "/":
             return "the root holds every parameter: name those that you mean"
         if overlap(key, SIM_TIME):
@@ -88,13 +88,13 @@ class ParamPolicy:
             return "" if self._time.share else "this module does not share its time; set share = true in its [time]"
         for rule in self._params.follow:
             if overlap(rule.to, key):
-                # A follower could be followed back, and two values would chase each other.
+                # If two modules followed each other, their values would never settle.
                 return f"{rule.to} is followed from {rule.owner}:{rule.key} here; follow that one"
         return self.why_not_get(key)
 
 
 def follow_rules(params: ParamSettings, time: TimeSettings) -> tuple[FollowRule, ...]:
-    """All that this module follows, its time included."""
+    """All parameters that this module follows, including the time if ``[time]`` has it followed."""
     return params.follow + ((FollowRule(SIM_TIME, time.follow, SIM_TIME),) if time.follow else ())
 
 
@@ -103,16 +103,16 @@ class Followed:
     """One followed parameter.
 
     Args:
-        rule: What it is.
-        peer: The number of the link that it is followed over; ``None`` while its owner is not linked.
-        last: The same, of the last link: an owner that was restarted has another number.
-        text: The owner's value as XML-RPC text, as it was last told; ``None`` where it has none, or before.
-        known: Whether the owner has said anything yet.
-        had: Whether this run of the owner has had a value; where it never had one, what is here stays.
-        ask: Whether the value has to be asked for: it is larger than a portion.
-        due: Whether the local core has to be looked at, or set.
-        doubted: Whether a local node has changed it since.
-        problem: What is wrong with it, or empty.
+        rule: Its owner, the owner's key, and the key here.
+        peer: The number of the peer that it is followed from; ``None`` while its owner is not linked.
+        last: ``peer`` of the last link: another run of the owner has another number.
+        text: The owner's value as XML-RPC text; ``None`` if the owner has none, or it is unknown.
+        known: Whether the owner's value, or its absence, is known.
+        had: Whether this run of the owner has had a value. Before that, an absent value does not delete the one here.
+        ask: Whether the value is to be requested, because it is larger than a portion.
+        due: Whether the local core is to be compared with the owner's value, and set.
+        doubted: Whether the local core has reported a change of it since the last comparison.
+        problem: Why it is not followed, or empty.
     """
 
     rule: FollowRule
@@ -128,14 +128,14 @@ class Followed:
 
     @property
     def state(self) -> str:
-        """In one word, for people: ``followed``, ``waiting`` (for its owner) or ``refused``."""
+        """The state for the user: ``followed``, ``waiting`` (for the owner) or ``refused``."""
         if self.problem:
             return "refused" if self.peer is not None else "waiting"
         return "followed" if self.peer is not None and self.known else "waiting"
 
 
 class Following:
-    """Which parameters are followed over which link: each has one owner.
+    """Which parameters are followed from which peer; each has one owner.
 
     Args:
         rules: What is followed.
@@ -145,14 +145,14 @@ class Following:
         self._entries: dict[FollowRule, Followed] = {rule: Followed(rule) for rule in rules}
 
     def __iter__(self) -> Iterator[Followed]:
-        """All of them, in order."""
+        """All followed parameters, in the order of the rules."""
         return iter(self._entries.values())
 
     def change(self, rules: Iterable[FollowRule]) -> tuple[list[Followed], list[Followed]]:
-        """Follow these from now on; those that stay are not touched.
+        """Replace the rules; the parameters of rules that stay are not touched.
 
         Returns:
-            Those that are not followed any more, and the new ones.
+            Those that are no longer followed, and the new ones.
         """
         before = self._entries
         self._entries = {rule: before.get(rule) or Followed(rule) for rule in rules}
@@ -160,10 +160,14 @@ class Following:
         return gone, [entry for rule, entry in self._entries.items() if rule not in before]
 
     def linked(self, peer: int, name: str) -> tuple[list[Followed], list[Followed]]:
-        """A peer of this name has a link.
+        """Follow the parameters of a peer that is linked now.
+
+        Args:
+            peer: The peer's number.
+            name: The peer's name; several peers may have it, and the first one is the owner.
 
         Returns:
-            Those that are followed over it now, and those that another peer of the same name owns already.
+            Those that are followed from this peer now, and those that another peer of the same name owns already.
         """
         mine, others = [], []
         for entry in self._entries.values():
@@ -179,10 +183,10 @@ class Following:
         return mine, others
 
     def unlinked(self, peer: int) -> list[Followed]:
-        """A link is gone: the values stay as they are.
+        """Note that a link is gone; the values stay as they are.
 
         Returns:
-            Those that it concerns: another peer of the name may own them now.
+            The parameters that were followed over it: another peer of the same name may own them now.
         """
         gone = [entry for entry in self._entries.values() if entry.peer == peer]
         for entry in gone:
@@ -190,7 +194,17 @@ class Following:
         return gone
 
     def told(self, peer: int, key: str, *, exists: bool, text: str | None) -> list[Followed]:
-        """The owner's value is this, or has to be asked for (``exists`` without a text)."""
+        """Store the value that the owner has reported.
+
+        Args:
+            peer: The owner's number.
+            key: The owner's key.
+            exists: Whether the owner has a value.
+            text: The value as XML-RPC text; ``None`` if there is none, or (with ``exists``) it is to be requested.
+
+        Returns:
+            The parameters that follow this key.
+        """
         found = [entry for entry in self._entries.values() if entry.peer == peer and entry.rule.key == key]
         for entry in found:
             if exists and text is None:
@@ -200,17 +214,20 @@ class Following:
         return found
 
     def touched(self, key: str) -> list[Followed]:
-        """A local node has changed a parameter: those that it may concern."""
+        """The followed parameters that a change of this local key may concern."""
         return [entry for entry in self._entries.values() if overlap(entry.rule.to, key)]
 
     @property
     def size(self) -> int:
-        """Characters remembered of all of them."""
+        """Characters of all values that are kept."""
         return sum(len(entry.text or "") for entry in self._entries.values())
 
 
 def learn(entry: Followed, text: str | None) -> None:
-    """Take the owner's value, or that it has none (``None``): from the beginning on, that leaves what is here."""
+    """Store the owner's value, or that the owner has none (``None``).
+
+    If this run of the owner has never had a value, the one here is kept; else the local core is to be set.
+    """
     entry.ask = False
     entry.known = True
     if text is not None:

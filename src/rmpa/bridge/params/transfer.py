@@ -1,8 +1,8 @@
-"""How a parameter crosses in portions, and what two agents ask each other about parameters.
+"""How a parameter crosses in portions, and the requests between two agents about parameters.
 
-Values cross as the text of an XML-RPC response (``ros.wire.xmlrpc``), so that their types survive: JSON knows neither
-binary data nor dates. Each question of ``bridge.session.peer_rpc`` carries at most ``limits.PARAM_PORTION``
-characters of it, and the next is asked when the last was answered: megabytes hold up no command. ::
+Values cross as the text of an XML-RPC response (``ros.wire.xmlrpc``), so that their types survive: JSON has neither
+binary data nor dates. Each request of ``bridge.session.peer_rpc`` carries at most ``limits.PARAM_PORTION`` characters
+of it, and the next is sent when the last was answered, so megabytes delay no command. ::
 
     param.get {key}                       → {size, text, reading}     reading: 0, or the number for param.more
     param.names {}                        → likewise; a list of the names of all parameters that may be read
@@ -10,11 +10,11 @@ characters of it, and the next is asked when the last was answered: megabytes ho
     param.put {writing, offset, text}     → {size}
     param.set {key, text}                 → {count}                   text, or what was put: {key, writing, size}
     param.delete {key}                    → {}
-    param.follow {keys}                   → {refused}                 from now on their news, as below
-    tell param.value {key, exists, size, text}                        without text: larger than a portion; ask for it
+    param.follow {keys}                   → {refused}                 from now on their changes, as below
+    notification param.value {key, exists, size, text}                without text: larger than a portion; read it
 
-The asker's side is two generators, for an agent's loop and for the command line alike: they yield questions and are
-sent the answers.
+The asking side is two generators, used by the agent's event loop and by the command line: they yield requests, and
+the answers are sent to them.
 """
 
 from __future__ import annotations
@@ -38,17 +38,22 @@ DELETE: Final = "param.delete"
 FOLLOW: Final = "param.follow"
 VALUE: Final = "param.value"
 QUESTIONS: Final = (GET, NAMES, MORE, PUT, SET, DELETE)
-"""What the command line may have its agent ask."""
+"""The requests that the command line may have its agent send."""
 
 Question = tuple[str, dict[str, Any]]
-"""What is asked, and its arguments."""
+"""The name of a request, and its arguments."""
 
 
 def reading(what: str, args: dict[str, Any]) -> Generator[Question, object, str]:
-    """Read a value (``param.get``, ``param.names``): yields questions, is sent the answers, returns the whole text.
+    """Read a value (``param.get``, ``param.names``): yields requests, is sent the answers, returns the whole text.
+
+    Args:
+        what: The name of the first request.
+        args: Its arguments.
 
     Raises:
-        RemoteProtocolError: The answers are not what they should be, or too large.
+        RemoteProtocolError: An answer is malformed, or the portions do not add up to the stated size.
+        LimitExceeded: The stated size is above ``limits.PARAM_TEXT_MAX``.
     """
     answer = _answer((yield what, args))
     size, text, number = _whole(answer, "size"), _text(answer), _whole(answer, "reading")
@@ -65,18 +70,18 @@ def reading(what: str, args: dict[str, Any]) -> Generator[Question, object, str]
 
 
 def writing(key: str, text: str, number: int) -> Generator[Question, object, int]:
-    """Set a parameter, a namespace's members one by one: yields questions, is sent the answers.
+    """Set a parameter, a namespace's members one by one: yields requests, is sent the answers.
 
     Args:
-        key: Its name.
-        text: The value.
-        number: For the portions; another one than those have that write through the same agent just now.
+        key: The parameter's name.
+        text: The value as XML-RPC text.
+        number: Identifies the portions; no other value that is being written through the same agent may have it.
 
     Returns:
         How many parameters were set.
 
     Raises:
-        RemoteProtocolError: The answers are not what they should be.
+        RemoteProtocolError: An answer is malformed, or the peer has lost a portion.
         LocalProtocolError: The value is too large.
     """
     if len(text) > limits.PARAM_TEXT_MAX:
@@ -93,17 +98,17 @@ def writing(key: str, text: str, number: int) -> Generator[Question, object, int
 
 
 def check_size(size: int) -> None:
-    """See that a value is not too large.
+    """Check the size of a value, in characters.
 
     Raises:
-        LimitExceeded: It is.
+        LimitExceeded: It is above ``limits.PARAM_TEXT_MAX``.
     """
     if not 0 <= size <= limits.PARAM_TEXT_MAX:
         raise LimitExceeded("parameter", size, limits.PARAM_TEXT_MAX)
 
 
 def too_large(key: str, size: int) -> str:
-    """Why a value cannot cross."""
+    """The error text for a value that is too large to cross."""
     most = limits.PARAM_TEXT_MAX
     return (
         f"{key} has {size} characters as XML-RPC text, above the {most} ({most >> 20} MiB) that cross between "
@@ -120,7 +125,7 @@ class _Transfer:
 
 
 class Transfers:
-    """The answering side's memory: what one peer reads or writes in portions just now."""
+    """The answering side's state: what one peer is reading or writing in portions."""
 
     def __init__(self) -> None:
         self._readings: dict[int, _Transfer] = {}
@@ -128,7 +133,12 @@ class Transfers:
         self._numbers = itertools.count(1)
 
     def answer(self, text: str, now: float) -> dict[str, object]:
-        """The answer to a question for a value: all of it, or its first portion."""
+        """The answer to ``param.get`` or ``param.names``: the whole text, or its first portion.
+
+        Args:
+            text: The value.
+            now: Monotonic seconds.
+        """
         if len(text) <= limits.PARAM_PORTION:
             return {"size": len(text), "text": text, "reading": 0}
         number = next(self._numbers)
@@ -136,10 +146,10 @@ class Transfers:
         return {"size": len(text), "text": text[: limits.PARAM_PORTION], "reading": number}
 
     def more(self, args: Mapping[str, Any], now: float) -> dict[str, object]:
-        """The next portion.
+        """The next portion of a value that is being read.
 
         Raises:
-            RemoteProtocolError: Nothing of the kind is being read, or not any more.
+            RemoteProtocolError: No such value is being read, or it was dropped.
         """
         offset = _whole(args, "offset")
         transfer = self._get(self._readings, _whole(args, "reading"), now)
@@ -149,11 +159,11 @@ class Transfers:
         return {"text": portion}
 
     def put(self, args: Mapping[str, Any], now: float) -> dict[str, object]:
-        """Take a portion of what is to be set; one at offset 0 begins.
+        """Store a portion of a value that is to be set; offset 0 begins a value.
 
         Raises:
-            LimitExceeded: It is too large.
-            RemoteProtocolError: It is not the next one.
+            LimitExceeded: The value is too large.
+            RemoteProtocolError: The portion is not the next one, or the value was dropped.
         """
         number, offset, text = _whole(args, "writing"), _whole(args, "offset"), _text(args)
         if offset == 0:
@@ -167,10 +177,10 @@ class Transfers:
         return {"size": transfer.size}
 
     def written(self, args: Mapping[str, Any], now: float) -> str:
-        """The text that is to be set: in the question itself, or put before.
+        """Take the text that is to be set: from the request itself, or from the portions put before.
 
         Raises:
-            RemoteProtocolError: It is not there.
+            RemoteProtocolError: The portions were dropped, or do not add up to the stated size.
         """
         if "writing" not in args:
             return _text(args)

@@ -1,1 +1,1 @@
-"""Services across the mesh: which stand where, and the calls between them."""
+"""Services across modules: which of them cross, where they are provided, and the calls between modules."""

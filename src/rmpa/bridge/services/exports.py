@@ -1,8 +1,7 @@
-"""Which services of the local graph the peers are told of, and which of them they have open to call.
+"""Which services of the local graph are offered to peers, and which of them each peer has open to call.
 
-Sans-I/O, like ``bridge.topics.exports`` for topics: the driver tells what the local graph provides, what peers ask
-for and
-what a server said of itself; it gets back actions. A peer opens a service once, however many clients it has there::
+Sans-I/O, like ``bridge.topics.exports`` for topics. The driver passes in changes of the local graph, peers' requests,
+and what servers said of their services; it gets back actions. A peer opens a service once for all of its clients::
 
     open ──server known──► ServiceOpened, ServeRoute ──closed, gone, restarted──► EndRoute
       │                                                                              ▲
@@ -49,7 +48,7 @@ class LocalService:
 
 @dataclass(frozen=True, slots=True)
 class ServiceAbout:
-    """What a server says of its service, as far as a peer must know it."""
+    """The type, MD5 sum, request type and response type of a service, as its server states them."""
 
     type: str
     md5: str
@@ -59,7 +58,7 @@ class ServiceAbout:
 
 @dataclass(frozen=True, slots=True)
 class Probe:
-    """Ask a local server what its service is; the answer comes by ``described`` or ``refused``."""
+    """Ask a local server for its ``ServiceAbout``; the answer goes to ``described`` or ``refused``."""
 
     service: str
     server: LocalService
@@ -67,15 +66,15 @@ class Probe:
 
 @dataclass(frozen=True, slots=True)
 class ServeRoute:
-    """Calls of a peer come on the route ``requests``; replies go out on ``route``.
+    """Serve a peer's calls: requests come in on the route ``requests``, replies go out on ``route``.
 
     Args:
-        peer: The caller.
-        route: The caller's id.
-        requests: Ours.
+        peer: The number of the calling peer.
+        route: The route of replies; the calling peer has chosen its number.
+        requests: The route of requests; this module has chosen its number.
         service: The service's local name.
-        server: The node that provides it.
-        timeout: Seconds that the caller waits for each.
+        server: The service's server in the local graph.
+        timeout: Seconds that the calling peer waits for each reply.
     """
 
     peer: int
@@ -88,7 +87,7 @@ class ServeRoute:
 
 @dataclass(frozen=True, slots=True)
 class EndRoute:
-    """No more calls come on a route, and no replies are waited for."""
+    """End an open route: no more requests come, and replies of calls under way are dropped."""
 
     peer: int
     route: int
@@ -97,7 +96,7 @@ class EndRoute:
 
 @dataclass(frozen=True, slots=True)
 class ServerGone:
-    """A server left, or is another one now: let go of what is connected to it."""
+    """The server of a service left or was replaced: close the connections to it."""
 
     service: str
 
@@ -107,12 +106,12 @@ ExportAction = Send | Warn | Probe | ServeRoute | EndRoute | ServerGone
 
 @dataclass(slots=True)
 class _ServiceRoute:
-    """One peer's wish to call a service.
+    """A route to a service that one peer has asked for.
 
     Args:
-        service: Its local name.
-        timeout: What the caller allows each call.
-        requests: The route that calls come on; 0 until it is open.
+        service: The service's local name.
+        timeout: Seconds that the peer allows for each call.
+        requests: The route that requests come in on; 0 until it is open.
     """
 
     service: str
@@ -122,11 +121,12 @@ class _ServiceRoute:
 
 @dataclass(slots=True)
 class _Callers:
-    """What one linked peer calls.
+    """The routes of one linked peer.
 
     Args:
-        sessions: What it has open, by its own route.
-        routes: Counts our routes: even ones, the odd ones are for our own calls.
+        sessions: The routes that it has asked for, by its own route number.
+        routes: Counts the route numbers that this module chooses for requests of this peer. They are even; the odd
+            ones are for replies to this module's own calls.
     """
 
     sessions: dict[int, _ServiceRoute] = field(default_factory=dict)
@@ -138,11 +138,11 @@ _DEFAULT_LIMITS: Final = LimitSettings()
 
 
 class ServiceExports:
-    """The outbound half: our services, called by peers.
+    """The outbound half: services of this module, called by peers.
 
     Args:
         rules: What may cross, and under which names.
-        limit_settings: How much is offered.
+        limit_settings: How many services are offered.
     """
 
     def __init__(self, rules: ServiceRules, limit_settings: LimitSettings = _DEFAULT_LIMITS) -> None:
@@ -152,7 +152,7 @@ class ServiceExports:
             limit_settings.services,
             offer=self._offer,
             wire=lambda offer: offer.service,
-            # Another server behind the same name: what peers know of it may no longer be true.
+            # Another server under the same name: what peers know of it may no longer be true.
             renewed=lambda before, now: before != now,
         )
         self._seen: dict[str, LocalService] = {}
@@ -161,25 +161,25 @@ class ServiceExports:
 
     @property
     def seen(self) -> Mapping[str, LocalService]:
-        """Every service of the local graph that was told of, whether it crosses or not."""
+        """The server of every service of the local graph, whether the service crosses or not."""
         return self._seen
 
     @property
     def offered(self) -> Mapping[str, LocalService]:
-        """What peers are told of."""
+        """The servers of the services that are offered to peers."""
         return self._catalogue.offered
 
     @property
     def beyond(self) -> Beyond:
-        """What is offered to no peer because there is too much (``limits.services``)."""
+        """The count of services that are offered to no peer because there are too many (``limits.services``)."""
         return self._catalogue.beyond
 
     def about(self, service: str) -> ServiceAbout | None:
-        """What is known of a service of ours."""
+        """What a service's server has said of it; ``None`` while that is unknown."""
         return self._about.get(service)
 
     def callers(self, service: str) -> tuple[int, ...]:
-        """The peers that have it open."""
+        """The numbers of the peers that have a service open."""
         return tuple(
             number
             for number, peer in self._peers.items()
@@ -194,7 +194,12 @@ class ServiceExports:
     # --- the local graph ---------------------------------------------------------------------------------------
 
     def graph(self, service: str, server: LocalService | None) -> list[ExportAction]:
-        """Set the server that a service has now, proxies left out; peers are told by ``advertise``."""
+        """Set a service's present server, or that it has none; ``advertise`` sends the change to the peers.
+
+        Args:
+            service: The service's local name.
+            server: Its server; ``None`` where there is none, or only a proxy that is not relayed.
+        """
         if self._seen.get(service) == server:
             return []
         if server is None:
@@ -206,10 +211,10 @@ class ServiceExports:
     def apply_rules(
         self, rules: ServiceRules, limit_settings: LimitSettings = _DEFAULT_LIMITS
     ) -> Iterator[list[ExportAction]]:
-        """Other rules hold from now on; what they do not touch goes on.
+        """Replace the rules; routes of services that the new rules still allow stay open.
 
         Returns:
-            What is to be done for one service after the other, looked at when it is asked for.
+            The actions for one service after the other; each service is judged when its item is requested.
         """
         self._rules, self._catalogue.limit = rules, limit_settings.services
         for known in self._catalogue.peers():
@@ -242,7 +247,7 @@ class ServiceExports:
         return named and self._rules.judge(service, node).allowed
 
     def _end(self, service: str, reason: str) -> list[ExportAction]:
-        """Its server is no longer what it was: end all routes to it."""
+        """End all routes to a service whose server left, was replaced, or may no longer be called."""
         self._about.pop(service, None)
         actions: list[ExportAction] = []
         for number, peer in self._peers.items():
@@ -251,23 +256,35 @@ class ServiceExports:
                     actions += self._drop(number, peer, route, f"{service}: {reason}")
         return [*actions, ServerGone(service)]
 
-    # --- telling -----------------------------------------------------------------------------------------------
+    # --- advertising -------------------------------------------------------------------------------------------
 
     def link_up(self, peer: int, name: str, instance: str = "") -> list[ExportAction]:
-        """A link is up: ``advertise`` begins with all we have, but for what came from that very run of the peer."""
+        """Begin the advertisement to a peer; ``advertise`` goes on with it.
+
+        What came from this very run of the peer is not offered to it.
+
+        Args:
+            peer: The peer's number.
+            name: The peer's name.
+            instance: The peer's run, as 32 hexadecimal digits.
+        """
         self._peers[peer] = _Callers()
         first = self._catalogue.link_up(peer, name, instance, judged=False)
         return [Send(peer, AdvertiseServices(tuple(first.added), tuple(first.removed), full=True, more=first.more))]
 
     def link_down(self, peer: int) -> list[ExportAction]:
-        """A link is gone, and all its routes."""
+        """End all routes of a peer whose link is gone."""
         self._catalogue.link_down(peer)
         gone = self._peers.pop(peer, None)
         sessions = gone.sessions.items() if gone is not None else ()
         return [EndRoute(peer, route, s.requests) for route, s in sessions if s.requests]
 
     def advertise(self, ready: Callable[[int], bool] = lambda _: True) -> list[ExportAction]:
-        """One message for each peer that has not heard everything and is ready; call again while ``pending``."""
+        """At most one message for each peer that has changes to be sent and is ready; call again while ``pending``.
+
+        Args:
+            ready: ``(peer)``: whether a message may be sent to this peer now.
+        """
         return [
             Send(peer, AdvertiseServices(tuple(portion.added), tuple(portion.removed), more=portion.more))
             for peer, portion in self._catalogue.portions(ready)
@@ -275,7 +292,7 @@ class ServiceExports:
         ]
 
     def _offer(self, known: _Peer, service: str, server: LocalService) -> ServiceOffer | None:
-        """What a peer is to know of a service, if it may at all."""
+        """The offer of a service to one peer; ``None`` if that peer may not have it."""
         if server.origin is not None and not may_have(known.instance, server.origin):
             return None
         wire = self._rules.wire_name(known.name, service)
@@ -286,10 +303,10 @@ class ServiceExports:
     # --- their calls -------------------------------------------------------------------------------------------
 
     def opened(self, number: int, message: OpenService) -> list[ExportAction]:
-        """A peer wants to call a service.
+        """Handle a peer's request to open a service.
 
         Raises:
-            RemoteProtocolError: Its route is in use.
+            RemoteProtocolError: The peer's route is in use.
         """
         peer = self._peers[number]
         if message.route in peer.sessions:
@@ -312,21 +329,27 @@ class ServiceExports:
         return [] if waiting else [Probe(service, server)]
 
     def closed(self, number: int, message: CloseService) -> list[ExportAction]:
-        """A peer will not call it any more; one that is not open is none of our worry (it crossed ours)."""
+        """Handle a peer's message that it will not call a service any more.
+
+        A route that is not open is ignored: this module's own ``ServiceClosed`` may have crossed the peer's message.
+        """
         session = self._peers[number].sessions.pop(message.route, None)
         if session is None or not session.requests:
             return []
         return [EndRoute(number, message.route, session.requests)]
 
     def described(self, service: str, server: LocalService, about: ServiceAbout) -> list[ExportAction]:
-        """A server has said what its service is."""
+        """Store what a server said of its service, and open the routes that waited for it.
+
+        Ignored if the service has another server by now.
+        """
         if self.offered.get(service) != server:
-            return []  # it is another one by now
+            return []  # the service has another server by now
         self._about[service] = about
         return self._start(service)
 
     def refused(self, service: str, reason: str) -> list[ExportAction]:
-        """A server does not answer, or refuses: the peers that wait for it are told."""
+        """Close the routes that wait for a server that does not answer, or refuses."""
         actions: list[ExportAction] = []
         for number, peer in self._peers.items():
             for route, session in list(peer.sessions.items()):

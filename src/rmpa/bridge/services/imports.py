@@ -1,17 +1,18 @@
 """Which services of the peers appear in the local graph, and which of them are open to be called.
 
-Sans-I/O, like ``bridge.topics.imports`` for topics: the driver tells what peers say, what the local graph provides
-itself
-and what local nodes want to call; it gets back actions. A graph has one provider for each service, so of several
-one is shown: a local one always, else that of the peer with the lowest GUID; the others are hidden, with the reason,
-and come when it goes. Each service of each peer is in one state of this table::
+Sans-I/O, like ``bridge.topics.imports`` for topics. The driver passes in the peers' messages, the services of the
+local graph, and the services that local nodes want to call; it gets back actions.
+
+A graph has one provider of each service, so one of several is shown: a local one always, else that of the peer with
+the lowest GUID. The others are hidden, with the reason, and one of them is shown when the first one leaves. Each
+service of each peer is in one state of this table::
 
     idle ──wanted──► opening ──opened──► open
       ▲                 │ closed, 5 s      │ closed, withdrawn, link down, released
       └─────────────────┴──────────────────┘
 
-What an opened service said of itself is remembered until it is withdrawn or its server is another one: a probe then
-costs nothing on the way.
+What the server of an opened service said of it is remembered until the service is withdrawn or advertised again.
+Until then a client's probe is answered without a message to the peer.
 """
 
 from __future__ import annotations
@@ -50,14 +51,14 @@ if TYPE_CHECKING:
 
 
 class ServiceRouteState(Enum):
-    """Where a remote service stands."""
+    """Whether a service of a peer can be called now."""
 
     IDLE = auto()
-    """It is not called."""
+    """No route is open or asked for."""
     OPENING = auto()
-    """Asked for, not answered."""
+    """The route is asked for, and the peer has not answered."""
     OPEN = auto()
-    """It can be called."""
+    """The service can be called."""
 
 
 _S = ServiceRouteState
@@ -70,11 +71,11 @@ TRANSITIONS: Final[Mapping[ServiceRouteState, frozenset[ServiceRouteState]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Provide:
-    """Let a peer's service appear in the local graph, as one of its node's proxy.
+    """Register a peer's service in the local graph, at the proxy of the node that provides it.
 
     Args:
         peer: The peer's number.
-        service: Its name here.
+        service: The service's name here.
         node: Its node, in the peer's graph.
     """
 
@@ -85,7 +86,7 @@ class Provide:
 
 @dataclass(frozen=True, slots=True)
 class Withdraw:
-    """Let it disappear; calls under way fail with the reason."""
+    """Remove a peer's service from the local graph; its waiting calls fail with the reason."""
 
     peer: int
     service: str
@@ -95,7 +96,7 @@ class Withdraw:
 
 @dataclass(frozen=True, slots=True)
 class OpenedService:
-    """It can be called: requests go out on ``requests``, replies come on ``route``."""
+    """A service can be called: requests go out on ``requests``, replies come in on ``route``."""
 
     peer: int
     service: str
@@ -106,7 +107,7 @@ class OpenedService:
 
 @dataclass(frozen=True, slots=True)
 class EndedService:
-    """It cannot be called (``route`` is its reply route, if it had one): waiting calls fail with the reason."""
+    """A service cannot be called, or no longer: its calls fail with the reason; ``route`` was that of its replies."""
 
     peer: int
     service: str
@@ -117,7 +118,7 @@ class EndedService:
 
 @dataclass(frozen=True, slots=True)
 class ForgetAbout:
-    """What was known of a shown service may no longer be true."""
+    """What is known of a shown service may no longer be true."""
 
     peer: int
     service: str
@@ -128,21 +129,21 @@ ImportAction = Send | Warn | Provide | Withdraw | OpenedService | EndedService |
 
 @dataclass(slots=True)
 class RemoteService:
-    """One service of one peer, as we see it.
+    """One service of one peer.
 
     Args:
-        wire: Its name on the way.
+        wire: Its name on the wire.
         node: Its node, in the peer's graph.
-        name: Its name here; empty: it must not be here.
+        name: Its name here.
         shown: Whether it is in the local graph.
-        hidden: Why it is not, or empty.
+        hidden: Why it is not in the local graph, or empty.
         state: Whether it can be called now.
-        route: Where its replies come, while it is asked for or open; else 0.
-        requests: Where its requests go, while it is open; else 0.
-        due: While it is asked for: when that has taken too long, monotonic seconds.
-        about: What it is, once known.
-        problem: Why it could not be opened last, or empty.
-        origin: Its module and node, if its peer only passes it on.
+        route: The route of its replies while it is asked for or open; else 0.
+        requests: The route of its requests while it is open; else 0.
+        due: While it is asked for: when the peer's answer is overdue, in monotonic seconds.
+        about: What its server said of it; ``None`` while that is unknown.
+        problem: Why it could not be opened or was closed last, or empty.
+        origin: Its module and node, if the peer relays it.
     """
 
     wire: str
@@ -161,12 +162,13 @@ class RemoteService:
 
 @dataclass(slots=True, kw_only=True)
 class _ServiceImportPeer(PeerOffers[str, RemoteService, ServiceOffer]):
-    """What one run of a peer offers; its nodes' places are for the services' names here.
+    """The services that one run of a peer offers; the things in ``nodes`` are the services' names here.
 
     Args:
-        rank: The lower one is shown.
-        routes: What is asked for or open, by our route.
-        serial: Counts our routes: odd ones, the even ones are for its calls.
+        rank: The value of the peer's GUID; of several services of one name, that with the lowest rank is shown.
+        routes: The services that are asked for or open, by their reply route.
+        serial: Counts the route numbers that this module chooses for replies: odd ones; the even ones are for
+            requests of the peer.
     """
 
     rank: int
@@ -178,11 +180,11 @@ _DEFAULT_LIMITS: Final = LimitSettings()
 
 
 class ServiceImports:
-    """The inbound half: the peers' services, called from here.
+    """The inbound half: services of the peers, called from this module.
 
     Args:
-        rules: What may cross, and under which names; the receiving side judges too.
-        limit_settings: How much of one peer is taken.
+        rules: What may cross, and under which names; they apply at the receiving module too.
+        limit_settings: How many services and nodes of one peer are taken.
     """
 
     def __init__(self, rules: ServiceRules, limit_settings: LimitSettings = _DEFAULT_LIMITS) -> None:
@@ -192,22 +194,22 @@ class ServiceImports:
         self.ways = RelayPaths()
         """The path by which each relayed module is reached."""
         self._local: dict[str, str] = {}
-        # By the name here: the peers that offer it.
+        # By the name here, then by peer: the services that have this name.
         self._claims: dict[str, dict[int, RemoteService]] = {}
         self._opening: dict[tuple[int, int], RemoteService] = {}
 
     def __iter__(self) -> Iterator[tuple[int, RemoteService]]:
-        """Each service of each peer."""
+        """The number of the peer and the service, for each service of each peer."""
         for number, peer in self._peers.items():
             for remote in peer.entries.values():
                 yield number, remote
 
     def get(self, peer: int, service: str) -> RemoteService | None:
-        """A peer's service by its name here."""
+        """A peer's service by its name here; ``None`` if the peer offers none of this name."""
         return self._claims.get(service, {}).get(peer)
 
     def peer_name(self, peer: int) -> str:
-        """How a peer is called, for texts."""
+        """The name of a peer, for texts."""
         found = self._peers.get(peer)
         return found.name if found is not None else "a peer that is gone"
 
@@ -217,18 +219,25 @@ class ServiceImports:
         return found is not None and found.away
 
     def beyond(self, peer: int) -> peer_limits.Beyond:
-        """What a peer offers beyond ``limits.services``."""
+        """The count of a peer's services beyond ``limits.services``."""
         known, limit = self._peers.get(peer), self._limit_settings.services
         return known.beyond("services", limit) if known is not None else Beyond("services", limit, 0)
 
     def crowded(self, peer: int) -> Mapping[str, Collection[str]]:
-        """The nodes of a peer whose services have no place here (``limits.nodes``), and these."""
+        """The nodes of a peer that have no place here (``limits.nodes``), and their services that wait for one."""
         return known.nodes.waiting if (known := self._peers.get(peer)) is not None else {}
 
     # --- links -------------------------------------------------------------------------------------------------
 
     def link_up(self, peer: int, name: str, rank: int, instance: str = "") -> list[ImportAction]:
-        """A link is up, of a new peer or of one that was away."""
+        """Add a linked peer, or note that a peer that was away has a link again.
+
+        Args:
+            peer: The peer's number.
+            name: The peer's name.
+            rank: The value of its GUID.
+            instance: Its run, as 32 hexadecimal digits.
+        """
         known = self._peers.get(peer)
         if known is None:
             self._peers[peer] = _ServiceImportPeer(name=name, nodes=NodePlaces(self._limit_settings.nodes), rank=rank)
@@ -239,11 +248,14 @@ class ServiceImports:
         return self._choose_of(self.ways.linked(peer, LinkedPeer(name, instance, Guid(rank)))) if instance else []
 
     def unlinked(self, peer: int) -> list[ImportAction]:
-        """Behind ``gone``: relays may bring on what the peer brought."""
+        """Choose other paths to the modules that were reached by a peer that is gone.
+
+        Call after ``gone``. A relay may still reach the peer itself, or modules that the peer relayed.
+        """
         return self._choose_of(self.ways.unlinked(peer))
 
     def _choose_of(self, instances: Collection[str]) -> list[ImportAction]:
-        """Some modules may be reached another way."""
+        """Choose again among the services of these modules: another path to them may be the best now."""
         touched = [
             service
             for service, claims in self._claims.items()
@@ -252,7 +264,7 @@ class ServiceImports:
         return [action for service in touched for action in self._choose(service)]
 
     def link_down(self, peer: int) -> list[ImportAction]:
-        """A link is gone: nothing can be called; what was offered stays until ``gone``."""
+        """Close the routes of a peer whose link is gone; its services stay in the graph until ``gone``."""
         known = self._peers.get(peer)
         if known is None:
             return []
@@ -263,7 +275,7 @@ class ServiceImports:
         return actions
 
     def gone(self, peer: int) -> list[ImportAction]:
-        """A peer does not come back, or not soon: its services leave the local graph."""
+        """Remove a peer that does not come back, or not soon: its services leave the local graph."""
         known = self._peers.get(peer)
         if known is None:
             return []
@@ -277,14 +289,14 @@ class ServiceImports:
     # --- what peers offer --------------------------------------------------------------------------------------
 
     def portions(self, peer: int, message: AdvertiseServices) -> Iterator[Change[ServiceOffer, str]]:
-        """Split an advertisement into portions that ``take_in`` deals with in a moment."""
+        """Split an advertisement into portions for ``take_in``, each of which is applied quickly."""
         known, full, more = self._peers.get(peer), message.full, message.more
         if known is None:
             return iter(())
         return known.changes(message.added, message.removed, lambda offer: offer.service, full=full, more=more)
 
     def take_in(self, peer: int, change: Change[ServiceOffer, str]) -> list[ImportAction]:
-        """A peer provides more, or less."""
+        """Apply a portion of a peer's advertisement."""
         known = self._peers.get(peer)
         if known is None:
             return []
@@ -299,11 +311,11 @@ class ServiceImports:
         return actions + [action for one in admitted for action in one]
 
     def advertised(self, peer: int, message: AdvertiseServices) -> list[ImportAction]:
-        """A peer says what it provides: all portions at once."""
+        """Apply a peer's advertisement as a whole."""
         return [action for change in self.portions(peer, message) for action in self.take_in(peer, change)]
 
     def _admit(self, peer: int) -> Iterator[list[ImportAction]]:
-        """Take in what was beyond ``limits.services`` while there is room, one after the other."""
+        """Take services that were beyond ``limits.services``, one at a time, while there is room."""
         while (known := self._peers.get(peer)) and (offer := known.admitted(self._limit_settings.services)):
             yield self._offer(peer, known, offer)
 
@@ -311,7 +323,7 @@ class ServiceImports:
         before = known.entries.get(offer.service)
         actions: list[ImportAction] = []
         if before is not None and (before.node, before.origin) == (offer.node, offer.origin):
-            # The same once more: another server behind it, or a new link; what it is may have changed.
+            # The same offer again: the server was replaced, or the link is a new one; its type may have changed.
             before.about = None
             return [ForgetAbout(peer, before.name)] if before.shown else []
         if before is not None:
@@ -340,7 +352,7 @@ class ServiceImports:
         if remote is None:
             return []
         known.nodes.leave(remote.node, remote.name)
-        # Our words may have crossed: what we asked for last is open over there, for another server perhaps.
+        # Messages may have crossed: the route asked for last may be open at the peer, for another server perhaps.
         actions = self._release(peer, remote, reason)
         another_way = remote.origin is not None and self.ways.remove(peer, remote.origin)
         if remote.shown:
@@ -359,7 +371,7 @@ class ServiceImports:
         return actions + self._next_in(known)
 
     def _next_in(self, known: _ServiceImportPeer) -> list[ImportAction]:
-        """A node of a peer may have left its place to another one."""
+        """Choose again among the services that waited for a node's place, as far as places are free."""
         actions: list[ImportAction] = []
         for waiting in known.nodes.next_in():
             for name in waiting:
@@ -370,7 +382,12 @@ class ServiceImports:
     # --- which is shown ----------------------------------------------------------------------------------------
 
     def local(self, service: str, node: str | None) -> list[ImportAction]:
-        """Say which node of this module provides a service now, if any."""
+        """Set the node of this module that provides a service; it has precedence over the peers' ones.
+
+        Args:
+            service: The service's name here.
+            node: The node; ``None`` if no node of this module provides it.
+        """
         if node is None:
             self._local.pop(service, None)
         else:
@@ -380,16 +397,16 @@ class ServiceImports:
     def apply_rules(
         self, rules: ServiceRules, limit_settings: LimitSettings = _DEFAULT_LIMITS
     ) -> Iterator[list[ImportAction]]:
-        """Other rules hold from now on; what they do not touch goes on.
+        """Replace the rules; services that they do not affect stay shown and open.
 
         Returns:
-            What is to be done for one service after the other, looked at when it is asked for.
+            The actions for one service after the other; each service is judged when its item is requested.
         """
         self._rules, self._limit_settings = rules, limit_settings
         for known in self._peers.values():
             known.nodes.bound(limit_settings.nodes)
         offers = [(number, wire) for number, known in self._peers.items() for wire in known.entries]
-        # A second time, for those whose new name was still another one's old one.
+        # A second time, for services whose new name was still the old name of another one.
         judged = (self._rejudge(number, wire, again=again) for again in (False, True) for number, wire in offers)
         return chain(judged, (actions for number in list(self._peers) for actions in self._admit(number)))
 
@@ -406,7 +423,7 @@ class ServiceImports:
         return [] if again or claimed is not remote else self._choose(name)
 
     def _choose(self, service: str) -> list[ImportAction]:
-        """Show the service of one peer, and hide those of the others."""
+        """Choose the one service of this name that is shown, and hide those of the other peers."""
         claims = self._claims[service]
         local = self._local.get(service)
         seen: str | None = f"{local} of this module provides it itself" if local is not None else None
@@ -434,7 +451,7 @@ class ServiceImports:
             remote.shown, remote.hidden = True, ""
             self._peers[number].nodes.show(remote.node)
             actions.append(Provide(number, service, remote.node))
-        # Not before: a service that comes is chosen likewise, and may need the place that was just found free.
+        # Only now: the services that this chooses could take the place that was found free above.
         return actions + [action for known in left for action in self._next_in(known)]
 
     def _objection(self, service: str, number: int, remote: RemoteService) -> str | None:
@@ -458,10 +475,12 @@ class ServiceImports:
     # --- calling -----------------------------------------------------------------------------------------------
 
     def want(self, peer: int, service: str, now: float) -> list[ImportAction]:
-        """A local node wants to call it, or to know its type: ``OpenedService`` or ``EndedService`` will follow.
+        """Open a service that a local node wants to call, or whose type it wants to know.
+
+        An ``OpenedService`` or ``EndedService`` follows; no action results if the route is asked for or open already.
 
         Raises:
-            LocalProtocolError: It is not shown, or its peer has no link: ask before.
+            LocalProtocolError: The service is not shown, or its peer has no link: check before the call.
         """
         known, remote = self._peers.get(peer), self.get(peer, service)
         if known is None or remote is None or not remote.shown or known.away:
@@ -477,10 +496,13 @@ class ServiceImports:
         return [Send(peer, OpenService(remote.route, remote.wire, self._rules.timeout(service)))]
 
     def opened(self, peer: int, message: ServiceOpened) -> list[ImportAction]:
-        """A peer's service can be called; one that we gave up meanwhile (our words crossed) is ignored.
+        """Handle a peer's answer that a service is open.
+
+        A route that was given up meanwhile is ignored: this module's own ``CloseService`` may have crossed the peer's
+        message.
 
         Raises:
-            RemoteProtocolError: It was open already.
+            RemoteProtocolError: The route was open already.
         """
         known = self._peers.get(peer)
         remote = known.routes.get(message.route) if known is not None else None
@@ -496,23 +518,23 @@ class ServiceImports:
         return [OpenedService(peer, remote.name, message.route, message.requests, remote.about)]
 
     def closed(self, peer: int, message: ServiceClosed) -> list[ImportAction]:
-        """A peer's service cannot be called, or no longer."""
+        """Handle a peer's message that a service cannot be called, or no longer; unknown routes are ignored."""
         known = self._peers.get(peer)
         if known is None or message.route not in known.routes:
             return []
         return self._end(peer, message.route, message.reason)
 
     def release(self, peer: int, service: str, reason: str = "nobody calls it") -> list[ImportAction]:
-        """It was not called for a while."""
+        """Close the route of a service that is not needed now; the next call opens it again."""
         remote = self.get(peer, service)
         return self._release(peer, remote, reason) if remote is not None else []
 
     def next_timer(self) -> float | None:
-        """When ``handle_timer`` is due, monotonic seconds."""
+        """When ``handle_timer`` is due, in monotonic seconds; ``None``: no route is asked for."""
         return min((remote.due for remote in self._opening.values()), default=None)
 
     def handle_timer(self, now: float) -> list[ImportAction]:
-        """Give up what was not answered in time."""
+        """Give up the routes that the peers have not opened in time."""
         actions: list[ImportAction] = []
         for (peer, _), remote in list(self._opening.items()):
             if remote.due <= now:

@@ -1,4 +1,4 @@
-"""Which services may cross, what they are called on their way, and how long a call may take: one pure value."""
+"""Which services may cross, their names at a peer and here, and the time-out of a call. Without I/O."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 OWN_SERVICES: Final = "/rmpa/**"
 LOGGERS: Final = ("**/get_loggers", "**/set_logger_level")
-"""Every node has these two; across modules they would double the graph for nothing."""
+"""Every node has these two services; if they crossed, they would double the graph for no use."""
 
 
 class ServiceRules:
@@ -22,7 +22,7 @@ class ServiceRules:
 
     Args:
         settings: ``[services]`` and ``[[service]]``.
-        policy: For what ``[[peer]]`` allows; topics' own rules do not touch services.
+        policy: For what ``[[peer]]`` allows; the rules of topics do not apply to services.
         names: For what ``[[peer]]`` renames.
     """
 
@@ -32,7 +32,14 @@ class ServiceRules:
         self._names = names if names is not None else Names()
 
     def judge(self, service: str, node: str) -> PolicyDecision:
-        """Decide about one service, by its name here and its node; the first "no" wins."""
+        """Decide whether a service may cross at all.
+
+        The built-in rules go first, then ``services.deny``, then ``services.allow``; what no glob fits may not cross.
+
+        Args:
+            service: Its name in the local graph.
+            node: The node that provides it.
+        """
         settings = self._settings
         if is_own(node):
             return PolicyDecision(False, f"{node} stands for a node of another module, or is the agent itself")
@@ -51,19 +58,28 @@ class ServiceRules:
         return PolicyDecision(False, f"no glob of services.allow fits {service}")
 
     def judge_for(self, peer: str, service: str, wire: str) -> PolicyDecision:
-        """Decide whether what ``judge`` lets cross may do so between us and one peer."""
+        """Decide whether a service that ``judge`` allows may cross between this module and one peer.
+
+        Args:
+            peer: The peer's name.
+            service: The service's name in the local graph.
+            wire: Its name on the wire.
+        """
         return self._policy.judge_for(peer, service, wire=wire)
 
     def local_name(self, peer: str, wire: str) -> str:
-        """What a peer's service is called here."""
+        """The name in the local graph of a service that a peer offers as ``wire``."""
         return self._names.local_name(peer, wire)
 
     def wire_name(self, peer: str, service: str) -> str:
-        """What a service of ours is called on the way to a peer."""
+        """The name on the wire, to this peer, of a service of this module."""
         return self._names.wire_name(peer, service)
 
     def timeout(self, service: str) -> float:
-        """Seconds that a call of a service may take: what the first ``[[service]]`` that fits says."""
+        """The time-out of a call of a service, in seconds.
+
+        It is that of the first ``[[service]]`` that fits the service's name, else that of ``[services]``.
+        """
         for rule in self._settings.rules:
             if any(matches(pattern, service) for pattern in rule.names):
                 return rule.timeout

@@ -1,1 +1,1 @@
-"""What is known of each peer across its links, and what the parts of the bridge have in common."""
+"""The sessions of the peers with their proxies and requests, and what the parts of the bridge share."""

@@ -1,4 +1,4 @@
-"""Drives the plans of one kind of thing that crosses (topics, services) in small slices, so that data goes first."""
+"""Drives the plans of topics, or of services, in small slices, so that data goes first."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ _ActionT_co = TypeVar("_ActionT_co", covariant=True)
 
 
 class ExportPlan(Protocol[_ActionT_co]):
-    """Decides what peers are told of the local graph."""
+    """Decides what of the local graph is advertised to peers."""
 
     @property
     def pending(self) -> bool:
-        """Whether there is something to ``advertise``."""
+        """Whether a peer has not received all changes yet."""
         ...
 
     def advertise(self, ready: Callable[[int], bool]) -> Sequence[_ActionT_co]:
-        """At most one message for each peer that is ready."""
+        """Return the actions of the next advertisement, at most one for each ready peer."""
         ...
 
 
@@ -44,31 +44,32 @@ class ImportPlan(Protocol[_ActionT_co]):
     """Decides what of the peers appears in the local graph."""
 
     def next_timer(self) -> float | None:
-        """When ``handle_timer`` is due, monotonic seconds."""
+        """When ``handle_timer`` is due, monotonic seconds; ``None`` if no timer runs."""
         ...
 
     def handle_timer(self, now: float) -> Sequence[_ActionT_co]:
-        """Do what is due."""
+        """Handle due timers; return the actions to carry out."""
         ...
 
 
 class GraphDriver(Generic[ActionT, AdvertisementT]):
-    """Gives two plans what has changed, and has their actions carried out, a little in each turn of the event loop.
+    """Passes changes to two plans and carries out their actions, a slice in each turn of the event loop.
 
-    A graph of thousands must not delay a message: names to look at, advertisements to apply, entries to judge by new
-    rules and actions to carry out are queued here, and data may be handled between any two of them.
+    A graph of thousands of names must not delay a message. Names to look at, advertisements to apply, entries to
+    judge by new rules and actions to carry out are therefore queued, and data may be handled between any two of them.
 
     Args:
         sessions: Finds the peer of an action.
         refusals: Logs and counts the warnings of the plans, and peers that break the protocol.
         exports: The outbound plan.
         imports: The inbound plan.
-        look_at: Tells the plans what the local graph has under these names; data may be handled between two of them.
+        look_at: Passes the present state of these names in the local graph to the plans. Data may be handled between
+            two names.
         advertisement: The type of the peers' advertisements.
-        apply: Splits a parsed advertisement into portions; each is applied when it is taken, and yields its actions.
+        apply: Splits a parsed advertisement into portions; each item that is taken applies one, and is its actions.
         do: Carries out an action that is neither ``Send`` nor ``Warn``.
         is_urgent: Whether an action is carried out at once, before those that wait.
-        on_told: Called when peers were told something.
+        on_told: Called after advertisements were sent.
         on_idle: Called when nothing is left to do after a change.
     """
 
@@ -97,7 +98,7 @@ class GraphDriver(Generic[ActionT, AdvertisementT]):
         self._is_urgent = is_urgent
         self._on_told = on_told
         self._on_idle = on_idle
-        # Ordered: taking the first item of a plain dict passes over all that were taken before it.
+        # Ordered: in a plain dict, taking the first item skips over the places of all items taken before.
         self._changed: OrderedDict[str, None] = OrderedDict()
         self._advertisements: deque[tuple[PeerSession, bytes | Iterator[Sequence[ActionT]]]] = deque()
         self._unread_bytes = 0
@@ -112,11 +113,11 @@ class GraphDriver(Generic[ActionT, AdvertisementT]):
 
     @property
     def idle(self) -> bool:
-        """Whether every change of the local graph was looked at."""
+        """Whether all changes of the local graph have been passed to the plans."""
         return not self._changed
 
     def close(self) -> None:
-        """Do nothing any more on its own; ``act`` still carries out what it is given."""
+        """Stop all slices and the timer; ``act`` still carries out actions."""
         self._closed = True
         self._timer.close()
         if self._scan_handle is not None:
@@ -125,12 +126,12 @@ class GraphDriver(Generic[ActionT, AdvertisementT]):
     # --- what there is to do ---------------------------------------------------------------------------------------
 
     def look(self, names: Iterable[str]) -> None:
-        """The local graph may have changed under these names."""
+        """Queue names under which the local graph may have changed."""
         self._changed |= dict.fromkeys(names)
         self.schedule()
 
     def advertised(self, session: PeerSession, payload: bytes) -> None:
-        """A peer advertises what it has. Reading that takes long, and is not done in the caller's place.
+        """Queue a peer's advertisement. Parsing takes long, so it is done later, unless too many bytes wait.
 
         Raises:
             LimitExceeded: It is longer than ``limits.ADVERTISEMENT_MAX``.
@@ -144,7 +145,7 @@ class GraphDriver(Generic[ActionT, AdvertisementT]):
             self._apply_next()
 
     def rejudge(self, judged: Iterator[Sequence[ActionT]]) -> None:
-        """Other rules hold: take this iterator's actions a portion at a time, in place of those of rules before."""
+        """Take the actions of ``judged`` a portion at a time, instead of the rest of an earlier iterator."""
         self._rejudging = judged
         self.schedule()
 
@@ -154,18 +155,18 @@ class GraphDriver(Generic[ActionT, AdvertisementT]):
         self.schedule()
 
     def link_down(self, session: PeerSession) -> None:
-        """A link is gone: what its peer advertised over it and was not applied yet is dropped."""
+        """Drop a peer's advertisements that are not applied yet, since its link is gone."""
         self._advertisements = deque(one for one in self._advertisements if one[0] is not session)
         self._unread_bytes = sum(len(waiting) for _, waiting in self._advertisements if isinstance(waiting, bytes))
 
     def gone(self, session: PeerSession) -> None:
-        """A session has ended."""
+        """Forget the pacing of a session that has ended."""
         self._pacing.forget(session.peer)
 
     # --- a slice of it ----------------------------------------------------------------------------------------
 
     def schedule(self) -> None:
-        """Do a slice of what there is to do in the next turn of the loop."""
+        """Do a slice of the queued work in the next turn of the loop."""
         if self._scan_handle is None and not self._closed:
             self._scan_handle = asyncio.get_running_loop().call_soon(self._scan)
 
@@ -181,7 +182,7 @@ class GraphDriver(Generic[ActionT, AdvertisementT]):
         if self._freeing and not tuple(islice(self._freeing[0], limits.APPLIED_AT_ONCE)):
             self._freeing.popleft()
         rejudged = tuple(islice(self._rejudging, limits.APPLIED_AT_ONCE))
-        # In one: actions of data that is handled in between belong behind all of these.
+        # In one call: actions from data that is handled in between have to follow all of these.
         self.act([action for actions in rejudged for action in actions])
         if self._changed or self._advertisements or self._freeing or rejudged or (told and self._exports.pending):
             self.schedule()
@@ -197,7 +198,7 @@ class GraphDriver(Generic[ActionT, AdvertisementT]):
             yield name
 
     def _schedule_later(self) -> None:
-        """Peers have to be told more, but what they were told is still on its way."""
+        """Schedules the next advertisements after ``limits.TELL_PAUSE``: earlier ones are still on their way."""
         if self._scan_handle is None and not self._closed:
             self._scan_handle = asyncio.get_running_loop().call_later(limits.TELL_PAUSE, self._scan)
 
@@ -207,7 +208,7 @@ class GraphDriver(Generic[ActionT, AdvertisementT]):
         return self._pacing.ready(peer, asyncio.get_running_loop().time(), busy=busy)
 
     def _apply_next(self) -> None:
-        """Parse the advertisement that waits for longest, or apply the next portion of one that was parsed."""
+        """Parses the advertisement that has waited longest, or applies its next portion if it is parsed."""
         session, waiting = self._advertisements.popleft()
         if not isinstance(waiting, bytes):
             if (actions := next(waiting, None)) is not None:
@@ -224,7 +225,7 @@ class GraphDriver(Generic[ActionT, AdvertisementT]):
             self._advertisements.appendleft((session, self._apply(session, message)))
 
     def refuse(self, session: PeerSession, error: RemoteProtocolError) -> None:
-        """A peer broke the protocol: log it and close its link."""
+        """Log that a peer broke the protocol, and close its link."""
         text = f"{session.link.name} broke the protocol: {error}"
         self.warn("link.malformed", session.link.remote_endpoint[0], text)
         session.link.abort(text)
@@ -232,7 +233,7 @@ class GraphDriver(Generic[ActionT, AdvertisementT]):
     # --- actions ----------------------------------------------------------------------------------------------
 
     def act(self, actions: Iterable[ActionT]) -> None:
-        """Carry these out behind those that wait already; data may be handled in between, and bring more of them."""
+        """Carry out actions after those that wait; data handled in between may add further ones."""
         for action in actions:
             if self._is_urgent(action):
                 self._carry_out(action)
@@ -260,5 +261,5 @@ class GraphDriver(Generic[ActionT, AdvertisementT]):
             self._do(action)
 
     def warn(self, kind: str, who: str, text: str) -> None:
-        """Log a warning, and count it as ``kind``; repeated ones are only counted."""
+        """Log a warning about ``who`` and count it as ``kind``; repeated ones are only counted."""
         self._refusals.refuse(asyncio.get_running_loop().time(), kind, who, text)

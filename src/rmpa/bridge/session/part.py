@@ -1,4 +1,4 @@
-"""What the bridge is made of: topics, services, parameters and others are parts alike."""
+"""The base class of the bridge's parts: topics, services, parameters and others."""
 
 from __future__ import annotations
 
@@ -13,34 +13,34 @@ if TYPE_CHECKING:
 
 
 class Part:
-    """Gets every event of the bridge and does nothing with it; parts override what they need.
+    """Ignores every event of the bridge; parts override the methods that they need.
 
     All methods are called from the event loop.
     """
 
     advertisement = ""
-    """The kind of control message that ``advertised`` takes before it is parsed; empty: none."""
+    """The ``op`` of the control messages that ``advertised`` gets unparsed; empty: none."""
 
     def start(self) -> None:
         """The bridge has started: the local core answers."""
 
     async def close(self) -> None:
-        """The bridge ends: all sessions have ended, the local core is still there."""
+        """Release everything; all sessions have ended, and the local core still answers."""
 
     # --- sessions ----------------------------------------------------------------------------------------------
 
     def remembered(self, identity: Identity) -> int | None:  # noqa: ARG002 - for those that override it
-        """The number of an ended session of this run of a peer, if the part still knows something under it."""
+        """The number of an ended session of this run of a peer, if the part still keeps something under it."""
         return None
 
     def link_up(self, session: PeerSession) -> None:
-        """A link is up, of a new peer or of one whose session waited (then ``link_down`` came before)."""
+        """A link is up, of a new peer or of one whose session waited (after ``link_down``)."""
 
     def link_down(self, session: PeerSession) -> None:
         """A link is gone; the peer may come back."""
 
     def grace_over(self, session: PeerSession) -> bool:  # noqa: ARG002 - for those that override it
-        """The peer did not come back within ``mesh.limits.AWAY_GRACE``, or its link did not end by silence.
+        """The peer is not back within ``mesh.limits.AWAY_GRACE``, or its link ended otherwise than by silence.
 
         Returns:
             Whether the part keeps something for the peer: then the session waits.
@@ -48,34 +48,34 @@ class Part:
         return False
 
     def outlasted(self, session: PeerSession, seconds: float) -> float | None:  # noqa: ARG002 - likewise
-        """The peer has been away for ``seconds``: what is not kept for longer goes.
+        """Drop everything that is kept for an absent peer for at most ``seconds``, the time that it has been away.
 
         Returns:
-            For how many seconds the next thing is kept, more than ``seconds``; ``None``: nothing is kept any more.
+            The next shortest time in seconds, more than ``seconds``; ``None``: nothing is kept any more.
         """
         return None
 
     def gone(self, session: PeerSession) -> None:
-        """The session ends for good: what came from the peer leaves the local graph."""
+        """The session ends for good: remove everything of the peer from the local graph."""
 
     def lane_lost(self, session: PeerSession) -> None:
-        """The bulk lane of a link is gone, and perhaps half a message in either direction."""
+        """A link lost its bulk lane, perhaps in the middle of a message in either direction."""
 
     # --- messages ----------------------------------------------------------------------------------------------
 
     def message(self, session: PeerSession, message: Message) -> bool:  # noqa: ARG002 - for those that override it
-        """A control message came.
+        """Handle a control message from a peer.
 
         Returns:
-            Whether it was this part's.
+            Whether the message belongs to this part.
 
         Raises:
-            RemoteProtocolError: It is not one that can come now; the link is closed.
+            RemoteProtocolError: The message is not allowed now; the link is closed.
         """
         return False
 
     def advertised(self, session: PeerSession, payload: bytes) -> None:
-        """A control message of the kind ``advertisement`` came, not parsed yet.
+        """Handle a control message of the kind ``advertisement``, not parsed yet.
 
         Raises:
             LimitExceeded: It is longer than ``limits.ADVERTISEMENT_MAX``; the link is closed.
@@ -84,21 +84,22 @@ class Part:
     # --- the local graph ---------------------------------------------------------------------------------------
 
     def graph_changed(self, change: GraphChange) -> None:
-        """A registration in the local graph came, changed or went."""
+        """Handle a registration in the local graph that was added, changed or removed."""
 
     def param_update(self, key: str) -> bool:  # noqa: ARG002 - for those that override it
-        """A parameter that the agent's own node has subscribed to has changed.
+        """Handle the change of a parameter that the agent's own node has subscribed to.
 
         Args:
-            key: Which, without a slash at its end; one below it may be what was subscribed to, or one above.
+            key: The changed key, without a slash at its end. The subscribed key may be this one, one below it or one
+                above it.
 
         Returns:
-            Whether this part has subscribed to it.
+            Whether this part has subscribed to the parameter.
         """
         return False
 
     def reload(self, settings: Settings) -> None:
-        """The settings were read again; of those that a running agent can take, others may hold from now on."""
+        """Take settings that were read again, as far as they can change in a running agent."""
 
     def reconcile(self) -> None:
-        """Compare what is with what should be, and mend it; called each ``limits.RECONCILE_INTERVAL``."""
+        """Compare the actual state with the planned one, and mend it; called each ``limits.RECONCILE_INTERVAL``."""

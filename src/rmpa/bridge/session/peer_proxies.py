@@ -29,18 +29,18 @@ async def _refuse_to_end(node: str, _caller: str, _reason: str) -> RosReply:
 
 
 def _nothing(_node: SlaveNode) -> None:
-    """Nothing is taken away when the proxy goes."""
+    """Does nothing: the holder has nothing to remove from the proxy."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Hold:
-    """One thing that a proxy is there for: a topic or a service of its node.
+    """A topic or service for which a proxy is kept.
 
     Args:
         node: The peer's node.
-        key: Names the thing among those of its node.
-        ready: Gets the proxy once it is there, and registers the thing.
-        left: Takes the thing away again, before the proxy goes.
+        key: Identifies the topic or service among those of its node.
+        ready: Gets the proxy when it exists, and registers the topic or service there.
+        left: Removes the topic or service, before the proxy is closed.
     """
 
     node: str
@@ -51,7 +51,7 @@ class _Hold:
 
 @dataclass(frozen=True, slots=True)
 class _Release:
-    """A thing is to leave its proxy."""
+    """A request to remove a topic or service from its proxy."""
 
     node: str
     key: str
@@ -59,11 +59,11 @@ class _Release:
 
 @dataclass(slots=True)
 class Proxy:
-    """A node of a peer, standing in the local graph.
+    """The proxy of one node of a peer.
 
     Args:
-        node: What stands there.
-        held: What it is there for.
+        node: The local node that stands for it.
+        held: The topics and services for which it is kept, by key.
     """
 
     node: SlaveNode
@@ -71,15 +71,15 @@ class Proxy:
 
 
 class PeerProxies:
-    """The proxies of one peer: each is there while something holds it.
+    """The proxies of one peer; each exists while a topic or service holds it.
 
-    Making a proxy may bind sockets, which takes a turn of the loop; so what changes the graph is done one after the
-    other by a task, in the order in which it was asked for.
+    Making a proxy may bind sockets, which takes a turn of the loop. Therefore one task makes all changes of the
+    graph, in the order of the calls.
 
     Args:
         prefix: The namespace of this peer's proxies.
         nodes: Makes the proxies.
-        on_kill: ``(node, caller id, reason) -> reply``: a proxy was asked to end; the node is the peer's.
+        on_kill: ``(node, caller id, reason) -> reply``: called when the proxy of this peer's node is asked to end.
     """
 
     def __init__(
@@ -95,9 +95,9 @@ class PeerProxies:
         self._holds: dict[tuple[str, str], _Hold] = {}
         self._jobs: asyncio.Queue[_Hold | _Release | None] = asyncio.Queue()
         self.problems: dict[str, str] = {}
-        """Why the proxy of a node could not be made, ready to read; it is tried again by ``reconcile``."""
+        """Why the proxy of a node could not be made, as text by node; ``reconcile`` tries again."""
         self.names: dict[str, str] = {}
-        """The proxies' names of nodes of other modules that the peer relays; others are named by ``prefix``."""
+        """Names of the proxies of relayed nodes, by the peer's node; all others are named with ``prefix``."""
         self._task = asyncio.create_task(self._work(), name=f"proxies {prefix}")
 
     def __len__(self) -> int:
@@ -112,7 +112,7 @@ class PeerProxies:
         return self.names.get(node) or proxy_name(self.prefix, node)
 
     def get(self, node: str) -> SlaveNode | None:
-        """The proxy of one of the peer's nodes, if it is there."""
+        """The proxy of one of the peer's nodes; ``None`` if it does not exist."""
         proxy = self._proxies.get(node)
         return proxy.node if proxy is not None else None
 
@@ -123,24 +123,24 @@ class PeerProxies:
         ready: Callable[[SlaveNode], None],
         left: Callable[[SlaveNode], None] = _nothing,
     ) -> None:
-        """Have a proxy stand for a node because of one topic or service, until ``release``.
+        """Keep a proxy for a node because of one topic or service, until ``release``.
 
         Args:
             node: In the peer's graph.
-            key: Names the topic or service at ``release``.
-            ready: Gets the proxy in a moment, to register the topic or service there.
-            left: Gets the proxy when the topic or service is to leave it; only after ``ready``.
+            key: Identifies the topic or service for ``release``.
+            ready: Called with the proxy in a later turn of the loop, to register the topic or service there.
+            left: Called with the proxy, after ``ready``, to remove the topic or service from it.
         """
         job = self._holds[node, key] = _Hold(node, key, ready, left)
         self._jobs.put_nowait(job)
 
     def release(self, node: str, key: str) -> None:
-        """A topic or service needs the proxy no longer: it leaves in a moment."""
+        """Remove a topic or service from its proxy in a later turn of the loop; the last one closes the proxy."""
         self._holds.pop((node, key), None)
         self._jobs.put_nowait(_Release(node, key))
 
     def reconcile(self) -> None:
-        """Try again what has failed, and forget what was known of nodes that have gone."""
+        """Try failed proxies again, and forget names and problems of nodes that have gone."""
         if not self._jobs.empty():
             return
         if self.names or self.problems:
@@ -154,7 +154,7 @@ class PeerProxies:
                 self._jobs.put_nowait(hold)
 
     async def close(self) -> None:
-        """Take away everything that is still there."""
+        """Carry out the queued changes, then close all proxies."""
         self._jobs.put_nowait(None)
         await self._task
 
@@ -171,10 +171,10 @@ class PeerProxies:
 
     async def _hold(self, hold: _Hold) -> None:
         if self._holds.get((hold.node, hold.key)) is not hold:
-            return  # released before its turn came
+            return  # released meanwhile
         proxy = await self._proxy(hold.node)
         if self._holds.get((hold.node, hold.key)) is not hold:
-            # Released while the proxy's sockets were being made: to register it would change a topic's type.
+            # Released while the proxy's sockets were being made: registering it now could change a topic's type.
             if not proxy.held:
                 await self._close_proxy(hold.node)
         elif (before := proxy.held.get(hold.key)) is not hold:
@@ -194,7 +194,7 @@ class PeerProxies:
             await self._close_proxy(job.node)
 
     async def _proxy(self, node: str) -> Proxy:
-        """The proxy of a node, made if it is not there."""
+        """Returns the proxy of a node, and makes it if necessary."""
         proxy = self._proxies.get(node)
         if proxy is None:
             made = self._nodes.make(self.name(node), lambda caller, reason: self._on_kill(node, caller, reason))
@@ -216,5 +216,5 @@ class PeerProxies:
         )
         if self.problems.get(node) != text:
             self.problems[node] = text
-            level = logging.DEBUG if is_shortage(error) else logging.ERROR  # a shortage is told for the process
+            level = logging.DEBUG if is_shortage(error) else logging.ERROR  # a shortage is reported for the process
             _log.log(level, "! %s: %s is not in the local graph: %s", self.prefix, node, text)

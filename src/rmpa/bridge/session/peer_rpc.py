@@ -1,7 +1,7 @@
-"""Questions between agents: what the parameters, ``rmpa why`` and others want to know of another module.
+"""Requests, responses and notifications between agents, for parameters, ``rmpa why`` and others.
 
-A handler gets the asking peer and the arguments, and returns what JSON can say, at once or as an awaitable; an
-``RmpaError`` becomes the error that the asker gets.
+A handler gets the requesting peer and the arguments. It returns a value that JSON can represent, or an awaitable of
+one. An ``RmpaError`` that it raises becomes the error of the response.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Listener = Callable[["PeerSession", dict[str, Any]], None]
 
 
 class PeerRpc(Part):
-    """Asks the peers, and answers them.
+    """Sends requests to the peers, and responds to theirs.
 
     Args:
         counters: Counts ``ask.refused`` and ``ask.failed``.
@@ -50,15 +50,15 @@ class PeerRpc(Part):
         self._answering: dict[int, set[asyncio.Task[None]]] = {}
 
     def on_request(self, what: str, handler: Handler) -> None:
-        """Answer a question from now on."""
+        """Set the handler of the requests named ``what``."""
         self._handlers[what] = handler
 
     def on_notification(self, what: str, listener: Listener) -> None:
-        """Take news of this name from now on."""
+        """Set the listener for the notifications named ``what``."""
         self._listeners[what] = listener
 
     def notify(self, session: PeerSession, what: str, args: dict[str, Any]) -> None:
-        """Send news to a linked peer."""
+        """Send a notification to a linked peer."""
         session.link.send_control(encode(Notification(what, args)))
 
     async def request(
@@ -68,11 +68,11 @@ class PeerRpc(Part):
         args: dict[str, Any],
         timeout: float = limits.ASK_TIMEOUT,  # noqa: ASYNC109 - the message names it
     ) -> Any:
-        """Ask a linked peer.
+        """Send a request to a linked peer, and return the value of its response.
 
         Raises:
-            PeerRefused: It answers with an error.
-            UnreachableError: It does not answer in time, or its link ends meanwhile.
+            PeerRefused: The peer responds with an error.
+            UnreachableError: The peer does not respond within ``timeout`` seconds, or its link ends meanwhile.
         """
         number = next(self._numbers)
         future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
@@ -88,7 +88,7 @@ class PeerRpc(Part):
             self._waiting.pop((session.peer, number), None)
 
     def link_down(self, session: PeerSession) -> None:
-        """The link is gone: requests over it fail, and answers to the peer are not worked out any more."""
+        """Fail the requests to a peer whose link is gone, and cancel the handlers of its own requests."""
         for (peer, _), (future, name) in list(self._waiting.items()):
             if peer == session.peer and not future.done():
                 future.set_exception(UnreachableError("agent", name, "its link has just ended; try again"))
@@ -96,7 +96,7 @@ class PeerRpc(Part):
             task.cancel()
 
     def message(self, session: PeerSession, message: Message) -> bool:
-        """Take a question or an answer."""
+        """Take a request, a response or a notification."""
         match message:
             case Request():
                 self._answer(session, message)
@@ -115,7 +115,7 @@ class PeerRpc(Part):
         return True
 
     async def close(self) -> None:
-        """Answer no more requests."""
+        """Cancel all handlers that are running."""
         tasks = [task for tasks in self._answering.values() for task in tasks]
         self._answering.clear()
         for task in tasks:

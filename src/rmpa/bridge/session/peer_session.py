@@ -1,4 +1,4 @@
-"""What the bridge knows of one run of a peer, across the links that come and go."""
+"""The state that the bridge keeps for one run of a peer, across its links."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class PeerState(Enum):
-    """Where a session stands.
+    """The state of a session.
 
     ::
 
@@ -27,9 +27,9 @@ class PeerState(Enum):
     LINKED = auto()
     """The peer has a link."""
     SILENT = auto()
-    """Its link fell silent; most peers are back within ``mesh.limits.AWAY_GRACE``."""
+    """Its link ended by silence; most peers are back within ``mesh.limits.AWAY_GRACE``."""
     AWAY = auto()
-    """It has no link, and some part keeps what belongs to it."""
+    """It has no link, and a part of the bridge keeps something for it."""
 
 
 @dataclass(slots=True, eq=False)
@@ -40,11 +40,11 @@ class PeerSession:
         peer: Its number in this agent; never used again for another run.
         link: Its link, or the last one while it has none.
         proxies: The nodes that stand for its nodes in the local graph.
-        handlers: What takes the data of each open route, by the route's id; filled by the parts.
-        time: How the messages of its link are dated here.
+        handlers: The handler of each open route's data, by the route's id; the parts fill it.
+        time: The time base of its link: the offset between its clock and the local one.
         state: Whether it has a link.
         away_since: When its last link ended, monotonic seconds.
-        wait: While it has no link: seconds behind ``away_since`` after which its absence is looked at next.
+        wait: Seconds from ``away_since`` to ``due``; ``None`` while it has a link.
     """
 
     peer: int
@@ -63,5 +63,5 @@ class PeerSession:
 
     @property
     def due(self) -> float | None:
-        """When its absence is looked at next, monotonic seconds; ``None`` while it has a link."""
+        """When something kept for the absent peer expires next, monotonic seconds; ``None`` while it has a link."""
         return None if self.wait is None else self.away_since + self.wait

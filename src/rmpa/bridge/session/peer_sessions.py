@@ -1,4 +1,4 @@
-"""Every peer's session: begun by its first link, kept while parts wait for the next one, ended for good."""
+"""The sessions of all peers: each begins with a link, and is kept while a part waits for the next one."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 
 
 class PeerSessions:
-    """The sessions of all peers; tells the parts of the bridge when one begins, loses its link, has one again, ends.
+    """The sessions of all peers; notifies the parts of the bridge when one begins, ends, or loses or gets a link.
 
     Args:
-        parts: Those that are told, in this order; more may be added until the first link is up.
+        parts: The parts, notified in this order; more may be added until the first link is up.
         nodes: Makes the proxies.
-        receiver: Hands on the data that comes on links.
-        on_kill: ``(session, node, caller id, reason) -> reply``: the proxy of a peer's node was asked to end.
+        receiver: Passes the data of links to the handlers of routes.
+        on_kill: ``(session, node, caller id, reason) -> reply``: called when a node's proxy is asked to end.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class PeerSessions:
         return self._by_link.get(link)
 
     def proxy_name(self, session: PeerSession, node: str, origin: Origin | None) -> str:
-        """The name of the proxy of a peer's node, or of the node of another module that the peer relays."""
+        """The name of the proxy of a peer's node, or, with ``origin``, of a node that the peer relays."""
         if origin is not None:
             session.proxies.names[node] = self._namespaces.relayed_name(origin)
         return session.proxies.name(node)
@@ -77,7 +77,7 @@ class PeerSessions:
     # --- links ---------------------------------------------------------------------------------------------------
 
     def link_up(self, link: PeerLink) -> None:
-        """A link is up: of a new peer, or of one whose session waits for it."""
+        """Attach a link to the session that waits for it, or begin a session."""
         session = self._waiting_for(link)
         if session is not None:
             session.link, session.state, session.wait = link, PeerState.LINKED, None
@@ -103,7 +103,7 @@ class PeerSessions:
         return session
 
     def _waiting_for(self, link: PeerLink) -> PeerSession | None:
-        """The session of this run of the peer, if it waits. One of an earlier run ends, for that will not be back."""
+        """The waiting session of this run of the peer, if there is one; ends that of an earlier run."""
         for session in self:
             if session.linked:
                 continue
@@ -114,7 +114,7 @@ class PeerSessions:
         return None
 
     def link_down(self, link: PeerLink) -> None:
-        """A link is gone; its peer may come back."""
+        """Detach a link that is gone; after silence its session waits for ``mesh.limits.AWAY_GRACE``."""
         session = self._by_link.pop(link, None)
         if session is None:
             return
@@ -131,7 +131,7 @@ class PeerSessions:
             self._grace_over(session)
 
     def _grace_over(self, session: PeerSession) -> None:
-        """The peer does not come back at once: what does not wait for it leaves the local graph."""
+        """Asks the parts what they keep for a peer that is not back; ends the session if they keep nothing."""
         session.state, session.wait = PeerState.AWAY, 0.0
         waits = [part.grace_over(session) for part in self._parts]
         if any(waits):
@@ -140,7 +140,7 @@ class PeerSessions:
             self._end(session)
 
     def _outlasted(self, session: PeerSession, now: float) -> None:
-        """The peer has been away for a while: what does not wait for longer leaves, and all when nothing does."""
+        """Lets the parts drop what has expired for an absent peer; ends the session if nothing is left."""
         seconds = max(now - session.away_since, session.wait or 0.0)
         waits = [part.outlasted(session, seconds) for part in self._parts]
         session.wait = min((wait for wait in waits if wait is not None), default=None)
@@ -164,7 +164,7 @@ class PeerSessions:
     # --- the end -------------------------------------------------------------------------------------------------
 
     def _end(self, session: PeerSession) -> None:
-        """The peer will not come back: all that is left of it leaves the local graph."""
+        """Ends a session for good: the rest of the peer is removed from the local graph."""
         session.wait = None
         self._timer.arm()
         self._by_number.pop(session.peer, None)
@@ -180,7 +180,7 @@ class PeerSessions:
         task.add_done_callback(self._closing.discard)
 
     async def close(self) -> None:
-        """End every session, and wait until nothing of them is left in the local graph."""
+        """End every session, and wait until all proxies are closed."""
         self._timer.close()
         for session in self:
             self._end(session)
@@ -190,20 +190,20 @@ class PeerSessions:
     # --- the rest ------------------------------------------------------------------------------------------------
 
     def lane_lost(self, link: PeerLink) -> None:
-        """A link has lost its bulk lane's connection, and perhaps half a message in either direction."""
+        """Notify the parts that a link lost its bulk lane, perhaps in the middle of a message."""
         session = self._by_link.get(link)
         if session is not None:
             for part in self._parts:
                 part.lane_lost(session)
 
     def clock(self, link: PeerLink) -> None:
-        """A link knows its peer's clock better."""
+        """Take a link's new estimate of its peer's clock."""
         session = self._by_link.get(link)
         if session is not None:
             session.time.set(link.clock_offset, link.clock_error)
 
     def reconcile(self) -> None:
-        """Try again to make the proxies that could not be made."""
+        """Try failed proxies again, and forget unused namespaces of relayed modules."""
         for session in self:
             yield_to_data()
             session.proxies.reconcile()

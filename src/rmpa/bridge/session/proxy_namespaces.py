@@ -1,4 +1,4 @@
-"""Names the proxies: one namespace for each module whose nodes stand in the local graph."""
+"""Names the proxies: one namespace for each module that has nodes in the local graph."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ if TYPE_CHECKING:
 
 
 class ProxyNamespaces:
-    """The namespaces of linked peers and of modules that relays pass on; no two modules share one."""
+    """The namespaces of peers and of relayed modules; no two modules share one."""
 
     def __init__(self) -> None:
         self._linked: dict[int, tuple[str, str]] = {}
-        """Of each session: its module's instance, and the namespace."""
+        """The module's instance and its namespace, by the session's number."""
         self._relayed: dict[str, str] = {}
-        """Of each relayed module's instance: the namespace."""
+        """The namespace of each relayed module, by its instance."""
 
     def add(self, peer: int, identity: Identity) -> str:
-        """The namespace of a linked peer, until ``remove``."""
+        """Return the namespace of a peer, which is reserved until ``remove``."""
         instance = identity.instance.hex()
         prefix = proxy_prefix(identity, self._taken(instance))
         self._linked[peer] = (instance, prefix)
         return prefix
 
     def remove(self, peer: int) -> None:
-        """A peer is gone for good."""
+        """Release the namespace of a peer that is gone for good."""
         self._linked.pop(peer, None)
 
     def relayed_name(self, origin: Origin) -> str:
-        """The name of the proxy of a relayed node: the same as if its module had a link."""
+        """The name of a relayed node's proxy, made by the same rules as for linked modules."""
         prefix = self._relayed.get(origin.instance)
         if prefix is None:
             module = Identity(Guid.parse(origin.guid), bytes.fromhex(origin.instance), origin.name)
@@ -43,7 +43,7 @@ class ProxyNamespaces:
         return proxy_name(prefix, origin.node)
 
     def forget_unused(self, names: Collection[str]) -> None:
-        """Forget relayed modules of whose proxies none is among ``names``."""
+        """Forget the relayed modules that have no proxy among ``names``."""
         self._relayed = {
             instance: prefix
             for instance, prefix in self._relayed.items()
@@ -51,6 +51,6 @@ class ProxyNamespaces:
         }
 
     def _taken(self, instance: str) -> set[str]:
-        """The namespaces that a module must leave to others."""
+        """The namespaces that other modules have."""
         linked = {prefix for other, prefix in self._linked.values() if other != instance}
         return linked | {prefix for other, prefix in self._relayed.items() if other != instance}

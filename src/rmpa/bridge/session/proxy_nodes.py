@@ -1,4 +1,4 @@
-"""Makes the nodes that stand for the nodes of peers: all at one pair of listening sockets, where that is possible."""
+"""Makes the proxy nodes; where possible, all of them share one pair of listening sockets."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _SOCKETS: Final = 2
-"""That of XML-RPC and that of TCPROS."""
+"""The listening sockets of one node: XML-RPC and TCPROS."""
 
 
 class ProxyNodes:
-    """The proxies' way to listen, and the nodes that were made.
+    """Makes proxies, and owns the listener that they share.
 
-    On loopback they share a listener, and each has an address of its own. Where nodes of other machines must reach
-    them, or this machine does not allow it, each has two listening sockets.
+    On loopback all proxies share a listener, and each has an address of its own. Where nodes of other machines must
+    reach them, or this machine does not allow it, each has two listening sockets.
 
     Args:
         core: The local core.
@@ -39,14 +39,14 @@ class ProxyNodes:
         self._counters = counters
         self._listener: SharedListener | None = None
         self.listening = ""
-        """How proxies listen here, ready to read: at which ports, or why each has two sockets of its own."""
+        """How the proxies listen, as text: at which ports, or why each has two sockets of its own."""
 
     def sockets(self, proxies: int) -> int:
-        """How many sockets listen for so many proxies."""
+        """The number of listening sockets for a number of proxies."""
         return _SOCKETS if self._listener is not None else _SOCKETS * proxies
 
     async def start(self) -> None:
-        """Listen for all proxies that are made from now on, if that works here."""
+        """Open the shared listener, if this host allows it."""
         host = self._core.node_host
         if not is_loopback(host):
             self.listening = f"two for each: nodes of other machines reach them, at {self._core.node_address}"
@@ -63,24 +63,24 @@ class ProxyNodes:
         self.listening = f"two for all, ports {xmlrpc} and {tcpros}, and an address 127.a.b.c for each"
 
     async def close(self) -> None:
-        """Listen no longer; the proxies are closed before."""
+        """Close the shared listener; call it after all proxies are closed."""
         if self._listener is not None:
             await self._listener.close()
             self._listener = None
 
     def make(self, name: str, on_kill: Callable[[str, str], Awaitable[RosReply]] | None = None) -> SlaveNode:
-        """A proxy, not started.
+        """Make a proxy, which is not started.
 
         Args:
             name: Its name in the local graph.
-            on_kill: ``(caller id, reason) -> reply``: it was asked to end (``rosnode kill``).
+            on_kill: ``(caller id, reason) -> reply``: called when it is asked to end (``rosnode kill``).
 
         Raises:
             OSError: It would have sockets of its own, and too few file descriptors are left (``EMFILE``).
         """
         if self._listener is None:
             with DESCRIPTORS.open_socket(Use.PROXY, what=f"the proxy {name}"):
-                pass  # there is room for its sockets, and for connections to them
+                pass  # only checks that there is room for its sockets, and for connections to them
         return SlaveNode(
             name,
             self._core.node_host,

@@ -1,7 +1,7 @@
-"""Which local sources are offered to which peers, and which are flowing (one copy a peer, on demand).
+"""Which local sources are offered to which peers, and which of them flow (on demand, one copy for each peer).
 
-Sans-I/O: the driver tells what the local graph holds, what peers ask for and what became of the connections to
-local publishers; it gets back actions.
+Sans-I/O: the driver passes in the state of the local graph, the requests of the peers and the events of the
+connections to local publishers. Each call returns the actions to carry out.
 
 A source is connected while at least one peer wants it::
 
@@ -9,15 +9,13 @@ A source is connected while at least one peer wants it::
       ▲               │ refused, lost          │ lost, restarted, gone
       └───────────────┴────────────────────────┘  every route of it: Closed(reason)
 
-A peer that lost a route asks again: the side that wants the data retries. A reliable route outlives its
-link: it is suspended, its source stays connected, and the peer's next ``OpenRoute`` goes on where it was
-(``link_away``).
+A peer that lost a route opens it again: the receiving side retries. A reliable route outlives its link: it is
+suspended, its source stays connected, and the peer's next ``OpenRoute`` continues it (``link_away``).
 
-Peers know sources by their wire names (``bridge.naming``); here all is keyed by the local ones but for what a peer
-says and is told.
+Messages to and from peers carry wire names (``bridge.naming``). Everything else here is keyed by local names.
 
-A change of the graph costs what changed, however large the graph is; what peers are to hear of it is gathered, and
-told a bounded number of sources at a time.
+The cost of a change depends on the size of the change, not on the size of the graph. Changes are gathered for each
+peer and advertised in portions of bounded size.
 """
 
 from __future__ import annotations
@@ -59,7 +57,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class LocalSource:
-    """A source of the local graph: its message type, its node's slave API, and its origin where it is relayed."""
+    """A source of the local graph: its message type, its node's slave API, and its origin if it is relayed."""
 
     type: str
     uri: str
@@ -68,15 +66,15 @@ class LocalSource:
 
 @dataclass(slots=True)
 class _Route:
-    """One peer's wish for a source.
+    """A route of a source that one peer has opened.
 
     Args:
-        contract: What holds for it.
-        asked: What the peer asked for.
-        live: Whether data goes there yet.
-        epoch: Of a reliable route, else 0.
-        after: Where a suspended one goes on.
-        named: The last numbering that the peer has a part of, and its last message; (0, 0) if it has none.
+        contract: The contract in force: the stronger terms of both ends.
+        asked: The contract that the peer asked for.
+        live: Whether data is sent on it yet.
+        epoch: Identifies the numbering of a reliable route; 0 for best effort.
+        after: Sequence of the last message that the peer has, if this continues a suspended route; else ``None``.
+        named: Epoch and sequence of the last message of this source that the peer has; (0, 0) if it has none.
     """
 
     contract: Contract
@@ -89,13 +87,13 @@ class _Route:
 
 @dataclass(slots=True)
 class _ExportedFlow:
-    """A source that some peer wants."""
+    """A source that at least one peer has opened."""
 
     uri: str
     routes: dict[tuple[int, int], _Route] = field(default_factory=dict)
-    """By (peer, route)."""
+    """Open routes by (peer, route id)."""
     away: dict[int, _Route] = field(default_factory=dict)
-    """Suspended, by peer."""
+    """Suspended routes by peer."""
     description: Description | None = None
 
     @property
@@ -108,9 +106,9 @@ class _Topic:
     """One topic of the local graph.
 
     Args:
-        seen: Its publishers as they were told, by node.
-        crossing: Those that policy lets cross, whether they are offered or there are too many.
-        rules: Which rules they were judged by.
+        seen: Its publishers by node, as ``Exports.graph`` last got them.
+        crossing: Those that policy lets cross, including those beyond ``limits.topics``.
+        rules: The number of the rules that they were judged by; ``apply_rules`` counts it up.
     """
 
     seen: Mapping[str, LocalSource]
@@ -128,11 +126,11 @@ class Exports:
     """The outbound half of the bridge.
 
     Args:
-        policy: What may cross.
-        contracts: What our side promises.
-        names: How our names read at the peers.
-        limit_settings: How much is offered.
-        kept: Keeps the messages of reliable routes.
+        policy: Decides which sources may cross.
+        contracts: The contracts that this module offers for its topics.
+        names: Translates local names to the names at the peers.
+        limit_settings: Bounds the number of offered topics.
+        kept: Knows the kept and lost messages of reliable routes.
     """
 
     def __init__(
@@ -155,83 +153,83 @@ class Exports:
         self._epochs = 0
         self._topics: dict[str, _Topic] = {}
         self._routes: dict[int, dict[int, Source]] = {}
-        """What each linked peer has open, by its route."""
+        """The open source of each route id, for each linked peer."""
         self._flows: dict[Source, _ExportedFlow] = {}
 
     @property
     def offered(self) -> Mapping[Source, LocalSource]:
-        """What peers are told of."""
+        """The sources that are offered to peers, before the rules for single peers."""
         return self._catalogue.offered
 
     @property
     def beyond(self) -> Beyond:
-        """What is offered to no peer because there is too much (``limits.topics``)."""
+        """How many sources are offered to no peer because of ``limits.topics``."""
         return self._catalogue.beyond
 
     def is_beyond(self, source: Source) -> bool:
-        """Whether a source is one of these."""
+        """Whether a source is offered to no peer because of ``limits.topics``."""
         return self._catalogue.is_beyond(source)
 
     def offer(self, peer: int, source: Source) -> TopicOffer | None:
-        """What a peer was told of a source, by the name that it has over there."""
+        """The offer of a source as it was advertised to a peer, with its wire name; ``None`` if it was not."""
         return self._catalogue.told(peer, source)
 
     def topics_for(self, peer: int) -> int:
-        """How many topics a peer may have."""
+        """How many topics a peer can open: those advertised to it, or all offered ones if no rule is for it."""
         known = self._catalogue.peer(peer)
         sources = known.told if known is not None and known.judged else self.offered
         return len({source.topic for source in sources})
 
     def local(self, peer: int, wire: Source) -> Source | None:
-        """The source that a peer knows by a name, or ``None`` if it may know none by it."""
+        """The local source that a peer means by a wire name; ``None`` if none is offered to it by that name."""
         known = self._catalogue.peer(peer)
         if known is None:
             return None
         source = known.by_wire.get(wire)
         local = self.offered.get(wire if source is None else source)
         if source is None and local is not None and not known.judged and self._offer(known, wire, local) is not None:
-            return wire  # it is about to be told
+            return wire  # its advertisement is on its way
         return source if local is not None else None
 
     def source(self, peer: int, route: int) -> Source | None:
-        """What a peer has open on a route."""
+        """The source that a peer has open on a route."""
         return self._routes.get(peer, {}).get(route)
 
     def flowing(self, source: Source) -> tuple[int, ...]:
-        """The peers that a source goes to now."""
+        """The peers to which a source's data is sent now."""
         flow = self._flows.get(source)
         return tuple(peer for (peer, _), route in flow.routes.items() if route.live) if flow else ()
 
     def contract(self, source: Source, peer: int) -> Contract | None:
-        """What holds for a source's route to a peer, while there is one."""
+        """The contract of a source's open route to a peer; ``None`` if there is no such route."""
         flow = self._flows.get(source)
         return next((route.contract for (p, _), route in flow.routes.items() if p == peer), None) if flow else None
 
     def description(self, source: Source) -> Description | None:
-        """What is known of a source's messages, while it flows."""
+        """The header of a source's publisher, while the source is connected; else ``None``."""
         flow = self._flows.get(source)
         return flow.description if flow else None
 
     @property
     def topics(self) -> Collection[str]:
-        """The topics that the local graph was last said to have."""
+        """The topics with publishers, as ``graph`` last reported them."""
         return self._topics.keys()
 
     @property
     def pending(self) -> bool:
-        """Whether there is something to ``advertise``."""
+        """Whether a peer has not received all changes yet, so that ``advertise`` has something to send."""
         return self._catalogue.pending
 
     def beginning(self, peer: int) -> bool:
-        """Whether a peer has not been told everything once since its link is up."""
+        """Whether the full advertisement on a peer's present link is not complete yet."""
         return self._catalogue.beginning(peer)
 
     def apply_rules(
         self, policy: Policy, contracts: Contracts, names: Names, limit_settings: LimitSettings = _DEFAULT_LIMITS
     ) -> list[Action]:
-        """Other rules hold from now on; what they leave as it is goes on untouched.
+        """Takes new rules, and ends routes whose contract changes with them; other routes go on untouched.
 
-        The topics are judged by them when ``graph`` tells of each next, and the peers hear of it by ``advertise``.
+        ``graph`` judges a topic by the new rules when it is called for it next; then ``advertise`` sends the changes.
         """
         self._policy, self._contracts, self._names, self._limit_settings = policy, contracts, names, limit_settings
         self._rules += 1
@@ -249,7 +247,7 @@ class Exports:
         return actions
 
     def graph(self, topic: str, publishers: Mapping[str, LocalSource]) -> list[Action]:
-        """Set a topic's publishers now, by node, proxies left out; peers are told by ``advertise``."""
+        """Set a topic's present publishers, by node, without proxies; ``advertise`` sends the changes."""
         before = self._topics.get(topic, _NOTHING)
         if before.seen == publishers and (before.rules == self._rules or not publishers):
             return []
@@ -278,13 +276,13 @@ class Exports:
         )
 
     def _came(self, source: Source, local: LocalSource) -> list[Action]:
-        """A source is there: new, as it was, with another type, or at another address."""
+        """Offers a source that is new, unchanged, or has another type or address."""
         before = self.offered.get(source)
         if not self._catalogue.put(source, local):
             return [self._catalogue.warning("sources.too_many")]
         if before is None or (before.type, before.origin) != (local.type, local.origin):
             self._catalogue.note(source)
-        # Peers need not know of a new address.
+        # A new address alone is not advertised.
         flow = self._flows.get(source)
         return self._end(source, "the node has restarted") if flow is not None and flow.uri != local.uri else []
 
@@ -298,7 +296,7 @@ class Exports:
         return actions
 
     def advertise(self, ready: Callable[[int], bool] = lambda _: True) -> list[Action]:
-        """One message for each peer that has not heard everything and is ready; call again while ``pending``."""
+        """Returns one message for each ready peer that has changes to receive; call again while ``pending``."""
         return [
             action
             for peer, portion in self._catalogue.portions(ready)
@@ -306,7 +304,7 @@ class Exports:
         ]
 
     def _told_portion(self, peer: int, portion: Portion[Source, TopicOffer, Source], *, full: bool) -> list[Action]:
-        """A portion as a message; routes of sources that the peer may not have any more end."""
+        """Makes the message of a portion, and ends routes of sources that the peer may not have any more."""
         actions: list[Action] = []
         for source in portion.ended:
             actions += self._end_for(source, peer, "it is not offered here any more, or by another name")
@@ -321,7 +319,7 @@ class Exports:
         return actions
 
     def _offer(self, known: _Peer, source: Source, local: LocalSource) -> TopicOffer | None:
-        """What a peer is to know of a source now."""
+        """The offer of a source for one peer; ``None`` if the peer may not know of it."""
         if local.origin is not None and not may_have(known.instance, local.origin):
             return None
         if not known.judged:
@@ -334,12 +332,12 @@ class Exports:
         return TopicOffer(wire, source.node, local.type, local.origin)
 
     def link_up(self, peer: int, name: str = "", instance: str = "") -> list[Action]:
-        """A link is up: begin to tell all we have; ``advertise`` goes on with it.
+        """Begins the full advertisement on a new link; ``advertise`` continues it.
 
         Args:
             peer: The peer's number.
-            name: The peer's name, which its rules go by.
-            instance: Its run, as 32 hexadecimal digits; nothing that came from there is relayed back to it.
+            name: The peer's name, which selects the rules for it.
+            instance: The peer's run, as 32 hexadecimal digits; its own sources are not relayed back to it.
         """
         self._routes[peer] = {}
         first = self._catalogue.link_up(peer, name, instance, judged=self._is_judged(name))
@@ -349,7 +347,12 @@ class Exports:
         return not self._names.of(name).plain or self._policy.has_rules_for(name)
 
     def link_down(self, peer: int, *, counting: bool = False) -> list[Action]:
-        """A peer is gone, and all its routes; ``counting``: suspended ones stay, for what it misses is counted."""
+        """Ends a peer's open routes, and its suspended ones too unless ``counting``.
+
+        Args:
+            peer: The peer's number.
+            counting: Keep suspended routes, so that the messages that the peer misses are still counted.
+        """
         actions: list[Action] = []
         self._catalogue.link_down(peer)
         for route, source in self._routes.pop(peer, {}).items():
@@ -357,7 +360,7 @@ class Exports:
         return actions if counting else actions + self.unclaimed(peer)
 
     def unclaimed(self, peer: int) -> list[Action]:
-        """A peer does not go on with its suspended routes."""
+        """Ends the suspended routes of a peer, which has not opened them again."""
         actions: list[Action] = []
         for source, flow in list(self._flows.items()):
             if flow.away.pop(peer, None) is not None:
@@ -365,12 +368,12 @@ class Exports:
         return actions
 
     def link_away(self, peer: int) -> tuple[list[Action], bool]:
-        """A link is gone, but its peer may come back.
+        """Suspends the reliable routes of a peer that may come back, and ends its other routes.
 
         Returns:
-            What to do, and whether a reliable route waits for the peer: if none does, ``link_down`` it.
+            The actions, and whether a reliable route waits for the peer; if none does, call ``link_down`` next.
         """
-        # What the peer had not asked for again yet waits anew.
+        # Suspended routes that the peer did not open again over this link start their outage anew.
         again = [(one, flow.away[peer].contract) for one, flow in self._flows.items() if peer in flow.away]
         actions: list[Action] = [SuspendRoute(one, peer, contract.outage) for one, contract in again]
         self._catalogue.link_down(peer)
@@ -386,7 +389,7 @@ class Exports:
         return actions, self.waits_for(peer)
 
     def given_up(self, source: Source, peer: int) -> list[Action]:
-        """A suspended route is not even counted any more."""
+        """Ends a suspended route whose lost messages cannot be counted any more."""
         flow = self._flows.get(source)
         if flow is None or flow.away.pop(peer, None) is None:
             return []
@@ -397,23 +400,23 @@ class Exports:
         return any(peer in flow.away for flow in self._flows.values())
 
     def inherit(self, old: int, new: int) -> None:
-        """A module has another run: what the old one's routes carried is counted until the new one asks for them."""
+        """Hands the suspended routes of a module's old run to its new run, which may open them again."""
         for flow in self._flows.values():
             if (route := flow.away.pop(old, None)) is not None:
                 flow.away[new] = route
 
     def outage(self, peer: int) -> float:
-        """For how many seconds messages are kept for a peer without a link."""
+        """The longest time, in seconds, for which messages are kept for a peer without a link; 0 if none are."""
         return max(
             (flow.away[peer].contract.outage for flow in self._flows.values() if peer in flow.away), default=0.0
         )
 
     def absent(self, source: Source) -> dict[int, Contract]:
-        """The peers whose suspended routes a source has, with what holds for each."""
+        """The peers to which a source has suspended routes, with the contract of each."""
         return {p: route.contract for p, route in flow.away.items()} if (flow := self._flows.get(source)) else {}
 
     def opened(self, peer: int, message: OpenRoute) -> list[Action]:
-        """A peer asks for a source."""
+        """Opens a route that a peer asks for, or answers with ``RouteClosed`` and the reason."""
         routes = self._routes[peer]
         if message.route in routes:
             return [
@@ -429,7 +432,7 @@ class Exports:
         local = self.offered[source]
         flow = self._flows.get(source)
         if flow is not None and any(other == peer for other, _ in flow.routes):
-            # One copy a peer: more would let it multiply what we send at will.
+            # One copy for each peer: otherwise a peer could multiply the traffic of this module at will.
             return [Send(peer, RouteClosed(message.route, f"{source} is open on another route of this link"))]
         routes[message.route] = source
         away = flow.away.pop(peer, None) if flow is not None else None
@@ -444,7 +447,7 @@ class Exports:
         return self._start(source, flow, flow.description)
 
     def _route(self, message: OpenRoute, topic: str, local: LocalSource, away: _Route | None) -> _Route:
-        """The wish of a peer; it goes on where a suspended one was if it names that one's epoch."""
+        """The route that a peer asks for; it continues a suspended one of the same epoch and contract."""
         asked, named = message.contract, (message.epoch, message.after)
         contract = combine(self._contracts.of(topic, local.type), asked)
         if contract.reliability is not Reliability.RELIABLE:
@@ -455,12 +458,12 @@ class Exports:
         return _Route(contract, asked, epoch=self._epochs, named=named)
 
     def closed(self, peer: int, message: CloseRoute) -> list[Action]:
-        """A peer wants no more of a route; one that is not open is none of our worry (it crossed ours)."""
+        """Ends a route that a peer closes; one that is not open is ignored, since both ends may close it at once."""
         source = self._routes[peer].pop(message.route, None)
         return self._remove(source, peer, message.route, wished=True) if source is not None else []
 
     def described(self, source: Source, description: Description) -> list[Action]:
-        """The local publisher has answered with its header."""
+        """Starts the routes of a source whose publisher has answered with its header."""
         flow = self._flows.get(source)
         if flow is None:
             return []
@@ -468,7 +471,7 @@ class Exports:
         return self._start(source, flow, description)
 
     def lost(self, source: Source, reason: str) -> list[Action]:
-        """The local publisher hung up, refused or does not answer."""
+        """Ends the routes of a source whose publisher hung up, refused or does not answer."""
         return self._end(source, reason, connected=False)
 
     def _start(self, source: Source, flow: _ExportedFlow, description: Description) -> list[Action]:
@@ -501,14 +504,14 @@ class Exports:
         return actions + self._disconnect(source, flow)
 
     def _disconnect(self, source: Source, flow: _ExportedFlow) -> list[Action]:
-        """Leave a source that no peer wants any more."""
+        """Disconnects a source without open or suspended routes."""
         if flow.wanted:
             return []
         del self._flows[source]
         return [Disconnect(source)]
 
     def _end_for(self, source: Source, peer: int, reason: str) -> list[Action]:
-        """A source goes to one peer no longer, though others may have it."""
+        """Ends a source's routes to one peer; those to other peers go on."""
         flow = self._flows.get(source)
         if flow is None:
             return []

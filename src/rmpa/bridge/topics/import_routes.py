@@ -1,4 +1,4 @@
-"""The routes that this module asks peers for: opened on demand, asked for again when they are lost. Pure."""
+"""The routes that this module opens at peers: on demand, and again after they were lost. Pure."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 
 
 class ImportRoutes:
-    """Drives the states of every remote source's route.
+    """Drives the route states of all remote sources.
 
     Args:
-        find: ``(peer, source)``: finds a remote source.
-        contracts: What this module asks for.
+        find: ``(peer, source)``: returns the remote source, or ``None`` if it is unknown.
+        contracts: The contracts that this module asks for.
         position: ``(peer, source)``: epoch and last message of a reliable route that outlived its link, or ``None``.
     """
 
@@ -37,26 +37,29 @@ class ImportRoutes:
         self.contracts = contracts
         self._position = position
         self._routes: dict[int, dict[int, Source]] = {}
-        """Of each linked peer: what was asked for or is open, by its route."""
+        """The requested and open sources by route id, for each linked peer."""
         self._last_route: dict[int, int] = {}
-        # (when, serial, peer, source); what no longer is a source's timer is passed over.
+        # Heap of (when, serial, peer, source); an item that is no longer its source's timer is skipped.
         self._timers: list[tuple[float, int, int, Source]] = []
         self._serial = 0
 
     def link_up(self, peer: int) -> None:
-        """A peer has a link: routes are counted anew."""
+        """Registers a peer's link; its route ids begin at 1 again."""
         self._routes[peer] = {}
         self._last_route[peer] = 0
 
     def link_down(self, peer: int) -> Collection[Source]:
-        """A peer has no link any more; return what was asked for or open."""
+        """Forgets the routes of a peer's link; return the sources that were requested or open."""
         self._last_route.pop(peer, None)
         return self._routes.pop(peer, {}).values()
 
     # --- what happens ------------------------------------------------------------------------------------------
 
     def opened(self, peer: int, message: RouteOpened, now: float) -> list[Action]:
-        """A route is open; one that was closed here meanwhile is ignored."""
+        """Takes the peer's answer that a route is open; ignored if the route was closed here meanwhile.
+
+        A description of another type than the offered one closes the route.
+        """
         routes = self._routes[peer]
         source = routes.get(message.route)
         entry = self._find(peer, source) if source is not None else None
@@ -81,7 +84,7 @@ class ImportRoutes:
         return [Describe(peer, source, message.route, message.description, *terms, following, lost, at_least)]
 
     def closed(self, peer: int, message: RouteClosed, now: float) -> list[Action]:
-        """The peer has no such route, or no longer."""
+        """Handles a route that the peer has refused or closed: it is opened again after the back-off."""
         source = self._routes[peer].pop(message.route, None)
         entry = self._find(peer, source) if source is not None else None
         if source is None or entry is None:
@@ -89,7 +92,7 @@ class ImportRoutes:
         return self._fail(peer, source, entry, message.reason, now)
 
     def demand(self, peer: int, source: Source, entry: RemoteTopic, now: float, *, wanted: bool) -> list[Action]:
-        """A local node listens to a source, or none does any more."""
+        """Opens a source's route for its first local listener, or lets it linger after the last one."""
         entry.wanted = wanted
         if wanted:
             if entry.state is RouteState.IDLE:
@@ -105,7 +108,7 @@ class ImportRoutes:
         return []
 
     def suspend(self, entry: RemoteTopic) -> None:
-        """The link of an entry's peer is gone, and the entry stays."""
+        """Suspends the route of an entry that outlives its peer's link."""
         entry.problem = "its peer is away"
         if entry.state is RouteState.LINGERING:
             entry.enter(RouteState.IDLE)
@@ -116,7 +119,7 @@ class ImportRoutes:
     # --- opening and closing -----------------------------------------------------------------------------------
 
     def open(self, peer: int, source: Source, entry: RemoteTopic, now: float) -> list[Action]:
-        """Ask for a source, or wait for the peer's next link."""
+        """Requests a source's route, or waits for the peer's next link."""
         routes = self._routes.get(peer)
         if routes is None:
             entry.enter(RouteState.OPENING)
@@ -131,13 +134,13 @@ class ImportRoutes:
         return [Send(peer, OpenRoute(route, source.topic, source.node, contract, epoch, after))]
 
     def close(self, peer: int, source: Source, entry: RemoteTopic, *, missed: bool = False) -> list[Action]:
-        """Leave a source alone, whatever its state."""
+        """Ends a source's route in any state; ``missed`` as in ``actions.Detach``."""
         actions: list[Action] = []
         if entry.route:
             self._routes.get(peer, {}).pop(entry.route, None)
             actions += [Send(peer, CloseRoute(entry.route)), Detach(peer, source, entry.route, missed=missed)]
         elif entry.state is RouteState.WAITING and entry.timer is None:
-            actions.append(Detach(peer, source, 0))  # what waited for a new link to go on
+            actions.append(Detach(peer, source, 0))  # it waited for a new link
         entry.route = 0
         entry.backoff.reset()
         if entry.state is RouteState.OPEN:
@@ -160,20 +163,20 @@ class ImportRoutes:
     # --- timers ------------------------------------------------------------------------------------------------
 
     def _enter(self, peer: int, source: Source, entry: RemoteTopic, state: RouteState, timer: float) -> None:
-        """Change a state, which is looked at again at a time."""
+        """Changes a state, and sets the timer that ends it (monotonic seconds)."""
         entry.enter(state, timer)
         self._serial += 1
         entry.serial = self._serial
         heappush(self._timers, (timer, self._serial, peer, source))
 
     def next_timer(self) -> float | None:
-        """When ``handle_timer`` is due."""
+        """When ``handle_timer`` is due, monotonic seconds; ``None`` if no timer runs."""
         while self._timers and not self._is_pending(self._timers[0]):
             heappop(self._timers)
         return self._timers[0][0] if self._timers else None
 
     def handle_timer(self, now: float) -> list[Action]:
-        """Do what is due, or a part of it: then ``next_timer`` is due again at once."""
+        """Handle due timers, at most ``limits.APPLIED_AT_ONCE``; if some remain, ``next_timer`` is in the past."""
         actions: list[Action] = []
         for _ in range(limits.APPLIED_AT_ONCE):
             if (due := self.next_timer()) is None or due > now:
@@ -193,7 +196,7 @@ class ImportRoutes:
         return actions
 
     def _is_pending(self, timer: tuple[float, int, int, Source]) -> bool:
-        """Whether this is still its source's timer."""
+        """Whether an item of the heap is still its source's timer."""
         when, serial, peer, source = timer
         entry = self._find(peer, source)
         return entry is not None and entry.timer == when and entry.serial == serial

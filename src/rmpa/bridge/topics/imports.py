@@ -1,13 +1,13 @@
 """Which sources of the peers appear in the local graph, and which routes are open for them.
 
-Sans-I/O: the driver says what peers advertise and whether local nodes listen; it gets back actions. The states of
-each source's route are in ``topics.remote_topic``.
+Sans-I/O: the driver passes in the peers' advertisements and whether local nodes listen. Each call returns the
+actions to carry out. The states of a source's route are in ``topics.remote_topic``.
 
-What each method costs depends on what it is told, not on how many peers and sources there are; only a long
-advertisement in one piece takes long (``portions``).
+The cost of a method depends on its arguments, not on the number of peers and sources. Only a long advertisement takes
+long, so it is split (``portions``).
 
-A source is known by its wire name, as its peer has it; under which topic it stands here is ``RemoteTopic.topic``
-(``bridge.naming``), and what the local graph says of topics is about those.
+Sources are keyed by their wire names. ``RemoteTopic.topic`` is the name of the topic in the local graph
+(``bridge.naming``); all arguments about the local graph use that one.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 def _nothing(_peer: int, _source: Source) -> None:
-    """Nothing outlives its link."""
+    """Returns ``None``: no route outlives its link."""
 
 
 _NO_NAMES: Final = Names()
@@ -58,14 +58,14 @@ _DEFAULT_LIMITS: Final = LimitSettings()
 
 @dataclass(slots=True, kw_only=True)
 class _ImportPeer(PeerOffers[Source, RemoteTopic, TopicOffer]):
-    """What came over one link, or over the links of one instance.
+    """The sources that one run of a peer offers, over one or more links.
 
     Args:
-        names: How the peer's names read here.
-        topics: What it offers by the topic here (dicts, for their order).
-        places: What is in the local graph, by its topic and node there.
-        silent: Whether its link fell silent before it ended.
-        relayed: What it only passes on, by the instance of the module whose it is (dicts, for their order).
+        names: Translates the peer's names to local ones.
+        topics: The offered sources by their local topic (dicts, for their order).
+        places: The sources shown in the local graph, by local topic and the peer's node.
+        silent: Whether its last link ended by silence.
+        relayed: The sources that it only relays, by the instance of their own module (dicts, for their order).
     """
 
     names: PeerNames
@@ -79,12 +79,12 @@ class Imports:
     """The inbound half of the bridge.
 
     Args:
-        policy: What may cross; the receiving side judges too.
+        policy: Decides which sources may cross; both ends judge.
         rng: Uniform numbers in [0, 1) for the back-off's jitter.
-        contracts: What our side asks for.
+        contracts: The contracts that this module asks for.
         position: ``(peer, source)``: epoch and last message of a reliable route that outlived its link, or ``None``.
-        names: How the peers' names read here.
-        limit_settings: How much of one peer is taken.
+        names: Translates the peers' names to local ones.
+        limit_settings: Bounds the topics and nodes that are taken from one peer.
     """
 
     def __init__(
@@ -104,11 +104,11 @@ class Imports:
         self._routes = ImportRoutes(self.get, self._contracts, position)
         self._peers: dict[int, _ImportPeer] = {}
         self.ways = RelayPaths()
-        """By which of its ways each module is reached that relays offer."""
+        """Selects the path to each module that relays offer."""
         self._local_types: dict[str, str] = {}
 
     def __iter__(self) -> Iterator[tuple[int, Source, RemoteTopic]]:
-        """Every known source, with its peer; what changes meanwhile may or may not be seen."""
+        """Every known source with its peer; changes during the iteration may be missed."""
         for peer, known in list(self._peers.items()):
             for source, entry in list(known.entries.items()):
                 yield peer, source, entry
@@ -122,15 +122,15 @@ class Imports:
         return any(source in known.entries for known in self._peers.values())
 
     def at(self, topic: str) -> Iterator[tuple[int, Source]]:
-        """What peers offer for a topic, by its name here: each source with its peer."""
+        """The sources that peers offer for a local topic, each with its peer."""
         return ((peer, source) for peer, known in self._peers.items() for source in known.topics.get(topic, ()))
 
     def offered_by(self, peer: int) -> Collection[str]:
-        """The topics that a peer offers, as they are here."""
+        """The topics that a peer offers, by their local names."""
         return known.topics.keys() if (known := self._peers.get(peer)) is not None else ()
 
     def relayed_topics(self, instance: str) -> set[str]:
-        """The topics of a module that relays pass on, as they are here."""
+        """The shown topics of a module that is reached by relays, by their local names."""
         return {
             known.entries[source].topic
             for known in self._peers.values()
@@ -139,9 +139,9 @@ class Imports:
         }
 
     def local_type(self, topic: str, type_name: str | None) -> list[Action]:
-        """Say the type of a topic that local nodes publish, or ``None`` for one that they do not.
+        """Set the type with which local nodes publish a topic; ``None`` if none publishes it.
 
-        A remote source of another type stays hidden.
+        Remote sources of another type are hidden, and the conflict is reported.
         """
         if self._local_types.get(topic) == type_name:
             return []
@@ -162,16 +162,16 @@ class Imports:
         return actions
 
     def beyond(self, peer: int) -> peer_limits.Beyond:
-        """What a peer offers beyond ``limits.topics``."""
+        """How much a peer offers beyond ``limits.topics``."""
         known, limit = self._peers.get(peer), self._limit_settings.topics
         return known.beyond("topics", limit) if known is not None else Beyond("topics", limit, 0)
 
     def crowded(self, peer: int) -> Mapping[str, Collection[Source]]:
-        """The nodes of a peer that have no place here (``limits.nodes``), and their sources."""
+        """The nodes of a peer that are hidden because of ``limits.nodes``, with their sources."""
         return known.nodes.waiting if (known := self._peers.get(peer)) is not None else {}
 
     def left_out(self) -> Iterator[tuple[int, str, TopicOffer]]:
-        """What is beyond ``limits.topics``, as far as it is remembered: its peer, its topic here, and what it is."""
+        """The remembered offers beyond ``limits.topics``: peer, local topic and offer of each."""
         for peer, known in list(self._peers.items()):
             for offer in list(known.surplus):
                 yield peer, self._names_of(known, offer.origin).local_name(offer.topic, offer.type), offer
@@ -184,10 +184,10 @@ class Imports:
         now: float,
         limit_settings: LimitSettings = _DEFAULT_LIMITS,
     ) -> Iterator[list[Action]]:
-        """Other rules hold from now on; what they leave as it is goes on untouched.
+        """Takes new rules; sources and routes that they do not change go on untouched.
 
         Returns:
-            What to do, source by source, as it is taken.
+            The actions, source by source; each source is judged when its item is taken.
         """
         self._policy, self._contracts, self._names, self._limit_settings = policy, contracts, names, limit_settings
         self._routes.contracts = contracts
@@ -200,7 +200,7 @@ class Imports:
         )
 
     def _admit(self, peer: int, now: float) -> Iterator[list[Action]]:
-        """Take in what was beyond ``limits.topics`` while there is room, one after the other."""
+        """Adds the remembered offers beyond ``limits.topics``, one at a time, while there is room."""
         while (known := self._peers.get(peer)) and (offer := known.admitted(self._limit_settings.topics)):
             yield self._add(peer, offer, now)
 
@@ -223,12 +223,12 @@ class Imports:
         return actions
 
     def link_up(self, peer: int, name: str = "", who: LinkedPeer | None = None) -> list[Action]:
-        """A link is up, perhaps of a peer that was away; its first message begins a full advertisement.
+        """Registers a link, of a new peer or of one that was away; its first message begins a full advertisement.
 
         Args:
             peer: The peer's number.
-            name: The peer's name, which its rules go by.
-            who: The module that has the link: what relays offer of it is not needed any more.
+            name: The peer's name, which selects the rules for it.
+            who: The peer itself: sources of it that relays offer are hidden while it has a link of its own.
         """
         new = _ImportPeer(name=name, nodes=NodePlaces(self._limit_settings.nodes), names=self._names.of(name))
         known = self._peers.setdefault(peer, new)
@@ -237,15 +237,15 @@ class Imports:
         return self._ways_changed(self.ways.linked(peer, who)) if who is not None else []
 
     def link_away(self, peer: int, *, briefly: bool = False) -> tuple[list[Action], bool]:
-        """A link is gone, but its peer may come back: what does not need a reliable route leaves the local graph.
+        """Suspends the routes of a peer that may come back; sources that do not outlive the link are dropped.
 
         Args:
             peer: The peer's number.
-            briefly: Nothing leaves yet: the link fell silent, and most of those are back at once. Called again
-                without this when the time is over.
+            briefly: Drop nothing yet: the link fell silent, and most silent peers are back soon. The method is
+                called again without it if the peer is not.
 
         Returns:
-            What to do, and whether something waits for the peer: if nothing does, ``link_down`` it.
+            The actions, and whether a source waits for the peer; if none does, call ``link_down`` next.
         """
         actions: list[Action] = []
         known = self._peers[peer]
@@ -257,7 +257,7 @@ class Imports:
         for source, entry in list(known.entries.items()):
             keep = briefly or entry.outlives(silent=known.silent)
             if entry.route:
-                # Without a listener, nothing is to go on.
+                # A lingering route has no listener, so it is not continued.
                 goes_on = keep and entry.state is not RouteState.LINGERING
                 missed = entry.wanted and entry.state is not RouteState.LINGERING
                 actions.append(Detach(peer, source, entry.route, keep=goes_on, missed=missed and not goes_on))
@@ -269,39 +269,40 @@ class Imports:
         return actions, bool(known.entries)
 
     def waits_for(self, peer: int) -> bool:
-        """Whether something of a peer stays for a while: what local nodes listen to, reliable or latched."""
+        """Whether a source outlives the peer's link: one with a local listener that is reliable or latched."""
         known = self._peers[peer]
         return any(entry.outlives(silent=known.silent) for entry in known.entries.values())
 
     def outages(self, peer: int) -> set[float]:
-        """For how many seconds each source waits that stays when its peer is away."""
+        """The outages, in seconds, of the sources that are kept for a peer."""
         return {entry.outage for entry in self._peers[peer].entries.values()}
 
     def outlasted(self, peer: int, seconds: float) -> list[Action]:
-        """A peer has been away for so long: what does not wait for longer leaves the local graph."""
+        """Drops the sources whose outage is over: their peer has been away for ``seconds``."""
         gone = [one for one in self._peers[peer].entries.items() if one[1].outage <= seconds]
         return [action for source, entry in gone for action in self._drop(peer, source, entry)]
 
     def detached(self, peer: int) -> list[Action]:
-        """A link is gone, and nothing waits for its peer: ``link_down`` follows. Costs what was open."""
+        """Detaches the open routes of a peer for which nothing waits; ``link_down`` is called next."""
         gone = [(source, entry) for source in self._routes.link_down(peer) if (entry := self.get(peer, source))]
         return [Detach(peer, source, entry.route, missed=entry.wanted) for source, entry in gone if entry.route]
 
     def link_down(self, peer: int) -> Iterator[Action]:
-        """A peer is gone for good: all that came from it leaves the local graph.
+        """Forgets a peer for good; the actions remove its sources from the local graph.
 
-        It is forgotten at once; to take the actions frees what it was made of, which takes long for thousands.
+        The peer is unknown as soon as this returns. Its entries are freed as the actions are taken, because freeing
+        thousands at once takes long.
         """
         self._routes.link_down(peer)
         known = self._peers.pop(peer, None)
         return _gone(peer, known.entries) if known is not None else iter(())
 
     def unlinked(self, peer: int) -> list[Action]:
-        """Behind ``link_down``: relays may bring on what the peer brought, and what it passed on."""
+        """Call after ``link_down``: other relays may now bring the peer's sources, and those that it relayed."""
         return self._ways_changed(self.ways.unlinked(peer))
 
     def _ways_changed(self, instances: Collection[str]) -> list[Action]:
-        """Some modules may be reached another way: what leaves does so first, for the names of the nodes stay."""
+        """Judges sources of modules whose path may have changed; shown ones first, so that their names get free."""
         touched = [
             (not entry.shown, peer, source)
             for instance in instances
@@ -317,18 +318,18 @@ class Imports:
         ]
 
     def _names_of(self, known: _ImportPeer, origin: Origin | None) -> PeerNames:
-        """The rules that a source's name goes by: those for its own module, not for the relay."""
+        """The naming rules of a source: those for its own module, not those for the relay."""
         return known.names if origin is None else self._names.of(origin.name)
 
     def portions(self, peer: int, message: Advertise) -> Iterator[Change[TopicOffer, Source]]:
-        """Split an advertisement into portions that ``take_in`` deals with in a moment."""
+        """Split an advertisement into portions, each small enough for one call of ``take_in``."""
         full, more = message.full, message.more
         return self._peers[peer].changes(
             message.added, message.removed, lambda offer: offer.source, full=full, more=more
         )
 
     def take_in(self, peer: int, change: Change[TopicOffer, Source], now: float) -> list[Action]:
-        """A peer publishes more, or less."""
+        """Applies a portion of an advertisement: sources that the peer has added or removed."""
         known = self._peers[peer]
         actions: list[Action] = []
         for source in change.removed:
@@ -341,34 +342,34 @@ class Imports:
         return actions + [action for one in admitted for action in one]
 
     def advertised(self, peer: int, message: Advertise, now: float = 0.0) -> list[Action]:
-        """A peer says what it publishes: all portions at once."""
+        """Applies a whole advertisement at once."""
         return [action for change in self.portions(peer, message) for action in self.take_in(peer, change, now)]
 
     # --- routes ------------------------------------------------------------------------------------------------
 
     def opened(self, peer: int, message: RouteOpened, now: float) -> list[Action]:
-        """A route that this module asked for is open; one that it closed meanwhile is ignored."""
+        """Takes the peer's answer that a route is open; ignored if the route was closed here meanwhile."""
         return self._routes.opened(peer, message, now)
 
     def closed(self, peer: int, message: RouteClosed, now: float) -> list[Action]:
-        """The other side has no such route, or no longer."""
+        """Handles a route that the peer has refused or closed."""
         return self._routes.closed(peer, message, now)
 
     def demand(self, peer: int, source: Source, now: float, *, wanted: bool) -> list[Action]:
-        """A local node listens to a source, or none does any more."""
+        """Reports the first local listener of a source, or that the last one has gone."""
         entry = self.get(peer, source)
         return self._routes.demand(peer, source, entry, now, wanted=wanted) if entry is not None else []
 
     def next_timer(self) -> float | None:
-        """When ``handle_timer`` is due."""
+        """When ``handle_timer`` is due, monotonic seconds; ``None`` if no timer runs."""
         return self._routes.next_timer()
 
     def handle_timer(self, now: float) -> list[Action]:
-        """Do what is due, or a part of it: then ``next_timer`` is due again at once."""
+        """Handle due timers, a bounded number of them; if some remain, ``next_timer`` is in the past."""
         return self._routes.handle_timer(now)
 
     def mismatched(self, peer: int, source: Source, subscriber: str, text: str) -> list[Action]:
-        """A local node was refused because its definition is another one: say so here and over there."""
+        """Reports, here and to the peer, a local subscriber that was refused because its definition differs."""
         return [
             Warn("mismatch.md5", str(source), text),
             Send(peer, Mismatch(source.topic, source.node, subscriber, text)),
@@ -381,7 +382,7 @@ class Imports:
         if source in known:
             entry = known[source]
             if (entry.type, entry.origin) == (offer.type, offer.origin):
-                # It was offered over a link before this one: ask again for what that took away.
+                # It was offered over an earlier link: open the route again that ended with that link.
                 waits = entry.state is RouteState.WAITING and entry.timer is None
                 return self._routes.open(peer, source, entry, now) if waits else []
             actions += self._forget(peer, source)
@@ -434,7 +435,7 @@ class Imports:
         ]
 
     def _yield_place(self, peer: int, source: Source, entry: RemoteTopic) -> list[Action]:
-        """A source has left the local graph: another one may have stood behind it."""
+        """Frees the place of a source that has left the local graph, and shows sources that waited for it."""
         known = self._peers[peer]
         del known.places[entry.topic, source.node]
         known.nodes.hide(source.node)
@@ -444,7 +445,7 @@ class Imports:
         return actions
 
     def _behind(self, peer: int, source: Source, entry: RemoteTopic) -> list[Action]:
-        """What may stand where a source stood."""
+        """Judges again the sources that could not be shown beside this one."""
         known = self._peers[peer]
         if entry.topic == CLOCK:
             entry.shown = False
@@ -462,7 +463,7 @@ class Imports:
             del known.topics[entry.topic]
 
     def _report_conflict(self, peer: int, source: Source, entry: RemoteTopic) -> list[Action]:
-        """Say loudly, on both sides, that a local topic of another type is in the way."""
+        """Reports a conflict, if there is one, in the log and to the peer: see ``RemoteTopic.conflict``."""
         if not entry.conflict:
             return []
         return [
@@ -494,7 +495,10 @@ class Imports:
         return why + "rename one of the topics or use one type", True
 
     def _why_no_time(self, peer: int, source: Source, entry: RemoteTopic) -> tuple[str, bool]:
-        """Time has one source: one node of the peer that is followed, or one of this module."""
+        """Why a peer's ``/clock`` is hidden, or empty, and whether that is a conflict.
+
+        Time has one source: one node of the followed peer, or one of this module.
+        """
         if entry.origin is not None:
             return "time does not come by a relay", False
         decision = self._policy.judge_clock(self._peers[peer].name)

@@ -1,4 +1,4 @@
-"""Subscribers that do not fit a source, here and at the peers: what ``rmpa topic info`` and the diagnostics show."""
+"""Subscribers whose type or definition does not fit a source, for ``rmpa topic info`` and the diagnostics."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 class Mismatches:
     """Texts by source and subscriber.
 
-    Subscriber: a local one's name (``/viewer``), or one at a peer behind the peer's name (``base/viewer``).
+    A subscriber is given by its name: ``/viewer`` here, ``base/viewer`` at the peer ``base``.
     """
 
     def __init__(self) -> None:
@@ -26,26 +26,26 @@ class Mismatches:
         return bool(self._texts)
 
     def texts(self, source: Source) -> tuple[str, ...]:
-        """All about one source, ready to read."""
+        """The texts about one source."""
         return tuple(self._texts.get(source, {}).values())
 
     def add(self, source: Source, who: str, text: str) -> None:
-        """Remember one, or say it anew; beyond ``limits.MISMATCHES_MAX`` of one source no more are remembered."""
+        """Remember a mismatch, or replace its text; dropped beyond ``limits.MISMATCHES_MAX`` for one source."""
         known = self._texts.setdefault(source, {})
         if who in known or len(known) < limits.MISMATCHES_MAX:
             known[who] = text
 
     def mended(self, source: Source, who: str) -> bool:
-        """It fits now, or has gone; whether it did not fit before."""
+        """Forget a subscriber that fits now or has gone; return whether it was remembered."""
         return self._texts.get(source, {}).pop(who, None) is not None
 
     def peer_gone(self, name: str) -> None:
-        """A peer is gone, with all its nodes that were refused."""
+        """Forget all subscribers at a peer that is gone."""
         for known in self._texts.values():
             for who in [who for who in known if who == name or who.startswith(name + "/")]:
                 del known[who]
 
     def keep(self, wanted: Callable[[Source], bool]) -> None:
-        """Forget all sources but these."""
+        """Forget the sources for which ``wanted`` is false."""
         for source in [source for source in self._texts if not wanted(source)]:
             del self._texts[source]

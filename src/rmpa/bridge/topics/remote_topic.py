@@ -1,4 +1,4 @@
-"""One topic of one peer as it stands here, and the states of its route. Pure.
+"""One source of a peer as the local graph shows it, and the states of its route. Pure.
 
 ::
 
@@ -27,18 +27,18 @@ if TYPE_CHECKING:
 
 
 class RouteState(Enum):
-    """Where a remote source's route stands."""
+    """The state of a remote source's route."""
 
     IDLE = auto()
-    """Visible in the local graph, without a listener."""
+    """No route: the source has no local listener."""
     OPENING = auto()
-    """Asked for, not answered."""
+    """Requested; the peer has not answered yet."""
     OPEN = auto()
     """Data flows."""
     LINGERING = auto()
-    """Data flows without a listener; perhaps one comes back."""
+    """Data still flows after the last listener has left; for ``limits.ROUTE_LINGER``."""
     WAITING = auto()
-    """It was closed although a node listens; it will be asked for again."""
+    """The route was lost although a node listens; it will be requested again."""
 
 
 _S = RouteState
@@ -56,27 +56,27 @@ _LISTENED: Final = frozenset({RouteState.OPENING, RouteState.OPEN, RouteState.WA
 
 @dataclass(slots=True)
 class RemoteTopic:
-    """One source of one peer, as we see it.
+    """One source of one peer.
 
     Args:
         type: Its message type.
-        topic: The topic that it is here.
-        backoff: Delays between attempts.
+        topic: Its topic in the local graph.
+        backoff: Delays between attempts to open its route.
         shown: Whether it is in the local graph.
         hidden: Why it is not, or empty.
-        conflict: Whether that is because a local node publishes the topic with another type, or time has come from
-            elsewhere before.
-        state: Where its route stands.
-        route: The route's id while it is asked for or open, else 0.
-        timer: When the state is looked at again, monotonic seconds.
-        description: What its messages are, once known.
+        conflict: Whether it is hidden because a local node publishes the topic with another type, or, for ``/clock``,
+            because time already has another source.
+        state: The state of its route.
+        route: The route's id while it is requested or open, else 0.
+        timer: When the state's time is over, monotonic seconds; ``None``: no timer.
+        description: The header of its publisher, once known.
         problem: Why the last attempt failed, or empty.
         wanted: Whether a local node listens.
-        contract: What holds for its route, once it was open.
-        asked: What was last asked for.
-        serial: Of the timer.
-        origin: Its module and node, if its peer only passes it on.
-        crowded: Whether it is hidden because its node has no place here (``limits.nodes``).
+        contract: The contract of its last open route; ``None`` before the first one.
+        asked: The contract that was last requested.
+        serial: Identifies the timer among earlier ones.
+        origin: Its module and node, if its peer only relays it.
+        crowded: Whether it is hidden because of ``limits.nodes``.
     """
 
     type: str
@@ -98,18 +98,23 @@ class RemoteTopic:
     crowded: bool = False
 
     def enter(self, state: RouteState, timer: float | None = None) -> None:
-        """Change the route's state as the table allows."""
+        """Change the route's state.
+
+        Raises:
+            LocalProtocolError: ``TRANSITIONS`` does not allow it.
+        """
         if state not in TRANSITIONS[self.state]:
             raise LocalProtocolError(f"{self.state.name} does not lead to {state.name}")
         self.state = state
         self.timer = timer
 
     def outlives(self, *, silent: bool) -> bool:
-        """Whether it stays when its peer's link is gone.
+        """Whether the source stays in the local graph when its peer's link is gone.
 
-        A reliable one does, so that nothing is lost. A latched one does if the link fell silent: its subscribers stay
-        connected, and are not sent again what they have when the peer is back; late ones get it meanwhile. One that
-        is relayed does not: another relay may bring it on.
+        Only a source with a listener does. A reliable one stays, so that no message is lost. A latched one stays if
+        the link fell silent (``silent``): its subscribers stay connected and do not get the same message again when
+        the peer is back, and new subscribers get it meanwhile. A relayed one does not stay, because another relay may
+        offer it.
         """
         if not self.wanted or self.origin is not None or self.state not in _LISTENED:
             return False
@@ -119,7 +124,7 @@ class RemoteTopic:
 
     @property
     def outage(self) -> float:
-        """For how many seconds it stays when it outlives its link: latched ones wait as by default."""
+        """For how many seconds it outlives its link: the contract's outage, or the default if it is not reliable."""
         if self.contract is not None and self.contract.reliability is Reliability.RELIABLE:
             return self.contract.outage
         return core_limits.RESUME_WINDOW

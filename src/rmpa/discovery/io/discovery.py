@@ -99,7 +99,7 @@ class Discovery:
     # --- life -------------------------------------------------------------------------------------------------
 
     async def start(self) -> None:
-        """Listen, and announce this agent. A socket that cannot be opened is logged; the rest works without it."""
+        """Listen, and announce this agent. A socket that cannot be opened is logged; discovery works without it."""
         self._started = True
         loop = asyncio.get_running_loop()
         loop.add_reader(self._udp.fileno(), partial(self._readable, self._udp, multicast=False))
@@ -167,7 +167,7 @@ class Discovery:
     # --- sockets ----------------------------------------------------------------------------------------------
 
     def _open_seed_port(self) -> None:
-        """Receive unicasts to the discovery port: seeds without a port name it. One agent of a machine gets them."""
+        """Receive unicasts to the discovery port, the port of seeds without one; one agent of a machine gets them."""
         self._receiver(_ALL_NETWORKS, multicast=False, lost="seeds of others must name our port")
 
     def _open_group(self) -> None:

@@ -71,7 +71,7 @@ class SeedResolver:
         self._tasks = [asyncio.get_running_loop().create_task(self._follow(host)) for host in names]
 
     async def close(self) -> None:
-        """Stop. A look-up that is under way ends by itself, in its thread."""
+        """Stop. A look-up in progress ends by itself, in its thread."""
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)

@@ -41,7 +41,7 @@ def open_receiver(host: str, port: int) -> socket.socket:
     try:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.setsockopt(socket.IPPROTO_IP, _IP_PKTINFO, 1)
-        # Without this, Linux hands us multicasts that any other program of this machine joined.
+        # Without this, Linux also delivers the multicasts of groups that other programs of this machine joined.
         sock.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
         sock.bind((host, port))
     except OSError:
@@ -53,7 +53,7 @@ def open_receiver(host: str, port: int) -> socket.socket:
 def receive(sock: socket.socket) -> tuple[bytes, Address, int]:
     """One packet, where it came from, and the index of the interface (0 if unknown).
 
-    One byte more than a beacon may have is read, so that a longer packet is seen to be too long.
+    One byte more than the longest beacon is read, so that a packet that is too long is recognised.
 
     Raises:
         OSError: Nothing waits, or the socket is broken.
@@ -124,8 +124,8 @@ class Sender:
         """Send to the group on each interface; return the number of interfaces without an error."""
         sent = 0
         for interface in interfaces:
-            # Left alone, Linux takes an address of another interface for what leaves by loopback: its own has only
-            # host scope.
+            # By default, Linux sends multicasts on loopback with a source address of another interface, because
+            # loopback's own address has only host scope.
             source = interface.addresses[0].packed if interface.loopback and interface.addresses else _ANY
             ancillary = [(socket.IPPROTO_IP, _IP_PKTINFO, _PKTINFO.pack(interface.index, source, _ANY))]
             try:

@@ -53,11 +53,11 @@ _SILENCE: Final = frozenset(
 """Errors of a connection that the remote side gave up after a silence, or whose process died with bytes unread."""
 
 _ANSWERED: Final = -1
-"""In place of a probe's stamp."""
+"""Takes the place of a probe's stamp."""
 
 
 class ConnectionOwner(Protocol):
-    """What a connection tells the mesh; all methods are called from the event loop."""
+    """The events that a connection reports to the mesh; all methods are called from the event loop."""
 
     def connection_judge(self, connection: Connection, hello: Hello) -> Refuse | None:
         """Decide on the hello of a dialler: ``None`` accepts the connection."""
@@ -80,11 +80,11 @@ class ConnectionOwner(Protocol):
         ...
 
     def connection_quiet(self, connection: Connection) -> None:
-        """Nothing came for ``limits.GHOST_QUIET``; repeated from time to time while that lasts."""
+        """No bytes were received for ``limits.GHOST_QUIET``; called again from time to time during the silence."""
         ...
 
     def connection_tick(self, connection: Connection) -> None:
-        """The timer of a connection that is up, about once in a keepalive interval."""
+        """The connection is up and its timer fired, about once in a keepalive interval."""
         ...
 
     def connection_closing(self, connection: Connection, reason: str) -> None:
@@ -99,14 +99,14 @@ class ConnectionOwner(Protocol):
 class Connection:
     """One TCP connection: frames, handshake, keepalive.
 
-    What its frames are for is decided by the link that receives them; see ``mesh.io.link.PeerLink``.
+    The link that receives its frames decides what they are for; see ``mesh.io.link.PeerLink``.
 
     Args:
         connection_id: The mesh's number for it.
         sock: Connected, non-blocking; owned by the connection from here on.
         role: Whether this side dialled.
         ours: The identity of this agent.
-        owner: What is told of events.
+        owner: Receives the events.
         clock: The time.
         endpoint: Address and port of the remote side.
         expected: The GUID that was dialled; ``None`` on an accepted connection.
@@ -138,7 +138,7 @@ class Connection:
         self.silent = False
         """Once ended: whether it ended by silence (lease expired, no route, reset) rather than by a bye."""
         self.stalls = StallWatch(segment, clock.now())
-        """Whether what is sent gets through."""
+        """Judges whether sent data gets through."""
         self._owner = owner
         self._clock = clock
         self._loop = asyncio.get_running_loop()
@@ -155,7 +155,7 @@ class Connection:
             sock,
             on_bytes=self._receive,
             on_close=self._lost,
-            # For control frames only: the link puts its lane's outbox in this place (``LaneSender.connect``).
+            # For control frames only: ``LaneSender.connect`` replaces it by the lane's outbox.
             outbox=Outbox(1, limits.CONNECTION_URGENT_BYTES),
             segment=segment,
         )
@@ -177,7 +177,7 @@ class Connection:
 
     @property
     def remote(self) -> Hello | None:
-        """What the remote side said of itself, as soon as it did."""
+        """The remote side's hello or welcome; ``None`` before it is received."""
         return self._machine.remote
 
     @property
@@ -209,7 +209,7 @@ class Connection:
 
     @property
     def lane(self) -> int:
-        """What the connection is for (``handshake.Lane``); of an accepted one once the remote side said it."""
+        """The lane (``handshake.Lane``); for an accepted connection it is known after the remote side's hello."""
         remote = self._machine.remote
         return self._requested_lane if self.dialled or remote is None else remote.lane
 
@@ -220,7 +220,7 @@ class Connection:
 
     @property
     def heard_at(self) -> float:
-        """Monotonic seconds at which bytes last came."""
+        """Monotonic seconds at which bytes were last received."""
         return max(self._machine.heard_at, self.stream.last_in)
 
     def deliver_to(self, data: OnData | None, part: OnPart | None, mark: OnMark | None) -> None:
@@ -233,7 +233,7 @@ class Connection:
         self._on_mark = _ignore_mark if mark is None else mark
 
     def send_mark(self, kind: FrameKind, route: int, sequence: int) -> None:
-        """Acknowledge messages of a route, or answer a fence: in front of all data that waits."""
+        """Acknowledge messages of a route, or answer a fence, before all waiting data."""
         if self._machine.state is ConnectionState.UP:
             frame = Frame(kind, route=route, sequence=sequence & SERIAL_MASK).serialize()
             self.stream.send((frame,), URGENT)
@@ -241,7 +241,8 @@ class Connection:
     def send_control(self, payload: bytes) -> None:
         """Send one control frame, before all data that waits; never dropped.
 
-        If more than ``limits.CONNECTION_URGENT_BYTES`` wait the connection is closed: the remote side does not read.
+        If more than ``limits.CONNECTION_URGENT_BYTES`` wait, the remote side does not read, and the connection is
+        closed.
         """
         if self._machine.state is not ConnectionState.UP:
             return
@@ -293,7 +294,7 @@ class Connection:
         self.stream.segment(size)
 
     def close(self, reason: str) -> None:
-        """Say bye, let the last bytes leave for at most ``limits.DRAIN_TIMEOUT``, and close."""
+        """Send a bye, wait at most ``limits.DRAIN_TIMEOUT`` for the last bytes to be sent, and close."""
         self._machine.close(reason, self._clock.now())
         self._send_output()
 
@@ -302,18 +303,18 @@ class Connection:
         self._machine.lost(reason)
 
     def sever(self, reason: str) -> None:
-        """Close at once and send not a byte more: its outbox belongs to another connection from now on."""
+        """Close at once without sending another byte, because the outbox now belongs to another connection."""
         self.stream.close()
         self._machine.lost(reason)
 
     def reset(self, reason: str) -> None:
-        """Close at once, so that the remote side notices although earlier bytes are lost on the way."""
+        """Close at once by a TCP reset, which the remote side notices even if earlier bytes were lost."""
         self.silent = True
         reset_at_close(self.sock)
         self.abort(reason)
 
     async def ended(self) -> None:
-        """Wait until the socket is closed and the owner has been told."""
+        """Wait until the socket is closed and the owner is notified."""
         await asyncio.shield(self._end)
 
     # --- inside ---------------------------------------------------------------------------------------------
@@ -343,7 +344,7 @@ class Connection:
                 self._machine.refuse(verdict, self._clock.now())
         elif isinstance(event, HandshakeDone):
             self.since = self._clock.now()
-            # The welcome leaves before all that the owner sends now.
+            # The welcome must be sent before anything that the owner sends now.
             self._send_output()
             self._timer.arm()
             self._owner.connection_opened(self)
@@ -360,12 +361,12 @@ class Connection:
         self._owner.connection_ponged(self)
 
     def _send_output(self) -> None:
-        """Send what the machine has to say; a connection that closes waits for the remote end, or its time."""
+        """Send the machine's output; a closing connection then waits for the remote end to close, or its time-out."""
         if self._machine.has_output:
             self.stream.send((self._machine.take_output(),), URGENT)
             self._check_urgent()
         if self._machine.state is ConnectionState.CLOSING and not self._finishing:
-            # Closing at once would turn what the remote side still sends into a reset that overtakes our bye.
+            # After a close at once, further bytes of the remote side would cause a reset, which overtakes the bye.
             self._finishing = True
             self._owner.connection_closing(self, f"{self.name}: its express lane ends")
             self.stream.finish()
@@ -387,19 +388,19 @@ class Connection:
         self._ended = True
         self._owner.connection_closing(self, reason)
         self._timer.close()
-        # Not from here: this may be ``receive``, or a ``send`` in the middle of the owner's loop over its links.
+        # Later, not from here: this may be ``receive``, or a ``send`` within the owner's loop over its links.
         self._loop.call_soon(self._report_end, reason)
 
     def _report_end(self, reason: str) -> None:
         self.stream.close()
         self.deliver_to(None, None, None)
-        # The machine would hold this object in a cycle until the collector looks, and what waits here may be large.
+        # The machine would keep this object, with its perhaps large buffers, in a reference cycle until a collection.
         self._machine.on_event = _ignore_event
         self._end.set_result(None)
         self._owner.connection_ended(self, reason)
 
     def _due(self, now: float) -> None:
-        # A large message renews the lease while it arrives, long before the machine sees a whole frame of it.
+        # A large message renews the lease while it is being received, long before the machine gets a whole frame.
         self._machine.heard(self.stream.last_in)
         was_up = self._machine.state is ConnectionState.UP
         if was_up:
@@ -424,4 +425,4 @@ def _ignore_mark(_kind: FrameKind, _route: int, _sequence: int) -> None:
 
 
 def _ignore_event(_event: ConnectionEvent) -> None:
-    """Drops what the machine of a connection that has ended still says."""
+    """Drops the events that the machine of an ended connection still reports."""

@@ -1,6 +1,6 @@
 """The sending end of one lane of a link, whether the lane has its connection or not.
 
-What is sent while there is no connection waits within the lane's bounds, and is sent first when there is one.
+Messages that are sent while there is no connection wait within the lane's bounds, and go first over the next one.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class LaneSender:
         """Whether the link is closing: nothing is sent or queued any more."""
         self._stream: Stream | None = None
         self._open: dict[int, QueuedMessage] = {}
-        """By route: messages that were begun by ``open``."""
+        """The messages that ``open`` has begun, by route."""
         self._loop = asyncio.get_running_loop()
 
     @property
@@ -41,31 +41,31 @@ class LaneSender:
         return self._stream is not None
 
     def connect(self, stream: Stream) -> None:
-        """Use a connection from now on, first for what waits."""
+        """Use a connection from now on; waiting messages are sent first."""
         self._stream = stream
         stream.adopt(self.outbox, pack_fragment_header)
 
     def disconnect(self) -> int:
-        """The connection is gone; return how many messages were cut in two, those in the kernel not counted."""
+        """Handle the end of the connection; return how many messages were cut off, without those in the kernel."""
         self._stream = None
         for parcel in self._open.values():
             if 0 < parcel.sent < parcel.size:
-                parcel.dropped = True  # its first bytes went down with the connection
+                parcel.dropped = True  # its first bytes were lost with the connection
         self._open.clear()
         return self.outbox.reset()
 
     def end(self) -> None:
-        """The link closes; what waits is sent within the drain time."""
+        """Take no more messages, because the link closes; waiting ones are sent within the drain time."""
         self.ended = True
         self._stream = None
 
     def clear(self) -> None:
-        """The link is gone: drop what the drain time was too short for."""
+        """Drop the waiting messages, because the link is gone."""
         self.outbox.clear()
         self._open.clear()
 
     def send(self, route: int, sequence: int, stamp_ns: int, payload: Buffer) -> int:
-        """Send one message; what the socket does not take is queued, keep-last, and copied only then.
+        """Send one message; bytes that the socket does not take are copied into a keep-last queue.
 
         Args:
             route: The route's id, 32 bits.
@@ -93,7 +93,7 @@ class LaneSender:
         return QueuedMessage(route, size, sequence & SERIAL_MASK, stamp_ns, self._loop.time())
 
     def extend(self, parcel: QueuedMessage, data: Buffer) -> int:
-        """Send further bytes of a message; return as for ``send``."""
+        """Send further bytes of an opened message; return how many older messages were dropped to make room."""
         if self._stream is not None:
             return self._stream.extend(parcel, data)
         if self.ended:
@@ -101,14 +101,14 @@ class LaneSender:
         return self.outbox.extend(parcel, bytes(data))
 
     def abandon(self, parcel: QueuedMessage) -> None:
-        """The rest of a message will never come."""
+        """Give up a message whose rest will never come."""
         if self._stream is not None:
             self._stream.abandon(parcel)
         elif not self.ended:
             self.outbox.abandon(parcel)
 
     def fence(self, route: int, number: int) -> None:
-        """Send a fence behind the messages of a route: it is answered when all of them have arrived."""
+        """Send a fence after the messages of a route; the peer answers it when all of them have arrived."""
         frame = Frame(FrameKind.FENCE, route=route, sequence=number, flags=FIRST | LAST).serialize()
         if self._stream is not None:
             self._stream.send_mark(frame, route)
@@ -116,22 +116,22 @@ class LaneSender:
             self.outbox.push(frame, route, self._loop.time(), pinned=True)
 
     def set_terms(self, route: int, depth: int, max_age: float | None, *, strict: bool) -> None:
-        """Bound what may wait of one route; see ``core.outbox``.
+        """Bound the waiting messages of one route; see ``core.outbox``.
 
-        A route whose messages never grow too old is a reliable one: its sender's window bounds it, and nothing of it
-        is dropped for the bytes of all routes.
+        Without ``max_age`` the route is a reliable one: its sender's window bounds it, and the bound on the bytes of
+        all routes drops none of its messages.
         """
         self.outbox.set_terms(route, depth, max_age, strict=strict, spared=max_age is None)
 
     def discard(self, route: int) -> None:
-        """Drop what waits of a route, and its bounds; the route goes on."""
+        """Drop the waiting messages of a route, and its bounds; the route stays open."""
         self.outbox.discard(route)
         self._open.pop(route, None)
         if self._stream is not None:
             self._stream.pump()
 
     def close_route(self, route: int) -> int:
-        """Discard what waits of a closed route; return how many messages that were. Its counts end too."""
+        """Discard the waiting messages of a closed route, and its counts; return the number of messages."""
         count = self.outbox.discard(route)
         self._open.pop(route, None)
         self.outbox.dropped.pop(route, None)

@@ -1,4 +1,4 @@
-"""The link to one peer: two lanes, each with a connection, and what receives the messages that come on them."""
+"""The link to one peer: two lanes, each with a connection, and the handlers of the received messages."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ OnLinkMark = Callable[["PeerLink", FrameKind, int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class LinkHandlers:
-    """What receives the frames of a link that is used with its peer.
+    """The handlers of the frames of a link that is used with its peer.
 
     Args:
         data: ``(link, route, sequence, stamp_ns, payload)``: a whole message; the payload is only valid during the
             call.
-        part: ``(link, route, sequence, stamp_ns, flags, part)``: a part of one, likewise.
+        part: ``(link, route, sequence, stamp_ns, flags, part)``: a part of a message; only valid during the call.
         mark: ``(link, kind, route, sequence)``: an acknowledgement, or the answer to a fence.
-        clock: ``(link)``: the peer's clock is known, or known better.
-        lane_lost: ``(link)``: the connection of the bulk lane is gone, with what was on its way; the link is not.
+        clock: ``(link)``: the estimate of the peer's clock is new or more exact.
+        lane_lost: ``(link)``: the bulk lane lost its connection, with the messages in flight; the link is still up.
     """
 
     data: OnLinkData
@@ -43,7 +43,7 @@ class LinkHandlers:
 class PeerLink:
     """The link to one peer, as the rooms above see it; it lives as long as the connection of its express lane.
 
-    The connection of the bulk lane may be missing, fall and be replaced meanwhile: what is sent by that lane waits.
+    The connection of the bulk lane may be missing, fall or be replaced meanwhile; messages for that lane wait.
 
     Args:
         connection: That of the express lane; its handshake is done.
@@ -66,9 +66,9 @@ class PeerLink:
         self.express: Final = LaneSender("express")
         self.bulk: Final = LaneSender("bulk")
         self.silent = False
-        """Once it is down: whether without a bye of the peer, so that the peer may be alive and linked again soon."""
+        """Once the link is down: whether it ended without a bye, so that the peer may soon be linked again."""
         self.mark: Final = connection.send_mark
-        """``(kind, route, sequence)``: acknowledge messages of a route: in front of all data that waits."""
+        """``(kind, route, sequence)``: acknowledges messages of a route, before all waiting data."""
         self._clock = clock
         self._handlers: LinkHandlers | None = None
         self._bulk_bytes_in = self._bulk_bytes_out = 0  # of the bulk lane's earlier connections
@@ -76,7 +76,7 @@ class PeerLink:
 
     @property
     def used(self) -> bool:
-        """Whether this link carries the peer's data; of two links dialled at the same time one does."""
+        """Whether this link carries the peer's data; of two links with one peer, only one is used."""
         return self._handlers is not None
 
     @property
@@ -103,7 +103,7 @@ class PeerLink:
 
     @property
     def resumed_at(self) -> float:
-        """When the express lane was last polled without bytes before its last silence ended, monotonic seconds."""
+        """Monotonic seconds of the express lane's last poll without bytes before its last silence ended."""
         return self.connection.stream.resumed_at
 
     @property
@@ -120,12 +120,12 @@ class PeerLink:
 
     @property
     def queue_bytes(self) -> int:
-        """Bytes that wait for the kernel, on both lanes."""
+        """Bytes that the kernel has not taken yet, on both lanes."""
         return self.connection.stream.pending_bytes + self.bulk.outbox.pending_bytes
 
     @property
     def busy(self) -> bool:
-        """Whether the express lane has a backlog: a further advertisement would delay the commands behind it."""
+        """Whether the express lane has a backlog, so that a further advertisement would delay later commands."""
         stream = self.connection.stream
         return stream.pending_bytes > 0 or stream.unacknowledged > limits.TELL_BACKLOG
 
@@ -141,7 +141,7 @@ class PeerLink:
 
     @property
     def heard_at(self) -> float:
-        """Monotonic seconds at which bytes last came on the express lane."""
+        """Monotonic seconds at which bytes were last received on the express lane."""
         return self.connection.heard_at
 
     def send_control(self, payload: bytes) -> None:
@@ -153,11 +153,11 @@ class PeerLink:
         return await self.connection.ping()
 
     def close_route(self, route: int) -> int:
-        """Discard what waits of a closed route; return how many messages that were. Its drop counts end too."""
+        """Discard the waiting messages of a closed route, and its drop counts; return the number of messages."""
         return self.express.close_route(route) + self.bulk.close_route(route)
 
     def close(self, reason: str) -> None:
-        """Say bye, let the last bytes leave for at most ``limits.DRAIN_TIMEOUT``, and close."""
+        """Send a bye, wait at most ``limits.DRAIN_TIMEOUT`` for the last bytes to be sent, and close."""
         self.connection.close(reason)
 
     def abort(self, reason: str) -> None:
@@ -167,14 +167,14 @@ class PeerLink:
     # --- for the mesh -----------------------------------------------------------------------------------------
 
     def use(self, handlers: LinkHandlers | None) -> None:
-        """Pass what comes on both lanes to these handlers; ``None``: the link is not used, and data is dropped."""
+        """Pass the frames of both lanes to these handlers; ``None``: the link is not used, and data is dropped."""
         self._handlers = handlers
         for connection in (self.connection, self.bulk_connection):
             if connection is not None:
                 self._receive_from(connection)
 
     def clock_known(self) -> None:
-        """The peer's clock is known, or known better."""
+        """Report a new estimate of the peer's clock to the handlers."""
         if self._handlers is not None:
             self._handlers.clock(self)
 
@@ -189,7 +189,7 @@ class PeerLink:
         self.bulk.connect(bulk.stream)
 
     def detach(self, bulk: Connection) -> bool:
-        """A connection is gone; return whether it was that of the bulk lane."""
+        """Handle the end of a connection; return whether it was the bulk lane's."""
         if self.bulk_connection is not bulk:
             return False
         self.bulk_connection = None
@@ -202,7 +202,7 @@ class PeerLink:
         return True
 
     def end_lanes(self, reason: str) -> None:
-        """The express lane's connection closes: send nothing more, and close the bulk lane's connection too."""
+        """Stop sending and close the bulk lane's connection, because the express lane's connection is closing."""
         self.express.end()
         self.bulk.end()
         if self.bulk_connection is not None:
@@ -211,7 +211,7 @@ class PeerLink:
             bulk.close(reason)
 
     def discard(self) -> int:
-        """The link has ended: drop what still waits, which may be large; return how many messages that were."""
+        """Drop all waiting messages after the end of the link, because they may be large; return their number."""
         self.use(None)
         discarded = self.express.outbox.waiting_entries + self.bulk.outbox.waiting_entries
         self.express.clear()
@@ -226,7 +226,7 @@ class PeerLink:
             connection.deliver_to(partial(handlers.data, self), partial(handlers.part, self), self._marked)
 
     def _marked(self, kind: FrameKind, route: int, sequence: int) -> None:
-        """Answer a fence by the express lane, whichever lane it came by; the handlers take the other marks."""
+        """Answer a fence on the express lane, whichever lane it arrived on; pass other marks to the handlers."""
         if kind is FrameKind.FENCE:
             self.mark(FrameKind.FENCED, route, sequence)
         elif self._handlers is not None:

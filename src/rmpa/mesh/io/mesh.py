@@ -61,16 +61,16 @@ OnControl = Callable[[PeerLink, bytes], None]
 class Mesh:
     """The links to all peers; of several links with one peer, one is used.
 
-    Each ``on_link_up`` is followed by exactly one ``on_link_down`` of the same link, and what comes on it lies in
+    Each ``on_link_up`` is followed by exactly one ``on_link_down`` of the same link; the link's data is delivered in
     between. All callbacks are called from the event loop; they may call any method.
 
     Args:
         identity: The identity of this agent; the listening socket's port is in its GUID.
         listen_socket: Bound and listening, non-blocking; owned by the mesh from here on.
         on_link_up: A peer is linked.
-        on_link_down: Its link is not used any more, and why.
-        on_control: ``(link, payload)``: a control frame came.
-        handlers: What receives the messages that come.
+        on_link_down: A peer's link is no longer used, with the reason.
+        on_control: ``(link, payload)``: a control frame was received.
+        handlers: The handlers of received messages.
         lanes: The options of the lanes' sockets.
         clock: The time; its ``now`` must be the loop's own clock.
         counters: Where refusals and failures are counted.
@@ -105,16 +105,16 @@ class Mesh:
         self._refusals = RefusalLog(_log, self.counters)
         self.dialler: Final = dialler if dialler is not None else Dialler(self._lanes, self.counters)
         self.paths = PathMonitor(self._clock, self.counters, self._reachable)
-        """What packets get through to the peers."""
+        """Checks whether large packets get through to the peers."""
         self._peering = Peering(identity, rng=rng, alive=self._alive)
         self._timer = MachineTimer(self._peering.next_timer, self._due, now=self._clock.now)
         self._connections: dict[int, Connection] = {}
         self._links: dict[int, PeerLink] = {}
-        """By the id of the express lane's connection."""
+        """The links, by the id of the express lane's connection."""
         self._pending: set[int] = set()
         """Accepted connections without a handshake."""
         self._dialled: dict[int, Guid] = {}
-        """Dialled connections without a handshake, and what they were dialled for."""
+        """Dialled connections without a finished handshake, each with the peer or link that it was dialled for."""
         self._dials: set[asyncio.Task[None]] = set()
         self._bulk_dials: dict[int, asyncio.Task[None]] = {}
         self._bulk_backoffs: dict[int, Backoff] = {}
@@ -131,7 +131,7 @@ class Mesh:
         self._act()
 
     async def close(self) -> None:
-        """Say bye on every connection, wait at most ``limits.DRAIN_TIMEOUT``, and close all sockets."""
+        """Send a bye on every connection, wait at most ``limits.DRAIN_TIMEOUT``, and close all sockets."""
         self._acceptor.close()
         if not self._running:
             return
@@ -153,22 +153,22 @@ class Mesh:
                 await asyncio.wait(late)
 
     def peer_found(self, identity: Identity, source: str | None = None) -> None:
-        """Discovery found a peer, or has news of it.
+        """Take in a peer that discovery found, or news of it.
 
         Args:
             identity: The peer; its addresses are dialled in turn.
-            source: The address that its own beacon came from, dialled first.
+            source: The source address of the peer's own beacon, which is dialled first.
         """
         self._peering.peer_found(identity, self._clock.now(), source)
         self._act()
 
     def peer_gone(self, guid: Guid) -> None:
-        """Discovery gave a peer up: it is dialled no more; a link that is up stays."""
+        """Stop dialling a peer that discovery has given up; a link that is up stays."""
         self._peering.peer_gone(guid, self._clock.now())
         self._act()
 
     def peers(self) -> list[PeerStatus]:
-        """All known peers: linked, or why not and when the next attempt is due."""
+        """The status of all known peers: linked, or why not and when the next attempt is due."""
         return self._peering.peers()
 
     def connections(self) -> list[Connection]:
@@ -230,14 +230,14 @@ class Mesh:
             link.clock_known()
 
     def connection_quiet(self, connection: Connection) -> None:
-        """A link is silent: TCP repeats ever more rarely, so try whether a new connection gets through."""
+        """Try a new connection to the peer of a silent link, because TCP retransmits more and more rarely."""
         link = self._used(connection)
         if self._running and link is not None and link.dialled and link.id not in self._redials:
             self._redials[link.id] = task = self._start(self._redial(link), f"redial {link.name}")
             task.add_done_callback(lambda _: self._redials.pop(connection.id, None))
 
     def connection_tick(self, connection: Connection) -> None:
-        """Check whether what a link sends gets through."""
+        """Check whether the data that a link sends gets through."""
         link = self._used(connection)
         if self._running and link is not None:
             self.paths.look(link)
@@ -281,10 +281,10 @@ class Mesh:
     # --- acting on the peering machine ----------------------------------------------------------------------
 
     def _act(self, ended: PeerLink | None = None) -> None:
-        """Do what the machine decided; a call from within a callback leaves it to the outer one.
+        """Carry out the outputs of the peering machine; a call from within a callback leaves them to the outer call.
 
         Args:
-            ended: The link whose end is being reported; it is not in the table any more.
+            ended: The link whose end is being reported; it is no longer in the table.
         """
         if self._acting:
             return
@@ -331,14 +331,14 @@ class Mesh:
         self._act()
 
     def _alive(self, link_id: int) -> bool:
-        """Whether bytes came by a link lately."""
+        """Whether bytes were received on a link within ``limits.GHOST_QUIET``."""
         link = self._links.get(link_id)
         return link is not None and self._clock.now() - link.heard_at < limits.GHOST_QUIET
 
     # --- bulk lanes -----------------------------------------------------------------------------------------
 
     def _dial_bulk(self, link: PeerLink, delay: float = 0.0) -> None:
-        """Dial the bulk lane of a link that this side dialled: the way that worked once will work again."""
+        """Dial the bulk lane of a link that this side dialled, at the endpoint that worked for the express lane."""
         ours = self._running and link.used and link.dialled
         if ours and link.bulk_connection is None and link.id not in self._bulk_dials:
             self._bulk_dials[link.id] = task = self._start(self._connect_bulk(link, delay), f"bulk {link.name}")
@@ -373,7 +373,7 @@ class Mesh:
         _log.debug("= %s: bulk lane (%s)", bulk.name, "dialled" if bulk.dialled else "accepted")
 
     def _bulk_ended(self, bulk: Connection, reason: str) -> None:
-        """A bulk lane's connection is over, or was refused; its link goes on, and gets another."""
+        """Handle the end or the refusal of a bulk lane's connection; the link goes on and gets another connection."""
         expected = self._dialled.pop(bulk.id, None)
         _log.debug("= %s: bulk lane ended: %s", bulk.name, reason)
         for link in list(self._links.values()):
@@ -404,7 +404,7 @@ class Mesh:
             self._open(sock, ConnectionRole.DIALLER, endpoint, dial.guid)
 
     async def _redial(self, link: PeerLink) -> None:
-        """Replace a link whose bytes are not acknowledged as soon as the peer can be reached again, on any path."""
+        """Replace a link without acknowledgements as soon as the peer can be reached again, on any path."""
         while link.used and not self._alive(link.id):
             try:
                 sock, endpoint = await self.dialler.redial(self._endpoints(link))
@@ -413,7 +413,7 @@ class Mesh:
                 await asyncio.sleep(limits.REDIAL_PAUSE)
                 continue
             if _is_over(link):
-                # It ended meanwhile, and its socket with it: the peering machine decides on the next dial.
+                # The link and its socket ended meanwhile: the peering machine decides on the next dial.
                 sock.close()
                 return
             if self._alive(link.id) or not unacknowledged(link.connection.sock):
@@ -488,7 +488,7 @@ class Mesh:
 
 
 def _is_over(link: PeerLink) -> bool:
-    """Whether a link was replaced or has ended; for the code behind an ``await``."""
+    """Whether a link was replaced or has ended; to be checked after an ``await``."""
     return not link.used
 
 

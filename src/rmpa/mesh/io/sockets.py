@@ -83,7 +83,7 @@ def limit_segments(sock: socket.socket, segment: int, counters: Counters) -> Non
 
 
 def reset_at_close(sock: socket.socket) -> None:
-    """Let ``close`` drop what waits and reset the connection: an orderly end would wait behind lost data."""
+    """Make ``close`` drop unsent data and reset the connection: an orderly end would have to wait for lost data."""
     with contextlib.suppress(OSError):
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 

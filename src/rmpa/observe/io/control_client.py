@@ -133,11 +133,11 @@ def find_agents(environ: Mapping[str, str]) -> list[FoundAgent]:
 
 
 def choose_agent(environ: Mapping[str, str], name: str | None = None) -> FoundAgent:
-    """The agent named, or that of RMPA_AGENT, or the only one, or the one whose core is ROS_MASTER_URI.
+    """The named agent; else that of RMPA_AGENT, the only running one, or the one whose core is ROS_MASTER_URI.
 
     Raises:
         UnreachableError: No agent runs, or none of that name.
-        RmpaError: Several agents run, and nothing says which is meant; they are listed.
+        RmpaError: Several agents run, and none is selected; the text lists them.
     """
     agents = find_agents(environ)
     wanted = name or environ.get("RMPA_AGENT")

@@ -89,7 +89,7 @@ class ControlServer:
         return sock
 
     async def close(self) -> None:
-        """Close all clients, remove socket and lock; twice does no harm."""
+        """Close all clients, remove socket and lock; may be called twice."""
         served = self._acceptor is not None
         if self._acceptor is not None:
             self._acceptor.close()

@@ -83,7 +83,7 @@ class PeersSection:
         return (*here, *(_bound_there(name, one) for one in self._bounds.there(peer)))
 
     def _relayed(self, known: Mapping[str, PeerInfo]) -> list[PeerInfo]:
-        """Modules without a link whose topics a relay passes on. The roster may know them all the same."""
+        """Modules without a link whose topics a relay passes on; the membership may know them too."""
         infos = []
         for origin, via in self._bridge.topics.imports.ways:
             blank = PeerInfo(name=origin.name, guid=origin.guid, instance=origin.instance, state="", since_ago=0.0)
@@ -145,7 +145,7 @@ class PeersSection:
 
 
 def _bound_here(peer: str, beyond: Beyond) -> BoundInfo:
-    """What of a peer is hidden here."""
+    """What this module hides of a peer because of its limits."""
     text = (
         f"{beyond.what} of {peer} stay hidden here: it has more than {_setting(beyond)} of this module; "
         f"raise it in rmpa.toml and `rmpa reload`, or deny some by {_deny(beyond)}"
@@ -154,7 +154,7 @@ def _bound_here(peer: str, beyond: Beyond) -> BoundInfo:
 
 
 def _bound_there(peer: str, beyond: Beyond) -> BoundInfo:
-    """What of this module is hidden at a peer."""
+    """What a peer hides of this module because of its limits."""
     text = (
         f"{beyond.what} of this module stay hidden at {peer}: there are more than {_setting(beyond)} over there; "
         f"raise it in its rmpa.toml and `rmpa reload` there, or deny some here by {_deny(beyond)}"
@@ -163,7 +163,7 @@ def _bound_there(peer: str, beyond: Beyond) -> BoundInfo:
 
 
 def own_text(beyond: Beyond) -> str:
-    """What of this module no peer is offered, ready to read."""
+    """What this module offers to no peer because of its limits, ready to read."""
     return (
         f"{beyond.what} of this module are offered to no peer: more than {_setting(beyond)}; raise it "
         f"in rmpa.toml and `rmpa reload`, or deny some by {_deny(beyond)}"

@@ -106,7 +106,7 @@ class NameLock:
                 raise StartError("rmpa up", problem, "stop it, or give this one a --name of its own") from None
             if self._still_there(fd):
                 break
-            os.close(fd)  # its last holder has removed the file after we opened it
+            os.close(fd)  # the last holder removed the file after it was opened here
         self._fd = fd
         with contextlib.suppress(OSError):  # a full disk: the lock holds without the process id in the file
             os.ftruncate(fd, 0)
@@ -119,7 +119,7 @@ class NameLock:
             return False
 
     def release(self) -> None:
-        """Remove the file and release the lock; twice does no harm."""
+        """Remove the file and release the lock; may be called twice."""
         if self._fd >= 0:
             with contextlib.suppress(OSError):
                 self.path.unlink()

@@ -50,7 +50,7 @@ class SnapshotSources:
         counters: The counters of parts that are not named here.
         notes: What else the user should know, each ready to read.
         started: When the agent started, seconds since the epoch.
-        requests: What came of each request of ``--realtime``.
+        requests: The outcome of each request of ``--realtime``.
     """
 
     core: Core
@@ -90,7 +90,7 @@ class SnapshotBuilder:
         return self._sources.endpoint()
 
     def reload(self, settings: Settings) -> None:
-        """Other settings hold from now on."""
+        """Use other settings from now on."""
         self._settings = settings
         self._topics.reload(settings)
 

@@ -74,7 +74,7 @@ class TopicsSection:
         self.reload(settings)
 
     def reload(self, settings: Settings) -> None:
-        """Other settings hold from now on."""
+        """Use other settings from now on."""
         self._policy = Policy(settings.policy, settings.peers, settings.time)
         self._contracts = Contracts(settings.contracts)
         self._follow = settings.time.follow

@@ -24,7 +24,7 @@ class Diagnosis(msgspec.Struct, frozen=True, kw_only=True):
         peer: The module of the publisher (server).
         to: The module of the users.
         node: The publisher (server), by its name in its own module; empty where there is none.
-        flows: Whether it gets through.
+        flows: Whether messages (calls) get through.
         stages: From the peer to the reader, up to the first that fails.
     """
 
@@ -51,7 +51,7 @@ class Diagnosis(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def until_failure(stages: Iterable[Check]) -> tuple[Check, ...]:
-    """The stages up to the first that fails; those behind it are not even asked for."""
+    """The stages up to the first that fails; later ones are not evaluated."""
     walked = []
     for stage in stages:
         walked.append(stage)
@@ -72,11 +72,11 @@ class PublisherReport(msgspec.Struct, frozen=True, kw_only=True):
         offered: Whether peers are offered it.
         route: The state of the route to the agent that asks: empty (none), ``opening`` (the publisher has not
             answered) or ``open``.
-        messages: That came from the publisher since its agent connected to it.
+        messages: Messages received from the publisher since its agent connected to it.
         dropped: Of these, those that were dropped because a link was too slow.
         lost: Messages of a reliable route to the agent that asks that were given up after too long an outage.
         oversized: Messages that are too long, and were left out.
-        oversized_bytes: The last one's.
+        oversized_bytes: The length of the last of these, in bytes.
         beyond: ``limits.topics`` of its module, if it is not offered because there are more; else 0.
         unreachable: Why its agent cannot connect to it, ready to read; empty where it can.
     """
@@ -125,7 +125,7 @@ class SubscriberConnection(msgspec.Struct, frozen=True, kw_only=True):
         number: The proxy's number for the connection.
         node: The subscriber's name.
         held: Whether it waits for the header, because the route is not open yet.
-        messages: Handed to the connection, dropped ones included.
+        messages: Messages handed to the connection, including dropped ones.
         waiting: Bytes in its queue.
         dropped: Messages dropped because the subscriber read too slowly.
     """

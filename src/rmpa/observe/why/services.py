@@ -54,9 +54,9 @@ class ServiceAtClient:
         answer: The type and md5 sum that a probe brought; empty if it was refused.
         refusal: Why the probe was refused, or empty.
         calls: The number of calls from here.
-        failed: Of these.
+        failed: The number of these calls that failed.
         problem: Why the last one failed, if it did not reach the server.
-        mismatch: What a client with another definition was told, or empty.
+        mismatch: The error that a client with another definition received, or empty.
     """
 
     wire: str = ""
@@ -87,13 +87,13 @@ def diagnose_service(
     """Judge all stages.
 
     Args:
-        begin: Those of the peer and its link.
+        begin: The stages of the peer and its link.
         to: This module.
         peer: The module that should provide it.
         service: Its name here.
         here: What is known here.
         there: What the peer's agent answered; ``None`` if it did not.
-        refusal: Why it did not.
+        refusal: Why the peer's agent did not answer.
     """
     stages = until_failure(chain(begin, _stages(peer, service, here, there, refusal)))
     node = (there.node if there is not None else "") or here.node

@@ -103,8 +103,8 @@ def diagnose_topic(ends: BothEnds, peer: str, later: BothEnds | None = None, wir
     Args:
         ends: What both ends know.
         peer: The peer's name (or GUID), as the user wrote it.
-        later: The same some time after, which shows whether messages move.
-        wire: The topic's name at the peer; the one here if empty.
+        later: What both ends know some time later, which shows whether messages flow.
+        wire: The topic's name at the peer; if empty, the name here.
 
     Returns:
         One diagnosis for each publisher; a single one where a stage before the publishers fails.
@@ -184,7 +184,7 @@ def _published(ends: BothEnds, peer: str, wire: str) -> Check:
 
 
 def _source_stages(ends: BothEnds, later: BothEnds | None, peer: str, node: str, wire: str) -> Iterator[Check]:
-    """The stages of one publisher, lazily: those behind the first that fails are not made."""
+    """Generate the stages of one publisher lazily: stages after the first that fails need not be built."""
     report = _report(ends, node)
     yield _policy_there(report, peer)
     if report is not None and report.unreachable:

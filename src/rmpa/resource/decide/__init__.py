@@ -1,1 +1,1 @@
-"""Decides which profile to apply: pure, without I/O and clocks."""
+"""Decides which profile a resource applies. Pure: no I/O, no clocks."""

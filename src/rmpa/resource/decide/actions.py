@@ -1,4 +1,4 @@
-"""Actions of the control loop for its driver: apply a profile, raise or clear an alarm."""
+"""Actions that the control loop returns to its driver: apply a profile, raise or clear an alarm, report a change."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ if TYPE_CHECKING:
 
 
 class AlarmKind(Enum):
-    """The kind of an alarm, and the level of REP 107 that it is shown with."""
+    """The kind of an alarm, which determines its diagnostic level (REP 107)."""
 
     ADAPTATION = "adaptation"
-    """A quality is not satisfied, and another profile takes over: WARN."""
+    """A quality is violated, and another profile takes over: WARN."""
     NON_ADAPTABLE = "non_adaptable"
     """No profile meets the requirements; the most similar one runs: ERROR."""
 
@@ -25,9 +25,9 @@ class Shortfall:
     """One attribute that violates the requirements.
 
     Args:
-        attribute: Its name.
-        requested: The bound.
-        offered: The measured value, or the one that the profile declares; ``None``: neither.
+        attribute: Name of the attribute.
+        requested: The bound that is violated.
+        offered: The measured value, or else the one that the profile declares; ``None``: there is neither.
     """
 
     attribute: str
@@ -37,14 +37,14 @@ class Shortfall:
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """An alarm for all clients.
+    """An alarm, which is published to all clients.
 
     Args:
         kind: Adaptation or non-adaptable.
         shortfalls: The violated attributes.
-        before: The profile that ran, or empty.
-        after: The one that takes over, or the same.
-        at: Monotonic seconds.
+        before: The profile that ran; empty: none.
+        after: The profile that takes over; equal to ``before`` if that stays.
+        at: When the alarm was raised, in monotonic seconds.
     """
 
     kind: AlarmKind
@@ -56,7 +56,7 @@ class Alarm:
 
 @dataclass(frozen=True, slots=True)
 class Apply:
-    """Apply this profile and report ``applied`` or ``failed``; ``why`` is for people."""
+    """Apply this profile, then report ``applied`` or ``failed`` to the loop; ``why`` is a text for people."""
 
     profile: str
     why: str
@@ -81,8 +81,8 @@ class Reacted:
     """A reconfiguration is complete.
 
     Args:
-        profile: The one that runs now.
-        reaction: Reaction time in seconds, since its cause: a request, or the beginning of the first violated window.
+        profile: The profile that runs now.
+        reaction: Seconds since the cause: a request, or the beginning of the first violated window.
     """
 
     profile: str

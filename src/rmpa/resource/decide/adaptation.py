@@ -1,18 +1,19 @@
-"""The control loop of a Smart Resource: from requirements and measurements to a profile (paper, section 3.1).
+"""The control loop of a Smart Resource: derives a profile from requirements and measurements (paper, section 3.1).
 
-MAPE-K, sans-I/O: *monitor* takes each window of measured quality, *analyse* compares it with the merged requirements
-(``violations``), *plan* is ``decision.Decider``, *execute* is the driver's work, which reports back. The states::
+The loop follows MAPE-K and does no I/O: *monitor* takes each window of measured quality, *analyse* compares it with
+the merged requirements (``violations``), *plan* is ``decision.Decider``, *execute* is done by the driver, which
+reports the outcome. The states::
 
     NONE ──decided──► APPLYING ──applied──► ACTIVE ──another profile is better──► APPLYING
                        │  ▲                    │
                        │  └─ next best ◄───────┘ violated
                        └─ failed, hung: excluded for a cool-down; the next best profile is applied
 
-A quality that is violated in ``k`` of the last ``n`` windows is a disturbance. If another profile can serve, that is
-an *adaptation event* (WARN): the violated profile is excluded for its cool-down and the other one applied. If none
-can, it is a *non-adaptable event* (ERROR): the best-effort profile runs. Without a disturbance the profile changes
-only for an improvement of more than ``improvement``, and not before ``dwell`` is over, so that two nearly equal ones
-do not alternate.
+A disturbance is a violation in ``k`` of the last ``n`` windows. If another profile meets the requirements, that is an
+*adaptation event* (WARN): the violated profile is excluded for its cool-down and the other one is applied. If none
+does, it is a *non-adaptable event* (ERROR): the best-effort profile runs if one is declared, else the profile stays.
+Without a disturbance the profile changes only for an improvement of more than ``improvement``, and not before
+``dwell`` seconds, so that two nearly equal profiles do not alternate.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class ProfileState(Enum):
     """State of the control loop."""
 
     NONE = auto()
-    """Nothing was decided yet, or every profile is excluded."""
+    """No profile runs or is being applied: nothing was decided yet, or every profile is excluded."""
     APPLYING = auto()
     ACTIVE = auto()
 
@@ -49,9 +50,9 @@ class Adaptation:
     """The control loop of one resource. Times are monotonic seconds.
 
     Args:
-        attributes: Declared ones, by name.
-        decider: Of its profiles.
-        settings: Parameters of the loop.
+        attributes: The attributes that clients may request, by name.
+        decider: Decides among the resource's profiles.
+        settings: Parameters of the loop; ``None``: the defaults.
     """
 
     def __init__(
@@ -63,51 +64,51 @@ class Adaptation:
         self._requirements: dict[str, Requirement] = {}
         self._merged = MergedRequirements()
         self._blocked: dict[str, str] = {}
-        """Profiles that preconditions or the context do not allow, and why."""
+        """Why a profile is blocked by its precondition or by the context, by profile."""
         self._cool_downs = CoolDowns(settings.cool_down, settings.cool_down_max)
         self._hanging: set[str] = set()
-        """Profiles that were given up while their functions ran, and still run."""
+        """Profiles that were given up and whose functions still run."""
         self._detector = ViolationDetector(attributes, settings.violations, settings.windows)
         self._state = ProfileState.NONE
         self._profile = ""
         self._target = ""
         self._pinned = ""
         self._restored_profile = ""
-        """The profile of before the restart, until the first decision."""
+        """The profile that ran before the restart; empty after the first decision."""
         self._active_since = -math.inf
         self._window_end: float | None = None
         self._apply_deadline = math.inf
         self._cause = math.inf
-        """When the cause of the present reconfiguration began; infinite: there is none."""
+        """When the cause of the present reconfiguration began; infinite: no reconfiguration is under way."""
         self._alarm: Alarm | None = None
         self._replan_at_once = False
-        """Whether something that skips the dwell time has changed while a profile was being applied."""
+        """Whether a change that skips the dwell time has occurred while a profile was being applied."""
         self._reapply_reason = ""
-        """Why the profile that is being applied has to be applied once more, or empty."""
+        """Why the profile that is being applied must be applied once more; empty: it need not."""
 
     @property
     def state(self) -> ProfileState:
-        """State of the loop."""
+        """The present state of the loop."""
         return self._state
 
     @property
     def profile(self) -> str:
-        """The profile that runs, or ran before the one that is being applied; empty before the first."""
+        """The profile that runs, or that ran before the one that is being applied; empty: none."""
         return self._profile
 
     @property
     def applying(self) -> str:
-        """The profile that is being applied, or empty."""
+        """The profile that is being applied; empty: none."""
         return self._target
 
     @property
     def pinned(self) -> str:
-        """The profile that was chosen by hand, or empty."""
+        """The profile that was chosen by hand; empty: the loop decides."""
         return self._pinned
 
     @property
     def alarm(self) -> Alarm | None:
-        """The alarm that is raised at present."""
+        """The alarm that is raised at present; ``None``: none is."""
         return self._alarm
 
     @property
@@ -117,11 +118,11 @@ class Adaptation:
 
     @property
     def requirements(self) -> Mapping[str, Requirement]:
-        """By client."""
+        """The requirement of each client, by client."""
         return self._requirements
 
     def explain(self, now: float) -> tuple[ProfileScore, ...]:
-        """The score of each profile at this moment, and the reasons of those that are excluded."""
+        """The present score of each profile, with the reason if the profile is excluded."""
         return self._decider.explain(self._merged.bounds, self._excluded(now))
 
     # --- requirements -------------------------------------------------------------------------------------------
@@ -129,13 +130,13 @@ class Adaptation:
     def restore(
         self, requirements: Iterable[Requirement], profile: str, cool_downs: Mapping[str, CoolDown], now: float
     ) -> None:
-        """Continue from the state of before a restart; called before ``start``.
+        """Take over the state that was saved before a restart; must be called before ``start``.
 
         Args:
-            requirements: Of the clients of then.
-            profile: The profile that ran; it is taken again if it is about as good as the best.
-            cool_downs: By profile.
-            now: The time.
+            requirements: The requirements that were in force.
+            profile: The profile that ran; it is chosen again if it is about as good as the best one.
+            cool_downs: The cool-downs that were not over, by profile.
+            now: The time of the call.
         """
         self._cool_downs.restore(cool_downs, now)
         self._requirements = {requirement.client: requirement for requirement in requirements}
@@ -143,11 +144,11 @@ class Adaptation:
         self._restored_profile = profile
 
     def cooling(self, now: float) -> dict[str, CoolDown]:
-        """The profiles that are excluded because they failed or were violated."""
+        """The cool-downs of profiles that are excluded because they failed or were violated, by profile."""
         return self._cool_downs.active(now)
 
     def start(self, now: float) -> list[Action]:
-        """Take the first profile."""
+        """Choose the first profile."""
         return self._plan(now, "the resource starts")
 
     def require(self, requirement: Requirement, now: float) -> list[Action]:
@@ -159,14 +160,14 @@ class Adaptation:
         """Drop a client's requirement.
 
         Raises:
-            PeerRefused: It has none.
+            PeerRefused: The client has no requirement.
         """
         if self._requirements.pop(client, None) is None:
             raise PeerRefused("the resource", f"{client} has asked for nothing here")
         return self._requirements_changed(now, f"{client} asks for nothing any more")
 
     def block(self, blocked: Mapping[str, str], now: float) -> list[Action]:
-        """Set the profiles that preconditions and the context do not allow, with reasons; all others are allowed."""
+        """Set the profiles that preconditions or the context block, with the reasons; all others are allowed."""
         if blocked == self._blocked:
             return []
         self._blocked = dict(blocked)
@@ -176,13 +177,13 @@ class Adaptation:
         """Run this profile whatever is requested; an empty name lets the loop decide again.
 
         Args:
-            profile: Its name, or empty.
-            now: The time.
-            restored: Whether it was chosen before a restart: a cool-down goes on then. A choice made now ends it,
-                since the cause may have been mended.
+            profile: Name of the profile, or empty.
+            now: The time of the call.
+            restored: Whether the choice was made before a restart; the profile's cool-down continues then. A new
+                choice ends the cool-down, since its cause may have been removed.
 
         Raises:
-            ConfigError: There is no such profile.
+            ConfigError: The resource has no profile of this name.
         """
         if profile:
             self._decider.profile(profile)
@@ -193,13 +194,16 @@ class Adaptation:
         return self._plan(now, why, at_once=True)
 
     def reconsider(self, why: str, now: float) -> list[Action]:
-        """Take the best profile without hysteresis and dwell time: the context has changed."""
+        """Choose the best profile without hysteresis and dwell time, because the context has changed."""
         return self._plan(now, why, at_once=True)
 
     # --- measurements -------------------------------------------------------------------------------------------
 
     def window(self, measured: Mapping[str, Value], now: float) -> list[Action]:
-        """Judge a window of quality that ends now under the active profile."""
+        """Judge a window of measured quality that ends now.
+
+        The window is ignored unless it began at least ``settle`` seconds after the active profile was applied.
+        """
         began = max(self._window_end, self._active_since) if self._window_end is not None else now
         self._window_end = now
         if self._state is not ProfileState.ACTIVE or began < self._active_since + self._settings.settle:
@@ -210,13 +214,13 @@ class Adaptation:
             return self._disturbed(detector.violated[0][0], detector.violated[-1][1], now)
         if not detector.violated:
             actions = self._plan(now, "a better profile can be taken")
-            if self._pinned_or_best(now).feasible:  # else an attribute that was not measured may fall short
+            if self._pinned_or_best(now).feasible:  # otherwise an attribute that was not measured may fall short
                 actions += self._clear_alarm()
             return actions
         return []
 
     def _disturbed(self, since: float, short: tuple[Shortfall, ...], now: float) -> list[Action]:
-        """Replace the active profile, which does not deliver what it offers."""
+        """React to a disturbance under the active profile: choose another profile, or raise an alarm."""
         why = f"{', '.join(s.attribute for s in short)} fell short"
         others = self._excluded(now) | {self._profile: "it does not give what is asked"}
         decision = self._decider.decide(self._merged.bounds, others)
@@ -224,7 +228,7 @@ class Adaptation:
             self._cool_downs.begin(self._profile, why, now)
             alarm = Alarm(AlarmKind.ADAPTATION, short, self._profile, decision.profile, now)
             return [*self._raise_alarm(alarm), *self._apply(decision.profile, why, now, since)]
-        # Without a better one the profile stays, unless a best-effort profile is declared for this case.
+        # No other profile meets the requirements: this one stays, unless a best-effort profile is declared.
         after = decision if decision.best_effort else self._decider.decide(self._merged.bounds, self._excluded(now))
         actions: list[Action] = []
         if not self._non_adaptable:
@@ -238,7 +242,7 @@ class Adaptation:
     # --- reports of the driver ----------------------------------------------------------------------------------
 
     def applied(self, profile: str, now: float) -> list[Action]:
-        """The profile has been applied; a report about another one than the present target is ignored."""
+        """Report that the profile has been applied; ignored unless it is the one that is being applied."""
         if self._state is not ProfileState.APPLYING or profile != self._target:
             return []
         self._state = ProfileState.ACTIVE
@@ -257,27 +261,30 @@ class Adaptation:
         return [Reacted(profile, reaction), *self._plan(now, why, at_once=at_once)]
 
     def failed(self, profile: str, why: str, now: float) -> list[Action]:
-        """The profile could not be applied; the next best one is."""
+        """Report that the profile could not be applied; the next best profile is applied instead.
+
+        The report is ignored unless the profile is the one that is being applied.
+        """
         if self._state is not ProfileState.APPLYING or profile != self._target:
             return []
         self._cool_downs.begin(profile, why, now)
         self._state = ProfileState.ACTIVE if self._profile else ProfileState.NONE
         self._target, self._apply_deadline = "", math.inf
-        # The failed profile may be in force in part, so the one that ran before is applied again as well.
+        # The failed profile may be partly in force, so even the profile that ran before is applied again.
         return self._plan(now, f"{profile} failed: {why}", again=True)
 
     def overdue(self, now: float) -> bool:
-        """Whether the profile that is being applied hangs; ``handle_timer`` gives it up."""
+        """Whether the profile that is being applied has exceeded its time-out; ``handle_timer`` gives it up then."""
         return self._apply_deadline <= now
 
     def ended_late(self, profile: str, now: float, *, touched: bool) -> list[Action]:
-        """The function of a profile that was given up has ended; the profile may be taken again.
+        """Report that the function of a profile that was given up has ended; the profile may be chosen again.
 
         Args:
-            profile: Excluded until this call, because two calls of one function must not overlap.
-            now: The time.
-            touched: Whether it may have changed the device since the function of the present profile began: that
-                profile is applied once more then, after the one that is being applied.
+            profile: The profile; excluded until this call, because two calls of one function must not overlap.
+            now: The time of the call.
+            touched: Whether the function may have changed the device after the present profile's function began. If
+                so, the present profile is applied once more, if necessary after its first application is complete.
         """
         self._hanging.discard(profile)
         why = f"the function of {profile} has ended late"
@@ -288,13 +295,13 @@ class Adaptation:
         return self._plan(now, why)
 
     def next_timer(self) -> float | None:
-        """When ``handle_timer`` is due."""
+        """When ``handle_timer`` is due; ``None``: no timer runs."""
         expiries = (r.expires for r in self._requirements.values() if r.expires is not None)
         first = min(self._apply_deadline, self._cool_downs.next_timer(), min(expiries, default=math.inf))
         return None if first == math.inf else first
 
     def handle_timer(self, now: float) -> list[Action]:
-        """A requirement expires, a cool-down is over, or a profile hangs."""
+        """Handle what is due: requirements that expire, cool-downs that end, a profile that hangs."""
         if self.overdue(now):
             self._hanging.add(self._target)
             return self.failed(self._target, self._hang_reason, now)
@@ -312,7 +319,7 @@ class Adaptation:
     def _requirements_changed(self, now: float, why: str) -> list[Action]:
         before, self._merged = self._merged.bounds, merge(self._requirements.values())
         if self._merged.bounds == before and self._state is not ProfileState.NONE:
-            return []  # a repetition, as of `rostopic pub -r`: it must neither hide a disturbance nor skip the dwell
+            return []  # a repetition (`rostopic pub -r`) must neither hide a disturbance nor skip the dwell time
         for name in self._merged.bounds:
             if name not in self._attributes:
                 raise LocalProtocolError(f"a bound of {name}, which is no attribute; check it before it comes here")
@@ -320,12 +327,12 @@ class Adaptation:
         return self._plan(now, why, at_once=True)
 
     def _plan(self, now: float, why: str, *, at_once: bool = False, again: bool = False) -> list[Action]:
-        """Take another profile if the change is worth it.
+        """Apply another profile if the change is worth it.
 
         Args:
-            now: The time.
-            why: What may have changed.
-            at_once: Whether to skip hysteresis and dwell time, because the requirements have changed.
+            now: The time of the call.
+            why: The reason for planning, for people.
+            at_once: Whether to skip hysteresis and dwell time: requirements, context or choice have changed.
             again: Whether to apply the decided profile even if it runs already.
         """
         if self._state is ProfileState.APPLYING:
@@ -345,13 +352,13 @@ class Adaptation:
     def _pinned_or_best(self, now: float) -> ProfileDecision:
         excluded = self._excluded_by_failure(now)
         if not self._pinned or self._pinned in excluded:
-            # A pinned profile that cannot be applied is tried again after its cool-down.
+            # A pinned profile that failed is tried again after its cool-down.
             return self._decider.decide(self._merged.bounds, excluded | self._blocked)
         others = {name: "another one was chosen by hand" for name in self._decider.profiles if name != self._pinned}
         return self._decider.decide(self._merged.bounds, others)
 
     def _prefer_restored(self, decision: ProfileDecision, now: float) -> ProfileDecision:
-        """At the first decision after a restart: the profile of before, unless another is worth the change."""
+        """At the first decision after a restart, keep the profile that ran before unless a change is worth it."""
         before, self._restored_profile = self._restored_profile, ""
         if not before or self._pinned or before == decision.profile or before in self._excluded(now):
             return decision
@@ -361,7 +368,7 @@ class Adaptation:
         return replace(decision, profile=before)
 
     def _worth_it(self, decision: ProfileDecision, now: float) -> bool:
-        """Whether a change pays while the requirements are the same: hysteresis and dwell time."""
+        """Whether a change is worth it while the requirements stay the same: applies hysteresis and dwell time."""
         if not self._profile or self._profile in self._excluded(now) or self._pinned:
             return True
         current = self._score(self._profile, now)
@@ -372,7 +379,7 @@ class Adaptation:
         return current.distance - decision.distance > self._settings.improvement
 
     def _update_alarm(self, decision: ProfileDecision, now: float) -> list[Action]:
-        """Raise the non-adaptable alarm if even the best profile is declared to fall short; else clear it."""
+        """Raise the non-adaptable alarm if even the decided profile's offers fall short; else clear it."""
         if decision.feasible:
             return self._clear_alarm() if self._non_adaptable and not self._detector.violated else []
         if self._non_adaptable or self._pinned:
@@ -397,7 +404,7 @@ class Adaptation:
         return next(score for score in self.explain(now) if score.profile == profile)
 
     def _excluded(self, now: float) -> dict[str, str]:
-        """All profiles that may not be taken, and why."""
+        """All profiles that may not be chosen, with the reasons."""
         return self._excluded_by_failure(now) | self._blocked
 
     def _excluded_by_failure(self, now: float) -> dict[str, str]:
@@ -420,5 +427,5 @@ class Adaptation:
         if self._alarm is None:
             return []
         alarm, self._alarm = self._alarm, None
-        self._cool_downs.reset(self._profile)  # it delivers again: its next cool-down is a short one
+        self._cool_downs.reset(self._profile)  # its quality is good again, so its next cool-down is the shortest
         return [Clear(alarm)]

@@ -1,8 +1,8 @@
 """The clients of a resource: their last messages, refusals and presence.
 
-Requirements themselves are merged by ``resource.declare.requirements``. Here is what belongs to one client: the mark
-on its request, by which it recognises the answer; the stamp of its request, so that a latched message that arrives
-again is the same request; the reason of a refusal; and how long it has been absent.
+``resource.declare.requirements`` merges the requirements themselves. This module keeps for each client: the mark on
+its request, by which the client recognises the answer; the stamp of its request, which identifies a latched message
+that arrives again; the reason of a refusal; and how long the client has been absent.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from rmpa.resource.declare.requirements import Requirement
 
 _ABSENT: Final = 2
-"""Consecutive checks without a connection after which a client is gone: the subscribers of a proxy connect anew after
-a short interruption of its link."""
+"""Number of consecutive checks without a connection after which a client is gone. One check is not enough: after a
+short interruption of its link, the connections of a proxy are made again."""
 
 
 @dataclass(slots=True)
@@ -31,12 +31,12 @@ class _Client:
     """A client that has sent a message.
 
     Args:
-        mark: Of its last message.
-        stamp: Of its last message, or empty.
-        values: Its requirement as text; ``None``: none that is valid.
-        refusal: Why its last message was refused, or empty.
-        absent: Consecutive checks without a connection.
-        grace: For a client of before a restart: until when it may come back, monotonic seconds.
+        mark: The mark of its last message.
+        stamp: The stamp of its last message, or empty.
+        values: The last valid requirement, as texts by attribute; ``None``: there was none.
+        refusal: Why its last message was refused; empty: it was accepted.
+        absent: Number of consecutive checks without a connection.
+        grace: For a client restored after a restart: how long it may stay unconnected, in monotonic seconds.
     """
 
     mark: str = ""
@@ -51,7 +51,7 @@ class Clients:
     """All clients of one resource.
 
     Args:
-        resource: Its name, for errors.
+        resource: Name of the resource, for errors.
         attributes: The attributes that clients may request, by name.
     """
 
@@ -60,33 +60,33 @@ class Clients:
         self._attributes = attributes
         self._known: dict[str, _Client] = {}
         self.expiries: dict[tuple[str, str], float] = {}
-        """Expiry of requests by client and stamp: a latched request that arrives again does not begin anew."""
+        """Expiry in monotonic seconds, by client and stamp: a latched request that arrives again keeps its expiry."""
 
     def received(self, name: str, mark: str, stamp: str) -> None:
-        """A client has sent a message.
+        """Record that a client has sent a message; called before ``read``, which uses the stamp.
 
         Args:
-            name: Its node.
-            mark: On the message; cut to a bound, because it is repeated in each response.
-            stamp: The message's, ``seconds.nanoseconds``; or empty.
+            name: Name of the client's node.
+            mark: The mark on the message; it is cut to a maximum length, because each response repeats it.
+            stamp: The message's stamp as ``seconds.nanoseconds``, or empty.
         """
         client = self._client(name)
         client.mark, client.stamp = mark[: limits.REQUIREMENT_TEXT_MAX], stamp
         client.grace = -math.inf
 
     def read(self, name: str, values: Sequence[tuple[str, str]], now: float) -> Requirement | None:
-        """Read a client's requirement, which replaces its previous one; without bounds it releases that.
+        """Read a client's requirement from the values of its message.
 
         Args:
-            name: Its node.
-            values: Attributes and texts of the message.
+            name: Name of the client's node.
+            values: Attributes with the texts of the requests.
             now: Monotonic seconds.
 
         Returns:
-            ``None`` for a latched request that arrives again after it has expired.
+            The requirement; ``None`` for a latched request that arrives again after it has expired.
 
         Raises:
-            ConfigError: It is invalid; the previous one stays in force.
+            ConfigError: The request is invalid.
         """
         requirement = parse_requirement(name, list(values), self._attributes, self._resource, now)
         client = self._client(name)
@@ -101,16 +101,16 @@ class Clients:
         return requirement
 
     def refuse(self, name: str, why: str) -> None:
-        """A client's last message is invalid."""
+        """Record why a client's last message was refused."""
         self._client(name).refusal = why
 
     def refusal(self, name: str) -> str:
-        """Why a client's last message was refused, or empty."""
+        """Why a client's last message was refused; empty: it was accepted."""
         client = self._known.get(name)
         return client.refusal if client is not None else ""
 
     def mark(self, name: str) -> str:
-        """The mark of a client's last message, which its response repeats."""
+        """The mark of a client's last message, which the response repeats; empty: there is none."""
         client = self._known.get(name)
         return client.mark if client is not None else ""
 
@@ -120,14 +120,14 @@ class Clients:
         return [name for name, client in self._known.items() if client.refusal]
 
     def remove_absent(self, connected: Collection[str], now: float) -> list[str]:
-        """Remove clients that are no longer connected; called periodically.
+        """Remove clients that have been unconnected for several calls; must be called periodically.
 
         Args:
-            connected: The nodes that are connected.
+            connected: The names of the nodes that are connected.
             now: Monotonic seconds.
 
         Returns:
-            The clients that were removed.
+            The names of the removed clients.
         """
         removed = []
         for name, client in list(self._known.items()):
@@ -143,12 +143,12 @@ class Clients:
     # --- over a restart -----------------------------------------------------------------------------------------
 
     def save(self, requirements: Mapping[str, Requirement], now: float, now_ns: int) -> list[SavedRequirement]:
-        """The requirements of all clients as they are stored.
+        """The requirements of all clients in the form in which they are stored.
 
         Args:
-            requirements: In force, by client.
+            requirements: The requirements in force, by client.
             now: Monotonic seconds.
-            now_ns: The same moment by the wall clock.
+            now_ns: The same moment by the wall clock, Unix nanoseconds.
         """
         found = []
         for name, requirement in requirements.items():
@@ -166,7 +166,7 @@ class Clients:
         return found
 
     def restore(self, saved: Iterable[SavedRequirement], now: float, now_ns: int) -> list[Requirement]:
-        """Put stored requirements in force; a client that does not return within the grace period is removed."""
+        """Return the stored requirements that have not expired, and keep their clients for a grace period."""
         found = []
         for one in saved:
             requirement = one.requirement(self._attributes, self._resource, now, now_ns)

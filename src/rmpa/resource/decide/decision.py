@@ -1,13 +1,15 @@
-"""The most similar profile: the System Profile that serves the merged requirements best (paper, section 3.1).
+"""Finds the most similar profile: the one that serves the merged requirements best (paper, section 3.1).
 
-For each requested attribute, a profile's *shortfall* is the distance of its value outside of the bound, relative to
-the attribute's tolerance, or else to its range over all profiles (0 or 1 where that is 0); a better value than the
-requested one has none. Its *distance* is the weighted root mean square of the shortfalls, plus a part of its cost::
+For each requested attribute, a profile's *shortfall* is the distance by which its value lies outside of the bound,
+divided by ``s``: the attribute's tolerance, or else its range over all profiles. Where that is 0, the shortfall is 0
+or 1. A value within the bound has no shortfall. A profile's *distance* ``D`` is the weighted root mean square of its
+shortfalls, plus a part of its cost::
 
     delta = max(0, shortfall) / s        D = sqrt(sum(w * delta^2) / sum(w)) + EPSILON * cost
 
-Of the profiles that meet every hard requirement the nearest serves. If none does: the declared best-effort profile,
-or the one with the smallest (largest weighted hard shortfall, D, cost). Ties go to the one declared first.
+The result is the profile with the least ``D`` among those that meet every hard requirement. If none does, it is the
+declared best-effort profile, or else the profile with the least (largest weighted hard shortfall, ``D``, cost). In a
+tie the profile that was declared first is chosen.
 """
 
 from __future__ import annotations
@@ -28,11 +30,11 @@ if TYPE_CHECKING:
     from rmpa.resource.declare.requirements import Bound
 
 EPSILON: Final = 1e-3
-"""Contribution of one unit of cost to the distance: it decides among profiles of nearly equal shortfall."""
+"""What one unit of cost adds to the distance: cost decides among profiles of nearly equal shortfall."""
 _FEW: Final = 3
-"""If more than one in so many profiles is feasible, all distances are computed at once, else one by one."""
+"""If fewer than one in so many profiles is feasible, distances are computed one by one, else all at once."""
 _MISSING: Final = 1.0
-"""The shortfall of an attribute that a profile does not offer: the whole range."""
+"""Shortfall of a profile that does not offer the attribute, or that offers another word: the whole range."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,12 +42,12 @@ class Term:
     """One attribute's part in a profile's distance.
 
     Args:
-        attribute: Its name.
-        wanted: The requested bound, for people.
-        offered: The profile's value, ``None`` if it has none.
-        delta: The shortfall, 0 where the request is met.
-        weight: Of the attribute.
-        hard: Whether a shortfall excludes the profile.
+        attribute: Name of the attribute.
+        wanted: The requested bound, as a text for people.
+        offered: The profile's value; ``None`` if it offers none.
+        delta: The relative shortfall; 0 if the request is met.
+        weight: Weight of the attribute, above 0.
+        hard: Whether a shortfall makes the profile infeasible.
     """
 
     attribute: str
@@ -66,10 +68,10 @@ class ProfileScore:
     """How well one profile serves the requirements.
 
     Args:
-        profile: Its name.
-        distance: ``D``.
-        hard_shortfall: The largest weighted shortfall of a hard requirement; 0: it is feasible.
-        excluded: Why it is excluded (a precondition, a cool-down), or empty.
+        profile: Name of the profile.
+        distance: The profile's ``D`` (see the module).
+        hard_shortfall: The largest weighted shortfall of a hard requirement; 0: all are met.
+        excluded: Why the profile is excluded (a precondition, a cool-down); empty: it is not.
         terms: The parts of the distance, in the order of the requested attributes.
     """
 
@@ -81,7 +83,7 @@ class ProfileScore:
 
     @property
     def feasible(self) -> bool:
-        """Whether it meets every hard requirement and may be taken."""
+        """Whether the profile meets every hard requirement and is not excluded."""
         return self.hard_shortfall == 0.0 and not self.excluded
 
 
@@ -90,10 +92,10 @@ class ProfileDecision:
     """The profile that serves best.
 
     Args:
-        profile: Its name; empty if all are excluded.
-        distance: Its ``D``.
-        feasible: Whether it meets every hard requirement; if not, this is a non-adaptable event.
-        best_effort: Whether it was taken because it is the declared best-effort profile.
+        profile: Name of the profile; empty if all are excluded.
+        distance: The profile's ``D`` (see the module); infinite if all are excluded.
+        feasible: Whether the profile meets every hard requirement; if not, this is a non-adaptable event.
+        best_effort: Whether it was chosen because it is the declared best-effort profile.
     """
 
     profile: str
@@ -106,8 +108,8 @@ class _Column:
     """The shortfalls of all profiles in one attribute.
 
     Args:
-        bound: The requested one.
-        deltas: One shortfall for each profile.
+        bound: The requested bound.
+        deltas: The shortfall of each profile, in order of declaration.
     """
 
     __slots__ = ("_squares", "bound", "deltas")
@@ -119,13 +121,13 @@ class _Column:
 
     @property
     def weighted(self) -> list[float]:
-        """The shortfalls times the weight."""
+        """Each shortfall times the bound's weight."""
         weight = self.bound.weight
         return self.deltas if weight == 1 else [weight * delta for delta in self.deltas]
 
     @property
     def squares(self) -> list[float]:
-        """The squares times the weight; lazy, because most decisions need few of them."""
+        """Each squared shortfall times the bound's weight; computed when first needed, because few decisions do."""
         if self._squares is None:
             weight = self.bound.weight
             if weight == 1:
@@ -136,15 +138,15 @@ class _Column:
 
 
 class Decider:
-    """Decides for one resource; values that are the same for all decisions are computed once.
+    """Decides among one resource's profiles; values that all decisions share are computed once.
 
     Args:
-        resource: Its name, for errors.
-        attributes: Declared ones, by name.
-        profiles: In order of declaration.
+        resource: Name of the resource, for errors.
+        attributes: The attributes that clients may request, by name.
+        profiles: The declared profiles, in order of declaration.
 
     Raises:
-        ConfigError: See ``check_profiles``.
+        ConfigError: The profiles are invalid; see ``check_profiles``.
     """
 
     def __init__(self, resource: str, attributes: Mapping[str, Attribute], profiles: Sequence[Profile]) -> None:
@@ -156,7 +158,7 @@ class Decider:
         self._places: dict[str, list[float | None]] = {}
         self._spans: dict[str, float] = {}
         self._known: dict[str, list[float]] = {}
-        """The places of the attributes that every profile offers."""
+        """The profiles' positions on the scale of each attribute that all profiles offer, by attribute."""
         self._columns: dict[str, _Column] = {}
         for name, attribute in attributes.items():
             places = [attribute.position(p.offers[name]) if name in p.offers else None for p in profiles]
@@ -171,14 +173,14 @@ class Decider:
 
     @property
     def profiles(self) -> Sequence[str]:
-        """The names, in order of declaration."""
+        """The profiles' names, in order of declaration."""
         return tuple(self._profiles)
 
     def profile(self, name: str) -> Profile:
         """The profile of this name.
 
         Raises:
-            ConfigError: There is none of that name.
+            ConfigError: The resource has no profile of this name.
         """
         found = self._profiles.get(name)
         if found is None:
@@ -191,8 +193,8 @@ class Decider:
         """The profile that serves the requirements best.
 
         Args:
-            bounds: By attribute; undeclared attributes raise ``KeyError``.
-            excluded: Reasons by the names of profiles that may not be taken.
+            bounds: The merged requirements by attribute; an undeclared attribute raises ``KeyError``.
+            excluded: Profiles that may not be chosen, with the reasons.
         """
         columns = [self._column(name, bound) for name, bound in bounds.items()]
         reasons = excluded or {}
@@ -221,7 +223,7 @@ class Decider:
     def explain(
         self, bounds: Mapping[str, Bound], excluded: Mapping[str, str] | None = None
     ) -> tuple[ProfileScore, ...]:
-        """Every profile's score with all its terms, in order of declaration."""
+        """The score of every profile with all its terms, in order of declaration; arguments as for ``decide``."""
         distances, hard = self._judge(bounds)
         reasons = excluded or {}
         texts = {name: describe_bound(self._attributes[name], bound) for name, bound in bounds.items()}
@@ -237,12 +239,12 @@ class Decider:
         )
 
     def distance(self, name: str, bounds: Mapping[str, Bound]) -> float:
-        """One profile's distance."""
+        """The distance ``D`` of one profile."""
         columns = [self._column(asked, bound) for asked, bound in bounds.items()]
         return self._distance(self.profiles.index(name), columns)
 
     def _judge(self, bounds: Mapping[str, Bound]) -> tuple[list[float], list[float]]:
-        """Distances and largest weighted hard shortfalls of all profiles."""
+        """The distance and the largest weighted hard shortfall of every profile, as two lists."""
         columns = [self._column(name, bound) for name, bound in bounds.items()]
         distances = self._distances(columns)
         hard = [column.weighted for column in columns if column.bound.hard]
@@ -251,7 +253,7 @@ class Decider:
         return distances, [*map(max, zip(*hard, strict=True))] if len(hard) > 1 else hard[0]
 
     def _distances(self, columns: Sequence[_Column]) -> list[float]:
-        """``D`` of every profile."""
+        """The distance ``D`` of every profile."""
         if not columns:
             return list(self._costs)
         scale = sum(column.bound.weight for column in columns)
@@ -259,7 +261,7 @@ class Decider:
         return [math.sqrt(total / scale) + cost for total, cost in zip(sums, self._costs, strict=True)]
 
     def _distance(self, index: int, columns: Sequence[_Column]) -> float:
-        """``D`` of one profile, bit for bit the value of ``_distances``."""
+        """The distance ``D`` of one profile, bit for bit equal to its value in ``_distances``."""
         if not columns:
             return self._costs[index]
         scale = sum(column.bound.weight for column in columns)
@@ -267,7 +269,7 @@ class Decider:
         return math.sqrt(total / scale) + self._costs[index]
 
     def _column(self, name: str, bound: Bound) -> _Column:
-        """The column of an attribute; cached, because most bounds are the same as at the last decision."""
+        """The column of an attribute; cached, because most bounds stay the same from one decision to the next."""
         known = self._columns.get(name)
         if known is not None and known.bound == bound:
             return known
@@ -277,14 +279,14 @@ class Decider:
     def _deltas(self, name: str, bound: Bound) -> list[float]:
         places, span = self._places[name], self._spans[name]
         if name not in self._offered:
-            return [0.0] * len(places)  # no profile offers it, so only measurements count
+            return [0.0] * len(places)  # no profile offers the attribute, so only measurements are judged
         if bound.words:
             words = self._attributes[name].words
             wanted = {float(words.index(word)) for word in bound.words}
             return [0.0 if place in wanted else _MISSING for place in places]
         low, high = bound.low, bound.high
         if span > 0:
-            if (known := self._known.get(name)) is not None:  # the usual case, in half of the time
+            if (known := self._known.get(name)) is not None:  # a fast path for the usual case: half of the time
                 if high == math.inf:
                     return [(low - place) / span if place < low else 0.0 for place in known]
                 if low == -math.inf:
@@ -318,7 +320,7 @@ class Decider:
 
 
 def describe_bound(attribute: Attribute, bound: Bound) -> str:
-    """A bound for people: ``at least 20 Hz``."""
+    """A bound as a text for people, such as ``at least 20 Hz``."""
     if bound.words:
         return " or ".join(word for word in attribute.words if word in bound.words)
     low = attribute.format(attribute.value_at(bound.low)) if bound.low > -math.inf else ""

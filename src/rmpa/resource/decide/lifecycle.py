@@ -1,4 +1,4 @@
-"""The life cycle of a resource, with the states of ROS 2's managed nodes (design.ros2.org/articles/node_lifecycle).
+"""The life cycle of a resource: the states of ROS 2's managed nodes (design.ros2.org/articles/node_lifecycle).
 
 ::
 
@@ -20,20 +20,20 @@ if TYPE_CHECKING:
 
 
 class LifecycleState(StrEnum):
-    """State of a resource."""
+    """State of a resource in its life cycle."""
 
     UNCONFIGURED = "unconfigured"
-    """Registered; holds no resources of the device yet."""
+    """The node is registered; the device is not open yet."""
     INACTIVE = "inactive"
     """Parameters can be set; no task runs and nothing is published."""
     ACTIVE = "active"
-    """Its tasks run."""
+    """The tasks run, and outputs are published."""
     FINALIZED = "finalized"
-    """Terminal."""
+    """The resource has ended; no transition leads out of this state."""
 
 
 class Transition(StrEnum):
-    """Transition between two states."""
+    """Transition between two states of the life cycle."""
 
     CONFIGURE = "configure"
     CLEANUP = "cleanup"
@@ -56,29 +56,29 @@ TRANSITIONS: Final[Mapping[tuple[LifecycleState, Transition], LifecycleState]] =
 
 
 class LifeCycle:
-    """State machine of one resource; the driver calls the user's callbacks and reports how they ended."""
+    """State machine of one resource's life cycle; its driver calls the user's callbacks and reports their outcome."""
 
     def __init__(self) -> None:
         self._state = LifecycleState.UNCONFIGURED
         self._under_way: Transition | None = None
         self.problem = ""
-        """Why the last transition failed, or empty."""
+        """Why the last transition failed; empty: it did not."""
 
     @property
     def state(self) -> LifecycleState:
-        """The state; during a transition the one where that began."""
+        """The present state; during a transition the state in which the transition began."""
         return self._state
 
     @property
     def under_way(self) -> Transition | None:
-        """The transition whose callback runs."""
+        """The transition whose callback runs; ``None``: no transition is under way."""
         return self._under_way
 
     def begin(self, transition: Transition) -> None:
         """Begin a transition; ``succeeded`` or ``failed`` ends it.
 
         Raises:
-            LocalProtocolError: It is not valid in this state, or another one is under way.
+            LocalProtocolError: The transition is not valid in this state, or another one is under way.
         """
         if self._under_way is not None:
             raise LocalProtocolError(f"{transition} while {self._under_way} is under way")
@@ -87,7 +87,11 @@ class LifeCycle:
         self._under_way = transition
 
     def succeeded(self) -> LifecycleState:
-        """The callback has returned; return the new state."""
+        """End the transition after its callback has returned, and return the new state.
+
+        Raises:
+            LocalProtocolError: No transition is under way.
+        """
         if self._under_way is None:
             raise LocalProtocolError("no transition is under way")
         self._state = TRANSITIONS[self._state, self._under_way]
@@ -96,9 +100,9 @@ class LifeCycle:
         return self._state
 
     def failed(self, why: str) -> LifecycleState:
-        """The callback has raised; return the state.
+        """End the transition after its callback has raised, and return the resulting state.
 
-        That is the old one, except after ``finalize`` and ``deactivate``: an error must not prevent the end.
+        The state stays the same, except after ``finalize`` and ``deactivate``: an error must not prevent these.
         """
         transition = self._under_way
         if transition in (Transition.FINALIZE, Transition.DEACTIVATE):

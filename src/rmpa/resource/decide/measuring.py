@@ -1,4 +1,4 @@
-"""Measures all quality attributes of one resource: of its outputs and inputs, and those that it observes itself."""
+"""Measures all quality attributes of one resource: of outputs, of inputs, and those that the user's code observes."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class QualityMeasurement:
     """Measures messages and observations; each window yields their quality.
 
     Args:
-        resource: Declared completely.
-        now: Monotonic seconds, as everywhere below.
+        resource: The resource, completely declared.
+        now: Beginning of the first window, in monotonic seconds; all times of this class are.
     """
 
     def __init__(self, resource: Resource, now: float) -> None:
@@ -31,22 +31,22 @@ class QualityMeasurement:
         for item in resource.inputs.values():
             self._add_input(item, now)
         self._unknown = {name: item for name, item in resource.inputs.items() if item.kind.known is None}
-        """Inputs whose type is learnt from their first publisher."""
+        """Inputs whose type is not known yet, by name; it is learnt from their first publisher."""
         self._primary = next(iter(resource.outputs), "")
-        """The output whose attributes are also named without its label."""
+        """The first output; its attributes are also available without the output's label."""
         self._declared = {
             name: ObservedQuality(declared.attribute) for name, declared in resource.declared_attributes.items()
         }
 
     def message(self, topic: str, raw: bytes, now: float, now_ns: int, caller: str = "") -> None:
-        """An output has sent, or an input received, a message.
+        """Measure a message that an output has sent or an input has received.
 
         Args:
-            topic: The output's or input's name.
+            topic: Declared name of the output or input.
             raw: The serialized message.
-            now: The time.
-            now_ns: The same moment by the wall clock, to which stamps refer.
-            caller: The publishing node, for inputs.
+            now: When it was sent or received.
+            now_ns: The same moment by the wall clock (Unix nanoseconds), to which stamps refer.
+            caller: For inputs: name of the publishing node.
         """
         if topic in self._unknown and self._unknown[topic].kind.known is not None:
             self._add_input(self._unknown.pop(topic), now)
@@ -59,19 +59,19 @@ class QualityMeasurement:
         )
 
     def observe(self, attribute: str, value: Value) -> None:
-        """The user's code observed one of its attributes."""
+        """Record a value that the user's code has observed of a declared attribute; others are ignored."""
         if (quality := self._declared.get(attribute)) is not None:
             quality.observe(value)
 
     def restart(self, now: float) -> None:
-        """Begin a new window, because another profile runs."""
+        """Discard the measurements so far and begin a new window, because another profile runs."""
         for topic in self._topics.values():
             topic.restart(now)
         for quality in self._declared.values():
             quality.restart()
 
     def window(self, now: float) -> dict[str, Value]:
-        """End a window; return its measured values by attribute."""
+        """End the window and return its measured values by attribute."""
         measured: dict[str, Value] = {}
         for name, topic in self._topics.items():
             for key, value in topic.window(now).items():
@@ -84,7 +84,7 @@ class QualityMeasurement:
         return measured
 
     def format(self, measured: Mapping[str, Value]) -> dict[str, str]:
-        """The values of a window with units, each attribute once."""
+        """The values of a window as texts with units; the first output's attributes only by their short names."""
         twice = f"{self._labels[self._primary]}." if self._primary else None
         return {
             name: self._attributes[name].format(value)

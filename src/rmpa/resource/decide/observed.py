@@ -1,6 +1,7 @@
-"""Quality as clients observe it, and inputs that are missing; both are judged once a window.
+"""Quality as observed by clients, and things that a resource lacks; both are judged once in each window.
 
-A resource measures the messages that it sends. Fewer may arrive in another module, which only the client there sees.
+A resource measures the messages that it sends. Fewer may arrive in another module, where only the client can measure
+the loss.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from rmpa.resource.declare.attributes import Attribute, Value
 
 MISSING_WINDOWS: Final = 2
-"""Consecutive windows in which something is missing before it is reported: connecting takes a while at the start."""
+"""Consecutive windows for which something must be missing before it is reported, since connecting takes a while."""
 _WORSE: Final = {Direction.MAX: -1, Direction.MIN: 1}
 
 
@@ -26,8 +27,8 @@ class ObservedQualities:
     """The last report of each client.
 
     Args:
-        attributes: The resource's, by name.
-        resource: Its name, for errors.
+        attributes: The resource's attributes, by name.
+        resource: Name of the resource, for errors.
         lifespan: Seconds for which a report counts.
     """
 
@@ -38,10 +39,10 @@ class ObservedQualities:
         self._reports: dict[str, tuple[float, dict[str, Value]]] = {}
 
     def report(self, client: str, values: Iterable[tuple[str, str]], now: float) -> None:
-        """Take a client's report, in place of its previous one.
+        """Take a client's report of attributes and values as texts, in place of its previous report.
 
         Raises:
-            ConfigError: An unknown attribute or an invalid value; the whole report is dropped then.
+            ConfigError: An attribute is unknown or a value is invalid; the whole report is dropped.
         """
         found: dict[str, Value] = {}
         for number, (name, text) in enumerate(values):
@@ -52,17 +53,20 @@ class ObservedQualities:
         self._reports[client] = (now, found)
 
     def observed(self, client: str, name: str) -> Value | None:
-        """The value of an attribute in a client's report, if any."""
+        """The value of an attribute in a client's last report; ``None``: it has none."""
         _, found = self._reports.get(client, (0.0, {}))
         return found.get(name)
 
     def worst(self, measured: Mapping[str, Value], clients: Collection[str], now: float) -> dict[str, Value]:
-        """The worse of the measured values and the reported ones.
+        """For each attribute the worst of the measured and the reported values.
 
         Args:
-            measured: By attribute.
-            clients: Those that have a requirement; reports of others do not count.
+            measured: The resource's own measurements, by attribute.
+            clients: The clients that have a requirement; reports of others do not count.
             now: Monotonic seconds.
+
+        Returns:
+            Values by attribute. Where no direction is better, a reported value replaces the measured one.
         """
         self._reports = {client: r for client, r in self._reports.items() if now - r[0] <= self._lifespan}
         worst = dict(measured)
@@ -79,21 +83,21 @@ class ObservedQualities:
         return worst
 
     def clear(self) -> None:
-        """Drop all reports: they are about the previous profile."""
+        """Drop all reports, because they describe the previous profile."""
         self._reports.clear()
 
 
 class MissingInputs:
-    """Tracks what a resource needs and lacks."""
+    """Tracks what a resource needs and lacks, so that short absences are not reported."""
 
     def __init__(self) -> None:
         self._windows: dict[str, int] = {}
 
     def update(self, missing: Iterable[str]) -> list[tuple[str, bool]]:
-        """Take what is missing in this window.
+        """Update with the texts about everything that is missing in this window.
 
         Returns:
-            The changes to report: each text with true (missing) or false (back).
+            The changes to report: each text, with true if it is missing now and false if it is back.
         """
         texts = set(missing)
         back = [text for text in self._windows if text not in texts]

@@ -1,7 +1,7 @@
-"""Measured quality of an output, an input, or a declared attribute, window by window.
+"""Measures the quality of an output, an input, or a declared attribute, window by window.
 
-Only sums are kept, so each message costs the same. Values that a window does not determine (the standard deviation of
-a single period, a latency without a stamp) are left out of it and not judged.
+Only sums are kept, so each message costs the same. Values that a window cannot determine (the standard deviation of a
+single period, a latency without a stamp) are left out and not judged.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ if TYPE_CHECKING:
 _HEADER: Final = struct.Struct("<III")
 _SECOND: Final = 1_000_000_000
 _SOURCES: Final = 64
-"""Publishers of one topic whose sequence numbers are tracked; with more of them all begin anew."""
+"""Number of publishers of one topic whose sequence numbers are tracked; one more, and the tracking starts afresh."""
 
 
 class TopicQuality:
     """Measures one output or input.
 
     Args:
-        now: Monotonic seconds.
-        stamped: Whether its messages begin with a ``std_msgs/Header``.
+        now: Beginning of the first window, in monotonic seconds.
+        stamped: Whether the messages begin with a ``std_msgs/Header``.
         numbered: Whether that header's ``seq`` counts the messages of each source, as client libraries set it.
-        deadline: Longest time between two messages in seconds (the QoS policy), or ``None``.
+        deadline: The contract's deadline: longest time between two messages in seconds; ``None``: no deadline.
     """
 
     def __init__(
@@ -55,13 +55,13 @@ class TopicQuality:
         self._lost = 0
 
     def message(self, raw: bytes | memoryview, now: float, now_ns: int, source: str = "") -> None:
-        """Take one message.
+        """Measure one message.
 
         Args:
-            raw: Its bytes, without the length prefix.
-            now: When it was sent or received, monotonic seconds.
-            now_ns: The same moment by the wall clock, to which its stamp refers.
-            source: The publisher; each has its own sequence numbers.
+            raw: The serialized message, without the length prefix.
+            now: When it was sent or received, in monotonic seconds.
+            now_ns: The same moment by the wall clock (Unix nanoseconds), to which the message's stamp refers.
+            source: Name of the publisher; each has its own sequence numbers.
         """
         last, self._last = self._last, now
         if last is not None:
@@ -93,18 +93,18 @@ class TopicQuality:
                 self._lost += gap
 
     def restart(self, now: float) -> None:
-        """Begin a new window without the measurements so far, because another profile runs."""
+        """Discard the measurements so far and begin a new window, because another profile runs."""
         self._began = now
         if self._last is not None:
-            self._last = now  # the time between the two profiles is no period
+            self._last = now  # the time from one profile to the other is no period
         self._clear()
 
     def window(self, now: float) -> dict[str, Value]:
-        """End the window; return its values by the names of ``attributes.MEASURED``."""
+        """End the window and return its values by attribute (``attributes.MEASURED``)."""
         span = max(now - self._began, 1e-9)
         silent = now - (self._last if self._last is not None else self._began)
         found: dict[str, Value] = {"bandwidth": self._bytes / span}
-        # The present period is at least as long as the silence: the rate of a source that stops falls at once.
+        # The present period is at least as long as the silence so far, so the rate falls as soon as a source stops.
         mean = self._sum / self._periods if self._periods else math.inf
         if self._last is None:
             found["rate"] = 0.0
@@ -130,10 +130,10 @@ class TopicQuality:
 
 
 class ObservedQuality:
-    """A declared attribute: the mean of a window's observations, or the last word.
+    """Measures a declared attribute: the mean of a window's observations, or the last observed word.
 
     Without a new observation the value of the last window stays valid: a battery's charge remains known between two
-    readings. Under another profile the attribute is unknown until it is observed again.
+    readings. After a change of profile the attribute is unknown until it is observed again.
     """
 
     def __init__(self, attribute: Attribute) -> None:
@@ -141,13 +141,13 @@ class ObservedQuality:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the value, because another profile runs."""
+        """Discard the value, because another profile runs."""
         self._sum = 0.0
         self._count = 0
         self._value: Value | None = None
 
     def observe(self, value: Value) -> None:
-        """Take one valid observation."""
+        """Record one observation, which must be a valid value of the attribute."""
         if isinstance(value, str):
             self._value = value
         else:
@@ -155,7 +155,7 @@ class ObservedQuality:
             self._count += 1
 
     def window(self) -> Value | None:
-        """End the window; return its value, or ``None`` if it was never observed."""
+        """End the window and return its value; ``None`` without any observation under the present profile."""
         if self._count:
             self._value = self._sum / self._count
             self._sum, self._count = 0.0, 0

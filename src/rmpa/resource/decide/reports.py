@@ -23,7 +23,7 @@ ALARM_LEVELS: Final = {AlarmKind.ADAPTATION: DiagnosticLevel.WARN, AlarmKind.NON
 
 
 def describe_alarm(alarm: Alarm) -> str:
-    """An alarm as a sentence."""
+    """Describe an alarm in a sentence."""
     names = ", ".join(short.attribute for short in alarm.shortfalls) or "the quality"
     if alarm.kind is AlarmKind.ADAPTATION:
         return f"adaptation: {names} fell short under {alarm.before}; {alarm.after} takes over"
@@ -33,7 +33,14 @@ def describe_alarm(alarm: Alarm) -> str:
 def alarm_values(
     alarm: Alarm, attributes: Mapping[str, Attribute], *, cleared: bool, reaction: float | None
 ) -> dict[str, str]:
-    """The values of an alarm message; ``reaction`` is that of the last reconfiguration in seconds."""
+    """The values of an alarm's message, by key.
+
+    Args:
+        alarm: The alarm.
+        attributes: The resource's attributes, by name.
+        cleared: Whether the alarm is over.
+        reaction: Seconds that the last reconfiguration took; ``None``: there was none.
+    """
     values = {"before": alarm.before, "after": alarm.after, "cleared": str(cleared).lower()}
     if cleared and reaction is not None:
         values["reaction"] = f"{reaction:.6g} s"
@@ -51,9 +58,9 @@ def health(loop: Adaptation, missing: Sequence[str], broken: Sequence[str]) -> t
     """Level and message of a resource's ``quality`` and ``/diagnostics``.
 
     Args:
-        loop: Its control loop.
-        missing: What it needs and lacks, as texts.
-        broken: What does not work, likewise.
+        loop: The resource's control loop.
+        missing: What the resource needs and lacks, as texts.
+        broken: What does not work, as texts.
     """
     alarm = loop.alarm
     if alarm is not None and alarm.kind is AlarmKind.NON_ADAPTABLE:
@@ -74,10 +81,10 @@ def answer_to(
     """Level, message and values of the response to a client.
 
     Args:
-        requirement: The client's.
+        requirement: The client's requirement.
         loop: The resource's control loop.
-        attributes: By name.
-        offered: The measured values of the requested attributes, as far as there are any.
+        attributes: The resource's attributes, by name.
+        offered: Measured values of the requested attributes; those not measured yet are left out.
     """
     values = {
         name: _compare(attributes[name], bound, offered.get(name), "not measured yet")
@@ -105,7 +112,7 @@ def _judge(loop: Adaptation, short: Sequence[str], *, conflict: bool) -> tuple[D
 
 
 def decision_report(loop: Adaptation, scores: Sequence[ProfileScore], reaction: float | None) -> dict[str, Any]:
-    """The score of each profile with all its terms, for ``rmpa profile explain``; plain values."""
+    """The present decision with each profile's score and terms, as plain values for ``rmpa profile explain``."""
     return {
         "profile": loop.profile,
         "applying": loop.applying,

@@ -1,7 +1,7 @@
-"""State that survives a restart: the configuration, the profile that ran, and the requirements of clients.
+"""State that survives a restart: parameters, choices by hand, the last profile, requirements and cool-downs.
 
-``resource.run.store`` keeps it as rows (kind, name) -> JSON text. Rows that contradict the present declaration (a
-parameter out of its new range, a profile that was removed) are left out and reported.
+``resource.run.store`` keeps the state as rows (kind, name) -> JSON text. Rows that contradict the present declaration
+(a parameter out of its new range, a profile that was removed) are left out and reported.
 """
 
 from __future__ import annotations
@@ -29,24 +29,25 @@ PARAMETER: Final = "parameter"
 REQUIREMENT: Final = "requirement"
 PROFILE: Final = "profile"
 CHOSEN: Final = (PROFILE, "chosen")
-"""The profile that was chosen by hand, or empty."""
+"""Key of the profile that was chosen by hand; the value is empty if none was."""
 LAST: Final = (PROFILE, "last")
-"""The profile that ran last."""
+"""Key of the profile that ran last."""
 COOL_DOWN: Final = "cool_down"
 CONTEXT: Final = ("context", "chosen")
-"""The context that was chosen by hand, or empty."""
+"""Key of the context that was chosen by hand; the value is empty if none was."""
 _SECOND: Final = 1_000_000_000
 
 
 class SavedRequirement(msgspec.Struct, frozen=True, kw_only=True):
-    """The requirement of one client as it was received.
+    """The requirement of one client, as it was received.
 
     Attributes:
-        client: Its node.
+        client: Name of the client's node.
         values: Attributes, ``priority`` and ``expires`` with their texts.
-        mark: Of the message, repeated in the responses to it.
-        stamp: Of the message, or empty; a latched message that arrives again has the same one.
-        expires_ns: Unix nanoseconds of the wall clock, since the monotonic one begins anew with each boot.
+        mark: The message's mark, which responses repeat.
+        stamp: The message's stamp, or empty; a latched message that arrives again has the same stamp.
+        expires_ns: When it expires, in Unix nanoseconds of the wall clock, because the monotonic clock restarts with
+            each boot; ``None``: never.
     """
 
     client: str
@@ -62,17 +63,23 @@ class SavedRequirement(msgspec.Struct, frozen=True, kw_only=True):
     def requirement(
         self, attributes: Mapping[str, Attribute], resource: str, now: float, now_ns: int
     ) -> Requirement | None:
-        """The parsed requirement, or ``None`` if it has expired meanwhile.
+        """The parsed requirement; ``None`` if it has expired.
+
+        Args:
+            attributes: The resource's attributes, by name.
+            resource: Name of the resource, for errors.
+            now: Monotonic seconds.
+            now_ns: The same moment by the wall clock, Unix nanoseconds.
 
         Raises:
-            ConfigError: It requests an attribute that the resource has no longer.
+            ConfigError: The texts are no valid requirement on the resource as it is declared now.
         """
         found = parse_requirement(self.client, list(self.values), attributes, resource, now)
         if self.expires_ns is None or found.expires is None:
             return replace(found, expires=None)
         if self.expires_ns <= now_ns:
             return None
-        # A clock that was set back meanwhile must not prolong it.
+        # If the wall clock was set back meanwhile, the requirement must not last longer than its whole duration.
         return replace(found, expires=min(found.expires, now + (self.expires_ns - now_ns) / _SECOND))
 
 
@@ -80,9 +87,9 @@ class SavedCoolDown(msgspec.Struct, frozen=True, kw_only=True):
     """The cool-down of a profile.
 
     Attributes:
-        until_ns: Its end, Unix nanoseconds of the wall clock.
-        cool_down: Its length in seconds.
-        why: Its reason, for people.
+        until_ns: End of the cool-down, in Unix nanoseconds of the wall clock.
+        cool_down: Length of the cool-down in seconds.
+        why: The reason, as a text for people.
     """
 
     until_ns: int
@@ -94,7 +101,7 @@ class SavedCoolDown(msgspec.Struct, frozen=True, kw_only=True):
         return msgspec.json.encode(self).decode()
 
     def left(self, now: float, now_ns: int) -> CoolDown | None:
-        """The rest of it by the monotonic clock; ``None`` if it is over.
+        """The rest of the cool-down, by the monotonic clock; ``None`` if it is over.
 
         If the wall clock was set back meanwhile, the whole cool-down is left; if it was set forward, it ends early.
         """
@@ -104,16 +111,16 @@ class SavedCoolDown(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class SavedState:
-    """The state of before a restart.
+    """The state that was saved before a restart.
 
     Args:
-        parameters: Those that are still valid, by name.
+        parameters: The values of parameters that are still valid, by name.
         chosen: The profile chosen by hand, or empty.
         last: The profile that ran last, or empty.
         context: The context chosen by hand, or empty.
-        requirements: Of clients that may come back.
-        cool_downs: By profile.
-        lost: Rows that are no longer valid, each as a text.
+        requirements: Requirements that have not expired; their clients may come back.
+        cool_downs: Cool-downs by profile.
+        lost: A text about each row that is no longer valid.
     """
 
     parameters: Mapping[str, ParameterValue] = field(default_factory=dict, hash=False)
@@ -126,11 +133,11 @@ class SavedState:
 
 
 def read_saved_state(rows: Mapping[Key, str], resource: Resource, now_ns: int) -> SavedState:
-    """Read the rows of a store, for a resource as it is declared now.
+    """Read the rows of a store and check them against the present declaration of the resource.
 
     Args:
-        rows: Untrusted: anything may have written the file.
-        resource: Declared completely.
+        rows: JSON texts by kind and name; untrusted, because any program may have written the file.
+        resource: The resource, completely declared.
         now_ns: Unix nanoseconds of the wall clock.
     """
     parameters: dict[str, ParameterValue] = {}

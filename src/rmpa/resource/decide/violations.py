@@ -14,16 +14,16 @@ if TYPE_CHECKING:
     from rmpa.resource.declare.requirements import Bound
 
 EXPECTED: Final = 1.25
-"""A soft bound that a profile is declared to miss may be missed by this factor more before it counts as violated."""
+"""Factor by which a soft bound may be missed further than the profile declares, before it counts as violated."""
 
 
 class ViolationDetector:
     """Judges windows of measured quality against the merged requirements, under one profile.
 
     Args:
-        attributes: By name.
-        violations: ``k``.
-        windows: ``n``.
+        attributes: The resource's attributes, by name.
+        violations: ``k``, the number of violated windows that are a disturbance.
+        windows: ``n``, the number of last windows that are kept.
     """
 
     def __init__(self, attributes: Mapping[str, Attribute], violations: int, windows: int) -> None:
@@ -32,7 +32,7 @@ class ViolationDetector:
         self._windows: deque[tuple[float, tuple[Shortfall, ...]]] = deque(maxlen=windows)
 
     def clear(self) -> None:
-        """Forget all windows: the profile or the requirements have changed."""
+        """Forget all windows, because the profile or the requirements have changed."""
         self._windows.clear()
 
     def add(
@@ -41,10 +41,10 @@ class ViolationDetector:
         """Judge a window; attributes that were not measured are left out.
 
         Args:
-            began: When it began, monotonic seconds.
-            measured: By attribute.
-            bounds: The merged requirements.
-            offers: The declared quality of the profile that runs.
+            began: When the window began, in monotonic seconds.
+            measured: Measured values by attribute.
+            bounds: The merged requirements by attribute.
+            offers: The declared quality of the profile that runs, by attribute.
         """
         self._windows.append(
             (
@@ -59,12 +59,12 @@ class ViolationDetector:
 
     @property
     def violated(self) -> list[tuple[float, tuple[Shortfall, ...]]]:
-        """The beginnings and shortfalls of the violated ones among the last windows."""
+        """The violated windows among the last ``n``, oldest first: when each began, and its shortfalls."""
         return [(began, short) for began, short in self._windows if short]
 
     @property
     def disturbed(self) -> bool:
-        """Whether enough of the last windows are violated."""
+        """Whether at least ``k`` of the last ``n`` windows are violated."""
         return len(self.violated) >= self._needed
 
     def _violates(self, name: str, bound: Bound, value: Value, offer: Value | None) -> bool:
@@ -73,6 +73,6 @@ class ViolationDetector:
             return False
         if bound.hard or offer is None or bound.met_by(attribute, offer):
             return True
-        # The profile was chosen although it misses this soft bound by so much.
+        # The profile was chosen although it is declared to miss this soft bound; judge by how far it misses it.
         beyond, declared = bound.excess(attribute.position(value)), bound.excess(attribute.position(offer))
         return beyond > EXPECTED * declared

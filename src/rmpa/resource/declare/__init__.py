@@ -1,7 +1,7 @@
 """What a user declares: resources, qualities, requirements, profiles, contexts, parameters.
 
-Programs import from ``rmpa.resource``. Names that ``rmpa.resource.declare`` had while it was a module are still found
-here, with a ``DeprecationWarning``.
+Programs should import from ``rmpa.resource``. The names that ``rmpa.resource.declare`` had as a single module are
+still available here, with a ``DeprecationWarning``.
 """
 
 from __future__ import annotations

@@ -13,12 +13,12 @@ class AdaptationSettings:
     """Parameters of a resource's control loop (``rmpa.resource.decide.adaptation``).
 
     Args:
-        violations: ``k``: so many violated windows …
-        windows: ``n``: … of the last so many are a disturbance.
-        improvement: ``h``: hysteresis; a change without a disturbance must lessen the distance by more than this.
-        dwell: Seconds that a profile runs at least before such a change.
-        settle: Settling time: windows that begin within so many seconds of a change are not judged, because what
-            the previous profile left in queues still arrives.
+        violations: ``k``: the number of violated windows among the last ``windows`` that is a disturbance.
+        windows: ``n``: the number of last windows that are considered.
+        improvement: ``h``: hysteresis; a change without a disturbance must reduce the distance by more than this.
+        dwell: Least number of seconds that a profile runs before a change without a disturbance.
+        settle: Settling time: windows that begin within so many seconds of a change are not judged, because messages
+            that were queued under the previous profile still arrive.
         cool_down: Seconds for which a profile is excluded after it failed or was violated.
         cool_down_max: The longest cool-down; it doubles with each further failure.
         apply_timeout: Seconds after which a profile that is being applied counts as hung.
@@ -44,11 +44,11 @@ def read_adaptation(
     """Check the arguments of ``Resource.adaptation``.
 
     Args:
-        where: For errors.
+        where: Description of the settings, for errors.
         violations: As in ``AdaptationSettings``.
-        windows: Likewise.
-        improvement: Likewise.
-        times: The others, and ``window``, by name: seconds, or texts with a unit.
+        windows: As in ``AdaptationSettings``.
+        improvement: As in ``AdaptationSettings``.
+        times: The other settings and ``window``, by name: seconds, or texts with a unit.
 
     Returns:
         The length of a quality window in seconds, and the settings.

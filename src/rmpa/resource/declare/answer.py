@@ -16,9 +16,10 @@ class RequirementAnswer:
     """How a resource serves one client.
 
     Args:
-        level: OK; WARN: a quality falls short; ERROR: no profile can serve, or the request is invalid.
-        message: A short explanation.
-        values: By attribute: the quality that was requested, and the one that is offered.
+        level: OK; WARN: a quality falls short, or no profile runs yet; ERROR: no profile meets the requirements, or
+            the request is invalid.
+        message: A short explanation for people.
+        values: By attribute a text with the requested and the measured quality.
     """
 
     level: DiagnosticLevel

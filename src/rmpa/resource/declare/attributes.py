@@ -1,7 +1,7 @@
-"""Quality attributes: the unit and scale of a quality, and which direction is better.
+"""Quality attributes: the unit and the scale of a quality, and which direction is better.
 
 The literature sorts requirements into four classes (paper, section 3.1: "temporal and spatial requirements,
-information reliability and operation performance"); the class is shown in reports and has no influence on decisions.
+information reliability and operation performance"). The class is shown in reports and does not influence decisions.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from rmpa.resource.declare.units import quantity
 
 
 class Direction(StrEnum):
-    """Which values satisfy a request."""
+    """Which values of an attribute are better."""
 
     MAX = "max"
     """More is better: a request is a lower bound (rate, resolution)."""
     MIN = "min"
     """Less is better: a request is an upper bound (latency, energy)."""
     TARGET = "target"
-    """As near as possible to an interval or a value (zoom, speed)."""
+    """Nearer to a requested value or interval is better (zoom, speed)."""
     EXACT = "exact"
-    """Exactly this value (frame id, encoding)."""
+    """Only a requested value will do (frame id, encoding)."""
 
 
 class Scale(StrEnum):
@@ -33,7 +33,7 @@ class Scale(StrEnum):
 
     LINEAR = "linear"
     LOG = "log"
-    """By their ratio: 10 to 20 Hz is as far as 20 to 40 Hz. For rates, latencies and bandwidths."""
+    """By the ratio: 10 Hz is as far from 20 Hz as 20 Hz from 40 Hz. For rates, latencies and bandwidths."""
     ORDINAL = "ordinal"
     """Ordered words; the distance is the difference of their positions."""
     NOMINAL = "nominal"
@@ -46,9 +46,9 @@ class Category(StrEnum):
     TEMPORAL = "temporal"
     SPATIAL = "spatial"
     RELIABILITY = "reliability"
-    """Of information: accuracy, confidence, loss."""
+    """Reliability of information: accuracy, confidence, loss."""
     PERFORMANCE = "performance"
-    """Of the operation: energy, CPU, cost."""
+    """Performance of the operation: energy, CPU, cost."""
 
 
 _LOG_FLOOR: Final = 1e-12
@@ -63,7 +63,7 @@ class Attribute:
     Args:
         name: ``rate``, ``latency``, ``accuracy`` …
         direction: Which values are better.
-        unit: Unit of its values (``resource.declare.units``); empty: a ratio.
+        unit: Unit of the values (``resource.declare.units``); empty: a ratio.
         scale: How distances are measured.
         category: The class of requirement, for reports.
         tolerance: A shortfall of this size counts as 1: in the unit (linear), as a ratio above 1 (log), in
@@ -100,14 +100,14 @@ class Attribute:
 
     @property
     def has_words(self) -> bool:
-        """Whether its values are words."""
+        """Whether the attribute's values are words."""
         return self.scale in (Scale.ORDINAL, Scale.NOMINAL)
 
     def check(self, value: Value, where: str) -> Value:
-        """Return the value if it is a valid value of this attribute.
+        """Return the value, a number as ``float``, if it is valid for this attribute.
 
         Raises:
-            ConfigError: It is not.
+            ConfigError: The value is not valid; ``where`` begins the error's text.
         """
         if self.has_words:
             if value not in self.words:
@@ -124,12 +124,12 @@ class Attribute:
         """Read a value as a user writes it: a number, ``"20 Hz"`` in any unit of the dimension, or a word.
 
         Raises:
-            ConfigError: It is not a value of this attribute.
+            ConfigError: The value is not valid for this attribute; ``where`` begins the error's text.
         """
         return self.check(value if self.has_words else quantity(value, self.unit, where), where)
 
     def position(self, value: Value) -> float:
-        """Position of a value on the attribute's scale: its number, its logarithm, or the index of its word.
+        """Position of a value on the attribute's scale: the number, its logarithm, or the index of the word.
 
         On a logarithmic scale 0 counts as ``_LOG_FLOOR``, so that every distance is finite.
         """
@@ -147,13 +147,13 @@ class Attribute:
 
     @property
     def tolerated_distance(self) -> float | None:
-        """The tolerance as a distance between positions, or ``None``."""
+        """The tolerance as a distance between two positions; ``None``: none is declared."""
         if self.tolerance is None:
             return None
         return math.log(self.tolerance) if self.scale is Scale.LOG else self.tolerance
 
     def format(self, value: Value) -> str:
-        """A value with its unit, for people."""
+        """A value with its unit, as a text for people."""
         return value if isinstance(value, str) else f"{value:.6g} {self.unit}".rstrip()
 
 
@@ -166,5 +166,5 @@ DEADLINE_MISSES: Final = Attribute("deadline_misses", Direction.MIN, "", Scale.L
 BANDWIDTH: Final = Attribute("bandwidth", Direction.MIN, "B/s", Scale.LOG, Category.PERFORMANCE)
 
 MEASURED: Final = {a.name: a for a in (RATE, PERIOD_SD, LATENCY, AGE, LOSS, DEADLINE_MISSES, BANDWIDTH)}
-"""The attributes that are measured for every output and input without being declared; losses and misses are shares
-of 1."""
+"""The attributes that are measured of every output and input without being declared, by name. ``loss`` and
+``deadline_misses`` are shares of 1."""

@@ -15,16 +15,16 @@ if TYPE_CHECKING:
 
 Hook = Callable[[], Awaitable[None] | None]
 TaskFunction = Callable[..., Awaitable[None] | None]
-"""Takes no argument if periodic, the message if it runs on an input."""
+"""The function of a task: a periodic one takes no argument, one that runs on an input takes the message."""
 
 
 class OnFailure(StrEnum):
-    """Restart policy of a task that raised or is stuck."""
+    """What happens to a task that has raised or is stuck."""
 
     RESTART = "restart"
-    """It runs again, after a back-off that grows with each failure in a row."""
+    """The task runs again after a back-off, which grows with each consecutive failure."""
     STOP = "stop"
-    """It ends; the resource runs on without it and reports it."""
+    """The task ends; the resource reports that and continues without the task."""
     DEACTIVATE = "deactivate"
     """The whole resource becomes inactive."""
 
@@ -36,20 +36,21 @@ class DeclaredProfile:
     profile: Profile
     apply: Hook
     needs: Callable[[], str | bool | None] | None = None
-    """Its precondition: true or ``None`` while the profile may be used; else false, or a text with the reason."""
+    """The precondition: true or ``None`` while the profile may be used, else false or the reason as a text."""
 
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """A situation of the robot: what it requires, and which outputs are published in it.
+    """A state of the world: what it requires, and which profiles and outputs apply in it.
 
     Args:
-        name: Unique.
-        when: A rule over topics and parameters (``resource.declare.context_rules``) that selects it, or empty.
-        requires: QoS requests to the resource itself, by attribute.
-        profiles: The only profiles that may run in it; empty: any.
-        outputs: The only outputs that are published in it; ``None``: all.
-        enter: Called when it begins.
+        name: Unique within the resource.
+        when: A rule over topics and parameters (``resource.declare.context_rules``) that selects the context; empty:
+            it is chosen by hand only.
+        requires: QoS requests on the resource itself, by attribute.
+        profiles: The only profiles that may run in the context; empty: any.
+        outputs: The only outputs that are published in the context, by name; ``None``: all.
+        enter: Called when the context is entered.
     """
 
     name: str
@@ -65,11 +66,11 @@ class Task:
     """A function of the resource that runs periodically or on each message of an input.
 
     Args:
-        name: Unique; the function's name by default.
-        function: Plain (then it runs in a thread of its own) or ``async``.
-        rate: Hz of a periodic one, else ``None``.
-        on: The input whose messages it runs on, else ``None``.
-        on_failure: Restart policy when it raises or is stuck.
+        name: Unique within the resource; the function's name by default.
+        function: A plain function, which runs in a thread of its own, or a coroutine function.
+        rate: Rate in Hz of a periodic task; ``None`` for a task that runs on messages.
+        on: The input on whose messages the task runs; ``None`` for a periodic task.
+        on_failure: What happens when a run raises or is stuck.
         stuck_after: Seconds that one run may take before it counts as stuck; ``None``: ten periods, at least 5 s.
         rate_parameter: The parameter whose value is the rate, or ``None``.
     """

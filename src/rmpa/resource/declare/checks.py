@@ -1,4 +1,4 @@
-"""Checks arguments of a declaration: functions, keys of a contract, members of an ``Enum``."""
+"""Checks the arguments of a declaration: functions, keys of a contract, values of an ``Enum``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def check_arity(function: Callable[..., object], count: int, where: str) -> None
     """Check that a function can be called with ``count`` arguments.
 
     Raises:
-        ConfigError: It cannot.
+        ConfigError: The function cannot be called that way; ``where`` begins the error's text.
     """
     what = "without arguments" if not count else "with the message"
     try:
@@ -32,10 +32,10 @@ def check_arity(function: Callable[..., object], count: int, where: str) -> None
 
 
 def read_contract(where: str, terms: Mapping[str, object]) -> Contract:
-    """The contract of an output or input, from the keys of a ``[[contract]]`` (docs/contracts.md).
+    """Make the contract of an output or input from the keys of a ``[[contract]]`` (docs/contracts.md).
 
     Raises:
-        ConfigError: An unknown key, or an invalid value.
+        ConfigError: A key is unknown or a value is invalid; ``where`` begins the error's text.
     """
     known = [key for key in LISTS["contract"] if key not in ("topics", "types")]
     for term in terms:
@@ -55,10 +55,10 @@ def read_contract(where: str, terms: Mapping[str, object]) -> Contract:
 
 
 def read_enum(kind: type[Any], text: str, where: str) -> Any:
-    """The member of an ``Enum`` with this value.
+    """Find the member of an ``Enum`` by its value.
 
     Raises:
-        ConfigError: It has no such value.
+        ConfigError: The ``Enum`` has no such value; ``where`` begins the error's text.
     """
     known = [item.value for item in kind]
     if text not in known:

@@ -1,6 +1,6 @@
-"""Interfaces of a resource: outputs, inputs, attributes that it observes, requirements of other resources.
+"""Interfaces of a resource: outputs, inputs, attributes that the user's code observes, requirements on others.
 
-While the resource runs, ``rmpa.resource.run`` binds them to a node: the fields ``on_…`` are its functions then.
+While the resource runs, ``rmpa.resource.run`` binds these to a node: it sets their fields ``on_…`` to its functions.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class TopicType:
     def __init__(self, name: str) -> None:
         self.name = name
         self.known: MessageType | None = None
-        """The type, once it is known."""
+        """The type; ``None`` until it is known."""
         self.problem: UnknownTypeError | None = None
-        """Why it is not known on this machine."""
+        """Why the type is not known on this machine; ``None`` if it is."""
         try:
             self.known = find_message_type(name)
         except UnknownTypeError as error:
@@ -48,10 +48,10 @@ class TopicType:
             self.problem = error
 
     def get(self) -> MessageType:
-        """The type.
+        """The message type.
 
         Raises:
-            UnknownTypeError: It is not known yet.
+            UnknownTypeError: The type is not known yet.
         """
         if self.known is None:
             assert self.problem is not None  # noqa: S101 - one of them is set
@@ -64,12 +64,12 @@ class Output:
     """A topic that the resource publishes.
 
     Args:
-        name: As declared, in the resource's namespace unless it is global.
-        kind: Its message type, which may be learnt later.
-        contract: The offered QoS of its messages; the agent's rules are applied on top.
+        name: The declared name, in the resource's namespace unless it is global.
+        kind: The message type, which may be learnt later.
+        contract: The offered QoS of the messages; the agent's rules are applied on top.
         latch: Whether a late subscriber gets the last message.
-        on_publish: ``(message fields, whole message)``; called in any thread. ``None`` while the resource does not
-            run.
+        on_publish: Called in any thread with ``(message fields, whole message)``; ``None`` while the resource does
+            not run.
     """
 
     name: str
@@ -80,19 +80,23 @@ class Output:
 
     @property
     def type(self) -> MessageType:
-        """Its message type.
+        """The output's message type.
 
         Raises:
-            UnknownTypeError: It is unknown on this machine, and no publisher was found yet.
+            UnknownTypeError: The type is unknown on this machine, and no publisher of it has been found yet.
         """
         return self.kind.get()
 
     def publish(self, message: object | None = None, /, **values: Any) -> None:
-        """Publish a whole message, or one made of field values; it is dropped while the resource is not active.
+        """Publish a whole message, or one made of field values.
+
+        While the resource is not active, messages are dropped, except those of functions of profiles and contexts:
+        these are queued until it is active.
 
         Raises:
-            MessageError: It does not fit the output's type.
-            LocalProtocolError: The resource does not run, or the calling profile function was given up.
+            MessageError: The message does not fit the output's type.
+            LocalProtocolError: The resource does not run, the calling profile or context function was given up, or
+                both a message and field values are given.
         """
         if self.on_publish is None:
             raise LocalProtocolError(f"{self.name} has nowhere to go: its resource does not run (rmpa run)")
@@ -104,9 +108,9 @@ class Input:
     """A topic that the resource needs.
 
     Args:
-        name: As declared.
-        kind: Its message type; its first publisher tells it if it is unknown on this machine.
-        contract: The requested QoS of its messages.
+        name: The declared name, in the resource's namespace unless it is global.
+        kind: The message type; if it is unknown on this machine, it is learnt from the topic's first publisher.
+        contract: The requested QoS of the messages.
         required: Whether the resource is stale while the topic has no publisher.
     """
 
@@ -117,28 +121,28 @@ class Input:
 
     @property
     def type(self) -> MessageType:
-        """Its message type; errors as of ``Output.type``."""
+        """The input's message type; raises ``UnknownTypeError`` while no publisher has been found."""
         return self.kind.get()
 
 
 @dataclass(eq=False)
 class DeclaredAttribute:
-    """An attribute of the user's own; ``observe`` reports its measured value.
+    """An attribute that a resource declares itself; the user's code reports its values by ``observe``.
 
     Args:
         attribute: The attribute.
-        on_observation: ``(attribute's name, value)``; called in any thread. ``None`` while the resource does not run.
+        on_observation: Called in any thread with ``(attribute's name, value)``; ``None`` unless the resource runs.
     """
 
     attribute: Attribute
     on_observation: Callable[[str, Value], None] | None = field(default=None, repr=False)
 
     def observe(self, value: Value) -> None:
-        """Report one observation in the attribute's unit; without effect while the resource does not run.
+        """Report one observed value in the attribute's unit; without effect while the resource does not run.
 
         Raises:
-            ConfigError: It is not a value of this attribute.
-            LocalProtocolError: The calling profile function was given up.
+            ConfigError: The value is not valid for this attribute.
+            LocalProtocolError: The calling profile or context function was given up.
         """
         checked = self.attribute.check(value, f"observation of {self.attribute.name}")
         if self.on_observation is not None:
@@ -148,12 +152,12 @@ class DeclaredAttribute:
 
 @dataclass(eq=False)
 class Demand:
-    """The standing requirement of this resource on another one, here or in another module.
+    """The standing requirement of a resource on another one, in the same or another module.
 
     Args:
-        resource: The other resource's node in this module's graph: ``/sonar``, ``/robot1/sonar``.
-        requests: By attribute of the other one; empty: none at present.
-        priority: The higher one wins a conflict between clients.
+        resource: Name of the other resource's node in this module's graph: ``/sonar``, ``/robot1/sonar``.
+        requests: QoS requests by attribute of the other resource; empty: none at present.
+        priority: In a conflict between clients the higher priority wins.
         answer: The last answer; ``None`` before the first.
         on_change: Called with this demand, in any thread, when the requests change; ``None`` while the resource does
             not run.
@@ -166,10 +170,10 @@ class Demand:
     on_change: Callable[[Demand], None] | None = field(default=None, repr=False)
 
     def ask(self, **requests: QoSRequest) -> None:
-        """Replace the requests, from a profile or a task, in any thread; without arguments nothing is requested.
+        """Replace the requests; without arguments nothing is requested. May be called in any thread.
 
         Raises:
-            LocalProtocolError: The calling profile function was given up.
+            LocalProtocolError: The calling profile or context function was given up.
         """
         with fenced_action(f"ask {self.resource}"):
             self.requests = requests
@@ -178,6 +182,6 @@ class Demand:
 
     @property
     def wishes(self) -> Mapping[str, QoSRequest]:
-        """The former name of ``requests``."""
+        """Deprecated name of ``requests``."""
         warnings.warn("Demand.wishes is deprecated: it is called requests now", DeprecationWarning, stacklevel=2)
         return self.requests

@@ -1,4 +1,4 @@
-"""Rules that select a context, over fields of topics and the resource's parameters.
+"""Rules that select a context by fields of topics and by the resource's parameters.
 
 ::
 
@@ -7,12 +7,12 @@
     negation   = "not" negation | "(" rule ")" | value [ ("==" | "!=" | "<" | "<=" | ">" | ">=") value ]
     value      = number | 'text' | "text" | true | false | ~parameter | /topic | /topic/field | /topic.field.field
 
-Example: ``/battery/charging == true and ~gain > 3``. The topic in ``/battery/charging`` is the longest part that the
-graph has as a topic, as for rostopic; ``/battery.charging`` is explicit. A topic alone means its only field
-(``std_msgs/Bool``). A value that is unknown (no message yet, no publisher) makes a comparison neither true nor false;
-a rule holds only if it is true for every value of the unknown ones (Kleene's logic).
+Example: ``/battery/charging == true and ~gain > 3``. In ``/battery/charging`` the longest part that is a published
+topic is the topic, as for rostopic; ``/battery.charging`` is explicit. A topic alone means the message's only field
+(``std_msgs/Bool``). A value that is unknown (no message yet, no publisher) makes a comparison neither true nor false.
+A rule holds only if it is true whatever the unknown values are (Kleene's logic).
 
-Pure: a rule is parsed into a tree once, which is evaluated with the values; nothing is evaluated as Python.
+Pure: a rule is parsed into a tree once, and the tree is evaluated with the values; nothing is evaluated as Python.
 """
 
 from __future__ import annotations
@@ -52,17 +52,17 @@ _EXAMPLE: Final = "for example /battery/charging == true and ~gain > 3"
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """A variable of a rule: ``/topic.field`` or ``~parameter``, as written."""
+    """A variable of a rule: ``/topic.field`` or ``~parameter``, as written in the rule."""
 
     text: str
 
     @property
     def parameter(self) -> str:
-        """The parameter's name, or empty for a topic's field."""
+        """The parameter's name; empty for a topic's field."""
         return self.text[1:] if self.text.startswith("~") else ""
 
     def candidates(self) -> Iterator[tuple[str, tuple[str, ...]]]:
-        """The possible topics and fields, the longest topic first; no field: the only one of the message."""
+        """Possible splits into a topic and its fields, longest topic first; no field: the message's only one."""
         topic, dot, fields = self.text.partition(".")
         if dot:
             yield topic, tuple(fields.split("."))
@@ -91,7 +91,7 @@ class _Not:
 
 @dataclass(frozen=True, slots=True)
 class _BooleanOperation:
-    """``and`` where ``conjunction``, else ``or``."""
+    """``and`` of all parts if ``conjunction`` is true, else ``or``."""
 
     conjunction: bool
     parts: tuple[_Node, ...]
@@ -102,17 +102,17 @@ _Node = _Compare | _Not | _BooleanOperation
 
 @dataclass(frozen=True, slots=True)
 class ContextRule:
-    """A parsed rule; ``references`` are its variables, each once."""
+    """A parsed rule; ``references`` has each variable of the rule once."""
 
     text: str
     root: _Node
     references: tuple[Reference, ...]
 
     def holds(self, values: Mapping[str, Scalar]) -> bool | None:
-        """Whether it is true; ``None`` if that depends on unknown values.
+        """Whether the rule is true; ``None`` if that depends on unknown values.
 
         Args:
-            values: The known values by the text of the reference.
+            values: The known values by reference, as written in the rule.
         """
         return _holds(self.root, values)
 
@@ -121,12 +121,12 @@ def parse_rule(text: str, parameters: Collection[str], where: str = "rule") -> C
     """Parse a rule.
 
     Args:
-        text: A ``rule`` of the grammar above.
+        text: A ``rule`` of the module's grammar.
         parameters: Names of the resource's parameters.
-        where: For errors.
+        where: Description of the rule, for errors.
 
     Raises:
-        ConfigError: A syntax error, or an unknown parameter.
+        ConfigError: The rule has a syntax error or an unknown parameter, or is too long or nested too deeply.
     """
     if len(text) > limits.CONTEXT_RULE_MAX:
         raise ConfigError(where, f"{len(text)} characters", f"at most {limits.CONTEXT_RULE_MAX}")
@@ -254,11 +254,11 @@ def _equal(left: Scalar, right: Scalar) -> bool:
 
 @dataclass(slots=True)
 class ContextSelector:
-    """Selects the context: the one chosen by hand, or the first whose rule holds.
+    """Selects the context: the one chosen by hand, or else the first whose rule holds.
 
     Args:
-        rules: By context, in order of declaration; contexts without a rule are chosen by hand only.
-        dwell: Seconds for which a context that a rule has selected stays at least.
+        rules: Rules by context, in order of declaration; contexts without a rule are chosen by hand only.
+        dwell: Least number of seconds between two changes of context by rules.
     """
 
     rules: Mapping[str, ContextRule]
@@ -269,11 +269,11 @@ class ContextSelector:
     """When the present context began, monotonic seconds."""
 
     def select(self, current: str, values: Mapping[str, Scalar], now: float) -> str:
-        """The context to be in; empty: none.
+        """Select the context to be in; empty: none.
 
         Args:
-            current: The present context.
-            values: As for ``ContextRule.holds``.
+            current: The present context; empty: none.
+            values: Known values, as for ``ContextRule.holds``.
             now: Monotonic seconds.
         """
         if self.chosen:

@@ -1,10 +1,10 @@
-"""Fencing: actions of a user's function have no effect once the function was given up.
+"""Fencing: actions of a user's function have no effect after the function was given up.
 
-A function that hangs in a thread cannot be stopped from outside. What it does later, under another profile, must not
+A function that hangs in a thread cannot be stopped from outside. Its later actions, under another profile, must not
 take effect. Each call of such a function is surrounded by a fence, which is closed when the call is given up. All
-actions that a resource offers (publishing, parameters, observations, requirements of other resources) check the fence
-first. Coroutines of the function and ``asyncio.to_thread`` are inside its fence; threads that it starts by itself are
-not.
+actions that a resource offers (publishing, parameters, observations, requirements on other resources) check the fence
+first. Coroutines, tasks and ``asyncio.to_thread`` calls of the function are inside its fence; threads that it starts
+by other means are not.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Fence(Protocol):
         ...
 
     def action(self, what: str) -> contextlib.AbstractContextManager[None]:
-        """Perform an action; the fence is not closed meanwhile.
+        """Enclose an action; the fence cannot be closed while it is performed.
 
         Args:
             what: The action, as in "publish on ranges".
@@ -40,7 +40,7 @@ class Fence(Protocol):
         ...
 
     def report_blocked(self, what: str) -> None:
-        """Report an action that came after the call was given up."""
+        """Report an action that was attempted after the call was given up."""
         ...
 
 
@@ -48,19 +48,19 @@ _CURRENT: ContextVar[Fence | None] = ContextVar("fence", default=None)
 
 
 def current_fence() -> Fence | None:
-    """The fence around the calling code; ``None`` around code that is never given up."""
+    """The fence around the calling code; ``None`` for code that is never given up."""
     return _CURRENT.get()
 
 
 def fenced_action(what: str) -> contextlib.AbstractContextManager[None]:
-    """Perform an action unless the calling function was given up; see ``Fence.action``."""
+    """Enclose an action, which is refused if the calling function was given up; see ``Fence.action``."""
     fence = _CURRENT.get()
     return contextlib.nullcontext() if fence is None else fence.action(what)
 
 
 @contextlib.contextmanager
 def inside(fence: Fence) -> Iterator[None]:
-    """Surround the calls in this block with a fence, and the threads and tasks that they start."""
+    """Surround the calls in this block with a fence, and also tasks and ``asyncio.to_thread`` calls started in it."""
     token = _CURRENT.set(fence)
     try:
         yield

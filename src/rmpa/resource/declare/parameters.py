@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 ParameterValue = bool | int | float | str
 INT_MIN: Final = INT32_MIN
 INT_MAX: Final = INT32_MAX
-"""Whole numbers have 32 bits in dynamic_reconfigure."""
+"""Bounds of integers, which have 32 bits in dynamic_reconfigure."""
 _ROS_TYPES: Final = {bool: "bool", int: "int", float: "double", str: "str"}
 
 
@@ -26,13 +26,13 @@ class Parameter:
     """A parameter; its value may change while the resource runs.
 
     Args:
-        name: A ROS base name.
-        default: Its initial value; its type is the parameter's.
-        low: The least value of a number.
-        high: The greatest.
-        choices: The only values, if the parameter is an enumeration.
-        unit: For people.
-        description: For people.
+        name: The parameter's name, a ROS base name.
+        default: The initial value; its type is the parameter's type.
+        low: The least value of a number; ``None``: no declared bound.
+        high: The greatest value of a number; ``None``: no declared bound.
+        choices: The only valid values, if the parameter is an enumeration.
+        unit: The unit, a text for people.
+        description: A text for people.
         on_change: Called with the parameter, in the thread that changed it; ``None`` while the resource does not run.
     """
 
@@ -48,15 +48,15 @@ class Parameter:
     def __post_init__(self) -> None:
         self._value: Any = self.default
         self.given = False
-        """Whether it was set for this start (``rmpa run --set``), which overrides the stored value."""
+        """Whether the value was given for this run (``rmpa run --set``); it then overrides stored values."""
 
     @property
     def value(self) -> Any:
         """The present value; may be set in any thread.
 
         Raises:
-            ConfigError: On setting: an invalid value.
-            LocalProtocolError: On setting: the calling profile function was given up.
+            ConfigError: On setting: the value is invalid.
+            LocalProtocolError: On setting: the calling profile or context function was given up.
         """
         return self._value
 
@@ -74,7 +74,7 @@ class Parameter:
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """The least and the greatest value of a number."""
+        """The least and the greatest value of a number: as declared, or else 32-bit for ``int`` and infinite."""
         low, high = (INT_MIN, INT_MAX) if isinstance(self.default, int) else (-math.inf, math.inf)
         return self.low if self.low is not None else low, self.high if self.high is not None else high
 
@@ -82,7 +82,8 @@ class Parameter:
         """Check the arguments of ``Resource.parameter``.
 
         Raises:
-            ConfigError: An unknown type, bounds the wrong way round, or a default or choice out of range.
+            ConfigError: The default's type is unknown, the bounds are the wrong way round or given for no number, or
+                the default or a choice is invalid.
         """
         if type(self.default) not in _ROS_TYPES:
             raise ConfigError(
@@ -101,7 +102,7 @@ class Parameter:
         """Return the value, converted to ``float`` where that is the parameter's type.
 
         Raises:
-            ConfigError: It is of another type, out of range, or none of the choices.
+            ConfigError: The value is of another type, out of range, or none of the choices.
         """
         where = f"parameter {self.name}"
         if isinstance(self.default, float) and isinstance(value, int) and not isinstance(value, bool):

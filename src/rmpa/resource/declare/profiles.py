@@ -24,8 +24,8 @@ class Profile:
         offers: The offered value of each attribute, in the attribute's unit. An attribute that only other profiles
             offer falls short of every request.
         cost: At least 0, in any unit that all profiles share; decides among profiles of nearly equal distance.
-        best_effort: Whether it runs when no profile can serve; at most one of a resource.
-        description: For people.
+        best_effort: Whether the profile runs when none meets the requirements; a resource has at most one such.
+        description: A text for people.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""QoS requests as a user writes them: ``at_least("20 Hz", hard=True)``."""
+"""QoS requests in the form in which a user writes them: ``at_least("20 Hz", hard=True)``."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class QoSRequest:
         """The request as a bound of an attribute.
 
         Raises:
-            ConfigError: It makes no sense for that attribute.
+            ConfigError: The request is not valid for that attribute; see ``requirements.bound``.
         """
         return bound(
             attribute,
@@ -60,11 +60,11 @@ def at_most(value: float | str, *, hard: bool = False, weight: float = 1.0) -> Q
 
 
 def exactly(*values: float | str, hard: bool = False, weight: float = 1.0) -> QoSRequest:
-    """Request this value, or one of these words."""
+    """Request this value, or one of several words: ``exactly("mono8", "rgb8")``."""
     one: Any = values[0] if len(values) == 1 else tuple(map(str, values))
     return QoSRequest(exactly=one, hard=hard, weight=weight)
 
 
 def between(low: float | str, high: float | str, *, hard: bool = False, weight: float = 1.0) -> QoSRequest:
-    """Request a value within an interval."""
+    """Request a value within an interval: ``between("1 m", "3 m")``."""
     return QoSRequest(at_least=low, at_most=high, hard=hard, weight=weight)

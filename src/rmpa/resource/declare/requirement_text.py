@@ -33,11 +33,11 @@ def parse_request(text: str, name: str) -> QoSRequest:
     """Read the request for one attribute.
 
     Args:
-        text: A ``request`` of the grammar above.
+        text: A ``request`` of the module's grammar.
         name: The attribute's name, for errors.
 
     Raises:
-        ConfigError: A syntax error.
+        ConfigError: The text has a syntax error or is too long.
     """
     where = f"requirement of {name}"
     if len(text) > limits.REQUIREMENT_TEXT_MAX:
@@ -85,7 +85,7 @@ def parse_bound(text: str, name: str, attributes: Mapping[str, Attribute], resou
     """Read the request for one attribute of a resource.
 
     Raises:
-        ConfigError: A syntax error, an unknown attribute, or a request that makes no sense for the attribute.
+        ConfigError: The text has a syntax error, the attribute is unknown, or the request is not valid for it.
     """
     attribute = find_attribute(attributes, name, resource)
     request = parse_request(text, name)
@@ -95,7 +95,7 @@ def parse_bound(text: str, name: str, attributes: Mapping[str, Attribute], resou
 
 
 def _share_unit(request: QoSRequest) -> QoSRequest:
-    """Apply the unit of the upper bound to both: ``1 .. 3 m`` means metres on both sides."""
+    """Apply the unit of the upper bound to a lower bound without a unit: ``1 .. 3 m`` means ``1 m .. 3 m``."""
     low, high = str(request.at_least), str(request.at_most)
     unit = re.search(r"[^\d.eE+\-\s]\S*$", high)
     if unit and re.fullmatch(r"[-+]?[\d.]+(?:[eE][-+]?\d+)?", low):
@@ -109,14 +109,14 @@ def parse_requirement(
     """Read the whole requirement of one client.
 
     Args:
-        client: The client's node name.
-        values: Attribute and text, and perhaps ``priority`` (a whole number) and ``expires`` (a duration).
-        attributes: The attributes of the resource.
-        resource: Its name, for errors.
+        client: Name of the client's node.
+        values: Attributes with their texts; optionally ``priority`` (a whole number) and ``expires`` (a duration).
+        attributes: The attributes of the resource, by name.
+        resource: Name of the resource, for errors.
         now: Monotonic seconds, from which ``expires`` counts.
 
     Raises:
-        ConfigError: The first error; the whole requirement is invalid then.
+        ConfigError: A text is invalid; the error is the first one, and the whole requirement is invalid.
     """
     bounds: dict[str, Bound] = {}
     priority, expires = 0, None

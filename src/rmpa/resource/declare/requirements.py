@@ -1,7 +1,7 @@
 """Requirements of clients on the quality of a resource, and their merge.
 
-Intervals are intersected in the order of the clients' priorities. A bound that would make the intersection empty is
-left out and reported to its client, so that a client of higher priority never pays for one of lower priority.
+The bounds on an attribute are intersected in the order of the clients' priorities. A bound that would make the
+intersection empty is left out and reported to its client, so it never weakens a bound of higher priority.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """The values of one attribute that satisfy one client; made by ``bound`` from a user's request.
+    """The values of one attribute that satisfy a request; ``bound`` makes it from a user's request.
 
     Args:
-        low: The least position on the attribute's scale that satisfies; ``-inf``: no bound.
-        high: The greatest.
-        words: The words of a nominal attribute that satisfy; else empty.
+        low: The least position on the attribute's scale that satisfies the request; ``-inf``: no bound.
+        high: The greatest position that satisfies the request; ``inf``: no bound.
+        words: The words that satisfy the request, if it is one for words; else empty.
         weight: Weight of a shortfall relative to other attributes, above 0.
-        hard: Whether a profile that falls short cannot serve at all.
+        hard: Whether a shortfall makes a profile infeasible.
     """
 
     low: float = -math.inf
@@ -46,7 +46,7 @@ class Bound:
         return self.low <= attribute.position(value) <= self.high
 
     def excess(self, position: float) -> float:
-        """Distance by which a position on the scale lies outside of the bound; 0 for words."""
+        """The distance by which a position on the scale lies outside of the bound; 0 for words."""
         return 0.0 if self.words else max(self.low - position, position - self.high, 0.0)
 
 
@@ -63,11 +63,11 @@ def bound(
 
     Args:
         attribute: The requested attribute.
-        at_least: The least value that satisfies: a number, ``"20 Hz"``, or a word.
-        at_most: The greatest.
-        exactly: The only one; for a nominal attribute one or several words.
-        weight: Weight of a shortfall, above 0.
-        hard: Whether a shortfall excludes a profile.
+        at_least: The least value that satisfies the request: a number, ``"20 Hz"``, or a word.
+        at_most: The greatest value that satisfies the request.
+        exactly: The only value that satisfies the request; of an attribute with words one or several.
+        weight: Weight of a shortfall relative to other attributes, above 0.
+        hard: Whether a shortfall makes a profile infeasible.
 
     Raises:
         ConfigError: The bounds are the wrong way round, the unit or word is unknown, nothing is requested, or the
@@ -98,7 +98,7 @@ def bound(
 
 
 def _check_side(asked: object, other: object, exactly: object, where: str, better: str, key: str) -> None:
-    """Refuse a bound on the side that requests nothing; an exact value is a bound on the side that counts."""
+    """Refuse a bound on the side that is better anyway; an exact value counts as a bound on the other side."""
     if asked is None or (other is not None and exactly is None):
         raise ConfigError(where, f"{better}, so a bound on the other side asks for nothing", f"give {key} alone")
 
@@ -120,9 +120,9 @@ class Requirement:
 
     Args:
         client: The client's node name, unique among the clients.
-        bounds: By attribute.
-        priority: The higher one wins a conflict.
-        expires: Monotonic seconds at which it is dropped; ``None``: never.
+        bounds: The requested bound of each attribute, by name.
+        priority: In a conflict between clients the higher priority wins.
+        expires: When the requirement is dropped, in monotonic seconds; ``None``: never.
     """
 
     client: str
@@ -133,12 +133,12 @@ class Requirement:
 
 @dataclass(frozen=True, slots=True)
 class RequirementConflict:
-    """A bound that contradicts those of clients of higher priority and is left out.
+    """A bound that is left out, because it contradicts bounds of higher or equal priority.
 
     Args:
-        client: The client that requested it.
-        attribute: The attribute.
-        against: The clients whose bounds it contradicts.
+        client: The client that requested the bound.
+        attribute: Name of the attribute.
+        against: The clients whose bounds are kept and contradict it together.
     """
 
     client: str
@@ -155,8 +155,8 @@ class MergedRequirements:
     """The requirements of all clients, merged.
 
     Args:
-        bounds: By attribute: the intersection, with the greatest weight; hard if any of its parts is.
-        conflicts: The bounds that were left out.
+        bounds: The intersection by attribute. It has the greatest weight of its parts, and is hard if one of them is.
+        conflicts: The bounds that were left out, in the order of their clients' priorities.
     """
 
     bounds: Mapping[str, Bound] = field(default_factory=dict, hash=False)
@@ -164,13 +164,13 @@ class MergedRequirements:
 
 
 def merge(requirements: Iterable[Requirement]) -> MergedRequirements:
-    """Intersect the bounds of all clients by descending priority; among equal priorities the earlier comes first."""
+    """Intersect the bounds of all clients by descending priority; equal priorities keep their given order."""
     clients = sorted(requirements, key=_descending_priority)
     requested: dict[str, list[Bound]] = {}
     for requirement in clients:
         for name, one in requirement.bounds.items():
             if (known := requested.get(name)) is None:
-                requested[name] = [one]  # faster than setdefault, which makes a list each time
+                requested[name] = [one]  # faster than setdefault, which would make a list each time
             else:
                 known.append(one)
     bounds: dict[str, Bound] = {}
@@ -221,7 +221,7 @@ def _intersect_by_priority(
 
 
 def _intersect(one: Bound, other: Bound) -> Bound | None:
-    """The intersection of two bounds, or ``None`` if it is empty."""
+    """The intersection of two bounds; ``None`` if it is empty."""
     low = one.low if one.low >= other.low else other.low  # noqa: FURB136 - max() takes twice as long
     high = one.high if one.high <= other.high else other.high  # noqa: FURB136
     words = one.words
@@ -242,7 +242,7 @@ def find_attribute(attributes: Mapping[str, Attribute], name: str, resource: str
     """Find an attribute by its name.
 
     Raises:
-        ConfigError: The resource has none of that name.
+        ConfigError: The resource has no attribute of this name.
     """
     found = attributes.get(name)
     if found is None:

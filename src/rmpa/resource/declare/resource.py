@@ -13,7 +13,7 @@
     def measure() -> None:
         ranges.publish(range=0.3)
 
-Each call checks its arguments and raises ``ConfigError`` with the problem and a remedy.
+Each of these calls checks its arguments and raises ``ConfigError`` with the problem and a remedy.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from rmpa.resource.declare.qos_request import QoSRequest
 
 _RATE_MAX: Final = 10_000
-"""Hz, of a periodic task."""
+"""The highest rate of a periodic task, in Hz."""
 _Function = TypeVar("_Function", bound=Callable[..., object])
 RESERVED: Final = frozenset(
     {
@@ -49,9 +49,9 @@ RESERVED: Final = frozenset(
         "profile", "quality", "requirements", "responses", "set_context", "set_parameters", "state",
     }
 )  # fmt: skip
-"""Names below a resource's node that are taken by its own topics, services and parameters."""
+"""Names below a resource's node that are reserved for topics, services and parameters of every resource."""
 NOT_ATTRIBUTES: Final = frozenset({"expires", "priority", "profile", "reaction"})
-"""Keys beside the attributes in a requirement or a quality report."""
+"""Keys of requirements and quality reports that cannot be names of attributes."""
 
 
 class Role(StrEnum):
@@ -66,13 +66,13 @@ class Resource:
     """The declaration of one Smart Resource.
 
     Args:
-        name: A ROS base name; its node is ``/<name>``.
+        name: A ROS base name; the resource's node is ``/<name>``.
         role: ``sensing``, ``acting`` or ``controlling``.
-        physical: Whether there is a device; else it is simulated.
-        description: For people.
+        physical: Whether the resource has a real device; else it is simulated.
+        description: A text for people.
 
     Raises:
-        ConfigError: An illegal name, or an unknown role.
+        ConfigError: The name is illegal or the role is unknown.
     """
 
     def __init__(self, name: str, *, role: str, physical: bool = True, description: str = "") -> None:
@@ -96,17 +96,17 @@ class Resource:
         self.demands: dict[str, Demand] = {}
         self.hooks: dict[str, Hook] = {}
         self.window = 1.0
-        """Seconds of one quality window."""
+        """Length of a quality window, in seconds."""
         self.settings = AdaptationSettings()
-        """Parameters of its control loop."""
+        """Parameters of the control loop."""
 
     # --- interfaces -------------------------------------------------------------------------------
 
     def output(self, name: str, kind: str, *, latch: bool = False, **contract: object) -> Output:
-        """Declare a topic that it publishes.
+        """Declare a topic that the resource publishes.
 
         Args:
-            name: In its namespace, or global (``/cmd_vel``).
+            name: A name in the resource's namespace, or a global one (``/cmd_vel``).
             kind: The message type, ``package/Name``: one that comes with rmpa, or of this machine's ROS packages
                 (``rmpa.ros.types.find``). A type of another package is learnt at the start from a publisher of that
                 type, here or in another module; the resource waits for one.
@@ -114,7 +114,7 @@ class Resource:
             contract: The keys of a ``[[contract]]``: ``deadline="100 ms"``, ``reliability="reliable"`` …
 
         Raises:
-            ConfigError: A duplicate or illegal name, or an unknown key of a contract.
+            ConfigError: The name is illegal or taken, or the contract has an unknown key or an invalid value.
             DefinitionError: The type's name is malformed, or its package is known and has no such type.
         """
         where = self._check_topic("output", name, self.outputs, self.inputs)
@@ -122,9 +122,10 @@ class Resource:
         return made
 
     def input(self, name: str, kind: str, *, required: bool = True, **contract: object) -> Input:
-        """Declare a topic that it needs; arguments and errors as for ``output``.
+        """Declare a topic that the resource needs; arguments and errors as for ``output``, except ``required``.
 
         A type that is unknown on this machine is learnt from the topic's publisher; the resource starts without it.
+        ``required``: whether the resource is stale while the topic has no publisher.
         """
         where = self._check_topic("input", name, self.inputs, self.outputs)
         made = self.inputs[name] = Input(name, TopicType(kind), read_contract(where, contract), required)
@@ -134,12 +135,12 @@ class Resource:
         """Declare a requirement on another resource: ``keeper.asks("sonar", accuracy=at_most("5 cm"))``.
 
         Args:
-            resource: The other resource's node in this module's graph.
-            priority: The higher one wins a conflict between clients.
-            requests: By attribute of the other one; a qualified one (``ranges.rate``) is written ``ranges__rate``.
+            resource: Name of the other resource's node in this module's graph.
+            priority: In a conflict between clients the higher priority wins.
+            requests: By attribute of the other resource; ``ranges.rate`` is written ``ranges__rate``.
 
         Raises:
-            ConfigError: An illegal or duplicate name, or the resource's own.
+            ConfigError: The name is illegal, is the resource's own, or has a requirement already.
         """
         where = f"what {self.name} asks of {resource}"
         name = resource if resource.startswith("/") else f"/{resource}"
@@ -163,10 +164,10 @@ class Resource:
         unit: str = "",
         description: str = "",
     ) -> Parameter:
-        """Declare a parameter; its type is that of its default.
+        """Declare a parameter, whose type is that of its default; ``Parameter`` explains the arguments.
 
         Raises:
-            ConfigError: A duplicate or illegal name, bounds the wrong way round, or a default out of range.
+            ConfigError: The name is illegal or taken, the bounds are the wrong way round, or the default is invalid.
         """
         where = self._check_name("parameter", name, self.parameters)
         made = Parameter(name, default, low, high, tuple(choices), unit, description)
@@ -185,19 +186,19 @@ class Resource:
         tolerance: float | str | None = None,
         words: Sequence[str] = (),
     ) -> DeclaredAttribute:
-        """Declare a quality attribute of its own, beside ``resource.declare.attributes.MEASURED``.
+        """Declare a quality attribute that the user's code observes, in addition to ``attributes.MEASURED``.
 
         Args:
             name: ``accuracy``, ``energy`` …
             better: ``max``, ``min``, ``target`` or ``exact``.
-            unit: See ``resource.declare.units``.
+            unit: Unit of the values (``resource.declare.units``); empty: a ratio.
             scale: ``linear``, ``log``, ``ordinal`` or ``nominal``.
             category: ``temporal``, ``spatial``, ``reliability`` or ``performance``.
             tolerance: A shortfall of this size counts as 1; with a unit, or a ratio on a log scale.
             words: The values of ordinal and nominal scales.
 
         Raises:
-            ConfigError: A duplicate or illegal name, or arguments that contradict each other.
+            ConfigError: The name is illegal or taken, or the arguments contradict each other.
         """
         where = f"attribute {name} of {self.name}"
         if name in self.attributes or name in MEASURED:
@@ -221,9 +222,10 @@ class Resource:
 
     @property
     def labels(self) -> dict[str, str]:
-        """The prefix of each output's and input's measured attributes, outputs first.
+        """The prefix of the measured attributes of each output and input, by name, outputs first.
 
-        The last part of its name; where that is taken, as many parts as are unique; ``in.scan`` if none are.
+        The prefix is the last part of the name; if that is taken, as many last parts as make it unique, joined by
+        dots; if all are taken, the whole name after ``in.`` or ``out.``.
         """
         found: dict[str, str] = {}
         for name in (*self.outputs, *self.inputs):
@@ -235,9 +237,9 @@ class Resource:
 
     @property
     def attributes(self) -> dict[str, Attribute]:
-        """All attributes that clients may request: its own, and those measured of each output and input.
+        """All attributes that clients may request: the declared ones, and those measured of each output and input.
 
-        ``rate`` is the first output's; ``scan.rate`` names the output or input (``labels``).
+        ``rate`` is that of the first output; ``scan.rate`` names the output or input by its label (``labels``).
         """
         found: dict[str, Attribute] = {}
         for position, label in enumerate(self.labels.values()):
@@ -264,14 +266,15 @@ class Resource:
         Args:
             offers: The offered quality: attribute to value, with a unit (``"40 Hz"``) or in the attribute's own.
             cost: Relative cost; decides among profiles of nearly equal distance.
-            best_effort: Whether it runs when no profile can serve.
-            needs: Its precondition: called once a window in a thread of its own, so it may block. It returns true or
-                ``None`` while the profile may be used, else false or a text with the reason.
-            name: By default the function's.
+            best_effort: Whether the profile runs when none meets the requirements.
+            needs: The precondition, called once in each window in a thread of its own, so it may block. It returns
+                true or ``None`` while the profile may be used, else false or a text with the reason.
+            name: By default the function's name.
             description: By default the first line of the function's docstring.
 
         Raises:
-            ConfigError: A duplicate name, an unknown attribute or unit, a second best-effort profile.
+            ConfigError: The name is taken, an attribute or unit is unknown, a value is invalid, or there is a
+                best-effort profile already.
         """
 
         def declare(function: _Function) -> _Function:
@@ -307,11 +310,13 @@ class Resource:
         outputs: Sequence[Output] | None = None,
         enter: Hook | None = None,
     ) -> Context:
-        """Declare a context, after the profiles and attributes that it names (arguments: ``behaviour.Context``).
+        """Declare a context; the profiles and attributes that it names must be declared before.
+
+        ``behaviour.Context`` explains the arguments.
 
         Raises:
-            ConfigError: A duplicate name, an unknown profile or attribute, an output of another resource, or a syntax
-                error in the rule.
+            ConfigError: The name is taken, a profile or attribute is unknown, an output is another resource's, or the
+                rule is invalid.
         """
         where = f"context {name} of {self.name}"
         if name in self.contexts:
@@ -343,15 +348,15 @@ class Resource:
         """Declare a task, which runs periodically at a rate or on each message of an input.
 
         Args:
-            rate: Such as ``"10 Hz"``; or a parameter, whose present value is the rate in Hz.
-            on: The input.
-            name: By default the function's.
-            on_failure: ``restart``, ``stop`` or ``deactivate``.
-            stuck_after: A run that takes longer, in seconds or with a unit, counts as stuck.
+            rate: The rate, such as ``"10 Hz"``, or a parameter whose present value is the rate in Hz.
+            on: The input on whose messages the task runs.
+            name: By default the function's name.
+            on_failure: ``restart``, ``stop`` or ``deactivate`` (``behaviour.OnFailure``).
+            stuck_after: A run that takes longer counts as stuck; in seconds or with a unit.
 
         Raises:
-            ConfigError: Neither or both of ``rate`` and ``on``, a rate out of range, an input or a parameter of
-                another resource.
+            ConfigError: Neither or both of ``rate`` and ``on`` are given, the rate is out of range, or the input or
+                parameter is another resource's.
         """
 
         def declare(function: _Function) -> _Function:
@@ -398,17 +403,17 @@ class Resource:
 
         Args:
             window: Length of a quality window.
-            violations: Violated windows …
-            windows: … of the last so many that are a disturbance.
-            improvement: Least improvement for a change without a disturbance.
-            dwell: Least time between such changes.
+            violations: Number of violated windows among the last ``windows`` that is a disturbance.
+            windows: Number of last windows that are considered.
+            improvement: Least improvement of the distance for a change without a disturbance.
+            dwell: Least time that a profile runs before such a change.
             settle: Time after a change in which windows are not judged.
-            cool_down: Exclusion of a profile that failed or was violated …
-            cool_down_max: … at most, if that happens repeatedly.
+            cool_down: Time for which a profile is excluded after it failed or was violated.
+            cool_down_max: The longest such time, if that happens repeatedly.
             apply_timeout: Time-out of a profile's function.
 
         Raises:
-            ConfigError: A time out of range, or more violations than windows.
+            ConfigError: A time is out of range, or ``violations`` is greater than ``windows``.
         """
         times = {
             "window": window,
@@ -428,7 +433,7 @@ class Resource:
             event: ``configure``, ``activate``, ``deactivate`` or ``finalize``.
 
         Raises:
-            ConfigError: An unknown transition, or one that has its function already.
+            ConfigError: The transition is unknown, or has a callback already.
         """
         known = ("configure", "activate", "deactivate", "finalize")
         if event not in known:
@@ -462,7 +467,7 @@ class Resource:
         return where
 
     def _check_name(self, kind: str, name: str, known: Mapping[str, object]) -> str:
-        """Check a new name; return its description for errors."""
+        """Check a new name, and return a description of the declared item for errors."""
         where = f"{kind} {name} of {self.name}"
         if not name or not is_legal_name(name) or name.startswith("~"):
             raise ConfigError(where, f"{name!r} is not a ROS name", "letters, digits, _ and /, a letter or / first")

@@ -42,13 +42,13 @@ def convert(value: float, unit: str, to: str, where: str) -> float:
     """Convert a value to another unit of the same dimension.
 
     Args:
-        value: In ``unit``.
-        unit: Its unit; a resource may use a unit of its own, which converts to no other.
+        value: The value, in ``unit``.
+        unit: The unit of the value. A unit that is not known here converts only to itself.
         to: The unit of the result.
-        where: For errors: the purpose of the value.
+        where: The purpose of the value, for errors.
 
     Raises:
-        ConfigError: One of them is unknown, or they measure different things.
+        ConfigError: A unit is unknown, or the two units have different dimensions.
     """
     if unit == to:
         return value
@@ -67,7 +67,7 @@ def quantity(text: str | float, to: str, where: str) -> float:
     """Read ``50 ms``, or a bare number in the unit ``to``, as a value in ``to``.
 
     Raises:
-        ConfigError: Not a finite number, or a unit of another dimension.
+        ConfigError: The text is no finite number with a unit, or its unit does not convert to ``to``.
     """
     if isinstance(text, bool):
         raise ConfigError(where, f"{text} is not a number with a unit", f"for example 20 {to}".rstrip())

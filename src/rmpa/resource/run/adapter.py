@@ -1,7 +1,7 @@
-"""Drives the control loop of a resource: measurements and requests in, profiles and reports out.
+"""Drives the control loop of a resource: takes measurements and requests, applies profiles, publishes reports.
 
-All of it goes by plain topics below the resource's node (``docs/smart-resources.md`` lists them), so any node in any
-module can use it. ``resource.decide.adaptation`` decides.
+Requests and reports are plain topics below the resource's node (``docs/smart-resources.md`` lists them), so any node
+in any module can use them. ``resource.decide.adaptation`` makes the decisions.
 """
 
 from __future__ import annotations
@@ -54,20 +54,20 @@ _log = logging.getLogger(__name__)
 _CLIENTS_INTERVAL: Final = 0.25
 """Seconds between checks whether clients are still connected."""
 _CONTEXT_PRIORITY: Final = 1 << 30
-"""Of the requirement of a context: above that of every client."""
+"""Priority of a context's requirement; above that of every client."""
 _CONTEXT_CLIENT: Final = "context "
-"""The beginning of a context's name as a client."""
+"""Prefix of the client name under which a context's requirement is kept."""
 
 
 class Adapter(RuntimePart):
     """The driver of one resource's control loop.
 
     Args:
-        runtime: Of the resource.
-        tasks: Paused while a profile is applied.
-        window: Seconds of one quality window.
-        settings: Of the control loop.
-        problems: What is wrong beside the quality: texts of what is missing, and of what does not work.
+        runtime: The runtime of the resource.
+        tasks: The resource's tasks, paused while a profile is applied.
+        window: Length of a quality window, in seconds.
+        settings: Settings of the control loop; ``None``: the defaults.
+        problems: Returns the problems apart from the quality, as texts: what is missing, and what does not work.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class Adapter(RuntimePart):
         self.clients = Clients(resource.name, self._attributes)
         self.reports = StatusPublisher(runtime)
         self.reaction: float | None = None
-        """Seconds that the last reconfiguration took, from its cause to its completion."""
+        """Seconds that the last reconfiguration took, from its cause to its completion; ``None`` before the first."""
         self._measuring: QualityMeasurement | None = None
         """``None`` before the start."""
         self._measured: dict[str, Value] = {}
@@ -122,15 +122,15 @@ class Adapter(RuntimePart):
     # --- start and end ------------------------------------------------------------------------------------------
 
     def restore(self, saved: SavedState) -> None:
-        """Continue from the state of before a restart; called before ``start``."""
+        """Take over the state that was saved before a restart; must be called before ``start``."""
         self._saved, self._chosen = saved, saved.chosen
 
     def preset(self, profile: str) -> None:
-        """Choose a profile by hand, or none, before ``start``."""
+        """Choose a profile by hand before ``start``; an empty name lets the loop decide."""
         self._chosen = profile
 
     async def start(self) -> None:
-        """Begin to measure, take the first profile, and serve clients."""
+        """Begin to measure, choose the first profile, and serve clients."""
         self._loop = asyncio.get_running_loop()
         await self._preconditions.start()
         self._measuring = QualityMeasurement(self._runtime.resource, self._loop.time())
@@ -149,7 +149,7 @@ class Adapter(RuntimePart):
         self._arm_timers()
 
     async def close(self) -> None:
-        """Decide nothing any more; a profile that is being applied may end."""
+        """Stop all decisions and reports; a profile that is being applied is given up."""
         self._closed = True
         for timer in self._timers:
             timer.close()
@@ -171,22 +171,22 @@ class Adapter(RuntimePart):
     # --- measurements -------------------------------------------------------------------------------------------
 
     def published(self, output: Output, raw: bytes, now_ns: int) -> None:
-        """Measure an output."""
+        """Measure a message that an output has sent."""
         if self._measuring is not None:
             self._measuring.message(output.name, raw, self._loop.time(), now_ns)
 
     def received(self, item: Input, message: Received) -> None:
-        """Measure an input."""
+        """Measure a message that an input has received."""
         if self._measuring is not None:
             self._measuring.message(item.name, message.raw, self._loop.time(), message.stamp_ns, message.caller_id)
 
     def observed(self, attribute: str, value: Value) -> None:
-        """Measure an attribute of the user's own."""
+        """Record an attribute's value that the user's code has observed."""
         if self._measuring is not None:
             self._measuring.observe(attribute, value)
 
     def _restart_window(self) -> None:
-        """Begin a new window: a profile is not judged by what was measured under the previous one."""
+        """Begin a new window, so that a profile is not judged by values measured under the previous one."""
         now = self._loop.time()
         if self._measuring is not None:
             self._measuring.restart(now)
@@ -195,7 +195,7 @@ class Adapter(RuntimePart):
             self._arm_timers()
 
     def _end_window(self, now: float) -> None:
-        # By the schedule, so that lateness does not add up.
+        # Counted from the due time, not from now, so that lateness does not add up.
         self._window_end = max((self._window_end or now) + self._window, now)
         measured = self._measuring.window(now) if self._measuring is not None else {}
         self._measured = self._observed_by.worst(measured, self.loop.requirements, now)
@@ -212,7 +212,7 @@ class Adapter(RuntimePart):
         try:
             self._observed_by.report(message.caller_id, values, self._loop.time())
         except ConfigError as error:
-            if self.clients.refusal(message.caller_id) != str(error):  # such reports are periodic
+            if self.clients.refusal(message.caller_id) != str(error):  # reports repeat; one error is logged once
                 self.refuse(message.caller_id, str(error))
 
     def _missing_changed(self, text: str, *, missing: bool) -> None:
@@ -240,10 +240,14 @@ class Adapter(RuntimePart):
             self._respond()
 
     def require(self, client: str, values: list[tuple[str, str]]) -> None:
-        """Set a client's requirement, in place of its previous one; without bounds it is released.
+        """Set a client's requirement, in place of its previous one.
+
+        Args:
+            client: Name of the client's node.
+            values: Keys and values of the request; a request without bounds releases the requirement.
 
         Raises:
-            ConfigError: It is invalid; the previous one stays in force.
+            ConfigError: The request is invalid; the previous requirement stays in force.
         """
         now = self._loop.time()
         requirement = self.clients.read(client, values, now)
@@ -256,11 +260,11 @@ class Adapter(RuntimePart):
         self._respond()
 
     def saved_requirements(self, now_ns: int) -> list[SavedRequirement]:
-        """The requirements as they are stored; ``now_ns``: Unix nanoseconds of the wall clock."""
+        """The requirements in the form in which they are stored; ``now_ns``: Unix nanoseconds of the wall clock."""
         return self.clients.save(self.loop.requirements, self._loop.time(), now_ns)
 
     def saved_cool_downs(self, now_ns: int) -> dict[str, SavedCoolDown]:
-        """The cool-downs as they are stored; ``now_ns``: Unix nanoseconds of the wall clock."""
+        """The cool-downs in the form in which they are stored; ``now_ns``: Unix nanoseconds of the wall clock."""
         now = self._loop.time()
         return {
             name: SavedCoolDown(
@@ -270,12 +274,12 @@ class Adapter(RuntimePart):
         }
 
     def enter_context(self, context: str, bounds: Mapping[str, Bound], blocked: Mapping[str, str]) -> None:
-        """Take the requirement of a context, above those of clients, and the profiles that it does not allow.
+        """Put a context's requirement in force, above those of clients, and block the profiles that it excludes.
 
         Args:
-            context: Its name; empty: no context.
-            bounds: By attribute.
-            blocked: Reasons by profile.
+            context: Name of the context; empty: no context.
+            bounds: The context's requirement, by attribute; empty: none.
+            blocked: Why a profile is excluded, by profile.
         """
         now = self._loop.time()
         self._blocked_by_context = dict(blocked)
@@ -294,13 +298,13 @@ class Adapter(RuntimePart):
         """Choose a profile by hand; an empty name lets the loop decide.
 
         Raises:
-            ConfigError: There is no such profile.
+            ConfigError: The resource has no profile of this name.
         """
         self._act(self.loop.pin(profile, self._loop.time()))
         self._respond()
 
     def refuse(self, client: str, text: str) -> None:
-        """Tell a client among the responses that its message is invalid."""
+        """Publish a response that the client's last message is invalid; ``text`` is the reason."""
         _log.warning("! %s: %s: %s", self._name, printable(client), text)
         self.clients.refuse(client, text)
         self._respond()
@@ -310,7 +314,7 @@ class Adapter(RuntimePart):
         return self.loop.explain(self._loop.time())
 
     async def settled(self) -> None:
-        """Wait until no profile is being applied; one that hangs is given up at its time-out."""
+        """Wait until no profile is being applied; a profile that hangs is given up at its time-out."""
         while self.loop.applying and not self._closed:
             await self._applier.wait()
 
@@ -326,7 +330,7 @@ class Adapter(RuntimePart):
     # --- actions ------------------------------------------------------------------------------------------------
 
     def _update_blocked(self) -> None:
-        """Block the profiles whose preconditions do not hold, and those that the context does not allow."""
+        """Block the profiles whose preconditions do not hold, and those that the context excludes."""
         if self._requirements is not None and not self._closed:  # not before the start
             blocked = self._preconditions.blocked() | self._blocked_by_context
             self._act(self.loop.block(blocked, self._loop.time()))
@@ -369,7 +373,12 @@ class Adapter(RuntimePart):
         self._respond()
 
     def report_late_action(self, before: str, text: str) -> None:
-        """Report an action of the function of a profile or context that was given up."""
+        """Report a late action of a profile's or context's function that was given up.
+
+        Args:
+            before: The profile or context of that function.
+            text: The message of the alarm and of the log.
+        """
         _log.warning("! %s: %s", self._name, text)
         values = {"before": before, "after": self.loop.applying or self.loop.profile}
         self.reports.alarm(DiagnosticLevel.WARN, text, values)
@@ -402,7 +411,7 @@ class Adapter(RuntimePart):
         self.reports.quality(level, message, values)
 
     def health(self) -> tuple[DiagnosticLevel, str]:
-        """Level and message of the resource's ``quality`` at this moment."""
+        """The present level and message of the resource's ``quality`` topic."""
         missing, broken = self._problems()
         broken += [f"the function of profile {name} hangs; it was given up" for name in self._applier.hanging]
         return health(self.loop, missing, broken)
@@ -431,7 +440,7 @@ class Adapter(RuntimePart):
         self.reports.responses(statuses)
 
     def _offered(self, requirement: Requirement) -> dict[str, Value]:
-        """The requested attributes as the client observes them, or else as they are measured here."""
+        """Values of the requested attributes: as observed by the client, or else as measured here."""
         found = {}
         for name in requirement.bounds:
             observed = self._observed_by.observed(requirement.client, name)
@@ -442,6 +451,6 @@ class Adapter(RuntimePart):
     def _response(
         self, level: DiagnosticLevel, client: str, message: str, values: Mapping[str, str]
     ) -> DiagnosticStatus:
-        """The status for a client; it repeats the mark of the request, by which the client recognises it."""
+        """The response for a client; it repeats the mark of the request, by which the client recognises it."""
         mark = self.clients.mark(client) or self._runtime.resource.name
         return DiagnosticStatus(level, client, message, mark, values)

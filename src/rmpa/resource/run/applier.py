@@ -22,20 +22,20 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _WAIT: Final = 0.25
-"""Seconds that ``wait`` waits at most."""
+"""The longest time in seconds that one call of ``wait`` takes."""
 _WAIT_IDLE: Final = 0.02
-"""The same if the task of the profile has died; the profile is given up at its time-out."""
+"""Seconds that ``wait`` takes if the task that applied the profile has died; the time-out gives the profile up."""
 
 
 class Applier:
     """Applies the profiles of one resource; all callbacks are called in the event loop.
 
     Args:
-        runtime: Queues messages meanwhile.
-        tasks: Paused meanwhile.
-        on_applied: ``(profile, error)``: its function has ended, with an error or with an empty text.
-        on_ended_late: ``(profile, touched, text)``: a function that was given up has ended; ``touched``: after the
-            present profile's function began, so it may have changed the device since.
+        runtime: Queues messages while a profile is applied.
+        tasks: Paused while a profile is applied.
+        on_applied: ``(profile, error)``: the profile's function has ended; ``error`` is empty if it succeeded.
+        on_ended_late: ``(profile, touched, text)``: a function that was given up has ended. ``touched``: the present
+            profile's function had begun by then, so the late one may have changed the device after it.
         on_late_action: ``(profile, text)``: a function that was given up has attempted an action, without effect.
     """
 
@@ -65,17 +65,17 @@ class Applier:
         return [call.name for call in self._hanging]
 
     def begin(self, profile: str) -> None:
-        """Apply a profile; the previous one is complete or was given up."""
+        """Begin to apply a profile; the previous one must be complete or given up."""
         self._call = call = FencedCall("profile", profile, self._on_late_action)
         self._task = task = asyncio.get_running_loop().create_task(self._apply(call), name=f"apply {profile}")
         self._running.add(task)
         task.add_done_callback(self._running.discard)
 
     def give_up(self) -> bool:
-        """Give up the function that runs; its messages are dropped.
+        """Give up the profile that is being applied; its queued messages are dropped.
 
         Returns:
-            Whether it still runs; ``on_ended_late`` is called when it ends.
+            Whether its function still runs; ``on_ended_late`` is called when that ends.
         """
         call, task = self._call, self._task
         if call is None or task is None:
@@ -91,19 +91,19 @@ class Applier:
         return True
 
     def resume(self) -> None:
-        """Resume tasks and messages after a profile was given up and no other one is applied."""
+        """Resume tasks and messages after a profile was given up and no other one is being applied."""
         self._runtime.release()
         self._tasks.resume()
 
     async def wait(self) -> None:
-        """Wait until the profile has been applied, or for a moment."""
+        """Wait until the profile has been applied, at most 0.25 s."""
         if self._task is None or self._task.done():
             await asyncio.sleep(_WAIT_IDLE)
         else:
             await asyncio.wait([self._task], timeout=_WAIT)
 
     async def close(self) -> None:
-        """Apply nothing any more; functions that hang in threads are left behind."""
+        """Give up the profile that is being applied, if any; functions that hang in threads are left behind."""
         self._closed = True
         if self._call is not None:
             self._call.give_up()
@@ -130,13 +130,13 @@ class Applier:
             self._ended_late(call)
             return
         if why:
-            call.give_up()  # coroutines and threads that it has started may still run
+            call.give_up()  # the function may have started coroutines and threads that still run
         self._runtime.release(drop=bool(why))
         self._tasks.resume()
         self._on_applied(call.name, why)
 
     def _ended_late(self, call: FencedCall) -> None:
-        """Report whether the device may be in another state than that of the present profile."""
+        """Report that a given-up function has ended, and whether it may have undone the present profile."""
         self._hanging.pop(call, None)
         present = self._call
         touched = bool(call.began and present is not None and present is not call and present.began)

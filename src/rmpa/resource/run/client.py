@@ -1,4 +1,4 @@
-"""A client of a resource, in any module: requests a quality and receives the answers.
+"""A client of a resource in this or another module: requests a quality and receives the answers.
 
 ::
 
@@ -33,11 +33,11 @@ if TYPE_CHECKING:
 
 
 class ResourceClient:
-    """One client of one resource; its requirement is released when it ends.
+    """One client of one resource; leaving the context (``async with``) releases its requirement.
 
     Args:
-        node: Registered; each node may have one client of a resource.
-        resource: The resource's node in this module's graph: ``sonar``, ``/robot1/sonar``.
+        node: A registered node; it may have one client for each resource.
+        resource: Name of the resource's node in this module's graph: ``sonar``, ``/robot1/sonar``.
     """
 
     def __init__(self, node: Node, resource: str) -> None:
@@ -52,7 +52,7 @@ class ResourceClient:
         self._change = asyncio.Event()
 
     async def __aenter__(self) -> Self:
-        """Connect.
+        """Subscribe to the resource's responses and advertise the requests.
 
         Raises:
             UnreachableError: The master does not answer.
@@ -83,14 +83,14 @@ class ResourceClient:
         """Request a quality, in place of the previous request, and wait for the answer.
 
         Args:
-            priority: The higher one wins a conflict between clients.
-            expires: ``"60 s"``: dropped after that; empty: when this client ends.
-            timeout: Seconds to wait.
+            priority: In a conflict between clients the higher priority wins.
+            expires: How long the request holds, such as ``"60 s"``; empty: until this client ends.
+            timeout: Seconds to wait for the answer.
             requests: By attribute; a qualified one (``ranges.rate``) is written ``ranges__rate``.
 
         Raises:
             PeerRefused: The request is invalid; the previous one stays in force.
-            UnreachableError: No such resource answers.
+            UnreachableError: No resource of this name has answered in time.
         """
         self.ask(priority=priority, expires=expires, **requests)
         try:
@@ -106,7 +106,7 @@ class ResourceClient:
         return self._answer
 
     def ask(self, *, priority: int = 0, expires: str = "", **requests: QoSRequest) -> None:
-        """Request as ``require`` does, without waiting; ``answers`` yields the answer."""
+        """Request a quality as ``require`` does, without waiting for the answer; ``answers`` yields it."""
         values = {name.replace("__", "."): str(request) for name, request in requests.items()}
         if priority:
             values[PRIORITY] = str(priority)
@@ -116,14 +116,14 @@ class ResourceClient:
 
     @property
     def connected(self) -> bool:
-        """Whether the resource is connected."""
+        """Whether the resource publishes responses to this client's node."""
         return self._responses is not None and self._responses.publishers > 0
 
     async def observe(self, **values: float | str) -> None:
         """Report the quality that this client observes: ``await sonar.observe(rate="12 Hz")``, periodically.
 
-        The resource measures what it sends; less may arrive here, and it has to adapt to that. A report counts for
-        three of the resource's quality windows, if this client has a requirement.
+        The resource measures the messages that it sends; fewer may arrive here, and it has to adapt to that. A report
+        counts for three of the resource's quality windows, provided that this client has a requirement.
 
         Args:
             values: By attribute, as in ``require``; a number is in the attribute's unit.
@@ -137,10 +137,10 @@ class ResourceClient:
             self.report(**values)
 
     def report(self, **values: float | str) -> None:
-        """Report as ``observe`` does, which must have been called once.
+        """Report as ``observe`` does, without waiting; ``observe`` must have been called once.
 
         Raises:
-            UnreachableError: It was not.
+            UnreachableError: ``observe`` has not been called.
         """
         if self._observed is None:
             raise UnreachableError("resource", self.resource, "await observe() once before")
@@ -154,7 +154,7 @@ class ResourceClient:
 
     @property
     def answer(self) -> RequirementAnswer | None:
-        """The last answer."""
+        """The last answer to the present request; ``None`` until it arrives."""
         return self._answer
 
     async def answers(self) -> AsyncIterator[RequirementAnswer]:
@@ -177,12 +177,12 @@ class ResourceClient:
         self._mark = secrets.token_hex(8)
         self._answer = None
         status: Any = [{"name": self._node.name, "hardware_id": self._mark, "values": pairs}]
-        # The stamp identifies a latched request that arrives again, so that its expiry does not begin anew.
+        # The stamp identifies a latched request that arrives again, so that its expiry does not start again.
         self._requirements.publish(self._requirements.make({"header": {"stamp": time.time()}, "status": status}))
 
     def _response_received(self, received: Received) -> None:
         for status in received.message.status:
-            # In the resource's graph this client may have another name (its proxy's); the mark is unique.
+            # In the resource's graph this client may have its proxy's name, so the unique mark identifies it.
             if status.hardware_id == self._mark:
                 values = {str(pair.key): str(pair.value) for pair in status.values}
                 answer = RequirementAnswer(DiagnosticLevel(int(status.level)), str(status.message), values)

@@ -1,7 +1,7 @@
-"""Switches a resource between its contexts: by hand (a topic, the configuration), or by their rules.
+"""Switches a resource between its contexts: by hand (a topic, the configuration) or by the contexts' rules.
 
-A switch is atomic: no task runs and no message is sent until the context's function has ended, its outputs and
-requirements are in force, and the resulting profile has been applied.
+A switch is atomic: no task runs and no message is sent until the context's function has ended, the context's outputs
+and requirements are in force, and the resulting profile has been applied.
 """
 
 from __future__ import annotations
@@ -38,18 +38,18 @@ _log = logging.getLogger(__name__)
 TOPIC: Final = "context"
 _HOLDER: Final = "context"
 _DEBOUNCE: Final = 0.02
-"""Seconds from a change of a value until the rules are evaluated; further changes meanwhile cost nothing."""
+"""Seconds from a change of a value until the rules are evaluated; changes within that time share one evaluation."""
 _INTERVAL: Final = 0.25
-"""Seconds between evaluations without a change: a dwell time may be over, a publisher gone."""
+"""Seconds between evaluations without a change: a dwell time may have ended, or a publisher may be gone."""
 
 
 class Contexts(RuntimePart):
-    """The contexts of one resource; started after the adapter.
+    """The contexts of one resource; must be started after the adapter.
 
     Args:
-        runtime: Of the resource.
-        tasks: Paused during a switch.
-        adapter: Takes the requirements of contexts.
+        runtime: The runtime of the resource.
+        tasks: The resource's tasks, paused during a switch.
+        adapter: Puts the requirements of contexts in force.
     """
 
     def __init__(self, runtime: Runtime, tasks: Tasks, adapter: Adapter) -> None:
@@ -73,7 +73,7 @@ class Contexts(RuntimePart):
         self._parameters = {r.text: r.parameter for rule in rules.values() for r in rule.references if r.parameter}
         self._subscribers: dict[str, Subscriber] = {}
         self._taps: dict[str, str] = {}
-        """Topics by the inputs and outputs that rules refer to."""
+        """The topic of each input or output of the resource that a rule refers to, by the declared name."""
         self._latest: dict[str, tuple[MessageType, bytes]] = {}
         self._current = ""
         self._retry = 0.0
@@ -83,29 +83,29 @@ class Contexts(RuntimePart):
         self._next_evaluation: float | None = None
         self._timer = MachineTimer(lambda: self._next_evaluation, self._evaluate)
         self._closed = True
-        """Before the start, and after the end."""
+        """True before ``start`` and after ``close``."""
 
     @property
     def current(self) -> str:
-        """The present context, or empty."""
+        """Name of the present context; empty: none."""
         return self._current
 
     @property
     def chosen(self) -> str:
-        """The one chosen by hand; empty: the rules decide."""
+        """Name of the context chosen by hand; empty: the rules decide."""
         return self._selector.chosen
 
     def preset(self, name: str) -> None:
-        """Choose a context by hand, or none, before ``start``."""
+        """Choose a context by hand before ``start``; an empty name lets the rules decide."""
         self._selector.chosen = name
 
     @property
     def problems(self) -> list[str]:
-        """Problems with the fields that rules refer to."""
+        """Why fields that rules refer to cannot be read; empty if all can."""
         return [field.problem for field in self._topic_fields.values() if field.problem]
 
     async def start(self) -> None:
-        """Enter the chosen context, and evaluate the rules from now on."""
+        """Enter the chosen context, if any, and evaluate the rules from now on."""
         self._loop, self._closed = asyncio.get_running_loop(), False
         await self._runtime.advertise_text(TOPIC, "")
         node = self._runtime.node
@@ -128,7 +128,7 @@ class Contexts(RuntimePart):
             self._timer.arm()
 
     async def close(self) -> None:
-        """Stay in the present context."""
+        """Stop the evaluation of rules; the present context stays."""
         self._closed = True
         self._timer.close()
         for task in self._work:
@@ -136,11 +136,11 @@ class Contexts(RuntimePart):
         await asyncio.gather(*self._work, return_exceptions=True)
 
     async def choose(self, name: str) -> None:
-        """Choose a context by hand; empty: the rules decide again.
+        """Choose a context by hand; an empty name lets the rules decide again.
 
         Raises:
-            ConfigError: There is no such context; nothing has changed.
-            PeerRefused: It could not begin; nothing has changed.
+            ConfigError: The resource has no context of this name; nothing has changed.
+            PeerRefused: The function of the context failed; the present context stays.
         """
         if name and name not in self._known:
             near = did_you_mean(name, self._known)
@@ -162,17 +162,17 @@ class Contexts(RuntimePart):
     # --- values of rules ----------------------------------------------------------------------------------------
 
     def received(self, item: Input, message: Received) -> None:
-        """Take the value of an input whose topic a rule refers to."""
+        """Keep the message of an input if a rule refers to its topic."""
         if item.name in self._taps:
             self._update(self._taps[item.name], message.kind, message.raw)
 
     def published(self, output: Output, raw: bytes, now_ns: int) -> None:  # noqa: ARG002
-        """Take the value of an output whose topic a rule refers to."""
+        """Keep the message of an output if a rule refers to its topic."""
         if output.name in self._taps:
             self._update(self._taps[output.name], output.type, raw)
 
     def parameter_changed(self, parameter: Parameter) -> None:
-        """Evaluate the rules that refer to the parameter."""
+        """Evaluate the rules soon if one of them refers to the parameter."""
         if parameter.name in self._parameters.values():
             self._evaluate_soon()
 
@@ -185,13 +185,13 @@ class Contexts(RuntimePart):
         found: dict[str, Scalar] = {text: parameters[name].value for text, name in self._parameters.items()}
         for text, item in self._topic_fields.items():
             if (subscriber := self._subscribers.get(item.topic)) is not None and not subscriber.publishers:
-                self._latest.pop(item.topic, None)  # unknown without a publisher
+                self._latest.pop(item.topic, None)  # without a publisher the value is unknown
             if (latest := self._latest.get(item.topic)) is not None and (value := item.read(*latest)) is not None:
                 found[text] = value
         return found
 
     async def _find_topics(self) -> None:
-        """Find the topics that rules refer to, until all are known."""
+        """Look up the topics that rules refer to, and subscribe to them, until all are found."""
         node = self._runtime.node
         delay = limits.CONTEXT_LOOK
         while missing := [item for item in self._topic_fields.values() if not item.topic]:
@@ -214,7 +214,7 @@ class Contexts(RuntimePart):
         ]
         self._taps.update(dict.fromkeys(own, topic))
         if own or topic in self._subscribers:
-            return  # subscribed already
+            return  # the resource or an earlier call has subscribed already
 
         def update(message: Received) -> None:
             self._update(topic, message.kind, message.raw)
@@ -259,7 +259,7 @@ class Contexts(RuntimePart):
         """Switch to a context.
 
         Raises:
-            PeerRefused: Its function failed; the resource stays as it was.
+            PeerRefused: The context's function failed; the resource stays in its present context.
         """
         async with self._switch_lock:
             if name == self._current or self._closed:
@@ -283,7 +283,11 @@ class Contexts(RuntimePart):
         self._publish()
 
     async def _enter(self, context: Context) -> None:
-        """Call a context's function."""
+        """Call a context's function, if it has one.
+
+        Raises:
+            PeerRefused: The function raised, or did not end within ``limits.CONTEXT_ENTER_TIMEOUT`` seconds.
+        """
         if context.enter is None:
             return
         timeout = limits.CONTEXT_ENTER_TIMEOUT
@@ -294,7 +298,7 @@ class Contexts(RuntimePart):
             async with limit:
                 await call.run(context.enter)
         except Exception as error:
-            call.give_up()  # also after an error: a coroutine that it has started may still run
+            call.give_up()  # also after an error: the function may have started a coroutine that still runs
             why = f"{type(error).__name__}: {error}"
             if isinstance(error, TimeoutError) and limit.expired():
                 why = f"its function has not ended after {timeout:g} s"
@@ -333,14 +337,14 @@ class _TopicField:
         self._fields: tuple[str, ...] = ()
         self._raw: bytes | None = None
         self._value: Scalar | None = None
-        """Of the last message, which may serve several evaluations."""
+        """The value read from ``_raw``, kept because several evaluations may read one message."""
         self.topic = ""
-        """Empty until it is known."""
+        """Global name of the topic; empty until it is found."""
         self.problem = ""
-        """Why the topic's messages have no such value, or empty."""
+        """Why the field cannot be read from the topic's messages; empty if it can."""
 
     def find(self, published: set[str]) -> bool:
-        """Find the topic among the published ones."""
+        """Find the topic among the published ones; false if none of the candidates is published."""
         for topic, fields in self._reference.candidates():
             if topic in published:
                 self.topic, self._fields = topic, fields
@@ -348,7 +352,7 @@ class _TopicField:
         return False
 
     def read(self, kind: MessageType, raw: bytes) -> Scalar | None:
-        """The field of a message; ``None`` if it does not exist or is no scalar."""
+        """The field's value in a serialized message; ``None`` if it does not exist or is no scalar."""
         if raw is not self._raw:
             self._raw, self._value = raw, self._read(kind, raw)
         return self._value

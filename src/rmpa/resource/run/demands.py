@@ -28,17 +28,17 @@ _log = logging.getLogger(__name__)
 
 
 class Demands(RuntimePart):
-    """All requirements of one resource on others.
+    """All requirements of one resource on other resources.
 
     Args:
-        runtime: Of the resource.
+        runtime: The runtime of the resource that has the requirements.
     """
 
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._clients: dict[str, ResourceClient] = {}
         self._first: dict[str, str] = {}
-        """The first output of each resource whose descriptor has been received."""
+        """Name of the first output of each resource whose descriptor has been received, by resource."""
         self._undo = contextlib.AsyncExitStack()
         self.descriptors: dict[str, Subscriber] = {}
         """Subscriptions to descriptors, by topic."""
@@ -67,7 +67,7 @@ class Demands(RuntimePart):
         self._clients.clear()
 
     def problems(self) -> tuple[list[str], list[str]]:
-        """Texts: resources that are not connected, and those that do not serve the requirement."""
+        """Problems as texts: resources that are not connected, and resources that miss the requirement."""
         missing, short = [], []
         for name, client in self._clients.items():
             demand = self._runtime.resource.demands[name]
@@ -80,7 +80,7 @@ class Demands(RuntimePart):
         return missing, short
 
     def window_ended(self, level: DiagnosticLevel, message: str, measured: Mapping[str, Value]) -> None:  # noqa: ARG002
-        """Report the requested attributes of inputs to the resources that send them."""
+        """Report the measured values of inputs to the resources that send them, for the requested attributes."""
         resource = self._runtime.resource
         labels = resource.labels
         for name, client in self._clients.items():
@@ -105,7 +105,11 @@ class Demands(RuntimePart):
             self._runtime.publish_descriptor()
 
     async def _observe(self, name: str, client: ResourceClient) -> None:
-        """Begin to report to a resource; its descriptor tells its first output, to which ``rate`` alone refers."""
+        """Begin to report observations to a resource.
+
+        A request without an output's name, such as ``rate``, refers to the resource's first output. The resource's
+        descriptor says which output that is.
+        """
 
         def descriptor_received(received: Received) -> None:
             for part in self._runtime.parts:

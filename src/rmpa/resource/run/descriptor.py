@@ -1,7 +1,7 @@
 """The descriptor of a resource: its metadata as JSON on the latched topic ``<resource>/descriptor``.
 
-It crosses the mesh like any topic, so every module sees what each resource offers and needs. The names of the fields
-are part of the wire format.
+The topic crosses the mesh like any other, so every module sees what each resource offers and needs. The names of the
+fields are part of the wire format.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ class TopicDescriptor(msgspec.Struct, frozen=True, kw_only=True):
     """An output or input.
 
     Attributes:
-        name: As declared.
-        topic: Its global name in the module.
-        type: Message type.
-        contract: The values that differ from the default, by key.
-        required: Inputs only: whether the resource is stale without it.
+        name: The declared name.
+        topic: Global name of the topic in the resource's module.
+        type: Name of the message type.
+        contract: The contract's values that differ from the defaults, by key.
+        required: For inputs only: whether the resource is stale without a publisher.
     """
 
     name: str
@@ -44,7 +44,7 @@ class TopicDescriptor(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ParameterDescriptor(msgspec.Struct, frozen=True, kw_only=True):
-    """A parameter; ``type`` is dynamic_reconfigure's name of it."""
+    """A parameter; ``type`` is the type's name in dynamic_reconfigure."""
 
     name: str
     type: str
@@ -69,7 +69,7 @@ class AttributeDescriptor(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ProfileDescriptor(msgspec.Struct, frozen=True, kw_only=True):
-    """A System Profile; ``offers`` are in the attributes' units."""
+    """A System Profile; ``offers`` has values by attribute, in the attributes' units."""
 
     name: str
     offers: dict[str, float | str]
@@ -79,7 +79,7 @@ class ProfileDescriptor(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ContextDescriptor(msgspec.Struct, frozen=True, kw_only=True):
-    """A context; empty ``profiles`` allow any, ``outputs`` of ``None`` publish all."""
+    """A context; empty ``profiles`` allow every profile, and with ``outputs`` of ``None`` all outputs publish."""
 
     name: str
     when: str = ""
@@ -89,7 +89,7 @@ class ContextDescriptor(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class TaskDescriptor(msgspec.Struct, frozen=True, kw_only=True):
-    """A task: periodic at ``rate`` Hz, perhaps the value of the parameter ``follows``, or on an input."""
+    """A task: runs at ``rate`` Hz, which the parameter ``follows`` may change, or on messages of the input ``on``."""
 
     name: str
     rate: float | None = None
@@ -101,9 +101,9 @@ class DemandDescriptor(msgspec.Struct, frozen=True, kw_only=True):
     """The present requirement on another resource.
 
     Attributes:
-        resource: The other resource's node in this module's graph.
-        wishes: Requests as texts (``>= 20 Hz hard``) by attribute of the other resource.
-        priority: The higher one wins a conflict between clients.
+        resource: Name of the other resource's node in this module's graph.
+        wishes: Requests as texts (``>= 20 Hz hard``), by attribute of the other resource.
+        priority: In a conflict between clients the higher priority wins.
     """
 
     resource: str
@@ -115,13 +115,13 @@ class Descriptor(msgspec.Struct, frozen=True, kw_only=True):
     """A whole resource.
 
     Attributes:
-        version: Of this format.
-        name: Its node's base name.
-        node: Its node's global name, in its own module.
+        version: Version of this format.
+        name: Base name of the resource's node.
+        node: Global name of the resource's node in its own module.
         role: ``sensing``, ``acting`` or ``controlling``.
-        physical: Whether there is a device; else it is simulated.
-        description: For people.
-        outputs: In order of declaration, as all others.
+        physical: Whether the resource has a real device; else it is simulated.
+        description: A text for people.
+        outputs: In the order of declaration, as are all the following.
     """
 
     version: int = VERSION
@@ -140,7 +140,7 @@ class Descriptor(msgspec.Struct, frozen=True, kw_only=True):
     asks: tuple[DemandDescriptor, ...] = ()
 
     def serialize(self) -> str:
-        """As JSON."""
+        """The descriptor as JSON."""
         return msgspec.json.encode(self).decode()
 
     @classmethod
@@ -148,8 +148,8 @@ class Descriptor(msgspec.Struct, frozen=True, kw_only=True):
         """Read the descriptor of a resource.
 
         Raises:
-            LimitExceeded: It is longer than ``limits.DESCRIPTOR_MAX``.
-            RemoteProtocolError: It is not a descriptor of this version.
+            LimitExceeded: The text is longer than ``limits.DESCRIPTOR_MAX``.
+            RemoteProtocolError: The text is not a descriptor of this version.
         """
         if len(text) > limits.DESCRIPTOR_MAX:
             raise LimitExceeded("descriptor of a resource", len(text), limits.DESCRIPTOR_MAX)
@@ -166,8 +166,8 @@ def describe(resource: Resource, node: str) -> Descriptor:
     """Make the descriptor of a declared resource.
 
     Args:
-        resource: Declared completely.
-        node: Its node's global name.
+        resource: The resource, completely declared.
+        node: Global name of the resource's node.
     """
     return Descriptor(
         name=resource.name,
@@ -211,7 +211,7 @@ def describe(resource: Resource, node: str) -> Descriptor:
 
 
 def _convert(declared: object, kind: type[_Kind]) -> _Kind:
-    """A descriptor from the attributes of a declaration that have the same names."""
+    """Make a descriptor from a declaration's attributes of the same names."""
     return msgspec.convert(declared, kind, from_attributes=True)
 
 

@@ -1,7 +1,7 @@
 """Converts a resource's configuration to dynamic_reconfigure's messages and back (wiki.ros.org/dynamic_reconfigure).
 
-Pure: parameters in, plain values of ``dynamic_reconfigure/Config`` and ``ConfigDescription`` out, and back. As in its
-servers, a number out of range is clipped; any other invalid value is refused, and nothing is changed then.
+Pure functions between parameters and the plain values of ``dynamic_reconfigure/Config`` and ``ConfigDescription``. A
+number out of range is clipped, as by dynamic_reconfigure's own servers; any other invalid value is an error.
 
 Two parameters are not declared by the user: ``profile`` (empty: the resource decides) and, where there are contexts,
 ``context`` (empty: the rules decide).
@@ -30,10 +30,10 @@ SERVICE_TYPE: Final = "dynamic_reconfigure/Reconfigure"
 PROFILE: Final = "profile"
 CONTEXT: Final = "context"
 AUTOMATIC: Final = "automatic"
-"""The name of an empty ``profile`` or ``context`` in enumerations."""
+"""Name that enumerations show for an empty ``profile`` or ``context``."""
 _LISTS: Final = {"bool": "bools", "int": "ints", "str": "strs", "double": "doubles"}
 _GROUP: Final[dict[str, Plain]] = {"name": "Default", "id": 0, "parent": 0}
-"""All parameters are in the one group that every server has."""
+"""The group of all parameters: the one that every server has."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,13 +50,13 @@ class ReconfigureEntry:
     """One parameter as dynamic_reconfigure's tools see it.
 
     Args:
-        name: A ROS base name.
+        name: The parameter's name, a ROS base name.
         kind: ``bool``, ``int``, ``double`` or ``str``.
-        default: Its default value.
-        low: The least value of a number; without a bound infinite, or the least of 32 bits.
-        high: The greatest.
-        description: For people, with the unit.
-        choices: The values of an enumeration, else empty.
+        default: The default value.
+        low: The least value of a number; without a declared bound ``-inf``, or the least 32-bit integer.
+        high: The greatest value of a number; without a declared bound ``inf``, or the greatest 32-bit integer.
+        description: A text for people, with the unit.
+        choices: The values of an enumeration; empty for other parameters.
     """
 
     name: str
@@ -98,11 +98,11 @@ def _pseudo(name: str, text: str, choices: Sequence[EnumChoice]) -> ReconfigureE
 
 
 def config(values: Mapping[str, ParameterValue], known: Mapping[str, ReconfigureEntry]) -> dict[str, Plain]:
-    """Plain values of a ``Config``.
+    """Make the plain values of a ``Config`` message.
 
     Args:
-        values: By parameter.
-        known: The entries of the parameters.
+        values: Values by parameter.
+        known: The entries of the parameters, by name.
     """
     made: dict[str, Any] = {key: [] for key in _LISTS.values()}
     for name, value in values.items():
@@ -112,7 +112,7 @@ def config(values: Mapping[str, ParameterValue], known: Mapping[str, Reconfigure
 
 
 def description(known: Mapping[str, ReconfigureEntry]) -> dict[str, Plain]:
-    """Plain values of a ``ConfigDescription``."""
+    """Make the plain values of a ``ConfigDescription`` message from the entries of the parameters."""
     parameters: list[Plain] = [
         {
             "name": entry.name,
@@ -139,12 +139,12 @@ def _bound(entry: ReconfigureEntry, *, low: bool) -> ParameterValue:
     value = entry.low if low else entry.high
     if entry.kind == "double":
         return float(value)
-    # The nearest whole number within the bound.
+    # An integer's bound may be a fraction: take the nearest integer within it.
     return max(INT_MIN, min(INT_MAX, math.ceil(value) if low else math.floor(value)))
 
 
 def _edit_method(entry: ReconfigureEntry) -> str:
-    """The enumeration; clients evaluate it as a Python expression, so it consists of ``repr`` alone."""
+    """The enumeration as clients expect it: a Python expression, which ``repr`` makes safe to evaluate."""
     if not entry.choices:
         return ""
     enum = [
@@ -167,7 +167,7 @@ def read_config(message: Any) -> dict[str, ParameterValue]:
     """The values of a ``Config`` message by parameter; groups are ignored, since there is only one.
 
     Raises:
-        ConfigError: A duplicate parameter.
+        ConfigError: The message has a parameter twice.
     """
     found: dict[str, ParameterValue] = {}
     kinds = {"bools": bool, "ints": int, "strs": str, "doubles": float}
@@ -183,10 +183,10 @@ def read_config(message: Any) -> dict[str, ParameterValue]:
 def checked(
     values: Mapping[str, ParameterValue], known: Mapping[str, ReconfigureEntry], parameters: Mapping[str, Parameter]
 ) -> dict[str, ParameterValue]:
-    """Check and clip the values that a client sets.
+    """Check the values that a client sets, and clip numbers to their bounds.
 
     Raises:
-        ConfigError: The first invalid value.
+        ConfigError: A name is unknown or a value is invalid; the first such error.
     """
     return {name: _checked(name, value, known, parameters) for name, value in values.items()}
 
@@ -207,10 +207,10 @@ def _checked(
 
 
 def choose(value: str, entry: ReconfigureEntry) -> str:
-    """Find a ``profile`` or ``context`` by its value or name.
+    """Find the value of a ``profile`` or ``context`` by the value itself, or by its shown name in any case.
 
     Raises:
-        ConfigError: There is none.
+        ConfigError: The enumeration has no such value.
     """
     for choice in entry.choices:
         if value == choice.value or value.lower() == choice.name.lower():
@@ -227,7 +227,7 @@ def _named(entry: ReconfigureEntry) -> str:
 def _clipped(value: ParameterValue, entry: ReconfigureEntry) -> ParameterValue:
     if isinstance(value, bool | str) or entry.kind not in ("int", "double") or entry.choices:
         return value
-    # The bounds have the parameter's type: a float is not a value of an int parameter.
+    # The bounds are converted to the parameter's type, since a float is no value of an int parameter.
     low, high = _bound(entry, low=True), _bound(entry, low=False)
     if value < float(low):
         return low
@@ -237,12 +237,15 @@ def _clipped(value: ParameterValue, entry: ReconfigureEntry) -> ParameterValue:
 def from_server(
     found: Mapping[str, Any], known: Mapping[str, ReconfigureEntry], parameters: Mapping[str, Parameter]
 ) -> tuple[dict[str, ParameterValue], list[str]]:
-    """The valid values of the parameter server at the start of a resource, and errors about the others.
+    """Read the parameter server's values at the start of a resource.
 
     Args:
-        found: The members of the resource's namespace; those that are not parameters are ignored.
-        known: The entries of the parameters.
-        parameters: The declared ones.
+        found: The members of the resource's namespace; members that are no parameters are ignored.
+        known: The entries of all parameters, by name.
+        parameters: The declared parameters, by name.
+
+    Returns:
+        The valid values by parameter, and a text about each invalid one.
     """
     taken: dict[str, ParameterValue] = {}
     problems: list[str] = []

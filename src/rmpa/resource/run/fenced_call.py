@@ -1,4 +1,4 @@
-"""Calls of user functions that may hang, inside a fence that is closed when the call is given up."""
+"""Calls user functions that may hang, each inside a fence that is closed when the call is given up."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 
 
 class FencedCall:
-    """One call of a function that applies a profile, or that enters a context.
+    """One call of a function that applies a profile or enters a context; implements ``Fence``.
 
     Args:
         kind: ``profile`` or ``context``.
-        name: Its name.
+        name: Name of the profile or context.
         on_late_action: ``(name, text)``: called in any thread, once for each kind of action that the function
             attempts after the call was given up.
     """
@@ -32,18 +32,18 @@ class FencedCall:
         self.kind = kind
         self.name = name
         self.began = 0.0
-        """When the function was called, seconds of the loop's clock; 0: not yet."""
+        """When the function was called, in seconds of the event loop's clock; 0: not yet."""
         self.in_thread = False
-        """Whether it runs in a thread now, which cannot be stopped from outside."""
+        """Whether the function runs in a thread now; a thread cannot be stopped from outside."""
         self._reported: set[str] = set()
         self._on_late_action = on_late_action
         self._closed = False
-        # Giving up waits for the action under way: one parameter is set, one message handed on.
+        # ``give_up`` waits for the action under way, such as one parameter set or one message passed on.
         self._lock = threading.RLock()
 
     @property
     def closed(self) -> bool:
-        """Whether it was given up."""
+        """Whether the call was given up."""
         return self._closed
 
     def give_up(self) -> None:
@@ -53,7 +53,7 @@ class FencedCall:
 
     @contextlib.contextmanager
     def action(self, what: str) -> Iterator[None]:
-        """See ``rmpa.resource.declare.fence.Fence``."""
+        """Perform an action unless the call was given up; see ``rmpa.resource.declare.fence.Fence``."""
         with self._lock:
             if not self._closed:
                 yield
@@ -62,7 +62,7 @@ class FencedCall:
         raise LocalProtocolError(f"{what}: {self.kind} {self.name} was given up meanwhile; it has no effect any more")
 
     def report_blocked(self, what: str) -> None:
-        """Report an action that came too late."""
+        """Report an action that was attempted after the call was given up; each kind of action once."""
         if what not in self._reported:
             self._reported.add(what)
             text = f"the function of {self.kind} {self.name} was given up; it has no effect: {what}"

@@ -1,4 +1,4 @@
-"""Reads the history of a resource from its store: events, and the profiles and quality windows they explain."""
+"""Reads the history of a resource from its store: events, quality windows, and the profiles that ran."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class HistoryEvent:
     """An alarm, or an action of the control loop.
 
     Args:
-        at: Unix seconds.
+        at: Time of the event, Unix seconds.
         event: ``apply``, ``reacted``, ``alarm``, ``over`` or ``late``; see ``docs/smart-resources.md``.
         level: ``OK``, ``WARN``, ``ERROR`` or ``STALE``.
-        message: For people.
-        details: Further values, such as the profile.
+        message: A text for people.
+        details: Further values by name, such as the profile.
     """
 
     at: float
@@ -41,11 +41,11 @@ class ProfileRun:
     """A span of time under one profile.
 
     Args:
-        profile: Its name.
-        at: When it was chosen, Unix seconds.
-        until: When the next one was chosen; ``None``: it is the last one.
-        why: Why it was chosen.
-        reaction: Seconds from the cause to the completion; ``None``: it was not applied, or not yet.
+        profile: Name of the profile.
+        at: When the profile was chosen, Unix seconds.
+        until: When the next profile was chosen, Unix seconds; ``None`` for the last one.
+        why: Why the profile was chosen.
+        reaction: Seconds from the cause to the completion; ``None``: the profile was not applied, or not yet.
     """
 
     profile: str
@@ -60,10 +60,10 @@ class QualityWindow:
     """One quality window.
 
     Args:
-        at: Its end, Unix seconds.
+        at: End of the window, Unix seconds.
         profile: The profile that ran.
-        level: The resource's health, as of ``HistoryEvent``.
-        message: For people.
+        level: The resource's health, with the same values as in ``HistoryEvent``.
+        message: A text for people.
         quality: Measured values by attribute, in the attributes' units.
     """
 
@@ -101,7 +101,7 @@ def read_windows(path: Path) -> list[QualityWindow]:
 
 
 def read_units(path: Path) -> dict[str, str]:
-    """The units of the resource's attributes, by its last descriptor; empty if there is none.
+    """The unit of each attribute, from the last descriptor in the store; empty without a readable descriptor.
 
     Raises:
         OSError: The store cannot be read.

@@ -1,4 +1,4 @@
-"""Learns the types of outputs that are unknown on this machine from a publisher, here or at a peer."""
+"""Learns the types of outputs that are unknown on this machine from a publisher, in this module or at a peer."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _log = logging.getLogger(__name__)
 
 
 async def learn_outputs(resource: Resource, master_uri: str, caller_id: str) -> None:
-    """Wait until the type of each output is known; logs the types that it waits for, and where they were searched.
+    """Wait until the type of each output is known; missing types and the places searched for them are logged once.
 
     Args:
-        resource: Declared completely; the types of its outputs are set.
-        master_uri: The core whose publishers are queried.
-        caller_id: The resource's node, which need not be registered yet.
+        resource: The resource, completely declared; the function sets the types of its outputs.
+        master_uri: URI of the master whose publishers are queried.
+        caller_id: Name of the resource's node, which need not be registered yet.
     """
     logged: set[str] = set()
     while missing := [output for output in resource.outputs.values() if output.kind.known is None]:
@@ -41,7 +41,7 @@ async def _learn(output: Output, master_uri: str, caller_id: str) -> bool:
     try:
         learnt = await fetch_type(master_uri, caller_id, output.kind.name)
     except UnreachableError as error:
-        _log.debug("! %s: %s", caller_id, error)  # the start that follows reports it
+        _log.debug("! %s: %s", caller_id, error)  # the resource's start reports an unreachable master
         return False
     if learnt is not None:
         output.kind.known = learnt.kind

@@ -43,13 +43,13 @@ _Row = TypeVar("_Row", SavedRequirement, SavedCoolDown)
 
 
 class Persistence(RuntimePart):
-    """The persistence of one resource.
+    """The part of a resource that writes its state and history to its store.
 
     Args:
-        runtime: Of the resource.
-        adapter: Its state is kept.
-        contexts: Likewise.
-        store: Not yet open; closed with the resource.
+        runtime: The runtime of the resource.
+        adapter: Provides the requirements, the cool-downs and the profiles to store.
+        contexts: Provides the context chosen by hand.
+        store: The resource's store, not yet open; closed with the resource.
     """
 
     def __init__(self, runtime: Runtime, adapter: Adapter, contexts: Contexts, store: ResourceStore) -> None:
@@ -61,11 +61,11 @@ class Persistence(RuntimePart):
 
     @property
     def problem(self) -> str:
-        """Why nothing can be stored at present, or empty."""
+        """Why nothing can be stored at present; empty if storing works."""
         return f"nothing is kept: {self._store.problem}" if self._store.problem else ""
 
     async def restore(self) -> SavedState:
-        """Open the store, restore the parameters and return the rest; called before the other parts start."""
+        """Open the store, restore the parameters and return the saved state; called before the parts start."""
         rows = await self._store.open()
         resource = self._runtime.resource
         found = read_saved_state(rows, resource, time.time_ns())
@@ -97,11 +97,11 @@ class Persistence(RuntimePart):
         self.requirements_changed()
 
     async def close(self) -> None:
-        """Write everything and close the store."""
+        """Write all pending changes and close the store."""
         await self._store.close()
 
     def parameter_changed(self, parameter: Parameter) -> None:
-        """Store a parameter."""
+        """Store the parameter's value."""
         self._put((PARAMETER, parameter.name), _json(parameter.value))
 
     # --- inside -------------------------------------------------------------------------------------------------
@@ -166,12 +166,12 @@ class Persistence(RuntimePart):
                 self._event("reacted", DiagnosticLevel.OK, f"{action.profile} runs", details)
 
     def missing_changed(self, text: str, *, missing: bool) -> None:
-        """Add a missing input, or its return, to the history."""
+        """Add to the history that something the resource needs is missing, or is back."""
         event, level = ("alarm", DiagnosticLevel.STALE) if missing else ("over", DiagnosticLevel.OK)
         self._event(event, level, text, {"kind": "missing"})
 
     def late_action(self, text: str) -> None:
-        """Add an action of a function that was given up to the history."""
+        """Add to the history that a function that was given up has ended late or attempted an action."""
         self._event("late", DiagnosticLevel.WARN, text, {})
 
     def _event(self, event: str, level: DiagnosticLevel, message: str, details: object) -> None:
@@ -191,7 +191,7 @@ def _decoded(text: str | None, kind: type[_Row]) -> _Row | None:
 
 
 def _same_requirement(before: str, one: SavedRequirement) -> bool:
-    """Whether a row is up to date; the expiry by the wall clock is never equal to the nanosecond."""
+    """Whether a stored row equals a requirement; expiries may differ by up to a second, since clocks vary."""
     known = _decoded(before, SavedRequirement)
     if known is None:
         return False
@@ -203,7 +203,7 @@ def _same_requirement(before: str, one: SavedRequirement) -> bool:
 
 
 def _same_cool_down(known: SavedCoolDown, one: SavedCoolDown) -> bool:
-    """Whether a row is up to date; it is not when the wall clock was set."""
+    """Whether a stored row equals a cool-down; not if the wall clock was set by a second or more."""
     if (known.cool_down, known.why) != (one.cool_down, one.why):
         return False
     return abs(known.until_ns - one.until_ns) < _SECOND

@@ -1,4 +1,4 @@
-"""Evaluates the preconditions of profiles (``needs=``), each in a thread of its own, since they may block."""
+"""Evaluates the preconditions of profiles (``needs=``), each in a thread of its own, because they may block."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Preconditions:
     """The preconditions of one resource.
 
     Args:
-        profiles: By name.
-        on_change: Called in the event loop when a result has changed.
+        profiles: The declared profiles, by name.
+        on_change: Called in the event loop when a result has changed or has arrived late.
     """
 
     def __init__(self, profiles: Mapping[str, DeclaredProfile], on_change: Callable[[], None]) -> None:
@@ -27,12 +27,12 @@ class Preconditions:
         self._on_change = on_change
         self._started = False
         self._results: dict[str, str] = {}
-        """By profile: why it must not run, or empty."""
+        """The last result by profile: why the profile must not run; empty: it may."""
         self._calls: dict[str, tuple[float, asyncio.Task[None]]] = {}
-        """By profile: the call under way, and when it began."""
+        """The call under way by profile, with its beginning in seconds of the event loop's clock."""
 
     async def start(self) -> None:
-        """Wait for the first results, at most ``limits.PRECONDITION_TIMEOUT``."""
+        """Call all preconditions and wait for the results, at most ``limits.PRECONDITION_TIMEOUT`` seconds."""
         self.check()
         if self._calls:
             await asyncio.wait([task for _, task in self._calls.values()], timeout=limits.PRECONDITION_TIMEOUT)
@@ -46,7 +46,7 @@ class Preconditions:
                 self._calls[name] = (loop.time(), loop.create_task(self._call(name, needs), name=f"needs of {name}"))
 
     def blocked(self) -> dict[str, str]:
-        """The profiles that must not run by the last results, and why."""
+        """The profiles that must not run, with the reason: by their last results, or because none has arrived."""
         now, found = asyncio.get_running_loop().time(), {}
         for name in self._needs:
             why = self._results.get(name, "its precondition was not answered yet")
@@ -58,7 +58,7 @@ class Preconditions:
         return found
 
     async def close(self) -> None:
-        """Stop; threads that hang are left behind."""
+        """Stop waiting for calls; threads that hang are left behind."""
         tasks = [task for _, task in self._calls.values()]
         for task in tasks:
             task.cancel()

@@ -1,7 +1,7 @@
 """Serves a resource's configuration as dynamic_reconfigure does: ``set_parameters`` and its two latched topics.
 
-The values are mirrored at the parameter server below the resource's node and loaded from there at the start, so that
-values of a launch file or ``rmpa param set`` take effect.
+The values are mirrored on the parameter server, below the name of the resource's node. They are loaded from there at
+the start, so that values of a launch file or ``rmpa param set`` take effect.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ _MIRROR_TIMEOUT: Final = 1.0
 
 
 class Reconfigure(RuntimePart):
-    """The configuration of one resource; ``load`` comes before the start of the other parts, ``start`` after it.
+    """The configuration of one resource. ``load`` must be called before the other parts start, ``start`` after it.
 
     Args:
-        runtime: Of the resource.
-        tasks: Paused while several parameters are set.
-        adapter: Takes a profile that is chosen by hand.
-        contexts: Take a context that is chosen by hand.
+        runtime: The runtime of the resource.
+        tasks: The resource's tasks, paused while several parameters are set.
+        adapter: Applies a profile that is chosen by hand.
+        contexts: Enter a context that is chosen by hand.
     """
 
     def __init__(self, runtime: Runtime, tasks: Tasks, adapter: Adapter, contexts: Contexts) -> None:
@@ -81,7 +81,7 @@ class Reconfigure(RuntimePart):
         await node.advertise_service(f"{node.name}/set_parameters", kind, self._serve)
 
     async def close(self) -> None:
-        """Publish nothing any more, and finish writing to the parameter server."""
+        """Stop publishing, and finish writing to the parameter server, for at most 1 s."""
         self._updates = None
         if self._mirror is not None:
             # The next start on this core loads these values.
@@ -91,7 +91,7 @@ class Reconfigure(RuntimePart):
 
     @property
     def values(self) -> dict[str, ParameterValue]:
-        """The present value of each parameter."""
+        """The present value of each parameter, with ``profile`` and ``context`` as chosen by hand."""
         found: dict[str, Any] = {
             name: parameter.value for name, parameter in self._runtime.resource.parameters.items()
         }
@@ -104,8 +104,9 @@ class Reconfigure(RuntimePart):
         """Set parameters together.
 
         Raises:
-            ConfigError: An invalid value, or a profile that cannot be applied; nothing is changed then.
-            PeerRefused: The context cannot be entered; nothing is changed then.
+            ConfigError: A value is invalid or a profile cannot be applied; nothing is changed.
+            LocalProtocolError: The resource ends.
+            PeerRefused: A context cannot be entered; no other value is changed.
         """
         wanted = checked(values, self._entries, self._runtime.resource.parameters)
         async with self._lock:
@@ -131,15 +132,15 @@ class Reconfigure(RuntimePart):
         self.publish()
 
     def acted(self, action: Action) -> None:  # noqa: ARG002
-        """Publish the configuration: another profile may be chosen by hand."""
+        """Publish the configuration, because the profile chosen by hand may have changed."""
         self.publish()
 
     def context_changed(self) -> None:
-        """Publish the configuration."""
+        """Publish the configuration, because the context chosen by hand may have changed."""
         self.publish()
 
     def publish(self) -> None:
-        """Publish the configuration if it has changed, and mirror it at the parameter server."""
+        """Publish the configuration if it has changed, and mirror it on the parameter server."""
         values = self.values
         if self._updates is None or self._quiet or values == self._published:
             return
@@ -155,7 +156,7 @@ class Reconfigure(RuntimePart):
         return {"config": config(self.values, self._entries)}
 
     async def _set_parameters(self, values: Mapping[str, ParameterValue]) -> None:
-        """Set declared parameters; several ones between two runs of the tasks, so that no run sees a part of them."""
+        """Set declared parameters; several are set while tasks are paused, so that no run sees only some of them."""
         if len(values) > 1:
             await self._tasks.pause(_HOLDER)
         try:
@@ -178,7 +179,7 @@ class Reconfigure(RuntimePart):
         raise ConfigError(f"profile {profile}", f"it could not be applied: {why}", "what was chosen before stays")
 
     async def _to_server(self) -> None:
-        """Write changed values until all are written."""
+        """Write changed values to the parameter server until all are written."""
         node = self._runtime.node
         try:
             while True:
@@ -193,7 +194,7 @@ class Reconfigure(RuntimePart):
             _log.debug("! %s: the parameter server: %s", node.name, error)
 
     async def load(self) -> None:
-        """Load the values that the parameter server holds."""
+        """Take over the values that the parameter server holds; invalid ones are logged and left out."""
         node, resource = self._runtime.node, self._runtime.resource
         found = await node.get_param(node.name, default={})
         if not isinstance(found, dict):

@@ -1,4 +1,4 @@
-"""Records which resources this module's graph has shown, here and in other modules."""
+"""Records the resources that this module's graph has shown: those of this module and of others."""
 
 from __future__ import annotations
 
@@ -24,17 +24,18 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 FILE: Final = "_known.sqlite"
-"""Beside the resources' own files; no resource has a name that begins with ``_``."""
+"""Name of the registry's file, beside the resources' own files; no resource's name begins with ``_``."""
 _ENDING: Final = f"/{TOPIC}"
 
 
 class RegistryWriter(RuntimePart):
-    """The registry of a process; a part of one of its resources, whose node it uses.
+    """Writes the registry of a process; it is a part of one resource of the process and uses that resource's node.
 
     Args:
-        runtime: Of that resource.
-        demands: Of that resource: they subscribe to some descriptors already, and a node subscribes to a topic once.
-        store: Not yet open; closed with the resource.
+        runtime: The runtime of that resource.
+        demands: That resource's requirements on others. They subscribe to some descriptors already, and a node may
+            subscribe to a topic only once.
+        store: The registry's store, not yet open; closed with the resource.
     """
 
     def __init__(self, runtime: Runtime, demands: Demands, store: ResourceStore) -> None:
@@ -49,18 +50,18 @@ class RegistryWriter(RuntimePart):
 
     @property
     def problem(self) -> str:
-        """Why nothing can be stored at present, or empty."""
+        """Why nothing can be stored at present; empty if storing works."""
         return f"other resources are not kept: {self._store.problem}" if self._store.problem else ""
 
     async def start(self) -> None:
-        """Read the registry of before, and scan the graph from now on."""
+        """Read the stored registry, and scan the graph from now on."""
         self.registry = ResourceRegistry(await self._store.open())
         for resource, message in self._early:
             self.descriptor_received(resource, message)
         self._scanning = asyncio.get_running_loop().create_task(self._scan(), name="look for resources")
 
     async def close(self) -> None:
-        """Write the last times."""
+        """Stop the scans, write the times when the present resources were last seen, and close the store."""
         if self._scanning is not None:
             self._scanning.cancel()
             await asyncio.wait([self._scanning])
@@ -84,7 +85,7 @@ class RegistryWriter(RuntimePart):
             await asyncio.sleep(limits.KNOWN_LOOK)
 
     async def _follow(self, topics: set[str]) -> None:
-        """Subscribe to new descriptors, and no longer to those that are gone."""
+        """Subscribe to new descriptors, and unsubscribe from those that are gone."""
         node = self._runtime.node
         own = f"{node.name}{_ENDING}"
         self._record(node.name, node.name, self._runtime.descriptor.serialize())
@@ -100,7 +101,7 @@ class RegistryWriter(RuntimePart):
                 _log.debug("= %s: listens to %s already", node.name, topic)
 
     def descriptor_received(self, resource: str, message: Received) -> None:
-        """Record a resource."""
+        """Record a resource whose descriptor has arrived; the message waits until the store has been read."""
         if self.registry is None:
             self._early.append((resource, message))
         else:
@@ -114,7 +115,7 @@ class RegistryWriter(RuntimePart):
         except RmpaError as error:
             _log.debug(
                 "! %s: %s: %s", self._runtime.node.name, path, error
-            )  # a topic of that name that is no descriptor
+            )  # another topic may have the same name and hold no descriptor
 
     def _present(self) -> set[Place]:
         name = self._runtime.node.name

@@ -38,16 +38,16 @@ class ResourceNode:
     """Runs one resource on the core of its module.
 
     Args:
-        resource: Declared completely.
-        master_uri: The core's.
-        window: Seconds of one quality window; ``None``: as declared.
-        settings: Of the control loop; ``None``: as declared.
-        store: Where its state is kept over a restart; ``None``: nowhere.
-        registry: Where the resources of this module's graph are recorded; for one resource of a process.
+        resource: The resource, completely declared.
+        master_uri: URI of the core's master.
+        window: Length of a quality window in seconds; ``None``: as declared.
+        settings: Settings of the control loop; ``None``: as declared.
+        store: Keeps the resource's state over a restart; ``None``: nothing is kept.
+        registry: Records the resources of this module's graph; one resource of a process has it, the others ``None``.
         observers: Further parts, started last.
 
     Raises:
-        ConfigError: It declares no profile, so there is nothing to decide.
+        ConfigError: The resource declares no profile, so there is nothing to decide.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class ResourceNode:
         self.resource = resource
         self.life = LifeCycle()
         self.ended = asyncio.Event()
-        """Set when the resource is finalized, or shut down through its node."""
+        """Set when the resource is finalized, or when its node is shut down from outside."""
         node = Node(resource.name, master_uri=master_uri, on_shutdown=lambda _reason: self.ended.set())
         self.runtime = Runtime(resource, node)
         self.runtime.close_outputs()
@@ -84,7 +84,7 @@ class ResourceNode:
         self.demands = Demands(self.runtime)
         self._persistence = Persistence(self.runtime, self.adapter, self.contexts, store) if store else None
         self.registry = RegistryWriter(self.runtime, self.demands, registry) if registry else None
-        # The parameters are loaded before ``configure``, which opens the device before a profile sets it.
+        # Parameters are loaded before ``configure``; ``configure`` opens the device before a profile sets it.
         first = [_StartStep(self.configuration.load), _StartStep(self._configure), self.tasks]
         parts = [*first, self.adapter, self.contexts, self.configuration, self.demands]
         stores = filter(None, (self._persistence, self.registry))
@@ -100,7 +100,8 @@ class ResourceNode:
         """Configure and activate the resource, once the types of all its outputs are known.
 
         Raises:
-            PeerRefused: The core has a node of this name already, or a callback of the life cycle raised.
+            PeerRefused: A node of this name runs at the core already, the core refuses a registration, or the
+                callback of ``configure`` or ``activate`` raised.
             UnreachableError: The core does not answer.
         """
         await self._refuse_duplicate()
@@ -123,19 +124,24 @@ class ResourceNode:
             raise
 
     async def activate(self) -> None:
-        """Begin the tasks again.
+        """Activate an inactive resource: open the outputs, call its callback, then start the tasks.
 
         Raises:
-            PeerRefused: Its callback raised.
+            LocalProtocolError: The resource is not inactive, or a transition is under way.
+            PeerRefused: The callback of ``activate`` raised; the resource stays inactive.
         """
         await self._change_state(Transition.ACTIVATE)
 
     async def deactivate(self) -> None:
-        """End all tasks."""
+        """Deactivate an active resource: end its tasks, call its callback, then close the outputs.
+
+        Raises:
+            LocalProtocolError: The resource is not active, or a transition is under way.
+        """
         await self._change_state(Transition.DEACTIVATE)
 
     async def close(self) -> None:
-        """Finalize the resource in any state."""
+        """Finalize the resource, from any state, and close its parts and its node; does nothing the second time."""
         if self.life.state is LifecycleState.FINALIZED:
             return
         if self._deactivating is not None:
@@ -147,7 +153,7 @@ class ResourceNode:
         self.ended.set()
 
     def problems(self) -> tuple[list[str], list[str]]:
-        """Problems beside the quality, as texts: what is missing, and what does not work."""
+        """Problems apart from the quality, as texts: first what is missing, second what does not work."""
         missing = [
             f"nobody publishes {name}"
             for name, item in self.resource.inputs.items()
@@ -171,7 +177,11 @@ class ResourceNode:
             raise
 
     async def _refuse_duplicate(self) -> None:
-        """Refuse to start if a node of this name runs; the registration would shut it down."""
+        """Refuse to start if a node of this name runs already, because registering again would shut that node down.
+
+        Raises:
+            PeerRefused: Such a node runs.
+        """
         node = self.runtime.node
         reply = await call_api(node.master_uri, "lookupNode", node.name, node.name)
         if reply.code != 1:
@@ -179,7 +189,7 @@ class ResourceNode:
         try:
             other = await call_api(str(reply.value), "getPid", node.name, timeout=1.0)
         except RmpaError:
-            return  # a stale registration
+            return  # a registration without a running node
         text = f"a node {node.name} runs there already (process {other.value})"
         raise PeerRefused(f"the core at {node.master_uri}", text, "end it, or name this resource otherwise")
 
@@ -221,7 +231,7 @@ class ResourceNode:
 
 
 class _StartStep(RuntimePart):
-    """A coroutine function that is called in the order of the parts; its errors end the start."""
+    """A part that calls one coroutine function when it starts; an error of that function ends the start."""
 
     def __init__(self, step: Callable[[], Awaitable[None]]) -> None:
         self._step = step
@@ -240,19 +250,19 @@ async def run_all(
     """Run resources until ``stop`` is set or all of them have ended.
 
     Args:
-        resources: Of one module, of different names.
-        master_uri: Its core's.
-        stop: Set by the caller.
-        ready: Called when all are active.
-        stores: The folder of their stores; ``None``: nothing is kept over a restart.
+        resources: Resources of one module, with different names.
+        master_uri: URI of the master of the module's core.
+        stop: Set by the caller to end all resources.
+        ready: Called when all resources are active.
+        stores: The folder of the resources' stores; ``None``: nothing is kept over a restart.
 
     Raises:
-        RmpaError: One of them cannot start; those that have started are closed.
+        RmpaError: A resource cannot start; the ones that have started are closed.
     """
     running: list[ResourceNode] = []
     stopped = asyncio.create_task(_wait(stop))
     try:
-        # Last those that wait for the type of an output.
+        # Resources that wait for the type of an output start last.
         for resource in sorted(resources, key=lambda each: any(o.kind.known is None for o in each.outputs.values())):
             store = ResourceStore(stores / f"{resource.name}.sqlite") if stores is not None else None
             registry = ResourceStore(stores / FILE) if stores is not None and not running else None
@@ -276,7 +286,7 @@ async def _start(node: ResourceNode, stopped: asyncio.Task[None]) -> bool:
     """Start a resource; false if it still waited for a type when ``stopped`` ended.
 
     Raises:
-        RmpaError: It cannot start.
+        RmpaError: The resource cannot start.
     """
     types = asyncio.create_task(node.learn(), name=f"types of {node.resource.name}")
     await asyncio.wait([types, stopped], return_when=asyncio.FIRST_COMPLETED)

@@ -1,7 +1,8 @@
 """The resources that this module's graph has shown, and when.
 
-Kept as rows of a store, two for each resource: its last descriptor, and the times when it was seen first and last
-(short, because they change often). Bounded: the resource that was seen least recently is removed.
+The registry is kept as rows of a store, two for each resource: its last descriptor, and the times when it was first
+and last seen. The times change often, so their row is short. The registry is bounded: when it is full, the resource
+that was seen least recently is removed.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ if TYPE_CHECKING:
 DESCRIPTOR: Final = "descriptor"
 SEEN: Final = "seen"
 Place = tuple[str, str]
-"""A resource's name in this module's graph, and the node that publishes for it there: itself, or its proxy."""
+"""A resource's name in this module's graph, and the node that publishes its descriptor there: its own or a proxy."""
 Rows = dict["Key", str | None]
 
 
 class _Times(msgspec.Struct, frozen=True):
-    """Unix nanoseconds of the wall clock."""
+    """When a resource was first and last seen, in Unix nanoseconds of the wall clock."""
 
     first_ns: int
     last_ns: int
@@ -39,11 +40,11 @@ class RegistryEntry:
     """One resource.
 
     Args:
-        path: Its name in this module's graph.
-        caller: The node that published for it: itself, or its proxy.
-        text: Its last descriptor, JSON.
-        first_ns: When it was seen first, Unix nanoseconds.
-        last_ns: When it was seen last.
+        path: Name of the resource in this module's graph.
+        caller: The node that published its descriptor: its own node or a proxy.
+        text: The last descriptor, as JSON.
+        first_ns: When the resource was first seen, Unix nanoseconds.
+        last_ns: When the resource was last seen, Unix nanoseconds.
     """
 
     path: str
@@ -57,16 +58,16 @@ class RegistryEntry:
         """The parsed descriptor.
 
         Raises:
-            RmpaError: It is invalid, which ``ResourceRegistry`` rules out.
+            RmpaError: The text is no valid descriptor; entries of a ``ResourceRegistry`` are always valid.
         """
         return Descriptor.parse(self.text)
 
 
 class ResourceRegistry:
-    """All resources that were seen. Its methods return the rows to write to the store.
+    """All resources that were seen. The methods that change it return the rows to write to the store.
 
     Args:
-        rows: Of the store; untrusted: invalid ones are left out.
+        rows: The store's rows, which are untrusted: invalid ones are left out.
     """
 
     def __init__(self, rows: Mapping[Key, str] | None = None) -> None:
@@ -92,10 +93,13 @@ class ResourceRegistry:
         return sorted(self._known.values(), key=lambda each: (-each.last_ns, each.path, each.caller))
 
     def record(self, path: str, caller: str, text: str, now_ns: int) -> Rows:
-        """Record a descriptor.
+        """Record a descriptor that ``caller`` has published at ``now_ns`` (Unix nanoseconds).
+
+        Returns:
+            The rows to write; a value of ``None`` deletes a row.
 
         Raises:
-            RmpaError: It is invalid.
+            RmpaError: The text is no valid descriptor.
         """
         Descriptor.parse(text)
         place = path, caller
@@ -109,7 +113,10 @@ class ResourceRegistry:
         return rows | self._bound()
 
     def update(self, present: Collection[Place], now_ns: int) -> Rows:
-        """Record which resources are present now; few times are written, to spare flash memory."""
+        """Record which resources are present at ``now_ns`` (Unix nanoseconds); returns the rows to write.
+
+        A present resource's time is written once in ``limits.KNOWN_WRITE`` seconds, to spare flash memory.
+        """
         rows: Rows = {}
         for place in self._known.keys() & set(present):
             self._known[place].last_ns = now_ns
@@ -121,14 +128,14 @@ class ResourceRegistry:
         return rows
 
     def flush(self) -> Rows:
-        """The times of all resources that are present."""
+        """The rows with the times of all resources that are present."""
         rows: Rows = {}
         for place in self._present:
             rows |= self._times(place)
         return rows
 
     def _is_due(self, place: Place, now_ns: int) -> bool:
-        """Whether its times are due to be written; at once if the clock was set back or forth."""
+        """Whether a resource's times must be written now; also after the wall clock was set far back or forth."""
         return abs(now_ns - self._written.get(place, 0)) >= limits.KNOWN_WRITE * 1e9
 
     def _times(self, place: Place) -> Rows:
@@ -154,4 +161,4 @@ class ResourceRegistry:
 
 
 def _name(place: Place) -> str:
-    return " ".join(place)  # neither has a space: they are ROS names
+    return " ".join(place)  # both parts are ROS names, which have no spaces

@@ -1,4 +1,4 @@
-"""A gate that keeps the runs of tasks apart from changes of the profile, the context or several parameters."""
+"""A gate that separates the runs of tasks from changes of the profile, the context or several parameters."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 ENTER_SLICE: Final = 0.1
-"""Seconds that a thread waits at most before it checks again whether it has to end."""
+"""The longest time in seconds that a waiting thread takes to notice that it has to end."""
 _POLL: Final = 0.002
-"""Seconds between checks of a coroutine whether the gate is open; changes are rare and short."""
+"""Seconds between a waiting coroutine's checks of the gate; polling will do, because changes are rare and short."""
 
 
 class RunGate:
-    """Lets runs begin while it is open; a closer can wait until no run is inside.
+    """Lets runs begin while it is open; after closing it, a closer can wait until no run is inside.
 
-    A profile is applied between two runs that way: no message is computed partly under one and partly under another.
+    Thereby a profile is applied between two runs, and no message is computed partly under each of two profiles.
     """
 
     def __init__(self) -> None:
@@ -27,8 +27,8 @@ class RunGate:
         self._inside: set[object] = set()
 
     def enter(self, run: object, ended: Callable[[], bool]) -> bool:
-        """Wait in a thread until the gate is open; false as soon as ``ended`` returns true."""
-        # No lock on the path of a task that is due: a closer looks at the runs inside only after it has closed.
+        """Wait in a thread until the gate is open; returns false if ``ended`` returns true while it is closed."""
+        # An open gate is entered without the lock: a closer examines the runs inside only after it has closed.
         self._inside.add(run)
         if not self._closers:
             return True
@@ -52,14 +52,14 @@ class RunGate:
             await asyncio.sleep(_POLL)
 
     def leave(self, run: object) -> None:
-        """The run has ended, or is stuck and no longer to be waited for."""
+        """Remove a run that has ended, or a stuck one that closers shall not wait for."""
         self._inside.discard(run)
         if self._closers:
             with self._change:
                 self._change.notify_all()
 
     def close(self, closer: str) -> None:
-        """Let no further run begin."""
+        """Let no further run begin until ``closer`` opens the gate again."""
         with self._change:
             self._closers.add(closer)
 

@@ -1,4 +1,4 @@
-"""The runtime of one resource: its node and topics, and the events that its parts receive (``RuntimePart``)."""
+"""The runtime of one resource: its node, its topics, and the events that its parts receive (``RuntimePart``)."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ _CLOSED: Final = "life cycle"
 
 
 class RuntimePart:
-    """A part of a running resource: its callbacks, which do nothing here. All are called in the event loop."""
+    """Base of the parts of a running resource. The callbacks do nothing here; all are called in the event loop."""
 
     async def start(self) -> None:
-        """The node is registered and the outputs are advertised; tasks do not run yet."""
+        """Start the part: the node is registered and the outputs are advertised; tasks do not run yet."""
 
     async def close(self) -> None:
-        """The resource ends; the node is still registered."""
+        """End the part: the resource ends; the node is still registered."""
 
     def published(self, output: Output, raw: bytes, now_ns: int) -> None:
         """An output has sent a message."""
@@ -56,13 +56,19 @@ class RuntimePart:
         """The user's code has observed one of its attributes."""
 
     def parameter_changed(self, parameter: Parameter) -> None:
-        """A parameter has another value."""
+        """A parameter's value has changed."""
 
     def acted(self, action: Action) -> None:
-        """The control loop has acted: applied a profile, raised or cleared an alarm."""
+        """The control loop has acted: begun or completed a profile, raised or cleared an alarm."""
 
     def window_ended(self, level: DiagnosticLevel, message: str, measured: Mapping[str, Value]) -> None:
-        """A quality window has ended: the resource's health, and the measured values by attribute."""
+        """A quality window has ended.
+
+        Args:
+            level: The resource's health.
+            message: The health as a text.
+            measured: Measured values by attribute.
+        """
 
     def requirements_changed(self) -> None:
         """The requirements, the profile or its cool-downs may have changed."""
@@ -71,21 +77,21 @@ class RuntimePart:
         """Something that the resource needs is missing, or is back."""
 
     def late_action(self, text: str) -> None:
-        """A function that was given up has ended, or attempted an action."""
+        """A function that was given up has ended late, or has attempted an action; ``text`` describes it."""
 
     def context_changed(self) -> None:
-        """Another context is active, or was chosen by hand."""
+        """The present context, or the choice of a context by hand, may have changed."""
 
     def descriptor_received(self, resource: str, message: Received) -> None:
-        """A resource that this one requests something of has published its descriptor."""
+        """Another resource, on which this one has a requirement, has published its descriptor."""
 
 
 class Runtime:
     """Runs one resource on a node: connects its declaration, its topics and its parts.
 
     Args:
-        resource: Declared completely.
-        node: Named as the resource; not yet entered.
+        resource: The resource, completely declared.
+        node: The resource's node, with the resource's name; not yet entered.
     """
 
     def __init__(self, resource: Resource, node: Node) -> None:
@@ -103,15 +109,15 @@ class Runtime:
         self._holders: set[str] = set()
         self._open = True
         self._refused: Counter[str] = Counter()
-        """By output: messages that were refused since the outputs were closed."""
+        """Number of messages refused since the outputs were closed, by output."""
         self._unusable: set[tuple[str, str]] = set()
-        """Inputs and publishers whose message definition cannot be used."""
+        """Pairs of an input and a publisher whose message definition cannot be used; each is logged once."""
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread = 0
         self._undo = contextlib.AsyncExitStack()
 
     async def start(self, parts: Iterable[RuntimePart] = ()) -> None:
-        """Register the node, its outputs and inputs, and start the parts in order.
+        """Register the node, its outputs and inputs, and start the parts in the given order.
 
         Raises:
             UnreachableError: The master does not answer.
@@ -141,11 +147,11 @@ class Runtime:
             self._undo = undo.pop_all()
 
     async def close(self) -> None:
-        """End the parts, the last one first, then the node."""
+        """Close the parts in reverse order of their start, then the node."""
         await self._undo.aclose()
 
     async def advertise_text(self, name: str, text: str) -> None:
-        """Advertise a latched topic ``std_msgs/String`` below the node, unless it is, and publish a text."""
+        """Publish a text on a latched topic ``std_msgs/String`` below the node; advertises it if necessary."""
         if name not in self._texts:
             publisher = await self.node.advertise(
                 f"{self.node.name}/{name}", MessageType("std_msgs/String"), latch=True
@@ -154,34 +160,40 @@ class Runtime:
         self.publish_text(name, text)
 
     def publish_text(self, name: str, text: str) -> None:
-        """Publish a text on a topic of ``advertise_text``, if it differs from the last one."""
+        """Publish a text on a topic that ``advertise_text`` has advertised, if it differs from the last text."""
         publisher, before = self._texts[name]
         if text != before:
             self._texts[name] = (publisher, text)
             publisher.publish(publisher.make({"data": text}))
 
     def publish_descriptor(self) -> None:
-        """Publish the descriptor anew, because the declaration has changed."""
+        """Publish the descriptor again after the declaration has changed."""
         self.descriptor = describe(self.resource, self.node.name)
         self.publish_text(TOPIC, self.descriptor.serialize())
 
     def publishers_of(self, item: Input) -> int:
-        """The number of publishers of an input's topic, here or in other modules."""
+        """The number of publishers of an input's topic, in this module and others."""
         subscriber = self._subscribers.get(item.name)
         return subscriber.publishers if subscriber is not None else 0
 
     def hold(self, holder: str = "profile") -> None:
-        """Queue messages from now on, so that no output mixes two profiles or two contexts.
+        """Queue messages from now on, so that no output mixes messages of two profiles or two contexts.
 
         Args:
-            holder: The kind of change: ``profile`` or ``context``; messages are sent when the last one is complete.
+            holder: The kind of change: ``profile``, ``context`` or the life cycle. The queue is sent when no holder
+                is left.
         """
         if not self._open:
-            self._retain({"profile", "context"} - {holder})  # the messages of the previous one are outdated
+            self._retain({"profile", "context"} - {holder})  # the previous change's messages are outdated
         self._holders.add(holder)
 
     def release(self, holder: str = "profile", *, drop: bool = False) -> None:
-        """Send the queued messages in order, or drop them, because they are of a profile that was not applied."""
+        """End a ``hold``; without another holder the queued messages are sent in order.
+
+        Args:
+            holder: As given to ``hold``.
+            drop: Drop the queued messages instead: they belong to a profile that was not applied.
+        """
         self._holders.discard(holder)
         if drop or not self._holders:
             held, self._held, self._held_bytes = self._held, deque(), 0
@@ -189,7 +201,7 @@ class Runtime:
                 self._send(output, raw)
 
     def open_outputs(self) -> None:
-        """Send messages from now on, and first those that profiles and contexts have published meanwhile."""
+        """Send messages from now on; first those that functions of profiles and contexts published while closed."""
         self._open = True
         for name, count in self._refused.items():
             _log.info("= %s: %s flows again; %d messages were refused", self.node.name, name, count)
@@ -197,21 +209,21 @@ class Runtime:
         self.release(_CLOSED)
 
     def close_outputs(self) -> None:
-        """Refuse messages from now on; logged once for each output.
+        """Refuse messages from now on; the first refusal of each output is logged.
 
-        Messages of the last profile's and the last context's function are queued: they describe the state in which
-        the resource is when the outputs open again.
+        Messages of the function of the last profile and of the last context are queued instead: they describe the
+        state that the resource has when the outputs open again.
         """
         self._open = False
         self.hold(_CLOSED)
 
     def drop(self) -> None:
-        """Drop the queued messages, which are of a profile that was given up; later ones are queued as before."""
+        """Drop the queued messages of a profile that was given up; later messages are queued as before."""
         self._held.clear()
         self._held_bytes = 0
 
     def call_in_loop(self, function: Callable[..., object], *args: Any) -> None:
-        """Call a function in the event loop: now in the loop's own thread, else soon."""
+        """Call a function in the event loop: at once if called in the loop's thread, else as soon as the loop can."""
         if threading.get_ident() == self._thread:
             function(*args)
         elif self._loop is not None:
@@ -241,7 +253,7 @@ class Runtime:
         self._subscribers[item.name] = await self.node.subscribe(topic, item.kind.name, learnt)
 
     def _learn(self, item: Input, message: Received) -> bool:
-        """Take the type of an input from its publisher's header; false if its definition cannot be used."""
+        """Take the type of an input from its publisher's header; false if the definition there cannot be used."""
         caller = printable(message.caller_id)
         try:
             kind = message.kind
@@ -260,12 +272,12 @@ class Runtime:
         """Send one message, or queue it while a profile or context is being applied.
 
         Args:
-            output: Its output.
+            output: The output that publishes the message.
             raw: The serialized message.
-            fence: Around the publishing function, if that can be given up.
+            fence: The fence of the publishing function; ``None`` if the function cannot be given up.
         """
         if fence is not None and fence.closed:
-            fence.report_blocked(f"publish on {output.name}")  # it was on its way from another thread
+            fence.report_blocked(f"publish on {output.name}")  # published in another thread before the fence closed
             return
         if not self._open and fence is None:
             self._refuse(output)
@@ -288,7 +300,7 @@ class Runtime:
             part.published(output, raw, now_ns)
 
     def _retain(self, kinds: set[str]) -> None:
-        """Drop the queued messages except those of functions of these kinds."""
+        """Drop the queued messages except those of functions of these kinds (``profile``, ``context``)."""
         self._held = deque(held for held in self._held if held[2] is not None and held[2].kind in kinds)
         self._held_bytes = sum(len(raw) for _, raw, _ in self._held)
 
@@ -309,7 +321,7 @@ class Runtime:
     def _publish(
         self, output: Output, numbers: Iterator[int], values: Mapping[str, Any], message: object | None
     ) -> None:
-        """Serialize a message in the caller's thread, which gets its errors, and send it in the event loop."""
+        """Serialize a message in the caller's thread, so that the caller gets the errors, and send it in the loop."""
         kind = output.type
         if message is not None and values:
             raise LocalProtocolError(f"{output.name}: a message and fields; give one or the other")

@@ -1,4 +1,4 @@
-"""Schedules and statistics of tasks, and back-off times after failures; pure, the time is an argument."""
+"""Schedules and statistics of tasks, and back-off times after failures. Pure: the time is an argument."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from typing import Final
 RESTART_FIRST: Final = 0.1
 """Seconds of the back-off after a task's first failure."""
 RESTART_MAX: Final = 5.0
-"""The longest back-off."""
+"""Seconds of the longest back-off."""
 STUCK_PERIODS: Final = 10
-"""A run that takes so many periods is stuck, unless declared otherwise."""
+"""Number of periods after which a run is stuck, unless declared otherwise."""
 STUCK_LEAST: Final = 5.0
-"""The least time in seconds after which a run is stuck, unless declared otherwise."""
+"""Lower bound in seconds of the time after which a run is stuck, unless declared otherwise."""
 _EARLY: Final = 1e-9
 
 
 class Schedule:
     """The due times of a periodic task: start, start + period, start + 2 periods and so on.
 
-    Absolute, so that lateness does not add up. A due time that is a whole period past is skipped.
+    The times are absolute, so that lateness does not add up. A due time that is a whole period past is skipped.
 
     Args:
-        period: Seconds, above 0.
-        start: The first time, monotonic seconds.
+        period: The period in seconds, above 0.
+        start: The first due time, in monotonic seconds.
     """
 
     def __init__(self, period: float, start: float) -> None:
@@ -35,7 +35,7 @@ class Schedule:
         self._tick = -1
 
     def next_due(self, now: float) -> float:
-        """Advance to the next due time and return it."""
+        """Advance to the next due time and return it, in monotonic seconds like ``now``."""
         self._tick += 1
         late = math.floor((now - self._start) / self.period + _EARLY) - self._tick
         if late > 0:
@@ -53,11 +53,11 @@ class TaskReport:
         failures: Runs that raised.
         overruns: Runs that took more than a period.
         missed: Due times that were skipped because of overruns.
-        dropped: Messages of its input that were dropped because it was too slow.
-        lateness: Mean seconds from the due time to the beginning of a run.
-        lateness_max: The greatest of them.
-        period_sd: Standard deviation of the time between two beginnings, seconds.
-        busy: Share of the window in which it ran.
+        dropped: Messages of the task's input that were dropped because the task was too slow.
+        lateness: Mean time from the due time to the beginning of a run, in seconds.
+        lateness_max: The longest such time, in seconds.
+        period_sd: Standard deviation of the time between the beginnings of two runs, in seconds.
+        busy: Share of the window in which the task ran, 0 to 1.
     """
 
     runs: int = 0
@@ -74,12 +74,12 @@ class TaskReport:
 def too_slow(report: TaskReport, period: float | None) -> str:
     """The reason why a task was too slow in a window, for people; empty if it was not.
 
-    It was if more than a tenth of its runs took longer than its period, or if messages of its input were dropped. A
-    single late run may be due to load of the machine.
+    A task was too slow if more than a tenth of its runs took longer than its period, or if messages of its input were
+    dropped. A single slow run does not count, because load of the machine may have caused it.
 
     Args:
-        report: Of the window.
-        period: Seconds, of a periodic task, else ``None``.
+        report: The statistics of the window.
+        period: The period in seconds; ``None`` for a task that runs on messages.
     """
     if report.dropped:
         return f"{report.dropped} messages of its input gave way to newer ones, {report.runs} were taken"
@@ -90,11 +90,11 @@ def too_slow(report: TaskReport, period: float | None) -> str:
 
 
 class TaskFigures:
-    """Measures one task: updated by the thread that runs it, read by the event loop. Keeps sums only.
+    """Measures one task: updated by the thread that runs the task, read by the event loop. It keeps only sums.
 
     Args:
-        period: Seconds, of a periodic task, else ``None``.
-        now: Monotonic seconds.
+        period: The period in seconds; ``None`` for a task that runs on messages.
+        now: The beginning of the first window, in monotonic seconds.
     """
 
     def __init__(self, period: float | None, now: float) -> None:
@@ -104,7 +104,7 @@ class TaskFigures:
         self._began: float | None = None
         self._last: float | None = None
         self.in_a_row = 0
-        """Failures since the last run that succeeded."""
+        """Number of failures since the last run that succeeded."""
         self.error = ""
         """The error of the last run; empty if it succeeded."""
         self._clear()
@@ -117,12 +117,12 @@ class TaskFigures:
 
     @property
     def running_since(self) -> float | None:
-        """When the present run began, or ``None`` between two runs."""
+        """When the present run began, in monotonic seconds; ``None`` between two runs."""
         return self._began
 
     def begun(self, due: float, now: float) -> None:
-        """A run begins that was due at ``due``."""
-        self._due, self._began = due, now  # evaluated after the run, to begin it sooner
+        """Record that a run begins at ``now`` that was due at ``due``, both in monotonic seconds."""
+        self._due, self._began = due, now  # evaluated after the run, so that the run begins sooner
 
     def _add_beginning(self, now: float) -> None:
         late = max(0.0, now - self._due)
@@ -137,7 +137,7 @@ class TaskFigures:
         self._last = now
 
     def ended(self, now: float, error: str = "") -> None:
-        """The run has ended, perhaps with an error."""
+        """Record that the run has ended; ``error`` is empty if it succeeded."""
         took = 0.0
         if self._began is not None:
             self._add_beginning(self._began)
@@ -155,11 +155,11 @@ class TaskFigures:
             self.in_a_row = 0
 
     def interrupted(self) -> None:
-        """The time to the next run is not a period: the task waited for another reason."""
+        """Exclude the time until the next run from the periods: the task waited for another reason."""
         self._last = None
 
     def retimed(self, period: float) -> None:
-        """The task has another period from now on."""
+        """Set the period, in seconds, that applies from now on."""
         self._period = period
         self._last = None
 
@@ -191,12 +191,12 @@ class TaskFigures:
 
 
 def restart_delay(in_a_row: int) -> float:
-    """The back-off in seconds after so many consecutive failures."""
+    """The back-off in seconds after ``in_a_row`` consecutive failures."""
     return min(RESTART_FIRST * 2.0 ** min(max(0, in_a_row - 1), 16), RESTART_MAX)
 
 
 def stuck_after(period: float | None, declared: float | None) -> float:
-    """Seconds after which a run counts as stuck; ``declared``: by the task, or ``None``."""
+    """Seconds after which a run counts as stuck: as declared, or else from the period (``None``: on messages)."""
     if declared is not None:
         return declared
     return max(STUCK_LEAST, STUCK_PERIODS * period) if period is not None else STUCK_LEAST

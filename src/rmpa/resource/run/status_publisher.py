@@ -24,7 +24,7 @@ class StatusPublisher:
     """The report topics of one resource (``docs/smart-resources.md`` lists them).
 
     Args:
-        runtime: Of the resource.
+        runtime: The runtime of the resource.
     """
 
     def __init__(self, runtime: Runtime) -> None:
@@ -45,7 +45,7 @@ class StatusPublisher:
             await self._runtime.advertise_text(name, "")
 
     def close(self) -> None:
-        """Publish nothing any more."""
+        """Stop publishing; later reports of quality, alarms and responses are dropped."""
         self.publishers.clear()
 
     def quality(self, level: DiagnosticLevel, message: str, values: Mapping[str, str]) -> None:
@@ -66,7 +66,7 @@ class StatusPublisher:
             self._publish("responses", statuses)
 
     def decision(self, profile: str, decision: Mapping[str, Any]) -> None:
-        """Publish the profile that runs, and the scores of all."""
+        """Publish the profile that runs and the decision (see ``decision_report``), each if it has changed."""
         self._runtime.publish_text("profile", profile)
         self._runtime.publish_text("decision", msgspec.json.encode(decision).decode())
 

@@ -1,8 +1,8 @@
 """A resource's file: its state over a restart, and a bounded history. SQLite in a thread of its own.
 
-Nothing here blocks the event loop, and no disk can stop a resource: if it is full, read-only or gone, that is logged
-once (``ResourceStore.problem``) and writing is tried again. A damaged file is renamed to ``.damaged`` and begun anew
-with everything that is known at that moment. ``rmpa.resource.run.history`` reads the last three tables::
+Nothing here blocks the event loop, and no disk failure stops a resource: if the disk is full, read-only or gone, that
+is logged once (``ResourceStore.problem``) and writing is tried again. A damaged file is renamed to ``.damaged``, and
+the new file begins with all known state. ``rmpa.resource.run.history`` reads the last three tables::
 
     state(kind, name, value, at_ns)                      value: JSON; see resource.decide.saved_state
     windows(at_ns, profile, level, message, quality)     quality: JSON, attribute -> value in the attribute's unit
@@ -66,10 +66,10 @@ _LOCK_RETRY: Final = 0.02
 
 @contextlib.contextmanager
 def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
-    """Open a store for reading, whether its resource runs or not, without disturbing it.
+    """Open a store for reading, without disturbing its resource if that runs.
 
     Raises:
-        OSError: It cannot be read.
+        OSError: The store cannot be read.
     """
     try:
         uri = f"{path.resolve().as_uri()}?mode=ro"
@@ -80,10 +80,10 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def read_state(path: Path) -> dict[Key, str]:
-    """The ``state`` of a store.
+    """The rows of a store's ``state`` table: values by kind and name.
 
     Raises:
-        OSError: It cannot be read.
+        OSError: The store cannot be read.
     """
     with open_read_only(path) as connection:
         return _state(connection)
@@ -95,12 +95,12 @@ def _state(connection: sqlite3.Connection) -> dict[Key, str]:
 
 
 class _DamagedError(Exception):
-    """The file is not a store, or not a readable one."""
+    """The file is no store, is damaged, or has the format of a later release."""
 
 
 @dataclass
 class _Pending:
-    """Changes to write."""
+    """Changes that wait to be written: rows of ``state`` (``None`` deletes one), and rows of the other tables."""
 
     state: dict[Key, str | None] = field(default_factory=dict)
     rows: deque[tuple[str, tuple[object, ...]]] = field(
@@ -112,12 +112,12 @@ class _Pending:
 
 
 class ResourceStore:
-    """One file. No method waits for the disk.
+    """The store of one resource. No method blocks the event loop; ``open`` and ``close`` await the thread.
 
     Args:
-        path: Created if it does not exist, with its folders.
+        path: The file; created with its folders if it does not exist.
         interval: Seconds between writes of the history.
-        bytes_max: Bound of the file's size.
+        bytes_max: The largest size of the file in bytes.
     """
 
     def __init__(
@@ -125,7 +125,7 @@ class ResourceStore:
     ) -> None:
         self.path = path
         self.problem = ""
-        """Why nothing can be stored at present, or empty."""
+        """Why nothing can be stored at present; empty if storing works."""
         self._interval = interval
         self._pages = bytes_max // _PAGE
         self._change = threading.Condition()
@@ -133,7 +133,7 @@ class ResourceStore:
         self._urgent = False
         self._closing = False
         self._known: dict[Key, str] = {}
-        """The content of ``state``, for a new file in place of a damaged one."""
+        """The content of ``state``, written to the new file after a damaged or deleted one."""
         self._connection: sqlite3.Connection | None = None
         self._inode = 0
         self._lock: int | None = None
@@ -141,7 +141,12 @@ class ResourceStore:
         self._thread = threading.Thread(target=self._run, name=f"store {path.stem}", daemon=True)
 
     async def open(self) -> dict[Key, str]:
-        """Open the file and return its ``state``; empty if it cannot be read, which is logged."""
+        """Open the file and return its ``state``.
+
+        Returns:
+            Values by kind and name; empty if the file cannot be read within ``limits.STORE_OPEN_TIMEOUT`` seconds,
+            which is logged.
+        """
         self._thread.start()
         try:
             async with asyncio.timeout(limits.STORE_OPEN_TIMEOUT):
@@ -151,26 +156,26 @@ class ResourceStore:
             return {}
 
     def put(self, key: Key, value: str | None) -> None:
-        """Set a row of ``state`` to a JSON text, or delete it; written at once."""
+        """Set a row of ``state`` to a JSON text, or delete it (``None``); the thread writes it without delay."""
         with self._change:
             self._pending.state[key] = value
             self._urgent = True
             self._change.notify()
 
     def window(self, at_ns: int, profile: str, level: int, message: str, quality: str) -> None:
-        """Add a window of quality to the history."""
+        """Add a quality window that ended at ``at_ns`` (Unix nanoseconds) to the history; ``quality`` is JSON."""
         self._add("windows", (at_ns, profile, level, message, quality))
 
     def event(self, at_ns: int, event: str, level: int, message: str, details: str) -> None:
-        """Add an event to the history."""
+        """Add an event at ``at_ns`` (Unix nanoseconds) to the history; ``details`` is JSON."""
         self._add("events", (at_ns, event, level, message, details))
 
     def descriptor(self, node: str, text: str, at_ns: int) -> None:
-        """Add a descriptor; the same one again only updates its ``last_ns``."""
+        """Add a node's descriptor (JSON) to the history; if it is there already, only its ``last_ns`` is updated."""
         self._add("descriptors", (node, text, at_ns, at_ns))
 
     async def close(self) -> None:
-        """Write everything and end the thread, which is left behind if the disk hangs."""
+        """Write all pending changes and end the thread; a thread whose disk hangs is left behind."""
         with self._change:
             self._closing = True
             self._change.notify()
@@ -210,7 +215,7 @@ class ResourceStore:
             self._pending.rows = deque(rows, maxlen=limits.STORE_PENDING_MAX)
 
     def _attempt(self, work: _Pending) -> bool:
-        """Write; replace a damaged file and write again. False: it failed."""
+        """Write changes; a damaged file is replaced first. Returns false if nothing could be written."""
         try:
             try:
                 self._write(work)
@@ -249,7 +254,7 @@ class ResourceStore:
         for table, row in work.rows:
             connection.execute(_INSERT[table], row)
         for table in {table for table, _ in work.rows}:
-            # The name is one of _KEPT's.
+            # The table's name is a key of _KEPT, never user input.
             oldest = f"(SELECT max(id) FROM {table}) - {_KEPT[table]}"  # noqa: S608
             connection.execute(f"DELETE FROM {table} WHERE id <= {oldest}")  # noqa: S608
 
@@ -281,7 +286,11 @@ class ResourceStore:
         return connection
 
     def _take_lock(self) -> None:
-        """Exclude a second process: a resource and a module of the same names on this machine."""
+        """Lock the file against a second process: another module of the same name may run the same resource here.
+
+        Raises:
+            OSError: Another process holds the lock for longer than ``limits.STORE_LOCK_TIMEOUT`` seconds.
+        """
         if self._lock is not None:
             return
         number = os.open(self.path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)

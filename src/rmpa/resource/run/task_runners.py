@@ -44,9 +44,9 @@ class TaskRunner:
     """Runs one task until it is stopped.
 
     Args:
-        task: As declared.
-        gate: Entered for each run.
-        on_failed: Called in the event loop with the error of a run that raised.
+        task: The declared task.
+        gate: Entered before each run and left after it.
+        on_failed: Called in the event loop with the error text of a run that raised.
     """
 
     def __init__(self, task: Task, gate: RunGate, on_failed: Callable[[str], None]) -> None:
@@ -54,19 +54,19 @@ class TaskRunner:
         period = 1 / rate if rate else None
         self.task = task
         self.waiting = False
-        """Whether its last run failed."""
+        """Whether the last run failed; the task waits for its back-off."""
         self.lost = 0
-        """Consecutive runs that were stuck."""
+        """Number of consecutive runs that were stuck."""
         self.problem: TaskProblem | None = None
-        """The problem of its last run; ``None`` after one that succeeded."""
+        """The problem of the last run; ``None`` after a run that succeeded."""
         self.over = ""
-        """Why it ended by itself, or empty."""
+        """Why the task has ended because of a failure; empty: it has not."""
         self.stopped = False
         self.stuck_after = stuck_after(period, task.stuck_after)
-        """Seconds that a run may take."""
+        """Seconds after which a run counts as stuck."""
         self.figures = TaskFigures(period, time.monotonic())
         self.period = period
-        """Seconds, of a periodic one, else ``None``."""
+        """The period in seconds; ``None`` if the task runs on messages."""
         self._gate = gate
         self._on_failed = on_failed
         self._messages: deque[Received] = deque()
@@ -81,24 +81,24 @@ class TaskRunner:
         return "stuck" if self.lost else "running"
 
     def _succeeded(self) -> None:
-        """A run has ended without an error."""
+        """Record a run that has ended without an error."""
         self.figures.ended(time.monotonic())
         self.waiting, self.lost, self.problem = False, 0, None
 
     def start(self) -> None:
-        """Begin."""
+        """Start the runs; must be called in the event loop."""
         raise NotImplementedError
 
     def stop(self, *, stuck: bool = False) -> None:
-        """End; a stuck run is not waited for."""
+        """End the runs; ``stuck``: the present run hangs, so nothing waits for it."""
         raise NotImplementedError
 
     async def ended(self) -> None:
-        """Wait until it has ended, ``limits.TASK_END_TIMEOUT`` at most."""
+        """Wait until the last run has ended, at most ``limits.TASK_END_TIMEOUT`` seconds."""
         raise NotImplementedError
 
     def wake(self) -> None:
-        """A message has arrived, or the period has changed."""
+        """Wake the run loop: a message has arrived, or the period has changed."""
         raise NotImplementedError
 
     def retime(self, rate: float) -> None:
@@ -109,7 +109,7 @@ class TaskRunner:
         self.wake()
 
     def enqueue(self, message: Received) -> None:
-        """Queue a message, drop-oldest."""
+        """Queue a message for a run; a full queue (``limits.TASK_QUEUE_MESSAGES``) drops its oldest."""
         if len(self._messages) >= limits.TASK_QUEUE_MESSAGES:
             self._messages.popleft()
             self.figures.dropped()
@@ -117,7 +117,10 @@ class TaskRunner:
         self.wake()
 
     def _next(self, schedule: Schedule, last: float) -> tuple[Schedule, float]:
-        """Advance to the next due time, monotonic seconds; a new period begins a new schedule after the last run."""
+        """Advance to the next due time, in monotonic seconds.
+
+        A changed period begins a new schedule: its first due time is one period after ``last``, the last one.
+        """
         if self.period is not None and schedule.period != self.period:
             schedule = Schedule(self.period, max(last + self.period, time.monotonic()))
         missed = schedule.missed
@@ -130,7 +133,7 @@ class TaskRunner:
 
     def _error(self, error: BaseException) -> str:
         text = f"{type(error).__name__}: {error}"
-        if self.problem is None or self.problem.text != text:  # one traceback for the same error
+        if self.problem is None or self.problem.text != text:  # a repeated error is logged once
             _log.warning("! task %s failed:", self.task.name, exc_info=error)
         return text
 
@@ -139,19 +142,19 @@ class AsyncTaskRunner(TaskRunner):
     """Runs a coroutine function in the event loop."""
 
     def start(self) -> None:
-        """Begin."""
+        """Start the runs in a task of the event loop."""
         self._wake = asyncio.Event()
         self._task = asyncio.get_running_loop().create_task(self._run(), name=f"task {self.task.name}")
 
     def stop(self, *, stuck: bool = False) -> None:
-        """End, also within a run."""
+        """Cancel the present run, if any, and end; ``stuck``: the run is no longer counted as inside the gate."""
         self.stopped = True
         if stuck:
             self._gate.leave(self)
         self._task.cancel()
 
     async def ended(self) -> None:
-        """Wait until it has ended."""
+        """Wait until the last run has ended, at most ``limits.TASK_END_TIMEOUT`` seconds."""
         await asyncio.wait([self._task], timeout=limits.TASK_END_TIMEOUT)
 
     def wake(self) -> None:
@@ -195,7 +198,7 @@ class AsyncTaskRunner(TaskRunner):
             await self._wake.wait()
 
     async def _once(self, due: float, message: Received | None) -> bool:
-        """Run once; false after a failure and its back-off."""
+        """Run once; returns false after a failure and its back-off."""
         await self._gate.enter_async(self)
         self.figures.begun(due, time.monotonic())
         try:
@@ -208,7 +211,7 @@ class AsyncTaskRunner(TaskRunner):
         except (Exception, SystemExit, asyncio.CancelledError) as error:
             own = asyncio.current_task()
             if isinstance(error, asyncio.CancelledError) and own is not None and own.cancelling():
-                raise  # this task is cancelled, not one that the run waits for
+                raise  # this task itself is cancelled, not a task that the run awaits
             text = await asyncio.to_thread(self._error, error)  # the traceback reads source files
         else:
             self._succeeded()
@@ -225,17 +228,17 @@ class ThreadTaskRunner(TaskRunner):
     """Runs a plain function in a thread of its own."""
 
     def start(self) -> None:
-        """Begin."""
+        """Start the runs in a new thread."""
         self._end = threading.Event()
         self._ready = threading.Semaphore(0)
         self._loop = asyncio.get_running_loop()
         self._done = asyncio.Event()
         name = f"task {self.task.name}"
-        # A daemon, because a stuck one must not keep the process from exiting.
+        # A daemon thread: a stuck one must not keep the process from exiting.
         threading.Thread(target=self._thread, name=name, daemon=True).start()
 
     def stop(self, *, stuck: bool = False) -> None:
-        """End after the present run; a stuck one is not waited for."""
+        """End after the present run; ``stuck``: the run hangs, so its thread is left behind."""
         self.stopped = True
         self._end.set()
         self._ready.release()
@@ -244,7 +247,7 @@ class ThreadTaskRunner(TaskRunner):
             self._done.set()
 
     async def ended(self) -> None:
-        """Wait until it has ended, ``limits.TASK_END_TIMEOUT`` at most."""
+        """Wait until the thread has ended, at most ``limits.TASK_END_TIMEOUT`` seconds."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(limits.TASK_END_TIMEOUT):
                 await self._done.wait()
@@ -288,12 +291,12 @@ class ThreadTaskRunner(TaskRunner):
             self._ready.acquire()
             if self._end.is_set():
                 return
-            with contextlib.suppress(IndexError):  # dropped in favour of newer ones
+            with contextlib.suppress(IndexError):  # woken without a message, or the message was dropped
                 message = self._messages.popleft()
                 self._once(message.stamp_ns / 1e9 - time.time() + time.monotonic(), message)
 
     def _once(self, due: float, message: Received | None) -> bool:
-        """Run once; false after a failure and its back-off."""
+        """Run once; returns false after a failure and its back-off, or if the task has to end."""
         if not self._gate.enter(self, self._end.is_set):
             return False
         self.figures.begun(due, time.monotonic())

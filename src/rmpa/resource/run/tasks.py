@@ -1,7 +1,8 @@
 """The tasks of a resource: periodic ones on an absolute schedule, others on the messages of an input.
 
-A task that raises is reported and restarted after a back-off, or ends, as declared. A run that does not return is
-reported as stuck: a coroutine is cancelled; a thread cannot be, so it is left behind and a new one takes over.
+A task that raises is reported, and is restarted after a back-off or ends, as declared. A run that does not return is
+reported as stuck and given up: a coroutine is cancelled; a thread cannot be stopped, so it is left behind. Unless the
+task ends by its declaration, a new coroutine or thread continues it.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ class Tasks(RuntimePart):
     """All tasks of one resource.
 
     Args:
-        runtime: Of the resource.
-        on_problem: Called in the event loop.
+        runtime: The runtime of the resource.
+        on_problem: Called in the event loop with each new problem of a task.
         on_deactivate: Called in the event loop with the reason, when the failure of a task deactivates the resource.
     """
 
@@ -58,16 +59,16 @@ class Tasks(RuntimePart):
         self._on_deactivate = on_deactivate
         self._runners: dict[str, TaskRunner] = {}
         self._slow: dict[str, TaskProblem] = {}
-        """Tasks that were too slow in the last two windows in which they ran, with the problem."""
+        """The problem of each task that was too slow in the last two windows in which it ran, by name."""
         self._lagged: set[str] = set()
-        """Tasks that were too slow in the last one; a single window may be due to load of the machine."""
+        """Names of tasks that were too slow in the last window; one alone may be due to load of the machine."""
         self._next_check: float | None = None
         self._timer = MachineTimer(lambda: self._next_check, self._check_stuck, now=time.monotonic)
         self._gate = RunGate()
 
     @property
     def running(self) -> Mapping[str, str]:
-        """By task: ``running``, ``waiting`` (it failed), ``stuck``, or ``stopped`` and why.
+        """State by task: ``running``, ``waiting`` (the last run failed), ``stuck``, or ``stopped`` and why.
 
         ``waiting`` and ``stuck`` last until a run succeeds.
         """
@@ -75,7 +76,7 @@ class Tasks(RuntimePart):
 
     @property
     def problems(self) -> list[str]:
-        """The problems of tasks at present, for people."""
+        """The present problems of tasks, as texts for people."""
         found = []
         for name, runner in self._runners.items():
             if runner.over:
@@ -122,10 +123,10 @@ class Tasks(RuntimePart):
         await asyncio.gather(*(runner.ended() for runner in runners))
 
     async def pause(self, holder: str = "profile") -> None:
-        """Let no run begin, and wait until none is under way; a stuck one is not waited for.
+        """Let no run begin, and wait until none is under way, at most ``limits.TASK_PAUSE_TIMEOUT`` seconds.
 
         Args:
-            holder: The kind of change; runs begin again when the last one is complete.
+            holder: The kind of change; runs begin again when each holder has called ``resume``.
         """
         self._gate.close(holder)
         await asyncio.to_thread(self._gate.wait_empty, limits.TASK_PAUSE_TIMEOUT)
@@ -135,7 +136,7 @@ class Tasks(RuntimePart):
         self._gate.open(holder)
 
     async def close(self) -> None:
-        """End with the resource."""
+        """End all tasks, because the resource ends."""
         await self.deactivate()
 
     def reports(self, now: float) -> dict[str, TaskReport]:
@@ -165,7 +166,7 @@ class Tasks(RuntimePart):
         runner.start()
 
     def _failed(self, task: Task, text: str) -> None:
-        """A run has raised."""
+        """Report a run that has raised, and end the task if it is declared not to restart."""
         runner = self._runners.get(task.name)
         if runner is None:
             return

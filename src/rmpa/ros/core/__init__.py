@@ -1,1 +1,1 @@
-"""ROS cores as the agent uses them: the embedded one, and a roscore that runs already."""
+"""ROS cores, as the agent uses them: the embedded core, and a real roscore that runs already."""

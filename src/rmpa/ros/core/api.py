@@ -34,30 +34,30 @@ class Core(Protocol):
         """Start the core, or connect to it.
 
         Raises:
-            StartError: It cannot be started with these settings.
+            StartError: The core cannot be started with these settings.
         """
 
     async def close(self) -> None:
-        """Unregister what the agent registered, and end what ends with the agent."""
+        """Unregister what the agent registered; an embedded core ends."""
 
     def call(self, method: str, *params: XmlRpcValue) -> RosReply:
         """Register or unregister, or write a parameter, as over XML-RPC but without waiting.
 
-        For a real roscore the call is queued; the reply is made of what is known here. Use ``ask`` for what only the
-        master knows (parameters' values).
+        For a real roscore the call is queued, and the reply follows from the local copy of the graph. Use ``ask`` for
+        values that only the master has, such as parameters.
 
         Returns:
             ``(code, status, value)``; the value must not be changed, nor may ``params`` be afterwards.
         """
 
     async def ask(self, method: str, *params: XmlRpcValue) -> RosReply:
-        """Call any method, behind all previous ``call``s, and wait for the master's own answer.
+        """Call any method, after all previous ``call``s, and wait for the master's own answer.
 
         Raises:
             UnreachableError: The master does not answer (a real roscore may be gone).
             RosFault: There is no such method.
             RemoteProtocolError: The answer is malformed.
-            LocalProtocolError: A parameter cannot be said in XML-RPC.
+            LocalProtocolError: A parameter cannot be expressed in XML-RPC.
         """
 
     def state(self) -> GraphState:
@@ -73,7 +73,7 @@ class Core(Protocol):
         """Call ``callback`` in the loop after each change of a registration."""
 
     def unreachable(self) -> Mapping[str, Unreachable]:
-        """The registered nodes that nothing can connect to; not to be changed."""
+        """The registered nodes to which connecting fails, by name; the caller must not change the mapping."""
 
     def suspect(self, node: str) -> None:
         """Check now whether this node is dead or has moved."""
@@ -85,4 +85,4 @@ class Core(Protocol):
         """Where the core stores its state and what it restored, for people; empty for nothing."""
 
     def unverified(self, topic: str) -> Mapping[str, str]:
-        """Publishers of a topic in the previous run that have not answered since, with their slave APIs."""
+        """Publishers of a topic, from the previous run, that have not answered since; with their slave APIs."""

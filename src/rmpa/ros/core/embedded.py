@@ -1,4 +1,4 @@
-"""The ROS core of this machine: master, parameter server and /rosout, for nodes as they are.
+"""The embedded ROS core: master, parameter server and /rosout, for unmodified ROS nodes.
 
 Every call is answered at once, in the event loop; the notifications that follow from it are sent by other tasks.
 """
@@ -39,9 +39,9 @@ DEFAULT_PORT: Final = 11311
 CALLER_ID: Final = "/rmpa_core"
 _LOOPBACK: Final = "127.0.0.1"
 ROS_DISTRO: Final = "noetic\n"
-"""With the line break that roscore's ``rosversion -d`` has; programs strip it."""
+"""The value of ``/rosdistro``, with the line break that roscore takes from ``rosversion -d``; programs strip it."""
 ROS_VERSION: Final = "1.15.15\n"
-"""The version of ros_comm whose master this core replaces."""
+"""The value of ``/rosversion``: the version of ros_comm whose master this core replaces."""
 
 
 class RosCore(Core):
@@ -50,12 +50,12 @@ class RosCore(Core):
     Args:
         host: The address to listen at; loopback unless the network shall reach this core.
         port: 0 lets the system choose.
-        advertised_host: What ``uri`` says; default: ``host``, or this machine's name where ``host`` is 0.0.0.0.
+        advertised_host: The host in ``uri``; default: ``host``, or this machine's name where ``host`` is 0.0.0.0.
         rosout: Whether to aggregate ``/rosout``.
         counters: Where refusals, calls and notifications are counted.
         on_shutdown: ``(reason)``: a client called ``shutdown``; the owner closes the core then.
         state: The file that stores registrations and parameters for the next run; ``None`` stores nothing.
-        fresh: Begin empty, whatever the file holds.
+        fresh: Begin empty, and ignore the content of the file.
         temporary: Whether a node of this name is not stored, because its owner registers it anew.
     """
 
@@ -136,7 +136,7 @@ class RosCore(Core):
                 raise
 
     async def close(self) -> None:
-        """End: /rosout first, then what calls the nodes, then the server; then write the last state."""
+        """Close /rosout, then the tasks that call nodes, then the server; then write the last state."""
         rosout, self._rosout = self._rosout, None
         if rosout is not None:
             await rosout.close()
@@ -156,7 +156,7 @@ class RosCore(Core):
 
     @property
     def port(self) -> int:
-        """The port that it listens at."""
+        """The port at which the core listens."""
         return self._server.port
 
     @property
@@ -172,7 +172,7 @@ class RosCore(Core):
     def call(self, method: str, *params: XmlRpcValue) -> RosReply:
         """Call a method of the Master or Parameter Server API, as over XML-RPC but at once.
 
-        Pending data goes first, so that hundreds of registrations in a row do not hold it up.
+        Pending data is served before, so that hundreds of registrations in a row do not hold it up.
 
         Returns:
             ``(code, status, value)``; the value must not be changed, nor may ``params`` be afterwards.
@@ -201,7 +201,7 @@ class RosCore(Core):
         self._listeners.add(callback)
 
     def notes(self) -> tuple[str, ...]:
-        """Problems with storing its state; the core itself runs as long as the agent."""
+        """Problems with storing the core's state; the core itself runs as long as the agent."""
         return self.persistence.notes() if self.persistence is not None else ()
 
     def restored(self) -> str:
@@ -229,7 +229,7 @@ class RosCore(Core):
         effects, changes = self._api.take()
         if self.persistence is not None:
             self.persistence.schedule_write()
-        # Queued before the callbacks run: the notification of what a callback registers must come later than these.
+        # Queued before the callbacks run: what a callback registers must be notified after these effects.
         if self._notifier is not None:
             for effect in effects:
                 self._notifier.add(effect)
@@ -246,5 +246,5 @@ class RosCore(Core):
 
     def _shutdown_requested(self, reason: str) -> None:
         if self._on_shutdown is not None:
-            # Behind the reply, for which the caller waits.
+            # Not at once: the caller waits for the reply, which is sent first.
             asyncio.get_running_loop().call_soon(self._on_shutdown, reason)

@@ -48,8 +48,8 @@ class _Write:
     Args:
         method: A method of the Master API.
         params: Its parameters, the caller id included.
-        done: Gets the answer, where a caller waits for it.
-        from_poll: Whether the call follows from a poll, which has shown the state of the master.
+        done: Gets the answer; ``None`` if no caller waits for it.
+        from_poll: Whether the call follows from a poll, which has dealt with other providers of a service already.
     """
 
     method: str
@@ -99,7 +99,7 @@ class ExternalCore(Core):
         self._ending = False
         self._problem = "it was not asked yet"
         self._other_agent = ""
-        # What the next poll looks up, and the request as bytes: mostly both the request and the answer are unchanged.
+        # What the next poll looks up, its encoded request, and the last answer: both are mostly unchanged.
         self._nodes: tuple[str, ...] = ()
         self._services: tuple[str, ...] = ()
         self._request = b""
@@ -128,7 +128,7 @@ class ExternalCore(Core):
         self._liveness.start()
 
     async def close(self) -> None:
-        """Unregister everything of the agent's at the master, if it answers."""
+        """Unregister all that the agent registered at the master, if it answers in ``limits.MASTER_FAREWELL``."""
         self._ending = True
         if self._writable:
             for method, params in self._mirror.unregister_calls():
@@ -172,7 +172,7 @@ class ExternalCore(Core):
     # --- asking it --------------------------------------------------------------------------------------------
 
     def call(self, method: str, *params: XmlRpcValue) -> RosReply:
-        """Queue a registration or a write of a parameter, behind all previous calls."""
+        """Queue a registration or a write of a parameter, after all previous calls."""
         yield_to_data()
         if method in REGISTRATIONS:
             reply = self._mirror.apply(method, params)
@@ -264,12 +264,15 @@ class ExternalCore(Core):
             self._wake.set()
 
     def _write(self, write: _Write) -> None:
-        """Queue a call, unless the master is gone: the first poll of one that is back shows what it lacks."""
+        """Queue a call; drop it while the master does not answer, or another agent is connected to it.
+
+        The first poll afterwards finds the registrations that the master lacks.
+        """
         if not self._writable:
             return
         self._queue(write)
         if len(self._writes) > limits.MASTER_WRITES_MAX:
-            # The next poll finds what is missing, more cheaply than choosing what could be left out.
+            # Dropping all is cheaper than choosing: the next poll finds what is missing.
             _log.warning("! the roscore at %s is slow: %d changes are told anew", self._uri, len(self._writes))
             self._drop_writes(UnreachableError("ROS master", self._uri, "it is too slow"))
             self._poll_soon()
@@ -288,7 +291,7 @@ class ExternalCore(Core):
     async def _flush(self) -> None:
         while self._writes and self._writable:
             batch = [self._writes.popleft() for _ in range(min(len(self._writes), limits.MASTER_WRITES_AT_ONCE))]
-            self._seen = b""  # the next answer must be read
+            self._seen = b""  # so that the next poll parses its answer even if the bytes are unchanged
             try:
                 if services := [one for one in batch if one.method == "registerService" and not one.from_poll]:
                     taken = await self._taken(services)
@@ -306,12 +309,15 @@ class ExternalCore(Core):
         self._written.set()
 
     async def _taken(self, services: list[_Write]) -> list[_Write]:
-        """Services of which the master has another provider, which no poll has shown yet; the next poll decides."""
+        """Fail and return registrations of services that have another provider at the master.
+
+        No poll has shown that provider yet; the next poll is made at once.
+        """
         try:
             names = [str(one.params[1]) for one in services]
             answers = await self._many(lookup_calls(self._own_node, (), names))
         except (LocalProtocolError, RemoteProtocolError, RosFault):
-            return []  # sending them shows what is wrong
+            return []  # sending the registrations shows what is wrong
         found = []
         for one, answer in zip(services, answers, strict=True):
             match answer:
@@ -377,7 +383,7 @@ class ExternalCore(Core):
             self.counters.add("master.looks")
             self._pace = limits.MASTER_LOOK_FIRST if changed else min(self._pace * 1.5, limits.MASTER_LOOK_IDLE)
         took = self._loop.time() - begin
-        # A large graph takes its master long to report: it must have time for its own work.
+        # Reporting a large graph takes the master long; between polls it needs time for its own work.
         pause = min(max(self._pace, limits.MASTER_LOOK_SHARE * took), limits.MASTER_LOOK_MAX)
         self._next_poll = self._loop.time() + (pause if self._writable else limits.MASTER_RETRY)
 
@@ -401,7 +407,7 @@ class ExternalCore(Core):
         return True
 
     async def _completed(self, survey: Survey) -> Survey:
-        """Look up the nodes and services that are new in it; the next polls look them up too."""
+        """Look up the nodes and services that are new in a survey; later polls include them in their request."""
         nodes, services = survey.nodes(), survey.holders_of_services()
         new_nodes = [node for node in nodes if node not in survey.uris]
         new_services = [service for service in services if service not in survey.services]
@@ -436,7 +442,7 @@ class ExternalCore(Core):
             self._queue(_Write(method, params, from_poll=True))
 
     async def _find_other_agent(self, foreign: Mapping[str, str]) -> str:
-        """Another agent that is alive at this master, as a text for people; empty for none."""
+        """Describe another agent that is alive at this master, as a text for people; empty for none."""
         for node in sorted(foreign, key=len):  # the agent's own node first: it has the shortest name
             yield_to_data()
             api = foreign[node]
@@ -496,7 +502,7 @@ class ExternalCore(Core):
             self._revival = self._loop.create_task(self._revive(dict(self._mirror.dead)), name="the dead")
 
     async def _revive(self, dead: Mapping[str, str]) -> None:
-        """Check whether nodes that were taken for dead listen again."""
+        """Check whether nodes that were taken for dead accept connections, and restore those that do."""
         for node, api in dead.items():
             if not await refuses(api) and self._mirror.dead.get(node) == api:
                 _log.info("= node %s at %s lives after all", node, api)

@@ -14,7 +14,7 @@ _log = logging.getLogger(__name__)
 
 
 class GraphListeners:
-    """The listeners of one core; an exception of one is logged and reaches neither the others nor a node."""
+    """The listeners of one core; an exception of one is logged, and affects neither the others nor a node."""
 
     def __init__(self) -> None:
         self._callbacks: list[Callable[[GraphChange], None]] = []

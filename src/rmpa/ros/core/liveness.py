@@ -1,9 +1,10 @@
 """Detects nodes that died without unregistering.
 
 A killed node leaves its registrations behind, and roscpp does so even on SIGTERM. For a node on this machine the
-kernel's table says whether it still listens, because rospy starts a thread for each connection; others are connected
-to. Only two refused connects prove a node dead: a network that is down does not. A node to which connecting fails for
-another reason is unreachable (``ros.master.reachability``).
+kernel's table shows whether it still listens, which spares the connection (rospy starts a thread for each). Other
+nodes, and those that the table lacks, are checked by connecting. Only two refused connects prove a node dead: a
+network that is down does not. A node to which connecting fails for another reason is unreachable
+(``ros.master.reachability``).
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ def listening_ports() -> set[int] | None:
 
 
 def read_tables() -> set[int] | None:
-    """The same from ``/proc``, where sock_diag is not available.
+    """Read the TCP ports in state LISTEN from ``/proc``, for kernels without sock_diag; ``None`` without ``/proc``.
 
     The kernel takes milliseconds where there are thousands of sockets. The files are read in short pieces, between
     which other threads can run.
@@ -94,7 +95,7 @@ class Liveness:
 
     @property
     def unreachable(self) -> Mapping[str, Unreachable]:
-        """The nodes that could not be connected to, by name; not to be changed."""
+        """The nodes to which connecting failed, by name; the caller must not change the mapping."""
         return self._reachability.unreachable
 
     def start(self) -> None:
@@ -155,7 +156,7 @@ class Liveness:
                 self._on_dead(node, api)
             return
         except OutOfDescriptors:
-            return  # our own shortage says nothing of the node
+            return  # a shortage of this process shows nothing about the node
         if self._nodes().get(node) != api:
             return
         if not problem:
@@ -205,11 +206,11 @@ async def refuses(api: str) -> bool:
 
 
 async def try_connect(api: str) -> str:
-    """Connect to a slave API and close the connection; return why it cannot be reached, or empty.
+    """Connect to a slave API and close the connection; return why it cannot be reached, or an empty text.
 
     Raises:
-        ConnectionRefusedError: Nothing listens there.
-        OutOfDescriptors: It could not be tried.
+        ConnectionRefusedError: Nothing listens at that address.
+        OutOfDescriptors: No file descriptor is left for the attempt.
     """
     try:
         host, port, _ = split_uri(api)

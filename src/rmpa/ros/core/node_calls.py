@@ -21,9 +21,9 @@ async def ping_node(node: str, uri: str, caller_id: str) -> NodePing:
         caller_id: The asking node's name.
 
     Raises:
-        UnreachableError: It does not answer.
-        PeerRefused: It answers with an error.
-        RemoteProtocolError: Its answer is malformed.
+        UnreachableError: The node does not answer.
+        PeerRefused: The node answers with an error.
+        RemoteProtocolError: The answer is malformed.
     """
     loop = asyncio.get_running_loop()
     begin = loop.time()
@@ -40,15 +40,15 @@ async def end_node(node: str, uri: str, caller_id: str, reason: str) -> bool:
         node: Its name, for errors.
         uri: Its slave API.
         caller_id: The asking node's name.
-        reason: For its log.
+        reason: For the node's log.
 
     Returns:
         Whether nothing listens at its slave API any more.
 
     Raises:
-        UnreachableError: It does not answer.
-        PeerRefused: It refuses.
-        RemoteProtocolError: Its answer is malformed.
+        UnreachableError: The node does not answer, and its port does not refuse connections.
+        PeerRefused: The node refuses.
+        RemoteProtocolError: The answer is malformed.
     """
     try:
         reply = await _call(node, uri, "shutdown", caller_id, reason)

@@ -1,8 +1,8 @@
 """Sends the master's notifications to slave APIs: in order and one at a time to each, independently of the others.
 
-rosmaster has three threads for all slaves, so that three stopped nodes stop every notification; here each URI has its
-own queue. Of one topic only the latest list of publishers is queued; parameter updates are sent one by one until many
-wait.
+rosmaster has three threads for all slaves, so three stopped nodes stop every notification; here each URI has its own
+queue. For each topic only the latest list of publishers is queued. Parameter updates are all sent, until
+``limits.NOTIFY_COALESCE`` notifications wait; from then on a newer update of a parameter replaces an older one.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ class Notifier:
     """One queue for each slave API, emptied by a task that runs while there is something in it.
 
     Args:
-        nodes_at: The nodes that are registered with a slave API; without any, nothing is sent again.
+        nodes_at: Returns the nodes that are registered with a slave API; a failed notification is not sent again if
+            there are none.
         on_unreachable: Called with a slave API that did not answer: its nodes may be dead.
         counters: ``notify.sent``, ``notify.failed``, ``notify.dropped``.
     """
@@ -69,7 +70,7 @@ class Notifier:
             return
         queue = self._queues.setdefault(effect.api, {})
         key = self._key(effect, len(queue))
-        # Last in the queue: parameters' updates overlap, so a newer one must also come later.
+        # Moved to the end: updates of nested parameters overlap, so a newer one must also be sent later.
         queue.pop(key, None)
         queue[key] = effect
         if len(queue) > limits.NOTIFY_QUEUE_MAX:
@@ -125,7 +126,7 @@ class Notifier:
         try:
             await self._send(effect)
         except OutOfDescriptors as error:
-            # Our own shortage, which is reported elsewhere: the node may be well.
+            # The shortage is this process's, and is reported elsewhere: the node may be well.
             self._counters.add("notify.failed")
             _log.debug("! %s", error)
             return False
@@ -154,7 +155,7 @@ class Notifier:
                 await self._shut_down(effect)
 
     async def _shut_down(self, effect: Shutdown) -> None:
-        """Ask a node whose name was taken to end, unless another node has its address by now."""
+        """Ask a node whose name another node has taken to end, unless its address is another node's by now."""
         found = await name_at(effect.api, effect.topics)
         if found is None and self._nodes_at(effect.api):
             found = self._nodes_at(effect.api)[0]

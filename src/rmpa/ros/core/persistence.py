@@ -1,4 +1,4 @@
-"""Stores the state of a core in a file, and restores it: parameters at once, nodes when they have been verified."""
+"""Stores the state of a core in a file, and restores it: parameters at once, nodes once they are verified."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class CorePersistence:
         return self._writer.problem
 
     async def open(self) -> None:
-        """Restore parameters and unverified nodes; before the core listens."""
+        """Restore parameters and unverified nodes; to be called before the core listens."""
         stored = await self._writer.open(fresh=self._fresh)
         registrations = self._api.registrations
         for node, record in stored.nodes.items():
@@ -88,7 +88,7 @@ class CorePersistence:
             _log.info("= %s", text)
 
     def beginning(self) -> str:
-        """What the file held at the start, for people; empty for nothing."""
+        """A text for people about the file's content at the start; empty if the file had none."""
         nodes = self.verification.counts.nodes
         if not self.params and not nodes:
             return ""
@@ -134,14 +134,14 @@ class CorePersistence:
     async def _without_stale_sim_time(self, stored: StoredRegistrations) -> Tree:
         """The parameters, without ``/use_sim_time`` where no restored node is left to publish ``/clock``.
 
-        A node that starts under it would wait for ever.
+        With that parameter and no clock, a node that starts would wait for ever.
         """
         if _SIMULATED not in stored.tree:
             return dict(stored.tree)
         if stored.nodes:
             try:
                 ports, addresses = await asyncio.to_thread(lambda: (listening_ports(), set(local_addresses())))
-            except OSError:  # no file descriptor is left to ask the kernel
+            except OSError:  # such as no file descriptor left to ask the kernel
                 return dict(stored.tree)
             if not all(is_gone(record.api, ports, addresses) for record in stored.nodes.values()):
                 return dict(stored.tree)

@@ -34,7 +34,7 @@ NODE: Final = "/rosout"
 TOPIC: Final = "/rosout"
 AGGREGATED: Final = "/rosout_agg"
 _LOGGERS: Final = {"ros": "rmpa.ros", "ros.rosout": "rmpa.ros.core.rosout"}
-"""By the names that the rosout of a roscore has for these."""
+"""Python's loggers, by the names that the rosout of a roscore gives to its own."""
 LOG_TYPE: Final = "rosgraph_msgs/Log"
 LOG_MD5: Final = "acffd30cd6b6de30f120938c17c593fb"
 _DEFINITION: Final = (
@@ -60,22 +60,22 @@ _DEFINITION: Final = (
     "\n"
     f"{HEADER_PART}"
 )
-"""As ROS's own publishers send it: rosbag and others compute the md5 sum from it."""
+"""The text that ROS's own publishers send: rosbag and others compute the md5 sum from it."""
 
 
 class Rosout:
     """Keeps the node ``/rosout`` in the graph, as users and tools expect it.
 
-    Like roscore it restarts the node when it ends (``rosnode kill /rosout``), at a new address, after
-    ``limits.ROSOUT_RESPAWN``. While another node has the name, this one does not run.
+    Like roscore it restarts the node when that ends (``rosnode kill /rosout``), at a new address, after
+    ``limits.ROSOUT_RESPAWN`` seconds. While another node has the name, this one does not run.
 
     Args:
         host: The address to listen at.
         advertised_host: The address that is registered.
         master_uri: The core's URI.
         call: Calls the core's master.
-        registrations: The core's tables, which say which node has the name.
-        counters: Where refusals are counted, and ``rosout.restarted``.
+        registrations: The core's tables, which show what node has the name.
+        counters: Count refusals, and ``rosout.restarted``.
     """
 
     def __init__(
@@ -173,7 +173,7 @@ class Rosout:
                     _log.warning("= another node is %s now, at %s; ours waits until it leaves", NODE, holder)
                     told = True
                 with contextlib.suppress(TimeoutError):
-                    # The end of a node with subscriptions to parameters alone is not reported.
+                    # The end of a node that only subscribed to parameters is not reported, so it is polled for.
                     async with asyncio.timeout(limits.ROSOUT_LOOK):
                         await self._changed.wait()
                 self._changed.clear()

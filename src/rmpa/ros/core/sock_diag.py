@@ -21,7 +21,7 @@ _FOUND: Final = struct.Struct("=BBBB")
 _PORT: Final = struct.Struct("!H")
 _BUFFER: Final = 1 << 16
 _TIMEOUT: Final = 1.0
-"""Seconds for an answer, which comes at once or never."""
+"""Seconds for an answer, which arrives at once or never."""
 
 
 def ask_listening_ports() -> set[int] | None:
@@ -44,7 +44,7 @@ def read_ports(data: bytes, ports: set[int]) -> bool:
     """Add the ports of one answer; return whether more answers follow.
 
     Raises:
-        ValueError: It is an error, or not an answer to this request.
+        ValueError: The answer is an error, or not one to this request.
     """
     while len(data) >= _HEADER.size:
         length, kind, *_ = _HEADER.unpack_from(data)

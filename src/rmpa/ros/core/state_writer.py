@@ -28,9 +28,9 @@ _log = logging.getLogger(__name__)
 _NONE: Final = (0, 0)
 _ROW: Final = 64
 _OPENS: Final = 3
-"""Attempts to open a locked file at the start, ``limits.CORE_STATE_LOCKED`` each."""
+"""Attempts to open a locked file at the start; each waits for ``limits.CORE_STATE_LOCKED``."""
 _RECORDS: Final = 8
-"""Nodes serialized before pending data goes first; each takes some 25 microseconds."""
+"""Nodes serialized in a row, before other pending data is served; each takes some 25 microseconds."""
 
 
 class StateWriter:
@@ -39,7 +39,7 @@ class StateWriter:
     Args:
         store: The file.
         api: The core's master.
-        temporary: Whether a node of this name is not stored: the agent registers its own anew.
+        temporary: Whether a node of this name is not stored, because the agent registers its own nodes anew.
         counters: ``kept.written``, ``kept.failed``, ``kept.unfit``.
     """
 
@@ -74,10 +74,10 @@ class StateWriter:
     # --- the start --------------------------------------------------------------------------------------------
 
     async def open(self, *, fresh: bool) -> StoredRegistrations:
-        """Open the file and read it; nothing if it cannot be read (``problem`` says why).
+        """Open the file and read it; the result is empty if it cannot be read (``problem`` says why).
 
         Args:
-            fresh: Restore nothing, and empty the file with the first write.
+            fresh: Return nothing, and empty the file with the first write.
         """
         try:
             rows = await self._opened()
@@ -97,7 +97,7 @@ class StateWriter:
         return found
 
     async def _opened(self) -> list[Row]:
-        """The rows; the previous process may still hold the file's lock."""
+        """Open the file and return its rows; tries again while the previous process holds the file's lock."""
         for _ in range(_OPENS - 1):
             try:
                 return await self._store.open()
@@ -107,7 +107,11 @@ class StateWriter:
         return await self._store.open()
 
     def restored_all(self, tree: Tree) -> None:
-        """The master has all that was read; ``tree`` are the parameters in the file."""
+        """Take the master's present state as stored: it has all that was read.
+
+        Args:
+            tree: The parameters in the file.
+        """
         self._revisions = dict(self._api.registrations.revisions)
         self._tree = tree
 
@@ -201,7 +205,7 @@ class StateWriter:
         return True
 
     def _forget(self) -> None:
-        """The file was replaced: everything has to be written."""
+        """Write everything with the next write, because the file was removed or replaced."""
         self._revisions, self._tree, self._known, self._size = {}, {}, {}, 0
         self._rewrite = True
 
@@ -265,5 +269,5 @@ class StateWriter:
 
 
 def _known(name: str, value: bytes) -> tuple[int, int]:
-    """Size and hash of a row. The name counts twice because it is in the index too."""
+    """Size in bytes and hash of a row. The name counts twice because it is in the index too."""
     return 2 * len(name) + len(value) + _ROW, hash(value)

@@ -1,9 +1,9 @@
 """The state file of a core: SQLite, accessed in threads.
 
-One table, ``kept(kind, name, value)``; ``ros.master.stored_rows`` says what is in it. A commit is one transaction in
-a write-ahead log, which survives the end of the process, however it ends, without a wait for the disk; a loss of
-power may take the last seconds. A file that is damaged, of another program or of a newer release is set aside under
-``.damaged``.
+It has one table, ``kept(kind, name, value)``; ``ros.master.stored_rows`` defines its rows. A commit is one
+transaction in a write-ahead log. It does not wait for the disk: the data survives any end of the process, but a loss
+of power may lose the last seconds. A file that is damaged, of another program or of a newer release is set aside
+under ``.damaged``.
 """
 
 from __future__ import annotations
@@ -51,11 +51,11 @@ def is_locked(error: OSError) -> bool:
 
 
 class _DamagedFileError(Exception):
-    """The file is not a state file."""
+    """The file cannot be used: it is damaged, too large, of another program or of a newer release."""
 
 
 class CoreStore:
-    """One file; its methods do not overlap.
+    """One state file; one access at a time: ``OSError`` while an earlier access still hangs.
 
     Args:
         path: Created if it does not exist, with its folders, for this user alone.
@@ -68,10 +68,10 @@ class CoreStore:
         self._busy = False
 
     async def open(self) -> list[Row]:
-        """Open it and read everything, in order.
+        """Open the file and read all rows, in the order in which they were first written.
 
         Raises:
-            OSError: It cannot be used; the text has the reason and a remedy.
+            OSError: The file cannot be used; the text has the reason and a remedy.
         """
         return await self._run(self._open, limits.CORE_STATE_OPEN)
 
@@ -79,7 +79,7 @@ class CoreStore:
         """Write rows and delete those that are ``None``, in one transaction.
 
         Args:
-            rows: Must not change meanwhile.
+            rows: Must not change until this returns.
             anew: Delete all other rows.
 
         Raises:
@@ -88,7 +88,7 @@ class CoreStore:
         await self._run(lambda: self._write(rows, anew=anew), limits.CORE_STATE_WRITE)
 
     async def copy_aside(self) -> Path | None:
-        """Copy a file that was not read to ``.before``, in place of an older copy.
+        """Copy a file that could not be read at the start to ``.before``, in place of an older copy.
 
         Returns:
             The copy, or ``None`` if the file is empty.
@@ -163,7 +163,7 @@ class CoreStore:
             raise _DamagedFileError("it is larger than a core's file can be")
         connection = sqlite3.connect(self.path, timeout=limits.CORE_STATE_LOCKED, check_same_thread=False)
         self._connection = connection
-        # The lock is held until the end: it keeps other processes away, and SQLite needs no shared memory.
+        # The lock is held until the file is closed: it keeps other processes away, and SQLite needs no shared memory.
         connection.execute("PRAGMA locking_mode = EXCLUSIVE")
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = NORMAL")

@@ -1,9 +1,9 @@
 """Verifies the nodes restored from the previous run: those that still run are registered again, the others discarded.
 
-rospy has its name in ``getName``, roscpp in the header of a topic that it publishes. A node is gone if its port
-refuses connections, or another node has the port. One that does not answer is asked again for a while. What a node
-registered or unregistered while there was no core follows from its own lists (``getPublications``,
-``getSubscriptions``), which are compared last.
+A rospy node gives its name in ``getName``, a roscpp node in the header of a topic that it publishes. A node is gone
+if its port refuses connections, or another node has the port. One that does not answer is asked again for
+``limits.VERIFY_PATIENCE``. What a node registered or unregistered while there was no core follows from its own lists
+(``getPublications``, ``getSubscriptions``), which are compared last.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _LISTS: Final = ((RegistrationKind.PUBLISHER, "getPublications"), (RegistrationK
 
 
 class _ProbeResult(enum.Enum):
-    """What the address of restored nodes answers."""
+    """The result of a probe of the address of restored nodes."""
 
     UP = "it is still that node"
     GONE = "nobody listens there"
@@ -68,7 +68,7 @@ class NodeVerification:
 
     Args:
         registrations: The master's tables.
-        carry_out: Called after each change of them.
+        carry_out: Called after each change of the tables.
     """
 
     def __init__(self, registrations: Registrations, carry_out: Callable[[], None]) -> None:
@@ -81,7 +81,7 @@ class NodeVerification:
         self._at_start: defaultdict[str, list[str]] = defaultdict(list)
         self._first = 0
         self._queued: set[str] = set()
-        """Addresses that were not asked yet, or have not answered their first question within
+        """Addresses that were not asked yet, or whose first answer is awaited for less than
         ``limits.VERIFY_PROMPT``."""
         self._all_asked = asyncio.Event()
         self._published: dict[str, None] = {}
@@ -89,7 +89,7 @@ class NodeVerification:
         self._notification_timer: asyncio.TimerHandle | None = None
 
     def start(self) -> None:
-        """Begin to ask all of them."""
+        """Begin to verify all unverified nodes, in tasks."""
         loop = asyncio.get_running_loop()
         for node, api in self.silent.items():
             self._at_start[api].append(node)
@@ -112,7 +112,7 @@ class NodeVerification:
 
     @property
     def all_asked(self) -> bool:
-        """Whether each node has been asked at least once."""
+        """Whether each restored node has been probed at least once."""
         return self._all_asked.is_set()
 
     @property
@@ -157,7 +157,11 @@ class NodeVerification:
         return {node: record for node, record in found.items() if record is not None and record.api == api}
 
     async def _ask(self, api: str, nodes: dict[str, NodeRecord]) -> _ProbeResult:
-        """Ask, with a bound on concurrent questions in which slow nodes do not count for long."""
+        """Probe an address.
+
+        At most ``limits.VERIFY_AT_ONCE`` probes run at once; one that takes longer than ``limits.VERIFY_PROMPT`` no
+        longer counts among them.
+        """
         await self._slots.acquire()
         held = True
 
@@ -176,7 +180,7 @@ class NodeVerification:
             leave()
 
     def _unqueue(self, api: str) -> None:
-        """An address has answered, or hangs; behind the last one, notify the subscribers."""
+        """Note that an address has answered or is slow; after the last one, notify the subscribers."""
         self._queued.discard(api)
         if not self._queued:
             self._schedule_notifications(0.0)
@@ -218,7 +222,7 @@ class NodeVerification:
             self._carry_out()
 
     def _asked(self, first: bool) -> bool:
-        """Count an address that has been asked for the first time."""
+        """Count an address that has been asked for the first time; return ``False``, the next value of ``first``."""
         if first:
             self._first -= 1
             if not self._first:
@@ -258,7 +262,7 @@ class NodeVerification:
                         return
                     if listed is None or registrations.node_api(node) != api:
                         return
-                    if registrations.revisions.get(node) == mark:  # else it changed meanwhile: ask again
+                    if registrations.revisions.get(node) == mark:  # else the node changed meanwhile: ask again
                         self._adjust(kind, node, api, listed)
                         break
 
@@ -297,9 +301,9 @@ async def _probe(api: str, nodes: dict[str, NodeRecord]) -> _ProbeResult:
 
 
 async def _has_registrations(api: str, nodes: dict[str, NodeRecord]) -> bool | None:
-    """Whether an unnamed node has all topics that these had registered, and at least one.
+    """Whether the node at an address lists all topics that the restored nodes had registered, and at least one.
 
-    ``None`` if the node does not answer with its lists either.
+    For a node whose name cannot be found out. ``None`` if the node does not answer with its lists either.
     """
     for kind, method in _LISTS:
         had = {topic for record in nodes.values() for topic in record.of(kind)}

@@ -1,6 +1,6 @@
 """XML-RPC calls to nodes and masters, each on a connection of its own.
 
-No connection is kept alive: each costs a Python node a thread, and to open one on loopback takes 50 microseconds.
+No connection is kept alive: each costs a Python node a thread, and opening one on loopback takes 50 microseconds.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _LOOPBACK: Final = "127.0.0.1"
 
 @functools.lru_cache(maxsize=1024)
 def split_uri(uri: str) -> tuple[str, int, str]:
-    """``http://host:port/path`` to ``(host, port, path)``; the path is at least ``/``.
+    """Split ``http://host:port/path`` into ``(host, port, path)``; the path is at least ``/``.
 
     Raises:
         UnreachableError: The text is not such a URI; ROS requires the port.
@@ -55,7 +55,7 @@ def is_own_name(host: str) -> bool:
 
 
 async def _addresses(host: str, port: int) -> list[tuple[str, int]]:
-    """Addresses of a host, best first; the resolver is not asked for numbers and names of this machine."""
+    """Addresses of a host, best first; numbers and names of this machine do not go to the resolver."""
     if is_own_name(host):
         return [(_LOOPBACK, port)]
     try:
@@ -80,9 +80,9 @@ async def _connect_one(address: tuple[str, int], use: Use) -> socket.socket:
     try:
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         await asyncio.get_running_loop().sock_connect(sock, address)
-        # This raises too, if the other side closed at once.
+        # getpeername() raises as well if the other side closed at once.
         if sock.getsockname() == sock.getpeername():
-            # A port of the ephemeral range where nothing listens can connect to itself.
+            # A connect to a port of the ephemeral range where nothing listens can connect to itself.
             raise ConnectionRefusedError(errno.ECONNREFUSED, "connected to itself")  # noqa: TRY301 - see below
     except BaseException:
         sock.close()
@@ -111,7 +111,7 @@ async def connect(host: str, port: int, use: Use = Use.DATA) -> socket.socket:
         except OSError as refused:
             error = refused
     if is_own_name(host) and host != "localhost":
-        # A node may listen at this machine's outer address only.
+        # A node may listen only at this machine's address in the network.
         for address in await _resolve(host, port):
             if address not in addresses:
                 try:
@@ -158,10 +158,10 @@ async def exchange(
     timeout: float,  # noqa: ASYNC109 - the message names it
     use: Use = Use.DATA,
 ) -> bytes:
-    """Send a ``methodCall`` document and return that of the response, unread.
+    """Send a ``methodCall`` document and return the document of the response, unparsed.
 
-    A caller that polls compares the bytes with those of the last response, and need not read the same one twice.
-    Arguments and errors are those of ``call``; ``read_response`` reads the document.
+    A caller that polls compares the bytes with those of the last response, and need not parse the same one twice.
+    Arguments and errors are those of ``call``; ``read_response`` parses the document.
     """
     host, port, path = split_uri(uri)
     loop = asyncio.get_running_loop()
@@ -188,7 +188,7 @@ async def exchange(
 
 
 async def read_response(body: bytes) -> XmlRpcValue:
-    """Read a response, with turns for others in between.
+    """Parse the document of a response; other callbacks run between the slices of a large one.
 
     Raises:
         RosFault, RemoteProtocolError: As for ``call``.
@@ -206,7 +206,7 @@ async def call_api(
     """Call a method of a ROS API, which answers ``[code, status, value]``.
 
     Raises:
-        RemoteProtocolError: The answer is not such a triple (roscpp's ``getBusStats`` is none).
+        RemoteProtocolError: The answer is not such a triple (that of roscpp's ``getBusStats`` is not).
         UnreachableError, RosFault, LocalProtocolError: As for ``call``.
     """
     return RosReply.of(await call(uri, method, *params, timeout=timeout, use=use))

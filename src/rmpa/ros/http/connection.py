@@ -1,4 +1,4 @@
-"""One client of an XML-RPC server: HTTP comes in, one call at a time is answered, everything is bounded."""
+"""One client of an XML-RPC server: received HTTP is parsed, one call at a time is answered, all sizes are bounded."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable
 
 _PIECE: Final = 16 * KIB
-"""Bytes parsed at once: the granularity of the bound on headers; pending data goes first in between."""
+"""Bytes parsed at once: the granularity of the bound on headers; other pending data is served in between."""
 
 
 class HttpConnectionOwner(Protocol):
-    """What a connection asks of its server."""
+    """The server of a connection, as the connection needs it."""
 
     def admit(self, connection: HttpConnection) -> bool:
         """Whether there is room for a new connection."""
 
     def remove(self, connection: HttpConnection) -> None:
-        """The connection is closed."""
+        """Forget a connection, which is closed."""
 
     def touch(self, connection: HttpConnection) -> None:
-        """The connection is used: it is the last to give way."""
+        """Note that a connection is used, and so is the last to be closed for a new one."""
 
     def reserve(self, connection: HttpConnection, size: int) -> bool:
-        """Whether there is room for a call of ``size`` bytes."""
+        """Whether there is room for a call of ``size`` bytes; slow connections may be closed for it."""
 
     def refuse(self, name: str, connection: HttpConnection, text: str) -> None:
         """Count a refusal by its name, and log it."""
@@ -51,7 +51,7 @@ class HttpConnection(asyncio.Protocol):
 
     Attributes:
         client: The client's address.
-        begun: The start of the call that is unfinished, or whose answer is not read, by the loop's clock.
+        begun: When the call began that is unfinished, or whose answer is not read yet, by the loop's clock.
         answered: The time of the last answer, by the loop's clock.
         gone: Done when the connection is closed.
     """
@@ -77,7 +77,7 @@ class HttpConnection(asyncio.Protocol):
 
     @property
     def idle(self) -> bool:
-        """Whether no request is on its way in and no answer on its way out."""
+        """Whether no request is being received or answered, and no answer is unread."""
         return not (
             self._requests.receiving or self._waiting or self._task or self._transport is None or self.pending
         )
@@ -89,22 +89,22 @@ class HttpConnection(asyncio.Protocol):
 
     @property
     def receiving(self) -> bool:
-        """Whether a request has begun to come and is incomplete."""
+        """Whether a part of a request is received, and the rest is not."""
         return self._requests.receiving
 
     @property
     def reserved(self) -> int:
-        """Bytes reserved for its call."""
+        """Bytes reserved for the connection's call."""
         return self._requests.body.reserved
 
     @property
     def received(self) -> int:
-        """Received bytes of an unfinished call; 0 while an answer is not read."""
+        """Received bytes of an unfinished call; 0 without one."""
         return len(self._requests.body) if self._requests.receiving else 0
 
     @property
     def pending(self) -> int:
-        """Bytes of answers that the client has not read."""
+        """Bytes of answers that wait to be sent, because the client does not read them."""
         return self._transport.get_write_buffer_size() if self._transport is not None else 0
 
     # --- asyncio's side ---------------------------------------------------------------------------------------
@@ -132,31 +132,31 @@ class HttpConnection(asyncio.Protocol):
             self.gone.set_result(None)
 
     def data_received(self, data: bytes) -> None:
-        """Parse it, unless a call is being answered, or it is the rest of a refused request."""
+        """Parse received bytes, later if a call is being answered; drop the rest of a refused request."""
         if not self._closing or self._task is not None:
             self._unread = memoryview(bytes(self._unread) + data if self._unread else data)
             if self._more is None:
                 self._advance()
 
     def eof_received(self) -> bool:
-        """A client may half-close behind its request; it still gets its answer."""
+        """Note the end of the client's stream; a client that half-closes after its request still gets the answer."""
         self._eof = True
         if self._more is None:
             self._advance()
         return self._task is not None or self._more is not None
 
     def pause_writing(self) -> None:
-        """The client does not read its answers: take no more calls."""
+        """Read no more calls, because the client does not read its answers."""
         self._writing_paused = True
         self._adjust_reading()
 
     def resume_writing(self) -> None:
-        """The client has read its answers."""
+        """Read calls again, because the client has read its answers."""
         self._writing_paused = False
         self._adjust_reading()
 
     def _adjust_reading(self) -> None:
-        """Read while nothing that was read waits."""
+        """Pause reading while a call is being answered, requests wait, or the client does not read its answers."""
         pause = self._task is not None or self._more is not None or self._writing_paused
         if pause is self._reading_paused or self._transport is None or self._transport.is_closing():
             return
@@ -167,7 +167,7 @@ class HttpConnection(asyncio.Protocol):
             self._transport.resume_reading()
 
     def _expect(self, seconds: float) -> None:
-        """Close the connection unless something happens within this time."""
+        """Close the connection after this many seconds, unless a later call sets another time, or it is answering."""
         self._deadline = self._loop.time() + seconds
         if self._timer is None or self._timer.when() > self._deadline:
             if self._timer is not None:
@@ -188,12 +188,12 @@ class HttpConnection(asyncio.Protocol):
     # --- requests ---------------------------------------------------------------------------------------------
 
     def _begin(self) -> None:
-        """The first byte of a request has come."""
+        """Start the time-out of a request, whose first byte has arrived."""
         self._expect(limits.HTTP_REQUEST_TIMEOUT)
         self.begun = self._loop.time()
 
     def _advance(self) -> None:
-        """Take the next request; of several that came at once the next ones follow in turn with other clients'."""
+        """Take the next request; further ones received with it follow in later turns of the event loop."""
         self._more = None
         while self._task is None and not self._closing:
             if self._waiting:
@@ -256,7 +256,7 @@ class HttpConnection(asyncio.Protocol):
             self._expect(limits.HTTP_REQUEST_TIMEOUT if self._requests.receiving else limits.HTTP_IDLE_TIMEOUT)
 
     def _reject(self, refusal: HttpRefusal) -> None:
-        """Answer with an HTTP error, end our half, and read on for a moment: closing would take the answer back."""
+        """Answer with an HTTP error and half-close; reading goes on for a moment: closing would lose the answer."""
         self._server.refuse(refusal.counter, self, refusal.text)
         self._closing = True
         if self._transport is not None and not self._transport.is_closing():
@@ -269,14 +269,14 @@ class HttpConnection(asyncio.Protocol):
     # --- the end ----------------------------------------------------------------------------------------------
 
     def close_when_answered(self) -> None:
-        """Close now, or behind the answer that is on its way."""
+        """Close now, or after the answer to the call under way."""
         self._closing = True
         if self._task is None:
             self._close()
 
     def _close(self) -> None:
         if self._transport is not None:
-            # What is written still leaves, but a client that does not read it cannot hold the socket.
+            # Written data is still sent, but a client that does not read it cannot hold the socket for long.
             self._transport.close()
             self._expect(limits.HTTP_REQUEST_TIMEOUT)
 

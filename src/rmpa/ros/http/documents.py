@@ -1,7 +1,7 @@
-"""Reads XML-RPC documents in slices of ``limits.XMLRPC_SLICE``, between which data goes first.
+"""Reads XML-RPC documents in slices of ``limits.XMLRPC_SLICE``; other pending data is served between two slices.
 
-A document of some MiB takes seconds to parse. It is not parsed in a thread: one that computes takes the interpreter
-from the event loop for milliseconds at a time.
+A document of some MiB takes seconds to parse. It is not parsed in a thread, because a thread that computes takes the
+interpreter from the event loop for milliseconds at a time.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def read_small(reader: DocumentReader[_T], document: Buffer) -> _T:
 
 
 async def read_large(reader: DocumentReader[_T], pieces: Iterable[Buffer]) -> _T:
-    """Read a document of any size; other callbacks have turns behind ``limits.HTTP_BODY_INLINE`` bytes.
+    """Read a document of any size; after ``limits.HTTP_BODY_INLINE`` bytes other callbacks run between slices.
 
     Args:
         reader: Its errors are raised.

@@ -1,8 +1,8 @@
 """Chooses the connection of an XML-RPC server to close when there are too many, or too many bytes of calls.
 
-All clients are on this machine, so addresses do not tell them apart. A well-behaved client is fast: it sends its call
-at once and reads the answer, while a port scanner or a stuck, stopped or hostile program sends a byte now and then.
-The slowest is closed, so that ``rostopic list`` is answered beside any number of these.
+All clients are on this machine, so their addresses do not distinguish them. A well-behaved client is fast: it sends
+its call at once and reads the answer. A port scanner, or a stuck, stopped or hostile program, sends a byte now and
+then. The slowest is closed, so that ``rostopic list`` is answered beside any number of these.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Client(Protocol):
 
     @property
     def idle(self) -> bool:
-        """Whether no call is on its way in, none is being answered and no answer is on its way out."""
+        """Whether no call is being received or answered, and no answer is unread."""
 
     @property
     def answering(self) -> bool:
@@ -31,7 +31,7 @@ class Client(Protocol):
 
     @property
     def reserved(self) -> int:
-        """Bytes reserved for its call."""
+        """Bytes reserved for the connection's call."""
 
     @property
     def received(self) -> int:
@@ -39,16 +39,16 @@ class Client(Protocol):
 
     @property
     def begun(self) -> float:
-        """The start of the call that is unfinished, or whose answer is not read, monotonic seconds."""
+        """When the call began that is unfinished, or whose answer is not read yet, in monotonic seconds."""
 
 
 _C = TypeVar("_C", bound=Client)
 
 
 def for_newcomer(connections: Iterable[_C], now: float) -> _C | None:
-    """The connection to close for a new one; ``None`` if all are being answered.
+    """Choose the connection to close for a new one; ``None`` if all are being answered.
 
-    The slowest of those below ``limits.HTTP_PACE_MIN``; else the one that is idle for longest, whose client
+    It is the slowest of those below ``limits.HTTP_PACE_MIN``; else the one that is idle for longest, whose client
     reconnects by itself; else the slowest of all.
 
     Args:
@@ -68,7 +68,7 @@ def for_newcomer(connections: Iterable[_C], now: float) -> _C | None:
 
 
 def for_call(connections: Iterable[_C], now: float) -> _C | None:
-    """The connection to close for the bytes of another call; ``None`` if none is slow."""
+    """Choose the connection to close for the bytes of another call; ``None`` if none is slow."""
     slow = [one for one in connections if one.reserved and not one.answering and _is_slow(one, now)]
     return min(slow, key=lambda one: _pace(one, now), default=None)
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 async def listen(name: str, host: str, port: int, use: Use) -> socket.socket:
-    """A socket that listens.
+    """Open a listening socket.
 
     Args:
         name: The server, for the text of errors.
@@ -28,7 +28,7 @@ async def listen(name: str, host: str, port: int, use: Use) -> socket.socket:
         use: The purpose of its connections.
 
     Raises:
-        StartError: The address is in use, not ours, or not allowed.
+        StartError: The address is in use, not of this machine, or not allowed.
     """
     try:
         address = await _resolve(host, port)

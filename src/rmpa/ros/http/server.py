@@ -1,7 +1,7 @@
-"""An XML-RPC server: POST to any path, one response in one piece, everything bounded.
+"""An XML-RPC server: POST to any path, each response in one piece, all sizes and times bounded.
 
-``ros.wire.http`` parses HTTP, ``ros.wire.xmlrpc`` the bodies. Made for clients as they are: XmlRpc++ wants
-``Content-length`` and no chunks, Python keeps its connections open for as long as its threads live.
+``ros.wire.http`` parses HTTP, ``ros.wire.xmlrpc`` the bodies. The server fits ROS's existing clients: XmlRpc++ wants
+``Content-length`` and no chunks; Python keeps its connections open for as long as its threads live.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class XmlRpcServer:
         self._use = use
         self._acceptor: Acceptor | None = None
         self._arriving: set[asyncio.Task[None]] = set()
-        # In the order of their last use: the first idle one is closed for a new one.
+        # In the order of their last use, which ``eviction.for_newcomer`` needs.
         self._connections: dict[HttpConnection, None] = {}
         self.port = 0
         """The listening port; 0 before ``start``."""
@@ -77,7 +77,7 @@ class XmlRpcServer:
         """Listen.
 
         Raises:
-            StartError: The address is in use, not ours, or not allowed.
+            StartError: The address is in use, not of this machine, or not allowed.
         """
         sock = await listen.listen(self._name, self._host, self._wanted_port, self._use)
         self.port = sock.getsockname()[1]
@@ -103,7 +103,7 @@ class XmlRpcServer:
             raise
 
     async def close(self) -> None:
-        """Stop listening, let calls that are being answered finish (``limits.DRAIN_TIMEOUT``), close the rest."""
+        """Stop listening; wait up to ``runtime.limits.DRAIN_TIMEOUT`` for calls under way; close all connections."""
         if self._acceptor is not None:
             self._acceptor.close()
             self._acceptor = None
@@ -179,7 +179,7 @@ class XmlRpcServer:
         self._refusals.refuse(now, name, connection.client, f"{self._name}: {connection.client}: {text}")
 
     def answer(self, body: memoryview, connection: HttpConnection) -> bytes | Awaitable[bytes]:
-        """The response to one call, at once unless the handler has to wait, or there is much to read or write."""
+        """Answer one call: at once, unless the handler has to wait, or there is much to read or write."""
         if len(body) > limits.HTTP_BODY_INLINE:
             return self._answer_large(body, connection)
         try:

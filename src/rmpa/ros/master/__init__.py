@@ -1,1 +1,1 @@
-"""The ROS master and parameter server as pure data: calls go in, replies and notifications come out."""
+"""The ROS master and parameter server without I/O: calls go in, replies and notifications come out."""

@@ -30,9 +30,9 @@ class ParamUpdate:
 
 @dataclass(frozen=True, slots=True)
 class Shutdown:
-    """``shutdown`` for the node ``node`` at the slave API ``api``, whose name another node took.
+    """``shutdown`` for ``node`` at the slave API ``api``, because another node has taken its name.
 
-    ``topics`` are those that it published: the header of one shows whether it still is that node.
+    ``topics`` are those that it published: the header of one shows whether that node is still at the address.
     """
 
     api: str
@@ -44,7 +44,7 @@ Effect: TypeAlias = PublisherUpdate | ParamUpdate | Shutdown
 
 
 class RegistrationKind(enum.Enum):
-    """What a node registered."""
+    """The kinds of registration at a master."""
 
     PUBLISHER = "publisher"
     SUBSCRIBER = "subscriber"

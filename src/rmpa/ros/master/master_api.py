@@ -1,7 +1,7 @@
 """The Master API and the Parameter Server API (wiki.ros.org/ROS/Master_API, …/Parameter_Server_API).
 
-A drop-in for rosmaster 1.15: the same methods, codes and values, the same calls to slaves in the same order. The
-status texts are our own.
+A drop-in for rosmaster 1.15: the same methods, codes and values, the same calls to slaves in the same order. Only the
+status texts differ.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ ERROR: Final = -1
 
 @dataclass(frozen=True, slots=True)
 class _Method:
-    """One method of the API: its parameters behind ``caller_id``, and the value of an error's reply."""
+    """One method of the API: its parameters after ``caller_id``, and the value in the reply of an error."""
 
     function: Callable[..., RosReply]
     parameters: tuple[tuple[str, v.Validator], ...]
@@ -42,10 +42,10 @@ class MasterApi:
     """One master with its parameter server.
 
     Args:
-        uri: What ``getUri`` answers.
-        pid: What ``getPid`` answers.
+        uri: The master's URI, for ``getUri``.
+        pid: The process id, for ``getPid``.
         on_shutdown: Called with the reason when a client calls ``shutdown``.
-        yielder: Lets pending data go first in a graph of thousands, and for large parameters.
+        yielder: Iterates, and serves pending data in between, in large graphs and for large parameters.
     """
 
     def __init__(self, uri: str, pid: int, on_shutdown: Callable[[str], None], *, yielder: Yielder = iter) -> None:
@@ -72,7 +72,7 @@ class MasterApi:
             arguments: The parameters, the caller id first.
 
         Returns:
-            Code 1 with the value; or 0 or -1 with text and a value of the same kind.
+            Code 1 with the value; or code 0 or -1 with the reason as text and, mostly, a value of the same type.
 
         Raises:
             RosFault: There is no such method.
@@ -127,7 +127,7 @@ class MasterApi:
         return {"faultCode": problem.code, "faultString": problem.text}
 
     def take(self) -> tuple[list[Effect], list[GraphChange]]:
-        """Take the effects and changes since the last time, in order."""
+        """Return the effects and changes since the previous call of this method, in order."""
         taken = self.registrations.effects, self.registrations.changes
         self.registrations.effects, self.registrations.changes = [], []
         return taken

@@ -1,8 +1,8 @@
-"""A copy of the graph of a master that is another program, and which registrations in it are the agent's own.
+"""A copy of the graph of a master that is another program; it marks the agent's own registrations.
 
 It has two sources: the agent's own registrations, which count at once, and surveys, which show those of others. A
-survey also shows which of our registrations the master lacks (it was restarted), or has too many of (an agent was
-killed).
+survey also shows own registrations that the master lacks (it was restarted), and leftovers that have to be
+unregistered (an agent was killed, or a call was lost).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ REGISTRATIONS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class _Own:
-    """One registration of the agent's: the call, the node's slave API, and the call that takes it back."""
+    """One registration of the agent: the call, the node's slave API, and the call that unregisters it."""
 
     call: Call
     api: str
@@ -51,19 +51,21 @@ class Mirror:
     """The copy of the graph of one master.
 
     Args:
-        yielder: Lets pending data go first in surveys of thousands of topics.
+        yielder: Iterates, and serves pending data in between, in surveys of thousands of topics.
     """
 
     def __init__(self, *, yielder: Yielder = iter) -> None:
         self._yielder = yielder
         self._known = Registrations()
         self._own: dict[Entry, _Own] = {}
-        # Calls since the last survey began, by the count of calls: that survey says nothing about them.
+        # Registrations changed by ``apply`` since the last survey began, with the number of that call: the survey may
+        # not show the change yet.
         self._touched: dict[Entry, int] = {}
         self._asked = 0
         # Nodes whose registrations the master has although nothing listens at their address any more.
         self._dead: dict[str, str] = {}
-        # Nodes that the previous run of the master knew: they may live, and their connections go on.
+        # Nodes that the previous run of the master knew and the present one lacks: they may live, and their
+        # connections go on.
         self._orphans: dict[str, str] = {}
         self._run = ""
 
@@ -96,27 +98,27 @@ class Mirror:
         return any(entry[2] == node for entry in self._own)
 
     def others(self) -> dict[str, str]:
-        """The nodes of others with their slave APIs."""
+        """The nodes that are not the agent's, with their slave APIs."""
         ours = {node for _, _, node in self._own}
         return {node: api for node, api in self._known.nodes().items() if node not in ours}
 
     def unregister_calls(self) -> list[Call]:
-        """The calls that unregister everything of the agent's, the latest registration first."""
+        """The calls that unregister all that the agent registered, the latest registration first."""
         return [own.undo for own in reversed(self._own.values())]
 
     def take_changes(self) -> list[GraphChange]:
-        """Take the changes since the last time."""
+        """Return the changes since the previous call of this method."""
         self._known.effects.clear()  # the master notifies the nodes
         changes, self._known.changes = self._known.changes, []
         return changes
 
-    # --- our own registrations --------------------------------------------------------------------------------
+    # --- the agent's own registrations ------------------------------------------------------------------------
 
     def apply(self, method: str, params: Sequence[XmlRpcValue]) -> RosReply:
-        """Apply one of ``REGISTRATIONS`` of the agent's to the copy; the caller sends it to the master.
+        """Apply a call of the agent, one of ``REGISTRATIONS``, to the copy; the caller sends it to the master.
 
         Returns:
-            What the master will answer, as far as it is known here.
+            The answer that the copy gives in place of the master.
         """
         self._asked += 1
         words = [param for param in params if isinstance(param, str)]
@@ -172,17 +174,17 @@ class Mirror:
     # --- the others -------------------------------------------------------------------------------------------
 
     def mark_dead(self, node: str, api: str) -> None:
-        """A node is dead: ignore what the master still has of it."""
+        """Remove a dead node from the copy, and ignore the registrations that the master still has of it."""
         self._dead[node] = api
         self._orphans.pop(node, None)
         self._known.purge(node, api)
 
     def mark_alive(self, node: str) -> None:
-        """A node lives after all; the next survey shows it again."""
+        """Undo ``mark_dead``: the next survey shows the node again."""
         self._dead.pop(node, None)
 
     def foreign_agents(self, survey: Survey, prefix: str, seen: int) -> dict[str, str]:
-        """Nodes that have names of an agent and are not this agent's: of another agent, or of one that was killed.
+        """Nodes with an agent's names that are not this agent's: of another agent, or left by one that was killed.
 
         Args:
             survey: The survey.
@@ -204,16 +206,17 @@ class Mirror:
         """Apply a survey to the copy.
 
         Args:
-            survey: Every node and service of it that still exists was looked up.
-            seen: ``asked`` when it began.
+            survey: The survey, in which every node and service that still exists was looked up.
+            seen: ``asked`` when the survey began.
             ignored: Nodes that are left out.
 
         Returns:
-            Calls that register what the master lacks of ours, and unregister what it has too much of.
+            Calls that register what the master lacks of the agent's registrations, and unregister those of the
+            agent's nodes that the agent does not have.
         """
         if self._run and survey.run != self._run:
-            # Nodes do not register at a restarted master before they restart themselves. Without a bridge their
-            # connections go on all the same, and so do the routes here.
+            # Nodes do not register at a restarted master until they restart themselves, but their connections go on.
+            # They stay in the copy, so that the routes to and from them go on too.
             self._orphans |= self.others()
         again = [] if survey.run == self._run else self._own_params()
         self._run = survey.run
@@ -232,7 +235,7 @@ class Mirror:
         return again
 
     def _own_params(self) -> list[Call]:
-        """Subscriptions to parameters, which no survey shows: all are registered at a new master."""
+        """Calls that subscribe to parameters; no survey shows these, so a restarted master gets all of them again."""
         return [own.call for (kind, _, _), own in self._own.items() if kind is RegistrationKind.PARAM]
 
     def _drop_gone(
@@ -275,7 +278,7 @@ class Mirror:
             if entry in self._own:
                 if self._touched.get(entry, 0) > seen:
                     return
-                # The master keeps the last provider of a service: ours was replaced, and is not registered again.
+                # The last provider of a service counts: the agent's was replaced, and is not registered again.
                 self._forget(*entry)
         self._known.register_service(service, uri, node, api)
 
@@ -303,7 +306,7 @@ class Mirror:
         return again
 
     def _surplus(self, survey: Survey, seen: int) -> list[Call]:
-        """Calls that unregister what the master has of our nodes and the copy has not."""
+        """Calls that unregister what the master has of the agent's nodes and the agent does not have."""
         ours = {node: own.api for (_, _, node), own in self._own.items()}
         nodes = {node: api for node, api in ours.items() if survey.uris.get(node) == api}
         again = []
@@ -316,12 +319,12 @@ class Mirror:
 def stale_registrations(
     survey: Survey, nodes: Mapping[str, str], yielder: Yielder = iter
 ) -> Iterator[tuple[Call, Entry]]:
-    """Everything that a master has of some nodes: the calls that unregister it, and the registrations.
+    """Yield all registrations that a master has of some nodes, each after the call that unregisters it.
 
     Args:
         survey: The survey.
         nodes: The nodes and their slave APIs.
-        yielder: Lets pending data go first in large graphs.
+        yielder: Iterates, and serves pending data in between, in large graphs.
     """
     for kind, table in survey.holders.items():
         for key, holders in yielder(table.items()):

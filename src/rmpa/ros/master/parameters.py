@@ -1,4 +1,4 @@
-"""The parameter tree, and the notifications of its subscribers.
+"""The parameter tree, and the notifications for its subscribers.
 
 The tree is never changed in place: a change copies the dicts along its path, so values that callers hold stay as they
 are. Keys are resolved names; a value that is a dict is a namespace.
@@ -49,7 +49,7 @@ def _without(tree: Tree, parts: list[str]) -> Tree:
 
 
 def holds_nil(value: XmlRpcValue, yielder: Yielder = iter) -> bool:
-    """Whether there is a nil in a value, at any depth; ROS has none, and no response with it can be written."""
+    """Whether a value is or contains nil, at any depth; ROS has no nil, and no response with one can be written."""
     return any(part is None for part in yielder(_all_parts(value)))
 
 
@@ -72,14 +72,14 @@ class Parameters:
 
     @property
     def tree(self) -> Tree:
-        """The whole tree, not to be changed; the same object until something in it changes, and so are its parts."""
+        """The whole tree, not to be changed; it and each of its parts stay the same object until a value changes."""
         return self._tree
 
     def get(self, key: str) -> XmlRpcValue:
-        """The value or the namespace at ``key``; ``/`` is the whole tree. Not to be changed.
+        """The value or the namespace at ``key``; ``/`` is the whole tree. The caller must not change it.
 
         Raises:
-            KeyError: There is none.
+            KeyError: ``key`` does not exist.
         """
         value: XmlRpcValue = self._tree
         for part in _parts(key):
@@ -97,14 +97,16 @@ class Parameters:
         return True
 
     def set(self, key: str, value: XmlRpcValue) -> None:
-        """Put a value or a namespace at ``key``; what was there is gone, a value on the way becomes a namespace.
+        """Put a value or a namespace at ``key``, in place of the former one.
+
+        Where a parent of ``key`` is a plain value, a namespace replaces it.
 
         Args:
-            key: Its resolved name.
+            key: The resolved name.
             value: Stored without a copy; must not be changed afterwards.
 
         Raises:
-            TypeError: The root is set to something that is no dict.
+            TypeError: ``key`` is the root, and ``value`` is no dict.
         """
         parts = _parts(key)
         if parts:
@@ -118,7 +120,7 @@ class Parameters:
         """Delete ``key``.
 
         Raises:
-            KeyError: There is none, or it is the root.
+            KeyError: ``key`` does not exist, or is the root.
         """
         parts = _parts(key)
         if not parts:
@@ -126,7 +128,7 @@ class Parameters:
         self._tree = _without(self._tree, parts)
 
     def names(self) -> Iterator[str]:
-        """The full names of all values as they are now; an empty namespace has none."""
+        """The full names of all values, from the tree at the time of the call; an empty namespace has none."""
         return _names("/", self._tree)
 
     def search(self, namespace: str, key: str) -> str | None:
@@ -164,7 +166,7 @@ def _names(namespace: str, tree: Tree) -> Iterator[str]:
 
 
 def _below(key: str, value: XmlRpcValue) -> Iterator[tuple[str, XmlRpcValue]]:
-    """Every key below ``key`` with its value, the namespaces before what is in them."""
+    """Yield every key below ``key`` with its value, each namespace before its content."""
     if isinstance(value, dict):
         for name, part in value.items():
             full = join(key, name) + "/"
@@ -184,18 +186,18 @@ def updates(
     Args:
         subscribers: Subscribed keys, each ending in ``/``, with nodes and their slave APIs.
         key: The key that changed.
-        value: What it is now; deleted is ``{}``.
-        setter: The node that set it, which is not notified where it subscribed the key or a namespace above.
-        yielder: Lets pending data go first for large values.
+        value: Its new value; ``{}`` if it was deleted.
+        setter: The node that set it, which is not notified for subscriptions of the key or of a namespace above it.
+        yielder: Iterates, and serves pending data in between, for large values.
 
     Returns:
-        In rosmaster's order: first for subscriptions of the key, of a namespace above it, or of something below that
-        is gone; then for subscriptions of something below that exists.
+        In rosmaster's order: first for subscriptions of the key, of a namespace above it, or of a key below it that
+        no longer exists; then for subscriptions of keys below it that exist.
     """
     if not subscribers:
         return []
     key = with_slash(key)
-    # Few values have subscriptions below them, and some are large.
+    # Walks through the value only if there is a subscription below it: few values have one, and some are large.
     within = any(subscribed != key and subscribed.startswith(key) for subscribed in subscribers)
     below = dict(yielder(_below(key, value))) if within else {}
     found: list[ParamUpdate] = []

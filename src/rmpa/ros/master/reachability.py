@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Unreachable:
-    """A node that cannot be connected to.
+    """A node to which connecting fails.
 
     Args:
         api: The slave API's URI that it registered with.
@@ -41,11 +41,18 @@ class Reachability:
 
     @property
     def unreachable(self) -> Mapping[str, Unreachable]:
-        """By node; not to be changed."""
+        """The nodes that could not be reached, by name; not to be changed."""
         return self._nodes
 
     def failed(self, node: str, api: str, problem: str, now: float) -> bool:
-        """An attempt to connect failed, but was not refused; return whether this withdraws the node."""
+        """Note an attempt to connect that failed without being refused; return whether this withdraws the node.
+
+        Args:
+            node: The node's name.
+            api: Its slave API.
+            problem: Why the attempt failed, for people.
+            now: Monotonic seconds.
+        """
         known = self._nodes.get(node)
         if known is None or known.api != api:
             known = Unreachable(api, problem, now)
@@ -54,7 +61,7 @@ class Reachability:
         return withdrawn and not known.withdrawn
 
     def reached(self, node: str) -> bool:
-        """A node can be connected to; return whether it was withdrawn before."""
+        """Note that a node can be connected to; return whether it was withdrawn before."""
         known = self._nodes.pop(node, None)
         return known is not None and known.withdrawn
 

@@ -1,8 +1,7 @@
 """The master's tables of publishers, subscribers, services and parameter subscriptions.
 
 Semantics are those of ros_comm's rosmaster 1.15, the order of lists included, because tools print them. Nodes
-restored from the previous run (``unverified``) are in no table and no answer until they have been verified
-(``confirm``).
+restored from the previous run (``unverified``) are in no table and no answer until they are verified (``confirm``).
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ class _Node:
 
 
 class Registrations:
-    """The tables, and what follows from each change.
+    """The tables, and the effects of each change.
 
     Each change appends to ``effects`` (calls to be made to slaves, in order) and to ``changes``; the owner empties
     both.
@@ -49,7 +48,7 @@ class Registrations:
         # service -> node -> service URI, likewise
         self._services: dict[str, dict[str, str]] = {}
         self._types: dict[str, str] = {}
-        # node -> the slave API from which a new node took the name, while the name is in use.
+        # node -> the slave API of the former node of that name, for as long as a new node has the name.
         self._evicted: dict[str, str] = {}
         self._state: GraphState | None = None
         self.unverified = UnverifiedNodes()
@@ -63,7 +62,7 @@ class Registrations:
     # --- questions --------------------------------------------------------------------------------------------
 
     def node_api(self, node: str) -> str | None:
-        """The slave API of a node; ``None`` without any registration."""
+        """The slave API of a node; ``None`` if the node has no registration."""
         found = self._nodes.get(node)
         return found.api if found is not None else None
 
@@ -84,7 +83,7 @@ class Registrations:
         return self._tables[kind].get(key, _NOBODY)
 
     def param_subscribers(self) -> dict[str, dict[str, str]]:
-        """Subscribed parameters (keys end in ``/``), each with its nodes and their APIs; not to be changed."""
+        """Subscribed parameters (keys end in ``/``), each with its nodes and their slave APIs; not to be changed."""
         return self._tables[RegistrationKind.PARAM]
 
     def service_uri(self, service: str) -> str | None:
@@ -100,13 +99,16 @@ class Registrations:
         return list(self._tables[RegistrationKind.PUBLISHER])
 
     def providers(self, kind: RegistrationKind) -> list[tuple[str, dict[str, str]]]:
-        """All keys of a kind, each with its nodes and their slave APIs; not to be changed."""
+        """All keys (topics, services or parameters) of a kind, each with its nodes and their slave APIs.
+
+        The caller must not change the inner dicts.
+        """
         return list(self._tables[kind].items())
 
     def state(self) -> GraphState:
         """All registrations; the same object until something changes.
 
-        The inner dicts are shared with the tables: for a graph of thousands this takes microseconds.
+        The inner dicts are shared with the tables, so this takes microseconds in a graph of thousands of nodes.
         """
         if self._state is None:
             self._state = GraphState(
@@ -121,9 +123,9 @@ class Registrations:
     # --- changes ----------------------------------------------------------------------------------------------
 
     def register_publisher(self, topic: str, topic_type: str, node: str, api: str) -> None:
-        """Add a publisher and notify the topic's subscribers, also when it was registered before.
+        """Add a publisher and notify the topic's subscribers, even if it was registered already.
 
-        Clients rely on the repetition: it makes rospy connect again.
+        Clients rely on the repeated notification: it makes rospy connect again.
         """
         retyped = False
         if topic_type != ANY_TYPE or topic not in self._types:
@@ -155,9 +157,9 @@ class Registrations:
     def subscribe_param(self, key: str, node: str, api: str) -> None:
         """Notify this node of changes below ``key``, which ends in ``/``.
 
-        A node whose name was taken by another one does not take it back by this. At rosmaster it does, and the new
-        node is asked to end (the one intended difference; tests/interop/test_core_api.py shows both): roscpp logs
-        that it was asked to end, and its log subscribes to a parameter with ``getCached``.
+        A node whose name another node has taken does not take it back by this call. With rosmaster it does, and the
+        new node is asked to end: roscpp logs the request to end, and its log subscribes to a parameter with
+        ``getCached``. This is the one intended difference; tests/interop/test_core_api.py shows both.
         """
         if self._evicted.get(node) != api:
             self._register(RegistrationKind.PARAM, key, node, api)
@@ -214,7 +216,7 @@ class Registrations:
     # --- nodes of the previous run ----------------------------------------------------------------------------
 
     def record(self, node: str) -> NodeRecord | None:
-        """Everything that a node has registered, before and after the restart."""
+        """Everything that a node registered before the core's restart and after it; ``None`` for an unknown node."""
         found, awaited = self._nodes.get(node), self.unverified.get(node)
         if found is None:
             return awaited
@@ -236,7 +238,7 @@ class Registrations:
         return record
 
     def restore(self, node: str, record: NodeRecord) -> None:
-        """Restore a node of the previous run as unverified. Its topics have their types again."""
+        """Restore a node of the previous run as unverified. The types of its topics count at once."""
         self.unverified.add(node, record)
         for topic, topic_type in [*record.publishers.items(), *record.subscribers.items()]:
             self._types.setdefault(topic, topic_type)
@@ -244,7 +246,9 @@ class Registrations:
         self._mark_changed(node)
 
     def confirm(self, node: str) -> tuple[list[str], list[str]]:
-        """Register an unverified node, which has answered, with all it had. Services of others stay theirs.
+        """Register an unverified node, which has answered, with all that it had.
+
+        A service that another node provides by now stays with that node.
 
         Returns:
             The topics that it publishes, for ``notify_new_subscribers``, and those that it subscribes to, for
@@ -274,7 +278,7 @@ class Registrations:
             self.effects.append(PublisherUpdate(api, topic, publishers))
 
     def discard(self, node: str) -> None:
-        """Drop an unverified node, and notify the subscribers that may be connected to it."""
+        """Drop an unverified node, and notify the restored subscribers, which may be connected to it."""
         record = self.unverified.pop(node)
         if record is not None:
             self._mark_changed(node)
@@ -282,11 +286,11 @@ class Registrations:
                 self._notify_subscribers(topic, self._restored.__contains__)
 
     def notify_new_subscribers(self, topic: str) -> None:
-        """Notify the subscribers of a topic that registered after the restart of its restored publishers."""
+        """Notify those subscribers of a topic that registered after the core's restart."""
         self._notify_subscribers(topic, lambda node: node not in self._restored)
 
     def _withdraw(self, kind: RegistrationKind, key: str, node: str, api: str) -> bool:
-        """Remove a registration of an unverified node; whether it was there."""
+        """Remove a registration of an unverified node; return whether it was there."""
         if not self.unverified.withdraw(kind, key, node, api):
             return False
         record = self.unverified.get(node)
@@ -296,7 +300,7 @@ class Registrations:
         return True
 
     def _mark_changed(self, node: str) -> None:
-        """The record of a node has changed."""
+        """Give a node a new revision, because its record has changed; forget one that has no record left."""
         if node in self._nodes or self.unverified.get(node) is not None:
             self._revision += 1
             self.revisions[node] = self._revision
@@ -307,7 +311,7 @@ class Registrations:
     # --- the tables -------------------------------------------------------------------------------------------
 
     def _claim_name(self, node: str, api: str) -> _Node:
-        """The node's entry; a node of the same name at another URI loses everything and is asked to end."""
+        """Return the node's entry; a node of that name at another URI loses its registrations and is asked to end."""
         awaited = self.unverified.get(node)
         if awaited is not None and awaited.api != api:
             self.effects.append(Shutdown(awaited.api, node, tuple(awaited.publishers)))
@@ -320,7 +324,7 @@ class Registrations:
             self._evicted[node] = found.api
             self._restored.discard(node)
             found = None
-            # Its place in the order of nodes stays, as rosmaster has it.
+            # The name keeps its place in the order of nodes, as in rosmaster.
         if found is None:
             found = self._nodes[node] = _Node(api)
         return found
@@ -381,7 +385,8 @@ class Registrations:
     def _notify_subscribers(self, topic: str, which: Callable[[str], bool] | None = None) -> None:
         """Send the subscribers of a topic (those that ``which`` accepts) the list of its publishers.
 
-        Restored subscribers get unverified publishers too: they are connected to these, and would disconnect.
+        Restored subscribers get unverified publishers too: they are connected to these, and would disconnect if the
+        list lacked them.
         """
         known = self._publishers(topic, unverified=False)
         old = self._publishers(topic, unverified=True)
@@ -389,6 +394,6 @@ class Registrations:
         for node, api in self.at(RegistrationKind.SUBSCRIBER, topic).items():
             if api not in told and (
                 which is None or which(node)
-            ):  # nodelets of one process share an API: it is told once
+            ):  # nodelets of one process share a slave API, which is notified once
                 told[api] = old if node in self._restored else known
         self.effects += [PublisherUpdate(api, topic, publishers) for api, publishers in told.items()]

@@ -1,13 +1,13 @@
 """Names as rosmaster resolves them: any characters, relative to the caller.
 
-Stricter rules (``core.names``) are for names of our own; a master accepts what rosmaster accepts.
+Stricter rules (``core.names``) hold for names that RMPA makes; a master accepts what rosmaster accepts.
 """
 
 from __future__ import annotations
 
 
 def canonical(name: str) -> str:
-    """Without doubled or trailing slashes; ``/`` and the empty name stay."""
+    """Return a name without doubled or trailing slashes; ``/`` and the empty name stay."""
     joined = "/".join(part for part in name.split("/") if part)
     return f"/{joined}" if name.startswith("/") else joined
 

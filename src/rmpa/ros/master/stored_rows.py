@@ -1,9 +1,9 @@
-"""A core's registrations and parameters as rows of its state file, and the way back.
+"""Converts a core's registrations and parameters to rows of its state file, and back.
 
 A row is ``(kind, name, value)``::
 
     ("node", "/talker", JSON of a NodeRecord)
-    ("param", JSON list of the names on the way to it, MessagePack)
+    ("param", JSON list of its namespaces and its name, MessagePack)
 
 A parameter's row is one value, or one empty namespace. Rows that are read are checked: bad ones are reported and left
 out, the rest is used.
@@ -37,19 +37,19 @@ Key: TypeAlias = tuple[str, str]
 """Kind and name of a row."""
 Row: TypeAlias = tuple[str, str, bytes]
 Path: TypeAlias = tuple[str, ...]
-"""The names of a parameter and its namespaces: a name may hold a slash where a struct was set."""
+"""The names of a parameter's namespaces, then its own; a name may hold a slash where a struct was set."""
 
 _DATETIME: Final = 1
 """A MessagePack extension: XML-RPC's dates have no time zone, and MessagePack's have one."""
 _RUN: Final = 256
-"""Elements of a list packed at once, some 10 microseconds."""
+"""Elements of a list that are packed at once, which takes some 10 microseconds."""
 _GONE: Final = object()
 _pack = msgspec.msgpack.Encoder().encode
 _CONTAINERS: Final = (dict, list, tuple)
 
 
 class NotStorableError(Exception):
-    """A value that cannot be stored; the text says why. It does not leave this package."""
+    """A value that cannot be stored; the text has the reason. Only ``StateWriter`` handles it."""
 
 
 @dataclass(slots=True)
@@ -76,7 +76,7 @@ def param_key(path: Path) -> Key:
 
 
 def changed_params(before: Tree, after: Tree) -> Iterator[tuple[Path, XmlRpcValue | None]]:
-    """The parameters that differ between two trees, with their values now; ``None`` for those that are gone.
+    """The parameters that differ between two trees, with their values in ``after``; ``None`` for deleted ones.
 
     Trees are never changed in place, so parts that both share are skipped.
     """
@@ -173,7 +173,7 @@ _unpack = msgspec.msgpack.Decoder(ext_hook=_unpacked_ext).decode
 
 
 def read(rows: Iterable[Row]) -> StoredRegistrations:
-    """Read rows. Those that are damaged, or that no node could have caused, are named in ``lost``."""
+    """Read rows. Those that are damaged, or that no call of a node could have caused, are reported in ``lost``."""
     kept = StoredRegistrations()
     for kind, name, value in rows:
         try:
@@ -204,7 +204,7 @@ def _node(name: str, row: bytes) -> NodeRecord:
 
 
 def _check_text(text: str) -> None:
-    """Raise ``ValueError`` where XML cannot hold the text: no response with it could be written."""
+    """Raise ``ValueError`` if XML cannot hold the text: no response with it could be written."""
     if legal_text(text) != text:
         raise ValueError(f"{brief(text)} has a character that XML cannot hold")
 

@@ -1,7 +1,7 @@
 """A survey of a master that is another program: one ``system.multicall``, and its answer.
 
-A ROS master does not notify of changes in its graph, so it is polled. ``getSystemState`` has the names alone; the URI
-of each node and service is looked up in the same call, because a node that restarts has the same name.
+A ROS master does not notify of changes in its graph, so it is polled. ``getSystemState`` returns only names. The URI
+of each node and service is looked up in the same call, because only the URI shows that a node was restarted.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from rmpa.core.yielding import Yielder
 
 _KINDS: Final = (RegistrationKind.PUBLISHER, RegistrationKind.SUBSCRIBER, RegistrationKind.SERVICE)
-"""In the order of ``getSystemState``."""
+"""The kinds of the three lists of ``getSystemState``, in order."""
 _HEAD: Final = ("getSystemState", "getTopicTypes", "getPid")
 
 Holders = dict[str, tuple[str, ...]]
-"""By topic or service: the nodes."""
+"""The nodes by topic or service."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class Survey:
         return self.holders[RegistrationKind.SERVICE]
 
     def with_more(self, uris: Mapping[str, str], services: Mapping[str, str]) -> Survey:
-        """A survey with more results of look-ups."""
+        """Return a copy of the survey with further look-up results: URIs of nodes and of services."""
         return Survey(self.holders, self.types, self.run, {**self.uris, **uris}, {**self.services, **services})
 
 
@@ -63,9 +63,9 @@ def one_call(method: str, params: Sequence[XmlRpcValue]) -> XmlRpcValue:
 
 
 def survey_calls(caller_id: str, nodes: Iterable[str], services: Iterable[str]) -> list[XmlRpcValue]:
-    """The calls of a survey that looks up these nodes and services; ``read_survey`` reads the answers."""
+    """The calls of a survey, with look-ups of the given nodes and services; ``read_survey`` reads the answers."""
     calls = [one_call(method, [caller_id]) for method in _HEAD]
-    # Behind the state, so that the look-ups are not older.
+    # After the state, so that the look-ups are not older.
     return [*calls, one_call("getParam", [caller_id, "/run_id"]), *lookup_calls(caller_id, nodes, services)]
 
 
@@ -81,7 +81,7 @@ def read_survey(
     """Read the answer to ``survey_calls`` with the same nodes and services.
 
     Raises:
-        RemoteProtocolError: It is malformed.
+        RemoteProtocolError: The answer is malformed.
     """
     if not isinstance(answer, list) or len(answer) < len(_HEAD) + 1:
         raise RemoteProtocolError(f"the master's answer to system.multicall is no list of answers: {brief(answer)}")
@@ -99,10 +99,13 @@ def read_survey(
 def read_lookups(
     answer: XmlRpcValue, nodes: Sequence[str], services: Sequence[str], *, yielder: Yielder = iter
 ) -> tuple[dict[str, str], dict[str, str]]:
-    """Read the answer to ``lookup_calls`` with the same nodes and services: the URIs of those that exist.
+    """Read the answer to ``lookup_calls`` with the same nodes and services.
+
+    Returns:
+        The URIs of the nodes and of the services that exist.
 
     Raises:
-        RemoteProtocolError: It is malformed.
+        RemoteProtocolError: The answer is malformed.
     """
     if not isinstance(answer, list) or len(answer) != len(nodes) + len(services):
         raise RemoteProtocolError(f"the master's answer to system.multicall is no list of answers: {brief(answer)}")

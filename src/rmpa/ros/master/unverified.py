@@ -1,4 +1,4 @@
-"""Nodes restored from the previous run of a core that have not answered yet since its restart."""
+"""Nodes restored from the previous run of a core, which have not answered since its restart."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class NodeRecord(msgspec.Struct, omit_defaults=True):
     params: dict[str, None] = msgspec.field(default_factory=dict)
 
     def serialize(self) -> bytes:
-        """As JSON."""
+        """Return the record as JSON."""
         return msgspec.json.encode(self)
 
     def of(self, kind: RegistrationKind) -> dict[str, str] | dict[str, None]:
-        """What it registered of one kind."""
+        """The node's registrations of one kind; the record's own dict, not a copy."""
         match kind:
             case RegistrationKind.PUBLISHER:
                 return self.publishers
@@ -70,14 +70,14 @@ class UnverifiedNodes:
             self._publishers.setdefault(topic, {})[node] = record.api
 
     def pop(self, node: str) -> NodeRecord | None:
-        """Remove a node."""
+        """Remove a node and return its record; ``None`` if it is not unverified."""
         record = self._records.pop(node, None)
         for topic in record.publishers if record is not None else ():
             self._forget_publisher(topic, node)
         return record
 
     def withdraw(self, kind: RegistrationKind, key: str, node: str, api: str) -> bool:
-        """Remove one registration, if ``api`` is that node's; whether it was there."""
+        """Remove one registration, if ``api`` is that node's; return whether it was there."""
         record = self._records.get(node)
         if record is None or record.api != api or key not in record.of(kind):
             return False

@@ -1,4 +1,7 @@
-"""Checks of the Master API's parameters: what rosmaster answers with code -1, and nothing stricter."""
+"""Checks of the Master API's parameters: they refuse what rosmaster answers with code -1.
+
+They are stricter in one point: ``limits.PARAM_DEPTH_MAX`` bounds the namespaces in a parameter's name.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from rmpa.ros.wire.xmlrpc import XmlRpcValue, brief
 
 
 class InvalidParameterError(Exception):
-    """A parameter that the caller has to correct; the text says which and how. Never leaves this room."""
+    """A parameter that the caller has to correct; the text names it and the fault. ``MasterApi.call`` catches it."""
 
 
 Validator: TypeAlias = Callable[[XmlRpcValue, str, str], XmlRpcValue]
@@ -40,7 +43,7 @@ def key(value: XmlRpcValue, name: str, caller_id: str) -> str:
 
 
 def node_name(value: XmlRpcValue, name: str, caller_id: str) -> str:
-    """A graph name, resolved; a colon or a space makes it none."""
+    """A graph name, resolved; one with a colon or a space is refused."""
     given = text(value, name, caller_id)
     if ":" in given or " " in given:
         raise InvalidParameterError(f"{name} {brief(given)} is not a graph name: it has a colon or a space in it")
@@ -63,14 +66,14 @@ def subgraph(value: XmlRpcValue, name: str, caller_id: str) -> str:
 
 
 def uri(value: XmlRpcValue, name: str, caller_id: str) -> str:  # noqa: ARG001 - a Validator
-    """A URI of an API. It is kept as it is: roscpp recognises itself by its exact text."""
+    """A URI of a slave API or service, kept unchanged: roscpp recognises itself by the exact text."""
     if not isinstance(value, str) or not value.startswith(("http://", "rosrpc://")):
         raise InvalidParameterError(f"{name} must be a URI like http://host:port/ or rosrpc://host:port")
     return value
 
 
 def type_name(value: XmlRpcValue, name: str, caller_id: str) -> str:  # noqa: ARG001 - a Validator
-    """``package/Name``, or ``*`` for "whatever it is"."""
+    """``package/Name``, or ``*`` for any type."""
     if not isinstance(value, str) or (value != ANY_TYPE and value.count("/") != 1):
         raise InvalidParameterError(f"{name} must be a type like std_msgs/String or *, not {brief(value)}")
     return value

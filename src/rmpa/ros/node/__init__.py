@@ -1,1 +1,1 @@
-"""ROS nodes of ours: publications, subscriptions and services at one address."""
+"""ROS nodes that run in this process: publications, subscriptions and services at one address."""

@@ -31,7 +31,7 @@ def keep_alive(sock: socket.socket) -> None:
 
 
 class AcceptedConnection:
-    """A connection that another node opened to one of ours.
+    """A connection that another node opened to a node of this process.
 
     Args:
         sock: Accepted, non-blocking; owned from here on.
@@ -41,7 +41,7 @@ class AcceptedConnection:
             after ``close()`` or ``refuse()``. The publication or service that takes the connection replaces it.
 
     Attributes:
-        on_bytes: Gets the bytes behind the header, as ``runtime.stream`` defines; without one, as for subscribers,
+        on_bytes: Gets the bytes after the header, as ``runtime.stream`` defines; with ``None``, as for subscribers,
             they are dropped.
     """
 
@@ -58,7 +58,7 @@ class AcceptedConnection:
         """The other side's header, once received."""
         self.peer: tuple[str, int] = sock.getpeername()[:2]
         self.messages = 0
-        """Messages sent, with those that were dropped later."""
+        """Messages queued for sending, those that were dropped later included."""
         self.on_end = on_end
         self.on_bytes: OnBytes | None = None
         self._on_header = on_header
@@ -91,8 +91,8 @@ class AcceptedConnection:
 
         Args:
             header: The reply header.
-            queue_messages: Messages in the queue of this connection at most.
-            queue_bytes: The same in bytes.
+            queue_messages: The most messages in the queue of this connection.
+            queue_bytes: The most bytes in the queue; one message always fits.
             nodelay: Whether TCP_NODELAY is set even if the other side did not ask for it.
         """
         if nodelay or self.fields.get("tcp_nodelay") == "1":
@@ -120,7 +120,7 @@ class AcceptedConnection:
         return self.stream.open(_MESSAGES, size)
 
     def extend(self, message: QueuedMessage, part: Buffer) -> int:
-        """Send a part of it; return how many older ones were dropped for it."""
+        """Send a part of a message; return how many older messages were dropped for it."""
         return self.stream.extend(message, part)
 
     def abandon(self, message: QueuedMessage) -> bool:
@@ -135,7 +135,7 @@ class AcceptedConnection:
         if self._has_header:
             if self.on_bytes is not None:
                 return self.on_bytes(data)
-            # A subscriber sends nothing; reading on shows the end of the stream.
+            # A subscriber sends nothing more; reading goes on to detect the end of the stream.
             return len(data), 0
         fields, consumed, wanted = parse_header(data)
         if fields is None:

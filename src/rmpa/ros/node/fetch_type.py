@@ -1,8 +1,8 @@
 """Fetches the definition of a message type from a node that publishes it: each publisher sends it in its header.
 
-The connection ends with the header and is not registered at the master. A lazy publisher, which works only while it
-has a subscriber, sees one for a moment. A connection to a peer's publisher goes through its proxy, which opens the
-route.
+The connection ends after the header and is not registered at the master. A lazy publisher, which works only while it
+has a subscriber, sees one for a moment. A connection to a peer's publisher goes through its proxy, and so opens the
+route of that publisher.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _PROXIES: Final = "/rmpa/"
-"""Prefix of the names of proxies for a peer's nodes. They are asked last, because that opens a route."""
+"""Prefix of the names of proxies for a peer's nodes. They are asked last, because asking one opens a route."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ async def fetch_type(
         caller_id: The name of the node that asks; it need not be registered.
         name: The type, ``package/Name``.
         topic: Its publishers are asked first.
-        elsewhere: Whether publishers of other topics are asked, too.
+        elsewhere: Whether publishers of other topics are asked, too, after those of ``topic``.
 
     Returns:
         ``None`` where no publisher of that type sent a definition.
@@ -135,7 +135,8 @@ async def _header(uri: str, topic: str, caller_id: str) -> Header:
     Args:
         uri: Its slave API.
         topic: The topic.
-        caller_id: Not that of a subscriber of the topic: a rospy publisher keeps one connection for each caller id.
+        caller_id: Must not be that of a subscriber of the topic: a rospy publisher keeps one connection for each
+            caller id.
     """
     told: asyncio.Future[Header] = asyncio.get_running_loop().create_future()
 

@@ -1,4 +1,4 @@
-"""``get_loggers`` and ``set_logger_level`` of a node of ours, as every roscpp and rospy node has them.
+"""``get_loggers`` and ``set_logger_level`` of a node of this process, as every roscpp and rospy node has them.
 
 With them rqt_logger_level and ``rosservice call /rmpa/set_logger_level rmpa.mesh debug`` set the levels of this
 program's log while it runs. The messages (roscpp/GetLoggers, roscpp/SetLoggerLevel) are serialized by hand, because
@@ -42,7 +42,7 @@ class LoggerServices:
     Args:
         node: Serves them.
         call: Calls the core's master.
-        loggers: Python's logger for each name that is shown.
+        loggers: The name of Python's logger, by the name that the services show.
     """
 
     def __init__(self, node: SlaveNode, call: Callable[..., RosReply], loggers: Mapping[str, str]) -> None:
@@ -74,7 +74,7 @@ class LoggerServices:
         parts = [LENGTH.pack(len(self._loggers))]
         for name, logger in self._loggers.items():
             level = logging.getLogger(logger).getEffectiveLevel()
-            # The highest level of ROS that is not above it.
+            # The highest ROS level that is not above the logger's level.
             word = next((w for w, number in reversed(_LEVELS.items()) if number <= level), "debug")
             parts += [_string(name), _string(word)]
         call.reply(True, b"".join(parts))

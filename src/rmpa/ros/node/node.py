@@ -62,7 +62,7 @@ class Node:
         master_uri: Replaces that of the environment.
         anonymous: Whether the name is made unique.
         environment: Replaces that of this process's variables; pass one to use command-line arguments.
-        on_shutdown: ``(reason)``: the master shuts the node down.
+        on_shutdown: ``(reason)``: called when the master shuts the node down, before the node closes.
         on_param_update: ``(key, value)``: a parameter subscribed to by ``follow_param`` has changed.
 
     Raises:
@@ -204,7 +204,7 @@ class Node:
         Args:
             topic: Resolved in the namespace.
             kind: The type; ``None`` accepts any. Without a definition on this machine the publisher's is used.
-            callback: Called in the loop with each message; what it raises is logged. Without one, use
+            callback: Called in the event loop with each message; its exceptions are logged. Without one, use
                 ``async for`` on the result.
             nodelay: Whether to ask publishers for TCP_NODELAY.
             queue_messages: Messages queued for the ``async for``; above it the oldest is dropped.
@@ -312,7 +312,7 @@ class Node:
         try:
             return await connect(found)
         except PeerRefused:
-            # There may be two versions here: one of a workspace, and the one that rmpa brings.
+            # This machine may have two versions of the type: one of a workspace, and the one that rmpa brings.
             other = await self._version_of(uri, resolved, found) if isinstance(kind, str) else None
             if other is None:
                 raise
@@ -343,7 +343,7 @@ class Node:
 
         Raises:
             UnreachableError: The master does not answer.
-            PeerRefused: It answers with a code other than 1.
+            PeerRefused: The master answers with a code other than 1.
         """
         reply = await self._call(method, *params)
         if reply.code != 1:
@@ -365,7 +365,7 @@ class Node:
         """A parameter's value, or ``default`` where one is given and the parameter does not exist.
 
         Raises:
-            PeerRefused: It does not exist.
+            PeerRefused: The parameter does not exist, and no ``default`` is given.
         """
         reply = await self._call("getParam", self._resolve(key))
         if reply.code == 1:
@@ -386,12 +386,15 @@ class Node:
         """Delete a parameter.
 
         Raises:
-            PeerRefused: It does not exist.
+            PeerRefused: The parameter does not exist.
         """
         await self.call_master("deleteParam", self._resolve(key))
 
     async def search_param(self, key: str) -> str | None:
-        """The full name of the nearest parameter of this name, up through the namespaces."""
+        """The full name of the nearest parameter of this name, searched upwards through the namespaces.
+
+        ``None`` if there is none.
+        """
         reply = await self._call("searchParam", key)
         return str(reply.value) if reply.code == 1 else None
 
@@ -415,10 +418,11 @@ class Node:
         return host, "127.0.0.1" if is_loopback(host) else "0.0.0.0"  # noqa: S104 - as every ROS node does
 
     async def _find_type(self, name: str) -> MessageType | None:
-        """A message type as found on this machine; ``None`` where a publisher may have it.
+        """Find a message type on this machine; ``None`` if only a publisher can supply it.
 
         Raises:
-            DefinitionError: It is malformed, or not in a package whose types rmpa brings.
+            DefinitionError: The definition is malformed, or rmpa brings the types of its package, but none of this
+                name.
         """
         try:
             return await asyncio.to_thread(find_message_type, name)
@@ -428,7 +432,7 @@ class Node:
             return None
 
     async def _version_of(self, uri: str, service: str, found: ServiceType) -> ServiceType | None:
-        """The server's version of a service type, if it differs and is found here."""
+        """Find the server's version of a service type; ``None`` if it is the same or is not on this machine."""
         try:
             said = (await probe(uri, service, self.name, limits.SERVICE_OPEN_TIMEOUT)).description
             other = await asyncio.to_thread(find_service_type, found.name, said.md5sum)
@@ -512,7 +516,7 @@ class Node:
         if self._ending is None and self._closing is None:
             if self._on_shutdown is not None:
                 self._on_shutdown(reason)
-            # Behind the answer to this call.
+            # In a task of its own, so that the answer to this call is sent first.
             self._ending = asyncio.get_running_loop().create_task(self.close(), name=f"shut down {self.name}")
 
     async def _close(self) -> None:

@@ -1,7 +1,7 @@
 """The publishing end of one topic.
 
-It sends raw bytes. A publication of a node of ours has its type from the start; that of a proxy for a remote
-publisher gets it when the route to that publisher opens, and holds its subscribers until then.
+It sends raw bytes. A publication of a node of this program has its type from the start. The publication of a proxy
+gets the type when the route to the remote publisher opens, and holds its subscribers until then.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ def _ignore(*_: object) -> None:
 class Publication:
     """One topic of one (real or proxy) node, with its subscribers.
 
-    Demand is the number of connections, held ones included. All callbacks are called in the loop; they may call
-    methods of the publication.
+    Demand is the number of connections, held ones included. All callbacks are called in the event loop; they may
+    call methods of the publication.
 
     Args:
         topic: Its global name; compared literally with what subscribers ask for.
         caller_id: The publishing node's name.
         description: Type, md5 sum, definition and latching, or ``None`` until ``describe()``.
-        on_first_subscriber: Demand has left 0.
-        on_last_subscriber: Demand is 0 again.
+        on_first_subscriber: Called when demand rises from 0.
+        on_last_subscriber: Called when demand returns to 0.
         on_mismatch: ``(fields, text)``: a subscriber was refused; its header and the text of the error header.
         on_listeners: ``listeners`` has changed.
         queue_messages: Messages queued for one slow subscriber; above it the oldest is dropped.
-        queue_bytes: The same in bytes; one message always fits.
+        queue_bytes: Bytes queued for one slow subscriber; one message always fits.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Publication:
         self.messages = 0
         """Messages published."""
         self.bytes = 0
-        """Their bytes, lengths included; each message counts once, whatever the number of subscribers."""
+        """Bytes published, lengths included; each message counts once, whatever the number of subscribers."""
         self._description: TopicDescription | None = None
         self._reply: dict[str, str] = {}
         self._on_first = on_first_subscriber
@@ -108,7 +108,7 @@ class Publication:
 
     @property
     def dropped(self) -> int:
-        """Messages dropped for slow subscribers, with those that have disconnected."""
+        """Messages dropped for slow subscribers, those that have disconnected included."""
         return self._dropped_before + sum(connection.dropped for connection in self._open)
 
     def connections(self) -> list[BusConnection]:
@@ -203,7 +203,7 @@ class Publication:
     def begin(self, size: int) -> None:
         """Begin a message of ``size`` bytes, its length included, whose parts follow.
 
-        A subscriber that connects before its end does not get it, unless it is latched.
+        A subscriber that connects before the message's end does not get it, unless the topic is latched.
         """
         self._size = self._left = size
         self._partial = [(connection, connection.begin(size)) for connection in self._open]
@@ -211,7 +211,7 @@ class Publication:
         self._whole = bytearray() if latching else None
 
     def extend(self, part: Buffer) -> None:
-        """Send a part to all subscribers that have its beginning."""
+        """Send the next part to all subscribers that have the message's beginning."""
         for connection, message in self._partial:
             connection.extend(message, part)
         self._left -= len(part)
@@ -231,12 +231,12 @@ class Publication:
                     connection.send(framed)
 
     def abort(self) -> int:
-        """Give up a message whose rest will not come.
+        """Give up the message in progress, whose rest will not arrive.
 
-        Subscribers that have its beginning are disconnected: TCPROS has no way to take back half a message.
+        Subscribers that got its beginning are disconnected: TCPROS has no way to take back half a message.
 
         Returns:
-            Their number: if any, the owner should register the topic again.
+            The number of disconnected subscribers: if any, the owner should register the topic again.
         """
         broken = [connection for connection, message in self._partial if connection.abandon(message)]
         self._partial = []
@@ -262,16 +262,16 @@ class Publication:
         self._latched = deque(self._latched, maxlen=min(depth, limits.LATCHED_MAX))
 
     def forget_latched(self) -> None:
-        """Drop the latched messages: their source is gone, or will send them again."""
+        """Drop the latched messages, because their source is gone or will send them again."""
         self._latched.clear()
 
     async def drained(self, timeout: float = runtime_limits.DRAIN_TIMEOUT) -> None:  # noqa: ASYNC109 - for all together
-        """Wait until all published messages were sent, at most ``timeout`` seconds."""
+        """Wait until all published messages are sent, at most ``timeout`` seconds."""
         if self._open:
             await asyncio.gather(*(connection.stream.drained(timeout) for connection in self._open))
 
     def withdraw(self) -> None:
-        """Close all connections, without a callback."""
+        """Close all connections without calling ``on_last_subscriber``."""
         self._withdrawn = True
         connections, self._held, self._open = (*self._held, *self._open), (), ()
         for connection in connections:

@@ -168,7 +168,7 @@ class ServiceConnection:
     ) -> tuple[bool, bytes | bytearray]:
         """Send a request and wait for its reply: the ``ok`` byte, and the response or the text of the error.
 
-        Cancellation closes the connection: the reply would be taken for that of the next call.
+        Cancellation closes the connection, because the late reply would be taken for that of the next call.
 
         Raises:
             LocalProtocolError: Another call is under way.
@@ -193,9 +193,10 @@ class ServiceConnection:
             raise
 
     def request(self, body: Buffer, done: Done, timeout: float | None = None) -> None:
-        """The same without waiting: ``done`` is called once from the loop, with the reply or the error.
+        """Send a request without waiting: ``done`` is called once in the event loop, with the reply or the error.
 
-        A ``body`` larger than ``service_stream.INLINE`` must not change until then.
+        A ``body`` larger than ``service_stream.INLINE`` must not change until then. ``timeout`` is in seconds;
+        ``None`` waits for ever.
 
         Raises:
             LocalProtocolError: Another call is under way.
@@ -220,7 +221,7 @@ class ServiceConnection:
             self._stream.send([head, body], BODIES)
 
     def close(self) -> None:
-        """Close at once; a call under way fails within this call."""
+        """Close at once; a call under way fails before this returns."""
         self._on_closed = None
         self._stop("the connection was closed")
 
@@ -237,7 +238,7 @@ class ServiceConnection:
             raise PeerRefused(f"service {self.service}: {who}", problem)
 
     def _was_closed_by_server(self) -> bool:
-        """Whether the server closed the connection since the last call; cheaper than a call that fails."""
+        """Whether the server has closed the connection since the last call; cheaper than a call that fails."""
         try:
             return not self._sock.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
         except (BlockingIOError, InterruptedError):

@@ -1,4 +1,4 @@
-"""The serving side of a service: ``SlaveNode.add_service`` puts an endpoint behind the node's TCPROS port."""
+"""The serving side of a service: ``SlaveNode.add_service`` attaches an endpoint to the node's TCPROS port."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _WHOLE: Final = 64 * KIB
-"""Requests up to here are taken in one piece, without a copy in between."""
+"""Requests of up to this many bytes are read in one piece, without a ``BodyBuffer``."""
 
 Describe = Callable[[], Awaitable[ServiceDescription | str]]
 Serve = Callable[["ServiceCall"], None]
@@ -49,7 +49,7 @@ class ServiceCall:
         request: The request's bytes, without a length; never changed.
         deadline: ``loop.time()`` at which the client gets an error.
         on_gone: Set by the handler; called at most once when no answer is needed any more, because the client has
-            disconnected, the deadline is over, or the service is withdrawn. Never called behind ``reply``.
+            disconnected, the deadline is over, or the service is withdrawn. Never called after ``reply``.
     """
 
     __slots__ = ("_client", "caller_id", "deadline", "on_gone", "request", "service")
@@ -81,7 +81,7 @@ class ServiceCall:
         self.reply(False, text.encode(errors="replace"))
 
     def abandon(self) -> None:
-        """The call needs no answer any more; for the endpoint."""
+        """Mark the call as needing no answer, and call ``on_gone``; only the client's connection calls this."""
         self._client = None
         on_gone, self.on_gone = self.on_gone, None
         if on_gone is not None:
@@ -99,8 +99,9 @@ class ServiceEndpoint:
         caller_id: The serving node's name.
         serve: Called in the loop with each request; answers at once or later by ``call.reply``. An exception becomes
             the client's error.
-        describe: Called at a header while ``description`` is ``None``; returns the description, or the text of an
-            error header, after which it is called again. Connections that come meanwhile wait for the same result.
+        describe: Called when a client's header arrives while ``description`` is ``None``. Returns the description,
+            or the text of an error header; after an error it is called again for the next client. Clients that
+            connect while it runs wait for the same result.
         description: The description, if it is known.
         timeout: Seconds for a call before the client gets an error.
         on_mismatch: ``(fields, text)``: a client with another md5 sum was refused.
@@ -162,7 +163,7 @@ class ServiceEndpoint:
             client.withdraw(text)
 
     async def closed(self) -> None:
-        """After ``withdraw``: wait until the last replies were sent, at most ``DRAIN_TIMEOUT``."""
+        """After ``withdraw``: wait until the last replies are sent, at most ``runtime.limits.DRAIN_TIMEOUT``."""
         if self._clients:
             self._empty = asyncio.get_running_loop().create_future()
             await asyncio.wait([self._empty], timeout=runtime_limits.DRAIN_TIMEOUT)
@@ -170,14 +171,14 @@ class ServiceEndpoint:
             client.close()
 
     def mismatch(self, fields: Mapping[str, str], text: str) -> None:
-        """A client's md5 sum does not match; for its connection."""
+        """Report a client whose md5 sum does not match; called by its connection."""
         if self._on_mismatch is not None:
             self._on_mismatch(fields, text)
         else:
             _log.warning("! %s", text)
 
     def remove(self, client: _ClientConnection) -> None:
-        """A connection has ended; for the connection."""
+        """Forget a connection that has ended; called by the connection."""
         self._clients.discard(client)
         if client in self._waiting:
             self._waiting.remove(client)
@@ -218,7 +219,7 @@ class ServiceEndpoint:
 
 
 class _ClientConnection:
-    """One client's connection: a request, its reply, and if it is persistent the next request."""
+    """One client's connection: a request, its reply, and, if the connection is persistent, the next request."""
 
     def __init__(self, endpoint: ServiceEndpoint, connection: AcceptedConnection) -> None:
         self._endpoint = endpoint
@@ -240,7 +241,12 @@ class _ClientConnection:
         connection.on_end = self._left
 
     def open(self, description: ServiceDescription, *, resume: bool = True) -> None:
-        """Answer the header; ``resume`` unless called within the read that brought the header."""
+        """Answer the client's header, or refuse it if the md5 sums differ.
+
+        Args:
+            description: The service's description.
+            resume: Read requests that are buffered already; ``False`` within the read that received the header.
+        """
         connection, endpoint = self._connection, self._endpoint
         problem = check_client(connection.fields, endpoint.service, endpoint.caller_id, description)
         if problem is not None:
@@ -262,7 +268,7 @@ class _ClientConnection:
         self._release()
 
     def withdraw(self, text: str) -> None:
-        """The service is withdrawn."""
+        """Answer a call under way with an error, and close once the last reply is sent."""
         call, self._call = self._call, None
         if call is not None and not self._ended:
             call.abandon()
@@ -432,7 +438,7 @@ class _ClientConnection:
             self._resume()
             return
         self._served = True
-        # Not now: a reply within a read of another connection is sent at the end of that read.
+        # Not at once: a reply made during the read of another connection is only sent at the end of that read.
         self._loop.call_soon(self._close_served)
 
     def _close_served(self) -> None:
@@ -450,7 +456,7 @@ class _ClientConnection:
     # --- the end ----------------------------------------------------------------------------------------------
 
     def _start_stall_timer(self) -> None:
-        """Close the connection if no bytes come within ``limits.SERVICE_STALL``."""
+        """Close the connection if no bytes arrive within ``limits.SERVICE_STALL`` seconds."""
         if self._stall is None:
             self._seen = self._connection.stream.bytes_in
             self._stall = self._loop.call_later(limits.SERVICE_STALL, self._stalled)
@@ -492,4 +498,4 @@ class _ClientConnection:
 
 
 def _ended(_connection: AcceptedConnection, _error: Exception | None) -> None:
-    """``on_end`` of a connection that the endpoint has released."""
+    """Does nothing; it is ``on_end`` of a connection that the endpoint has released."""

@@ -1,4 +1,4 @@
-"""Sends large requests and responses in parts, between which pending data goes first."""
+"""Sends large requests and responses in parts; other pending data is served between two parts."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ class Service:
         self.endpoint = ServiceEndpoint(name, caller_id, self._serve, description=kind.describe(), timeout=timeout)
 
     async def close(self) -> None:
-        """Unregister; calls under way get an error."""
+        """Unregister the service; calls under way get an error."""
         await self._on_close(self.name)
 
     def _serve(self, call: ServiceCall) -> None:
@@ -79,7 +79,7 @@ class Service:
     async def _respond(self, call: ServiceCall, result: Awaitable[Any]) -> None:
         try:
             self._reply(call, await result)
-        except Exception as error:  # noqa: BLE001 - the same, as a task's top
+        except Exception as error:  # noqa: BLE001 - the top of the user's code, as a task
             self._failed(call, error)
 
     def _reply(self, call: ServiceCall, result: Any) -> None:

@@ -80,7 +80,7 @@ class SharedListener:
         _log.info("= proxies listen at 127.x addresses of their own, ports %d (XML-RPC) and %d (TCPROS)", *self.ports)
 
     async def close(self) -> None:
-        """Stop listening; the nodes are closed before."""
+        """Stop listening; the owner has closed the nodes before."""
         self._http.close()
         self._tcpros.close()
         await self._strays.close()
@@ -108,15 +108,15 @@ class SharedListener:
         self._addresses.free(address, asyncio.get_running_loop().time())
 
     def _answer_stray(self, sock: socket.socket, client: tuple[str, int]) -> None:
-        """Answer a call to a node that is gone with an error.
+        """Answer a call to the address of a closed node with an error.
 
-        After a reset rospy would repeat ``requestTopic`` twice a minute in a thread, as long as it lives.
+        After a reset, rospy would repeat ``requestTopic`` twice a minute in a thread until its process ends.
         """
         self._counters.add("address.unknown.xmlrpc")
         self._strays.adopt(sock, client)
 
     def _reset_stray(self, sock: socket.socket, _client: tuple[str, int]) -> None:
-        """Reset a TCPROS connection to a node that is gone, like a port where nothing listens: roscpp backs off."""
+        """Reset a TCPROS connection to the address of a closed node, as a closed port would: roscpp backs off."""
         self._counters.add("address.unknown.tcpros")
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
         sock.close()
@@ -132,7 +132,7 @@ class _Port:
 
     def __init__(self, name: str, stray: Adopt) -> None:
         self.nodes: dict[str, Adopt] = {}
-        """By address."""
+        """The takers of accepted connections, by the nodes' addresses."""
         self.number = 0
         self._name = name
         self._stray = stray
@@ -170,7 +170,7 @@ async def _test_address(address: str, port: _Port) -> None:
     """Connect to an address, and wait until the connection is accepted with it.
 
     Raises:
-        OSError: It is not.
+        OSError: The connection fails, or is not accepted in ``limits.SHARED_PROBE_TIMEOUT``.
     """
     loop = asyncio.get_running_loop()
     arrived: asyncio.Future[None] = loop.create_future()

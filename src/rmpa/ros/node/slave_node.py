@@ -39,7 +39,8 @@ def _not_followed(_key: str, _value: XmlRpcValue) -> bool:
 class SlaveNode:
     """Serves the topics and services of one node; its owner registers them at a master.
 
-    It has no task, and two listening sockets, or none where many nodes share a listener: an agent can have thousands.
+    It has no task of its own, and two listening sockets, or none with a shared ``listener``: an agent can run
+    thousands of such nodes.
 
     Args:
         name: The node's global name.
@@ -47,13 +48,13 @@ class SlaveNode:
         master_uri: The answer to ``getMasterUri``.
         advertised_host: The address to register, if it differs from ``host``.
         port: The XML-RPC server's; 0 lets the system choose.
-        listener: Started; accepts for this node instead of sockets of its own, and assigns its address: ``host``,
-            ``advertised_host`` and ``port`` are ignored then.
+        listener: A started listener that accepts this node's connections and assigns its address; ``host``,
+            ``advertised_host`` and ``port`` are then ignored.
         counters: Count refusals.
-        on_shutdown: ``(reason)``: the master shuts this node down; its owner closes it.
+        on_shutdown: ``(reason)``: the master shuts this node down; the owner has to close it.
         on_param_update: ``(key, value) -> whether the node subscribed to that key``.
-        on_publisher_update: ``(topic, uris)``, behind the node's own subscriptions.
-        on_kill: ``(caller id, reason) -> reply``: awaited for the answer to ``shutdown``, after ``on_shutdown``.
+        on_publisher_update: ``(topic, uris)``, called after the node's own subscription is updated.
+        on_kill: ``(caller id, reason) -> reply``: awaited after ``on_shutdown`` for the answer to ``shutdown``.
         taps: The owner's own connections to publishers, for ``getBusInfo`` and ``getBusStats``.
     """
 
@@ -119,7 +120,7 @@ class SlaveNode:
         self._api.uri = f"http://{self._advertised}:{self._http.port}/"
 
     async def close(self) -> None:
-        """Close the topics, then the servers; unregister before."""
+        """Close the topics and services, then the servers; the owner has unregistered them before."""
         for topic in tuple(self._publications):
             self.remove_publication(topic)
         services = tuple(self._services.values())
@@ -218,18 +219,18 @@ class SlaveNode:
         return (self._advertised, self._tcpros.address[1]) if topic in self._publications else None
 
     def publisher_update(self, topic: str, publishers: Sequence[str]) -> None:
-        """The master sends the publishers of a topic."""
+        """Apply the master's list of publishers of a topic."""
         subscription = self._subscriptions.get(topic)
         if subscription is not None:
             subscription.update(publishers)
         self._on_publisher_update(topic, publishers)
 
     def param_update(self, key: str, value: XmlRpcValue) -> bool:
-        """A parameter has changed."""
+        """Pass a changed parameter on; return whether the node subscribed to its key."""
         return self._on_param_update(key, value)
 
     def shut_down(self, reason: str) -> None:
-        """The master shuts the node down."""
+        """Pass the master's request to shut down on to ``on_shutdown``."""
         _log.info("< %s: asked to shut down: %s", self.name, reason)
         self._on_shutdown(reason)
 

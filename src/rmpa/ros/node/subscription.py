@@ -49,10 +49,10 @@ class PartsTaker(Protocol):
         """A message of ``size`` bytes, its length included, begins."""
 
     def part(self, part: memoryview) -> None:
-        """A part of it, valid during the call only."""
+        """The next part of the message; the view is valid during the call only."""
 
     def abort(self) -> None:
-        """The rest of the message will not come."""
+        """The rest of the message will not arrive."""
 
 
 OUT_OF_FILES: Final = "the subscribing side has no file descriptor left for it; `rmpa doctor` there says what to do"
@@ -70,18 +70,18 @@ class PublisherConnection:
         caller_id: The subscribing node; a rospy publisher keeps one connection for each (topic, caller id).
         on_message: ``(framed)``: one message with its 4-byte length in front; the view is only valid during the call.
             It must not raise.
-        on_parts: Receives messages above ``limits.CUT_THROUGH_BYTES`` while they still arrive; without it they too
-            are passed to ``on_message``.
-        on_header: ``(fields)``: the publisher's reply, before its first message, at each connection.
+        on_parts: Receives messages above ``core.limits.CUT_THROUGH_BYTES`` in parts while they still arrive; without
+            it they too are passed to ``on_message``.
+        on_header: ``(fields)``: the publisher's reply header; called at each connection, before its first message.
         on_refused: ``(text)``: the publisher refused, or has another md5 sum; there is no further attempt.
-        on_lost: ``(reason)``: the connection failed or ended; it is tried again with back-off. Half a message is
-            dropped.
+        on_lost: ``(reason)``: the connection failed or ended; it is tried again with back-off. An incomplete message
+            is dropped.
         on_oversized: ``(size)``: a message of more than ``limits.TCPROS_MESSAGE_MAX`` begins; it is read and dropped.
         type_name: The type to ask for.
         md5sum: The md5 sum to ask for; ``*`` accepts any.
         definition: The definition to send, if known.
         nodelay: Whether to ask for TCP_NODELAY on the publisher's side.
-        number: The node's own number for this connection.
+        number: The connection's number within the node, for ``getBusInfo``.
         rng: Uniform numbers in [0, 1), for the jitter of the back-off.
     """
 
@@ -116,7 +116,7 @@ class PublisherConnection:
         """Whether the last connection ended because the publisher broke the protocol."""
         self.number = number
         self.refused: str | None = None
-        """Why the publisher refused or does not match; ``None`` if it does."""
+        """Why the publisher refused or does not match; ``None`` while it has not refused."""
         self._caller_id = caller_id
         self._type = type_name
         self._md5sum = md5sum
@@ -147,7 +147,7 @@ class PublisherConnection:
 
     @property
     def ended(self) -> bool:
-        """Whether the task has ended."""
+        """Whether the connection's task has ended, or was never started."""
         return self._task is None or self._task.done()
 
     @property
@@ -172,13 +172,13 @@ class PublisherConnection:
             await asyncio.wait([self._task])
 
     def connection(self) -> BusConnection:
-        """For ``getBusInfo`` and ``getBusStats``."""
+        """The connection's row in ``getBusInfo`` and ``getBusStats``."""
         return BusConnection(
             self.number, self.uri, INBOUND, self.topic, self.connected, self._info, self.bytes, self.messages
         )
 
     def _forget_task(self, _: asyncio.Task[None]) -> None:
-        """A cancelled task refers to its frames, and so to this object."""
+        """Drop the reference to the ended task: a cancelled task refers to its frames, and so to this object."""
         self._task = None
 
     async def _run(self) -> None:
@@ -195,7 +195,7 @@ class PublisherConnection:
             await asyncio.sleep(self._backoff.delay())
 
     async def _attempt(self) -> str:
-        """Connect and wait until the connection ends; return why it did."""
+        """Connect and wait until the connection ends; return the reason."""
         try:
             host, port = await self._request_topic()
             async with asyncio.timeout(limits.TCPROS_CONNECT_TIMEOUT):
@@ -273,7 +273,7 @@ class PublisherConnection:
         """Consume the rest of a message, or the header, before further messages.
 
         Returns:
-            Consumed bytes, and what ``_take`` returns for wanted; less than 0 if messages may follow.
+            The number of consumed bytes, and ``_take``'s second result; the latter is -1 if messages may follow.
         """
         start = 0
         if self._skipping:
@@ -297,13 +297,13 @@ class PublisherConnection:
         return start + consumed, wanted
 
     def _begin_skipping(self, size: int) -> None:
-        """A message that is too long begins: drop its bytes."""
+        """Begin to drop a message of ``size`` bytes that is longer than ``limits.TCPROS_MESSAGE_MAX``."""
         self._skipping = LENGTH.size + size
         self.oversized += 1
         self._on_oversized(size)
 
     def _skip(self, data: memoryview) -> int:
-        """Drop the received bytes of such a message; return their number."""
+        """Drop the received bytes of a message that is too long; return their number."""
         count = min(self._skipping, len(data))
         self._skipping -= count
         self.bytes += count
@@ -352,7 +352,7 @@ class PublisherConnection:
 
 
 class Subscription:
-    """A topic that a node of ours subscribes to: one connection to each listed publisher.
+    """A topic that a node of this process subscribes to: one connection to each listed publisher.
 
     Unlike rospy it disconnects from publishers that are no longer listed. A publisher that refused is tried again
     when the master lists it again.
@@ -410,15 +410,15 @@ class Subscription:
         }
 
     def connections(self) -> list[BusConnection]:
-        """For ``getBusInfo`` and ``getBusStats``."""
+        """The rows of all connections in ``getBusInfo`` and ``getBusStats``."""
         return [connection.connection() for connection in self._connections.values()]
 
     def update(self, uris: Iterable[str], *, keep: bool = False) -> None:
         """Apply the master's list of publishers: connect to the new ones, disconnect from the missing ones.
 
         Args:
-            uris: Their slave APIs.
-            keep: Disconnect from none: the list of a restarted master is incomplete.
+            uris: The slave APIs of the listed publishers.
+            keep: Disconnect from none, because the list of a restarted master is incomplete.
         """
         listed = {uri for uri in uris if uri != self._own_uri}
         for uri in () if keep else self._connections.keys() - listed:

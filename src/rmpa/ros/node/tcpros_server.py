@@ -34,10 +34,10 @@ class TcprosServer:
 
     Args:
         name: The node's name, for the texts.
-        publications: By topic; read at each header, so that the owner can change it.
+        publications: By topic; read again at each header, so that the owner can change it.
         counters: Count ``tcpros.refused.*``.
         numbers: The numbers of connections, shared with the node's outgoing ones.
-        services: By name; read at each header.
+        services: By name; read again at each header.
         clock: For the rate limit of the log.
     """
 
@@ -108,7 +108,7 @@ class TcprosServer:
         """
         try:
             connection = AcceptedConnection(sock, next(self._numbers), on_header=self._header, on_end=self._ended)
-        except OSError:  # it is gone already
+        except OSError:  # the client has disconnected already
             sock.close()
             return
         if len(self._accepted) >= min(self._forget_at, limits.TCPROS_CONNECTIONS_MAX):

@@ -45,7 +45,7 @@ class Received:
 
     @cached_property
     def kind(self) -> MessageType:
-        """The message type, if need be from the publisher's header.
+        """The message type: the subscriber's, or the one in the publisher's header.
 
         Raises:
             DefinitionError: The publisher's definition cannot be used.
@@ -121,10 +121,10 @@ class Publisher:
         return self.publish_raw(self._known().serialize(message))
 
     def publish_raw(self, payload: Buffer) -> int:
-        """Publish bytes, without a length in front.
+        """Publish a serialized message, without a length in front; returns as ``publish``.
 
         Raises:
-            ValueError: They are more than ``limits.TCPROS_MESSAGE_MAX``.
+            ValueError: The message is longer than ``ros.limits.TCPROS_MESSAGE_MAX`` bytes.
         """
         return self.publication.publish_framed(frame_message(payload))
 
@@ -133,11 +133,11 @@ class Publisher:
         await self._change.wait()
 
     async def drained(self) -> None:
-        """Wait until all published messages were sent, at most ``DRAIN_TIMEOUT``."""
+        """Wait until all published messages are sent, at most ``runtime.limits.DRAIN_TIMEOUT`` seconds."""
         await self.publication.drained()
 
     async def close(self) -> None:
-        """Send what is queued, unregister, and close the connections."""
+        """Send the queued messages, unregister, and close the connections."""
         await self.drained()
         await self._on_close(self.topic)
 
@@ -222,7 +222,7 @@ class Subscriber:
         await self._on_close(self.topic)
 
     def ended(self) -> None:
-        """End the ``async for``: no message will come any more."""
+        """End the ``async for`` once its queue is empty; no further messages arrive."""
         self._ended = True
         self._wake.set()
 

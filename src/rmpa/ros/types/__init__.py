@@ -1,1 +1,1 @@
-"""Message, service and action types: definitions, md5 sums, where they are found, and messages as objects."""
+"""Message, service and action types: their definitions and md5 sums, the search for them, and messages as objects."""

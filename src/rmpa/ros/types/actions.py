@@ -1,6 +1,6 @@
 """Actions: the seven message types of a ``.action`` file, as actionlib's ``genaction`` writes them.
 
-Pure. A file has a goal, a result and a feedback with lines ``---`` between (wiki.ros.org/actionlib).
+Pure. A file has a goal, a result and a feedback, separated by lines ``---`` (wiki.ros.org/actionlib).
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ _PIECES: Final = ("Goal", "Result", "Feedback")
 
 
 def actions_of(message: str) -> Iterator[tuple[str, str]]:
-    """The actions that a message may belong to, and its part in each: ``DoActionGoal`` to ``("Do", "ActionGoal")``.
+    """Yield the actions that a message may belong to, and its part in each: ``("Do", "ActionGoal")`` and others.
+
+    ``DoActionGoal`` may be the ``ActionGoal`` of ``Do`` or the ``Goal`` of ``DoAction``.
 
     Args:
         message: The name without its package.
@@ -37,11 +39,11 @@ def action_message(action: str, part: str, text: str) -> str | None:
 
     Args:
         action: The action's name without its package.
-        part: The part, as ``actions_of`` gives it.
-        text: The ``.action`` file.
+        part: The part, as ``actions_of`` yields it.
+        text: The content of the ``.action`` file.
 
     Returns:
-        ``None`` if the file has not three parts.
+        The message's own text; ``None`` if the file does not have three parts.
     """
     pieces = [""]
     for line in text.split("\n"):

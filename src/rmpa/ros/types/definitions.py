@@ -61,15 +61,15 @@ class UnknownTypeError(DefinitionError):
     """No definition of a type was found."""
 
     fetchable: bool = True
-    """Whether a publisher may have it: rmpa does not bring the types of its package."""
+    """Whether a publisher may supply the definition; ``False`` if rmpa brings the other types of its package."""
 
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """One field.
+    """One field of a message type.
 
     Args:
-        name: As written.
+        name: The name, as written.
         type: A primitive, or ``package/Name``.
         array: Whether it is an array.
         size: The length of a fixed-size array; 0 for one of any length.
@@ -82,7 +82,7 @@ class Field:
 
     @property
     def primitive(self) -> bool:
-        """Whether its type is built in."""
+        """Whether the field's type is built in."""
         return self.type in PRIMITIVES
 
     def __str__(self) -> str:
@@ -96,9 +96,9 @@ class Specification:
 
     Args:
         name: ``package/Name``.
-        text: Its own text.
-        fields: In order.
-        constants: ``type name=value`` in order, as the MD5 sum has them.
+        text: The type's own text.
+        fields: The fields, in order.
+        constants: ``type name=value`` in order, in the form in which the MD5 sum is computed.
     """
 
     name: str
@@ -139,7 +139,7 @@ def _constant(name: str, line: str, clean: str) -> str:
     if kind not in PRIMITIVES or kind in ("time", "duration"):
         raise DefinitionError(name, f"{clean[:80]!r} is not a constant")
     if kind == "string":
-        # The value of a string constant is all text behind its "=", a "#" included.
+        # The value of a string constant is all text after its "=", a "#" included.
         left, _, value = line.partition("=")
         return f"string {left.strip().partition(' ')[2]}={value.strip()}"
     constant, _, value = rest.partition("=")
@@ -166,11 +166,11 @@ def parse_definition(name: str, text: str) -> dict[str, Specification]:
     """Read a full definition: the type's own text, then ``MSG:`` blocks of all embedded types.
 
     Returns:
-        By name; the type itself comes first.
+        The types by name; the type itself is the first.
 
     Raises:
-        DefinitionError: It is malformed, an embedded type is missing, or a type contains itself.
-        LimitExceeded: It is larger than ``limits.DEFINITION_MAX``.
+        DefinitionError: The text is malformed, an embedded type is missing, or a type contains itself.
+        LimitExceeded: The text is longer than ``limits.DEFINITION_MAX``.
     """
     if len(text) > limits.DEFINITION_MAX:
         raise LimitExceeded(f"definition of {name[:80]}", len(text), limits.DEFINITION_MAX)
@@ -262,8 +262,8 @@ def full_text(name: str, known: Mapping[str, Specification]) -> str:
 
 @functools.cache
 def packaged_texts(file: str) -> Mapping[str, str]:
-    """The definitions in a file of this package, by name of the type."""
-    # Not by importlib.resources: that takes 10 ms of every start.
+    """The definitions in a data file of this package, by the type's name."""
+    # Not by importlib.resources, which takes 10 ms of every start.
     texts: dict[str, str] = json.loads(Path(__file__).with_name(file).read_bytes())
     return texts
 
@@ -280,9 +280,9 @@ def complete(known: dict[str, Specification], find: Callable[[str], str | None])
         find: Returns the own text of a type, or ``None``.
 
     Raises:
-        UnknownTypeError: One is not found.
-        DefinitionError: One is malformed.
-        LimitExceeded: All together are larger than ``limits.DEFINITION_MAX``.
+        UnknownTypeError: An embedded type is not found.
+        DefinitionError: An embedded type is malformed.
+        LimitExceeded: All together are longer than ``limits.DEFINITION_MAX``.
     """
     size = 0
     todo = [(name, embedded) for name in known for embedded in known[name].depends()]
@@ -315,7 +315,7 @@ def known_specifications(name: str) -> Mapping[str, Specification]:
     """A type that rmpa brings, and all that it embeds.
 
     Raises:
-        DefinitionError: rmpa does not bring it.
+        DefinitionError: The type is not one that rmpa brings.
     """
     if name not in _texts():
         raise UnknownTypeError(

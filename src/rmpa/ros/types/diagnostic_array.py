@@ -1,6 +1,6 @@
 """Serializes ``diagnostic_msgs/DiagnosticArray`` (REP 107), which an agent publishes on /diagnostics.
 
-By hand: the agent needs few messages, and rosbags with numpy would double its memory.
+The code is written by hand, because the agent needs few messages, and rosbags with numpy would double its memory.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ ARRAY_DEFINITION: Final = (
     "string key # what to label this value when viewing\n"
     "string value # a value to track over time\n"
 )
-"""As ROS's own publishers send it: rosbag and others compute the md5 sum from it."""
+"""The text that ROS's own publishers send: rosbag and others compute the md5 sum from it."""
 _LENGTH: Final = struct.Struct("<I")
 _HEADER: Final = struct.Struct("<III")
 _SECOND: Final = 1_000_000_000
@@ -81,7 +81,7 @@ class DiagnosticStatus:
     values: Mapping[str, str]
 
     def serialize(self) -> bytes:
-        """One element of the array."""
+        """Serialize the status as one element of the array."""
         parts = [bytes((self.level,)), *map(_text, (self.name, self.message, self.hardware_id))]
         parts.append(_LENGTH.pack(len(self.values)))
         for key, value in self.values.items():
@@ -90,7 +90,7 @@ class DiagnosticStatus:
 
 
 def frame_array(sequence: int, stamp_ns: int, statuses: Iterable[bytes]) -> bytes:
-    """A whole message with its length in front, as TCPROS sends it.
+    """Assemble a whole message with its length in front, as TCPROS sends it.
 
     Args:
         sequence: ``header.seq``, modulo 2^32.

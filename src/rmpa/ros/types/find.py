@@ -1,8 +1,8 @@
 """Finds the definition of a message or service type by its name, for commands, nodes and Smart Resources.
 
-The search goes through the sourced workspaces (``ros.types.installed``), the types that rmpa brings, and the ROS
-installations of this machine. So a workspace's version of a standard type is preferred, as by the nodes of that
-workspace. With an md5 sum (of a service's server or a publisher) the version that has it is used, wherever it is. A
+The search goes through the sourced workspaces (``ros.types.installed``), then the types that rmpa brings, then the
+ROS installations of this machine. So a workspace's version of a standard type is preferred, as by the nodes of that
+workspace. If an md5 sum is given (of a service's server or a publisher), the first version with that sum is used. A
 type that is not found may be fetched from a publisher: ``ros.node.fetch_type``.
 """
 
@@ -60,9 +60,9 @@ def find_message_type(name: str, md5: str = "", environ: Mapping[str, str] | Non
         environ: Replaces this process's environment variables.
 
     Raises:
-        UnknownTypeError: It is in none of the places, which the text names.
+        UnknownTypeError: The type is in none of the searched places, which the text names.
         DefinitionError: The definition is malformed, or has another md5 sum.
-        LimitExceeded: It is too long.
+        LimitExceeded: The definition is too long.
     """
     return _again(_message, name, md5, SearchPath.read(os.environ if environ is None else environ))
 
@@ -76,7 +76,7 @@ def find_service_type(name: str, md5: str = "", environ: Mapping[str, str] | Non
 
 
 def _again(find: Callable[[str, str, SearchPath], _Type], name: str, md5: str, path: SearchPath) -> _Type:
-    """Find a type; if it is missing, search again without the cache: it may have been built since."""
+    """Find a type; if it is missing, search again without the cache, as it may have been built since."""
     fresh = packages_below.cache_info().currsize == 0
     try:
         return find(name, md5, path)
@@ -94,7 +94,7 @@ def message_with_sum(name: str, md5: str, path: SearchPath) -> MessageType:
     Raises:
         DefinitionError: As for ``find_message_type``.
     """
-    # Called for each message. With a sum the result stays valid when the files change.
+    # Called for each message, so it is cached. With a sum the result stays valid when the files change.
     return _again(_message, name, md5, path)
 
 
@@ -158,7 +158,7 @@ def _make_message(name: str, found: Found, path: SearchPath) -> MessageType:
     if known_text(name) is not None:
         ours = MessageType(name)
         if ours.md5sum == made.md5sum:
-            return ours  # it is built already
+            return ours  # its serialization code may be generated already
     return made
 
 
@@ -196,10 +196,10 @@ def _embedding(name: str, error: UnknownTypeError, what: str) -> UnknownTypeErro
 
 
 def _embedded(found: Found, path: SearchPath, name: str) -> str | None:
-    """The own text of a type that is embedded in one that was found.
+    """The own text of a type that a found definition embeds.
 
     Raises:
-        UnknownTypeError: There is none.
+        UnknownTypeError: No definition of the embedded type is found.
     """
     if name in found.embedded:
         return found.embedded[name]

@@ -1,4 +1,4 @@
-"""The message type of a connection header, for each message: failed searches are cached."""
+"""Finds the message type of a connection header; results are cached, so it can be called for each message."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _missing_lock: Final = threading.Lock()
 
 
 def _unless_missing(name: str, md5: str, path: SearchPath) -> MessageType:
-    """Find a message type with a sum, unless the last search failed within ``limits.TYPE_MISSING``."""
+    """Find a message type with a sum; repeat the error of a search that failed within ``limits.TYPE_MISSING``."""
     key = name, md5, path
     with _missing_lock:
         when, error = _missing.get(key, (0.0, None))
@@ -31,7 +31,7 @@ def _unless_missing(name: str, md5: str, path: SearchPath) -> MessageType:
             del _missing[key]
             error = None
     if error is not None:
-        raise error.with_traceback(None)  # it would grow with each message
+        raise error.with_traceback(None)  # the traceback would grow with each message
     try:
         return message_with_sum(name, md5, path)
     except RmpaError as problem:
@@ -44,9 +44,10 @@ def _unless_missing(name: str, md5: str, path: SearchPath) -> MessageType:
 
 
 def type_of_header(fields: Mapping[str, str]) -> MessageType:
-    """The message type of a publisher's connection header, by its definition or else as found on this machine.
+    """The message type of a publisher's connection header: from its definition, else as found on this machine.
 
-    May be called for each message: a failed search is not repeated within ``limits.TYPE_MISSING``.
+    May be called for each message: results are cached, and a failed search is not repeated within
+    ``limits.TYPE_MISSING`` seconds.
 
     Raises:
         DefinitionError: As for ``MessageType.learn`` and ``find_message_type``.

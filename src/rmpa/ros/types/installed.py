@@ -6,10 +6,9 @@ The search order is, in the workspaces:
 * the packages below each folder of ROS_PACKAGE_PATH (``ros.types.packages``): ``msg/Name.msg``, ``srv/Name.srv``,
   or ``action/Name.action`` for the messages of an action;
 * in each prefix of CMAKE_PREFIX_PATH (a devel or install space) genpy's modules, ``share``, and the source folders
-that
-  its file ``.catkin`` lists.
+  that its file ``.catkin`` lists.
 
-Then, sourced or not, ``/opt/ros/*`` (that of ROS_DISTRO first) and ``/usr``, likewise.
+After the workspaces, ``/opt/ros/*`` (that of ROS_DISTRO first) and ``/usr`` are searched likewise, sourced or not.
 """
 
 from __future__ import annotations
@@ -45,9 +44,9 @@ class SearchPath:
 
     Args:
         python: The folders of PYTHONPATH.
-        packages: Those of ROS_PACKAGE_PATH.
-        prefixes: Those of CMAKE_PREFIX_PATH.
-        distribution: ROS_DISTRO.
+        packages: The folders of ROS_PACKAGE_PATH.
+        prefixes: The prefixes of CMAKE_PREFIX_PATH.
+        distribution: The value of ROS_DISTRO.
     """
 
     python: tuple[str, ...] = ()
@@ -57,7 +56,7 @@ class SearchPath:
 
     @classmethod
     def read(cls, environ: Mapping[str, str]) -> SearchPath:
-        """Read it from environment variables."""
+        """Read the search path from environment variables."""
         python, packages, prefixes = (
             tuple(dict.fromkeys(part for part in environ.get(name, "").split(os.pathsep) if part))
             for name in ("PYTHONPATH", "ROS_PACKAGE_PATH", "CMAKE_PREFIX_PATH")
@@ -66,7 +65,7 @@ class SearchPath:
 
     @property
     def system(self) -> tuple[str, ...]:
-        """The prefixes of ROS installations, sourced or not: first that of the distribution, then the newest."""
+        """The prefixes of ROS installations: that of ``distribution``, the other distributions Z to A, ``/usr``."""
         try:
             found = sorted((str(prefix) for prefix in _DISTRIBUTIONS.iterdir()), reverse=True)
         except OSError:
@@ -75,7 +74,7 @@ class SearchPath:
         return (*found, *_SYSTEM)
 
     def __str__(self) -> str:
-        """For the text of errors."""
+        """The searched places, for the text of errors."""
         variables = (
             ("ROS_PACKAGE_PATH", self.packages),
             ("CMAKE_PREFIX_PATH", self.prefixes),
@@ -99,7 +98,7 @@ class Found:
 
     Args:
         text: A message's own text; or a service's request, a line ``---`` and its response.
-        embedded: The own texts of embedded types, as far as its file has them.
+        embedded: The own texts of embedded types, as far as the file has them.
         where: The file.
     """
 
@@ -165,7 +164,7 @@ def definitions_of(package: str, path: SearchPath, kind: str) -> tuple[list[Path
 
 
 def _places(package: str, path: SearchPath, *, sourced: bool) -> Iterator[tuple[bool, Path]]:
-    """Folders that may be the package's, each with whether it holds genpy's modules instead of definitions."""
+    """Yield the folders that may be the package's; ``True`` for one with genpy's modules instead of definitions."""
     if sourced:
         for entry in path.python:
             yield True, Path(entry, package)
@@ -182,7 +181,7 @@ def _places(package: str, path: SearchPath, *, sourced: bool) -> Iterator[tuple[
 
 
 def _sources(prefix: str) -> list[str]:
-    """The source folders of a devel space; none of an install space."""
+    """The source folders of a devel space; empty for an install space."""
     text = read_text(Path(prefix, ".catkin"), limits.PACKAGE_FILE_MAX) or ""
     return [entry for entry in text.strip().split(";") if entry.startswith("/")]
 
@@ -197,26 +196,26 @@ def _of_action(folder: Path, base: str) -> Iterator[Found]:
 
 
 def _split(full_text: str) -> tuple[str, dict[str, str]]:
-    """The own text, and those of the embedded types by name."""
+    """Split a full definition into the type's own text and those of the embedded types, by name."""
     own, *rest = full_text.split(f"\n{SEPARATOR}\nMSG: ")
     blocks = (block.partition("\n") for block in rest)
     return own, {name.strip(): text for name, _, text in blocks}
 
 
 def _full_texts(module: Path) -> dict[str, str]:
-    """``_full_text`` of each class of a module that genpy made; empty if there is none."""
+    """The ``_full_text`` of each class of a module that genpy made, by the class's name; empty without a module."""
     texts: dict[str, str] = {}
     current = ""
     for match in _FULL_TEXT.finditer(_read(module) or ""):
         if match[1]:
             current = match[1]
         else:
-            texts[current] = match[2].replace('\\"', '"')  # nothing else is escaped
+            texts[current] = match[2].replace('\\"', '"')  # genpy escapes nothing else
     return texts
 
 
 def _names(folder: Path, suffix: str) -> set[str]:
-    """The names of the files with a suffix, without it."""
+    """The names of a folder's files with a suffix, without the suffix."""
     try:
         return {
             entry.stem for entry in islice(folder.iterdir(), limits.PACKAGE_ENTRIES_MAX) if entry.suffix == suffix

@@ -52,7 +52,7 @@ class MessageType:
         name: ``package/Name``.
         specifications: The type and all that it embeds, by name; by default those that rmpa brings.
             ``rmpa.ros.types.find`` finds those of this machine's packages.
-        source: The file of its definition; empty for one that rmpa brings or that a publisher sent.
+        source: The file of the definition; empty for one that rmpa brings or that a publisher sent.
 
     Raises:
         DefinitionError: The type is not known, or malformed.
@@ -70,16 +70,16 @@ class MessageType:
 
     @classmethod
     def learn(cls, name: str, definition: str, md5: str = "") -> MessageType:
-        """A type from its publisher's header; the last ``limits.RECEIVED_TYPES_MAX`` are cached.
+        """Make a type from its publisher's header; the last ``limits.RECEIVED_TYPES_MAX`` types are cached.
 
         Args:
             name: ``package/Name``.
             definition: The full text.
-            md5: The publisher's md5 sum, with which the text is checked.
+            md5: The publisher's md5 sum, with which that of the text is compared; empty for no comparison.
 
         Raises:
-            DefinitionError: The text is malformed, or has another sum.
-            LimitExceeded: It is too long.
+            DefinitionError: The text is malformed, or has another md5 sum.
+            LimitExceeded: The text is too long.
         """
         learnt = _learn(name, definition)
         if md5 and learnt.md5sum != md5:
@@ -96,19 +96,19 @@ class MessageType:
         return self._specifications[self.name].fields
 
     def serialize(self, message: object) -> bytes:
-        """A message object as bytes, without a length in front.
+        """Serialize a message object, without a length in front.
 
         Raises:
-            MessageError: A field holds what its type does not allow.
+            MessageError: A field has a value that its type does not allow.
         """
         try:
             return bytes(self._store.serialize_ros1(message, _inner(self.name)))
         except Exception as error:
-            # rosbags checks nothing: the exception depends on the field.
+            # rosbags does not check values: the exception depends on the field.
             raise MessageError(f"cannot serialize a {self.name}: {type(error).__name__}: {error}") from error
 
     def deserialize(self, raw: Buffer) -> Any:
-        """Bytes to a message object, with numpy arrays for arrays of numbers.
+        """Deserialize bytes to a message object, with numpy arrays for arrays of numbers.
 
         Raises:
             MessageError: The bytes are too short, too long, or a string in them is not UTF-8.
@@ -119,10 +119,10 @@ class MessageType:
             raise MessageError(f"{len(raw)} bytes are not a {self.name}: {error}") from error
 
     def make(self, values: Plain | Mapping[str, object] = None) -> Any:
-        """A message object from plain values; missing fields are 0, empty or false, as in ROS.
+        """Make a message object from plain values; missing fields are 0, empty or false, as in ROS.
 
         Args:
-            values: A mapping of fields; or a list of all fields in order; or the value itself where there is one
+            values: A mapping of fields; or a list of all fields in order; or the value itself if the type has one
                 field only. Times are ``{secs, nsecs}`` or seconds.
 
         Raises:
@@ -131,7 +131,7 @@ class MessageType:
         return self._make(self.name, values, "")
 
     def to_plain(self, message: object) -> dict[str, Plain]:
-        """A message object as plain values; times are ``{secs, nsecs}``."""
+        """Convert a message object to plain values; times are ``{secs, nsecs}``."""
         return self._plain(self.name, message)
 
     # --- inside -----------------------------------------------------------------------------------------------
@@ -261,7 +261,11 @@ def _primitive(kind: str, value: Plain, path: str) -> bool | float | str:
 
 
 def _sequence(field: Field, value: Any, path: str) -> Any:
-    """A program's value for an array: numpy's array or bytes as an array to serialize, all else as a list."""
+    """Convert a value for an array: a numpy array or bytes to an array of the field's type, all else to a list.
+
+    Raises:
+        MessageError: The value is no sequence, or does not fit the field.
+    """
     if isinstance(value, tuple):
         return list(value)
     raw = isinstance(value, bytes | bytearray | memoryview) and field.type in ("uint8", "char", "byte", "int8")
@@ -318,7 +322,7 @@ def _names(fields: Sequence[Field]) -> str:
 
 @functools.cache
 def _inner(name: str) -> str:
-    """``package/Name`` as rosbags writes it."""
+    """Convert ``package/Name`` to rosbags' form, ``package/msg/Name``."""
     package, _, base = name.partition("/")
     return f"{package}/msg/{base}"
 
@@ -353,8 +357,8 @@ def _learnt_store(name: str, specifications: Mapping[str, Specification]) -> Typ
     store = Ros1Store(Stores.EMPTY)
     try:
         for each in specifications.values():
-            # From the parsed fields: without comments and constants, which serialization does not need, and without
-            # lines that rosbags parses differently.
+            # Made from the parsed fields: serialization needs no comments and constants, and rosbags parses some
+            # lines differently.
             text = "".join(f"{field} {field.name}\n" for field in each.fields)
             store.register(get_types_from_msg(text, _inner(each.name)))
     except (TypesysError, SyntaxError, ValueError) as error:

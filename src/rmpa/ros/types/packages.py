@@ -1,9 +1,9 @@
 """Finds the ROS packages below a folder as rospack does (wiki.ros.org/rospack).
 
 A folder with a ``package.xml`` (catkin) or ``manifest.xml`` (rosbuild) is a package, and none is within another.
-``CATKIN_IGNORE`` hides a folder and all below it, ``rospack_nosubdirs`` what is below. Symbolic links are followed,
-each folder once. The search is bounded (``limits.PACKAGE_*``) and breadth first; what cannot be read is skipped. Only
-packages with definitions are found.
+``CATKIN_IGNORE`` hides a folder and all below it, ``rospack_nosubdirs`` only the folders below. Symbolic links are
+followed; each folder is searched once. The search is bounded (``limits.PACKAGE_*``) and breadth first; unreadable
+folders are skipped. Only folders with definitions (``msg``, ``srv``, ``action``) are found.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def packages_below(root: str) -> Packages:
 
 
 def package_folders(package: str, root: str) -> Iterator[Path]:
-    """The folders of a package below a root; one right below it is found without a search."""
+    """Yield the folders of a package below a root, first one directly below it, which needs no search."""
     direct = Path(root, package)
     is_direct = _is_package(direct, package)
     if is_direct:
@@ -80,12 +80,12 @@ class _Search:
     def __init__(self) -> None:
         self.packages: list[tuple[str, Path]] = []
         self.loose: list[tuple[str, Path]] = []
-        """Folders with definitions but without a manifest, which ROS does not take for packages."""
+        """Folders with definitions but without a manifest, which ROS does not count as packages."""
         self._seen: set[tuple[int, int]] = set()
         self._entries = 0
 
     def run(self, root: Path) -> bool:
-        """Search; return whether no limit was met."""
+        """Search; return ``False`` if a limit ended the search."""
         waiting = deque([(root, 0)])
         whole = True
         for _ in range(limits.PACKAGE_FOLDERS_MAX):
@@ -100,7 +100,7 @@ class _Search:
         return whole and not waiting
 
     def _look(self, folder: Path) -> list[str]:
-        """Add a folder if it is a package; return the names of the folders in it to search."""
+        """Add a folder if it has definitions; return the names of the folders in it to search next."""
         files, inner = self._entries_of(folder)
         if "CATKIN_IGNORE" in files:
             return []
@@ -113,7 +113,7 @@ class _Search:
         return sorted(name for name in inner - DEFINITIONS if not name.startswith("."))
 
     def _entries_of(self, folder: Path) -> tuple[set[str], set[str]]:
-        """The names of its files and of its folders; none if it was searched before or cannot be read."""
+        """The names of a folder's files and folders; empty if it was searched before or cannot be read."""
         files: set[str] = set()
         folders: set[str] = set()
         try:
@@ -147,9 +147,9 @@ def _declared_name(folder: Path) -> str:
 
 
 def read_text(path: Path, size_max: int) -> str | None:
-    """A file's text, or ``None`` where it cannot be read, is larger, or is no regular file (a FIFO would block).
+    """A file's text; ``None`` if it is unreadable, above ``size_max`` bytes, or no regular file (a FIFO would block).
 
-    Bytes that are not UTF-8 stay as surrogates.
+    Bytes that are not UTF-8 are kept as lone surrogates.
     """
     try:
         about = path.stat()

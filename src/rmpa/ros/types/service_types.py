@@ -1,7 +1,8 @@
 """Service types: their definitions, MD5 sums, and requests and responses as Python objects.
 
-A definition is the request's text, a line ``---``, and the response's (wiki.ros.org/srv). rmpa brings those of ROS's
-own packages; ``ros.types.find`` finds those of this machine's packages. No server sends its definition.
+A definition is the request's text, a line ``---``, and the response's text (wiki.ros.org/srv). rmpa brings the
+definitions of ROS's own packages; ``ros.types.find`` finds those of this machine's packages. Unlike publishers,
+servers do not send their definitions.
 """
 
 from __future__ import annotations
@@ -32,9 +33,10 @@ class ServiceType:
 
     Args:
         name: ``package/Name``.
-        text: Its definition; by default the one that rmpa brings.
-        find: Returns the own text of an embedded message type, or ``None``; by default of those that rmpa brings.
-        source: The file of its definition; empty for one that rmpa brings.
+        text: The definition; by default the one that rmpa brings.
+        find: Returns the own text of an embedded message type, or ``None``; by default it finds the types that rmpa
+            brings itself.
+        source: The file of the definition; empty for one that rmpa brings.
 
     Raises:
         DefinitionError: The type is not known, or malformed.
@@ -82,7 +84,7 @@ def known_service(name: str) -> str:
     """The definition of a service type that rmpa brings.
 
     Raises:
-        DefinitionError: rmpa does not bring it.
+        DefinitionError: The type is not one that rmpa brings.
     """
     if name not in _texts():
         raise UnknownTypeError(

@@ -21,4 +21,4 @@ HEADER_PART: Final = (
     "#Frame this data is associated with\n"
     "string frame_id\n"
 )
-"""To the byte as ROS's publishers send it: rosbag and others compute md5 sums from definitions."""
+"""Equal to the byte to the text of ROS's publishers: rosbag and others compute md5 sums from definitions."""

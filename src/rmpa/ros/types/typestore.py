@@ -1,7 +1,8 @@
-"""A rosbags type store without CDR: a message type is ready in a quarter of the time.
+"""A rosbags type store without CDR, which prepares a message type in a quarter of the time.
 
-rosbags generates twelve functions for each type when it is first used; three of them are for ROS 1. This module is
-imported when the first message is built or read (see ``ros.types.messages``).
+rosbags generates twelve functions for each type when the type is first used; only three of them are for ROS 1, and
+only these are generated here. This module is imported when the first message is built or read (see
+``ros.types.messages``).
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ class Ros1Store(Typestore):
     """A store that begins with the types of one of rosbags' stores.
 
     Args:
-        begin: That store.
+        begin: The rosbags store whose types it gets.
     """
 
     def __init__(self, begin: Stores) -> None:
@@ -32,7 +33,7 @@ class Ros1Store(Typestore):
         self.types = dict(known.types)
 
     def get_msgdef(self, typename: str) -> Msgdef[object]:
-        """The generated functions of a type; generated at the first call.
+        """The serialization functions of a type, which are generated at the first call.
 
         Raises:
             KeyError: The type is not known.

@@ -1,8 +1,8 @@
 """Collects the body of an XML-RPC call; a call that is too large is answered with an XML-RPC fault.
 
-Of all errors a fault is the one that ROS's clients show: ``rospy.set_param`` ignores a status of -1 and xmlrpc.client
-hides the text of an HTTP error, while ``rosparam`` and ``roslaunch`` print a fault's text. A client reads no answer
-before it has sent its whole call, so a refused call is read to its end, but only its beginning is kept.
+A fault is the only error that ROS's clients show: ``rospy.set_param`` ignores a status of -1 and xmlrpc.client hides
+the text of an HTTP error, while ``rosparam`` and ``roslaunch`` print a fault's text. A client reads no answer before
+it has sent its whole call, so a refused call is read to its end, but only its beginning is kept.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class CallBody:
     """Collects one body after the other.
 
     Args:
-        reserve: ``(bytes) -> whether there is room``: asked once for each large call.
+        reserve: ``(bytes) -> whether there is room``: called once for each large call.
     """
 
     __slots__ = ("_data", "_left_out", "_reserve", "_why", "reserved")
@@ -73,18 +73,18 @@ class CallBody:
             self._left_out = size - len(self._data)
 
     def end(self) -> tuple[memoryview, str]:
-        """The whole body and an empty text; or of a refused one its beginning and the text of the fault."""
+        """Return the whole body and an empty text; for a refused one its beginning and the text of the fault."""
         data, size, why = self._data, len(self), self._why
         self._data, self._left_out, self._why = bytearray(), 0, None
         return memoryview(data), why(data, size) if why is not None else ""
 
     def answered(self) -> None:
-        """Release what is reserved: the call is answered."""
+        """Release the reserved bytes, because the call is answered."""
         self.reserved = 0
 
 
 def call_name(begin: bytes | bytearray) -> str:
-    """A call's method, and of a parameter its key: ``setParam /map``; ``a call`` if the bytes do not show it.
+    """A call's method, with the key if it is about a parameter: ``setParam /map``; ``a call`` if it is unknown.
 
     Args:
         begin: The first bytes of the call.

@@ -1,6 +1,6 @@
 """HTTP/1.1 (RFC 9112) as XML-RPC uses it: bytes in, requests or a response out. httptools (llhttp) does the parsing.
 
-A request is a POST to any path; its body may have a length or come in chunks. Of a response only the body counts.
+A request is a POST to any path; its body has a length or is sent in chunks. Of a response only the body is used.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class HttpRequest(NamedTuple):
     """One XML-RPC call.
 
     Args:
-        body: The XML; of a call that is too large only its beginning.
+        body: The XML; for a call that is too large only its beginning.
         refusal: The text of the fault for a call that is too large; empty for all others.
         close: Whether the connection ends with the answer.
     """
@@ -45,12 +45,12 @@ class HttpRequest(NamedTuple):
 
 
 class HttpRefusal(NamedTuple):
-    """A request that is answered with an HTTP error; nothing behind it is read.
+    """A request that is answered with an HTTP error; nothing after it is parsed.
 
     Args:
-        status: Of the answer.
-        text: Its body.
-        counter: What counts it: ``http.malformed``.
+        status: The status code of the answer.
+        text: The body of the answer.
+        counter: The counter of the refusal, such as ``http.malformed``.
     """
 
     status: int
@@ -59,16 +59,16 @@ class HttpRefusal(NamedTuple):
 
 
 class RequestParser:
-    """Parses what one client sends.
+    """Parses the requests of one client.
 
     Args:
-        reserve: ``(bytes) -> whether there is room``: asked once for each large call.
+        reserve: ``(bytes) -> whether there is room``: called once for each large call.
         on_begin: Called with the first byte of each request.
 
     Attributes:
-        body: The body of the request that is coming in.
+        body: The body of the request that is being received.
         receiving: Whether a request has begun and is not complete.
-        expects_continue: The client waits for ``CONTINUE`` before it sends a body; the connection resets it.
+        expects_continue: Whether the client waits for ``CONTINUE`` before it sends a body; the owner resets it.
     """
 
     def __init__(self, reserve: Callable[[int], bool], on_begin: Callable[[], None]) -> None:
@@ -81,7 +81,7 @@ class RequestParser:
         self._refused = False
         self._headers: dict[bytes, bytes] = {}
         self._without_body = 0
-        """Bytes since the last that were a body's: of headers, trailers and the lines between chunks."""
+        """Bytes since the last body data or end of a request: of headers, trailers and the lines between chunks."""
         self._progress = False
 
     def feed(self, data: Buffer) -> list[HttpRequest | HttpRefusal]:
@@ -105,14 +105,14 @@ class RequestParser:
         return found
 
     def feed_eof(self) -> list[HttpRequest | HttpRefusal]:
-        """The client sends no more: a refusal if a request is incomplete."""
+        """Note the end of the client's stream; return a refusal if a request is incomplete."""
         if self.receiving:
             self._refuse(400, "the connection ended within a request", "http.malformed")
         found, self._found = self._found, []
         return found
 
     def close(self) -> None:
-        """Parse no more: breaks a reference cycle, which would wait for the garbage collector."""
+        """Parse no more; this breaks a reference cycle, which would wait for the garbage collector."""
         self._parser = None
 
     def _refuse(self, status: int, text: str, counter: str) -> None:
@@ -123,19 +123,19 @@ class RequestParser:
     # --- called by the parser ---------------------------------------------------------------------------------
 
     def on_message_begin(self) -> None:
-        """The first byte of a request."""
+        """Begin a request at its first byte."""
         self.receiving = True
         self._headers = {}
         self._on_begin()
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """One header, or one of the trailers."""
+        """Note one header, or one of the trailers."""
         name = name.lower()
-        # Two Host headers make none of the allowed values.
+        # Two Host headers count as an empty one, which is refused for HTTP/1.1.
         self._headers[name] = b"" if name == b"host" and name in self._headers else value
 
     def on_headers_complete(self) -> None:
-        """All headers of a request: refuse what cannot be answered before its body comes."""
+        """Check the headers of a request: refuse one that cannot be answered before its body arrives."""
         if self._parser is None:
             return
         headers = self._headers
@@ -157,13 +157,13 @@ class RequestParser:
                 self.expects_continue = not self._refused
 
     def on_body(self, data: bytes) -> None:
-        """A part of the body."""
+        """Add a part of the body."""
         self._progress = True
         if not self._refused:
             self.body.add(data)
 
     def on_message_complete(self) -> None:
-        """The last byte of a request."""
+        """Complete a request at its last byte."""
         self._progress = True
         self.receiving = self.expects_continue = False
         if not self._refused and self._parser is not None:
@@ -172,7 +172,7 @@ class RequestParser:
 
 
 class ResponseParser:
-    """Parses one response; the status is not believed: XmlRpc++ and its copies put anything there.
+    """Parses one response. Its status is ignored, except 1xx: XmlRpc++ and its copies send arbitrary ones.
 
     Args:
         uri: The server's, for errors.
@@ -184,10 +184,10 @@ class ResponseParser:
         self._parser = HttpResponseParser(self._events)
 
     def feed(self, data: bytes) -> bytes | None:
-        """Take the next bytes, or none at the end of the connection; return the body once it is complete.
+        """Take the next bytes, or empty ones at the end of the connection; return the body once it is complete.
 
         Raises:
-            RemoteProtocolError: This is not HTTP, the connection ended too early, or the body is larger than
+            RemoteProtocolError: The bytes are not HTTP, the connection ended too early, or the body is larger than
                 ``limits.HTTP_BODY_MAX``.
         """
         events = self._events
@@ -196,22 +196,22 @@ class ResponseParser:
         try:
             self._parser.feed_data(data)
         except HttpParserError as error:
-            if not events.complete:  # else it is about what comes behind the response
+            if not events.complete:  # else the error is in bytes after the response
                 raise RemoteProtocolError(f"{self._uri} does not speak HTTP: {error}") from error
         if len(events.body) > limits.HTTP_BODY_MAX:
             raise LimitExceeded("XML-RPC response", len(events.body), limits.HTTP_BODY_MAX)
         if not events.complete and data:
             return None
-        # A status of 1xx comes before the response itself.
+        # A response with status 1xx precedes the response itself.
         return bytes(events.body) if self._parser.get_status_code() >= 200 else None
 
 
 class _ResponseEvents:
-    """Called by the parser. It does not know the parser: no reference cycle.
+    """Takes the parser's callbacks. It has no reference to the parser, which avoids a reference cycle.
 
     Attributes:
-        body: What has come of it.
-        complete: Whether the last byte has come.
+        body: The received part of the body.
+        complete: Whether the last byte has arrived.
         until_close: Whether the body ends with the connection: it has neither a length nor chunks.
     """
 

@@ -2,7 +2,7 @@
 
 Pure: bytes in, values out. A client connects, both sides send a header, then the client sends a request with its
 length in front and the server answers with a byte for success, a length, and the response or the text of an error.
-One request is under way on a connection at a time; without ``persistent`` the server closes behind its reply.
+One request is under way on a connection at a time; without ``persistent`` the server closes after its reply.
 
 Names and md5 sums are compared as rospy and roscpp 1.15 do: literally, ``*`` matching every sum.
 """
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.tcpros import Buffer, Header
 
 REPLY: Final = struct.Struct("<BI")
-"""In front of a response: the ``ok`` byte and the length."""
+"""The head of a reply: the ``ok`` byte and the length of the body."""
 _SCHEME: Final = "rosrpc://"
 _TRUE: Final = ("1", "true")
 
@@ -99,7 +99,7 @@ def is_persistent(fields: Mapping[str, str]) -> bool:
 
 
 def is_probe(fields: Mapping[str, str]) -> bool:
-    """Whether a client asks for the description alone."""
+    """Whether a client asks only for the description, and will send no request."""
     return fields.get("probe", "").lower() in _TRUE
 
 
@@ -146,7 +146,7 @@ def parse_reply_head(data: Buffer) -> tuple[bool, int] | None:
     """The ``ok`` byte of a reply and the length of its body, or ``None`` without enough bytes.
 
     Raises:
-        LimitExceeded: It claims more than ``limits.SERVICE_MESSAGE_MAX``.
+        LimitExceeded: The reply claims more than ``limits.SERVICE_MESSAGE_MAX``.
     """
     if len(data) < REPLY.size:
         return None
@@ -157,10 +157,10 @@ def parse_reply_head(data: Buffer) -> tuple[bool, int] | None:
 
 
 class BodyBuffer:
-    """A request or response of a known size that comes in parts; memory is taken as bytes come.
+    """A request or response of a known size that arrives in parts; memory is allocated as bytes arrive.
 
     Args:
-        size: Its bytes.
+        size: The number of its bytes.
     """
 
     __slots__ = ("data", "size")
@@ -170,14 +170,14 @@ class BodyBuffer:
         self.data = bytearray()
 
     def take(self, part: memoryview) -> int:
-        """Append the bytes that belong to it; return their number."""
+        """Append the bytes that belong to this request or response; return their number."""
         mine = part[: self.size - len(self.data)]
         self.data += mine
         return len(mine)
 
     @property
     def whole(self) -> bool:
-        """Whether all bytes have come."""
+        """Whether all bytes have arrived."""
         return len(self.data) == self.size
 
 

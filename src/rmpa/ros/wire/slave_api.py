@@ -1,7 +1,7 @@
-"""The Slave API: what a node answers over XML-RPC (wiki.ros.org/ROS/Slave_API).
+"""The Slave API: the methods that a node serves over XML-RPC (wiki.ros.org/ROS/Slave_API).
 
-Pure: a call comes in as a method and its parameters, and leaves as ``RosReply(code, status, value)``. The state of
-the node and the effects of a call are behind ``NodeView``.
+Pure: a call is a method with its parameters, and its result a ``RosReply(code, status, value)``. ``NodeView`` gives
+the state of the node and takes the effects of calls.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ _SUCCESS: Final = 1
 
 @dataclass(frozen=True, slots=True)
 class BusConnection:
-    """One topic connection of a node, for ``getBusInfo``, ``getBusStats`` and our own tools.
+    """One topic connection of a node, for ``getBusInfo``, ``getBusStats`` and RMPA's own tools.
 
     Args:
-        number: The node's own number for it.
+        number: The connection's number within the node.
         other: The other side: a subscriber's caller id, or a publisher's slave API URI.
         direction: ``"o"`` to a subscriber, ``"i"`` from a publisher.
         topic: The topic.
         connected: Whether messages can flow.
         info: The addresses, for people.
-        bytes: Sent or received, headers included.
-        messages: Sent or received.
+        bytes: Bytes sent or received.
+        messages: Messages sent or received.
         dropped: Messages dropped because the other side is slow; 0 inbound.
         waiting: Bytes queued because the other side is slow; 0 inbound.
     """
@@ -71,13 +71,13 @@ class NodeView(Protocol):
         """Host and port for subscribers of a topic; ``None`` if the node does not publish it."""
 
     def publisher_update(self, topic: str, publishers: Sequence[str]) -> None:
-        """The master sends the publishers of a topic, as slave API URIs."""
+        """Apply the master's list of publishers of a topic, as slave API URIs."""
 
     def param_update(self, key: str, value: XmlRpcValue) -> bool:
-        """A parameter has changed (``{}``: deleted); ``False`` if the node has not subscribed to it."""
+        """Handle a changed parameter (``{}`` if deleted); return ``False`` if the node has not subscribed to it."""
 
     def shut_down(self, reason: str) -> None:
-        """The master wants the node to end."""
+        """Handle the master's request that the node ends."""
 
 
 class SlaveApi:
@@ -102,7 +102,7 @@ class SlaveApi:
         """Answer one call; mistakes of the caller are answered with code -1, as rospy does.
 
         Raises:
-            KeyError: There is no such method (the server answers a fault).
+            KeyError: There is no such method; see ``METHODS``.
         """
         arity, default, answer = self._METHODS[method]
         if not params:
@@ -207,7 +207,7 @@ class SlaveApi:
         "getName": (0, "", _get_name),
         "getUri": (0, "", _get_uri),
     }
-    """Parameters behind the caller id, the value of an error's reply, and the answer."""
+    """By method: the number of parameters after the caller id, the value in an error's reply, and the function."""
 
 
 METHODS: Final = tuple(SlaveApi._METHODS)  # noqa: SLF001 - the same module
@@ -215,7 +215,7 @@ METHODS: Final = tuple(SlaveApi._METHODS)  # noqa: SLF001 - the same module
 
 
 def _check(method: str, params: Sequence[XmlRpcValue]) -> str | None:
-    """What is wrong with the parameters behind the caller id, or ``None``."""
+    """Check the parameters after the caller id; return the text of an error, or ``None``."""
     if method in ("publisherUpdate", "requestTopic"):
         topic, items = params
         if not isinstance(topic, str) or not topic:

@@ -1,7 +1,7 @@
 """TCPROS: connection headers and message framing (wiki.ros.org/ROS/TCPROS, wiki.ros.org/ROS/Connection%20Header).
 
 Pure: bytes in, values out. Each side of a connection sends one header; the publisher alone decides whether they match
-(``check_subscriber``). Behind the headers come messages, each with its length in front. All integers are
+(``check_subscriber``). After the headers messages follow, each with its length in front. All integers are
 little-endian 32-bit.
 
 Where the wiki leaves something open, this module does what rospy and roscpp 1.15 both accept. Unlike them it checks
@@ -28,7 +28,7 @@ Buffer = bytes | bytearray | memoryview
 LENGTH: Final = struct.Struct("<I")
 """The length in front of headers, fields and messages."""
 ANY: Final = "*"
-"""The type or md5 sum of a subscriber that takes whatever is published."""
+"""The type or md5 sum of a subscriber that accepts any type."""
 _SHOWN: Final = 200
 
 
@@ -72,7 +72,7 @@ class TopicDescription:
 
 
 def printable(text: str) -> str:
-    """Received text made safe for logs and terminals: without control characters and surrogates, and cut."""
+    """Make received text safe for logs and terminals: replace control characters and surrogates, cut long text."""
     shown = text if len(text) <= _SHOWN else text[:_SHOWN] + "…"
     return "".join(c if c.isprintable() else "�" for c in shown)
 
@@ -97,7 +97,7 @@ def decode_header(body: Buffer) -> Header:
     name the last one counts.
 
     Raises:
-        MalformedHeader: A field is empty, has no ``=``, or is longer than what is left.
+        MalformedHeader: A field is empty, has no ``=``, or is longer than the rest of the header.
     """
     fields: Header = {}
     view = memoryview(body)
@@ -124,8 +124,8 @@ def parse_header(data: Buffer) -> tuple[Header | None, int, int]:
     """Read a header from the front of the received bytes.
 
     Returns:
-        ``(fields, consumed, wanted)``: without enough bytes ``(None, 0, wanted)``, where ``wanted`` is the number
-        that is needed in all.
+        ``(fields, consumed, wanted)``; without enough bytes ``(None, 0, wanted)``, where ``wanted`` is the number of
+        bytes that is needed in all.
 
     Raises:
         LimitExceeded: The header claims more than ``limits.TCPROS_HEADER_MAX``.
@@ -149,7 +149,7 @@ def frame_message(payload: Buffer) -> bytes:
     """A message with its length in front.
 
     Raises:
-        ValueError: It is longer than ``limits.TCPROS_MESSAGE_MAX``.
+        ValueError: The message is longer than ``limits.TCPROS_MESSAGE_MAX``.
     """
     if len(payload) > limits.TCPROS_MESSAGE_MAX:
         raise ValueError(f"message of {len(payload)} bytes exceeds the limit of {limits.TCPROS_MESSAGE_MAX}")
@@ -161,11 +161,11 @@ def split_messages(data: memoryview) -> tuple[list[memoryview], int, int]:
 
     Returns:
         ``(messages, consumed, wanted)``: each message is a view into ``data`` with its 4-byte length in front;
-        ``wanted`` counts from behind the consumed bytes, as ``runtime.stream`` asks for.
+        ``wanted`` is the number of bytes needed from the first unconsumed one on, as ``runtime.stream`` defines it.
 
     Raises:
-        LimitExceeded: The first message claims more than ``limits.TCPROS_MESSAGE_MAX``. Whole messages before such a
-            message are returned first.
+        LimitExceeded: The first message claims more than ``limits.TCPROS_MESSAGE_MAX``. If whole messages precede
+            such a message, they are returned, and the next call raises.
         MalformedStream: The first message claims more than ``limits.TCPROS_LENGTH_MAX``.
     """
     messages: list[memoryview] = []
@@ -211,8 +211,8 @@ def publisher_header(topic: str, caller_id: str, description: TopicDescription) 
     """The reply header of a publisher.
 
     Raises:
-        ValueError: The description has ``*`` for its type or md5 sum. Such a reply ends up in bags, and a roscpp
-            subscriber sends it to every other publisher.
+        ValueError: The description has ``*`` for its type or md5 sum. Such a type would be recorded in bags, and a
+            roscpp subscriber would send it to every other publisher.
     """
     if ANY in (description.type, description.md5sum):
         raise ValueError(f"a publisher of {topic} cannot have the type {description}")
@@ -227,7 +227,7 @@ def publisher_header(topic: str, caller_id: str, description: TopicDescription) 
 
 
 def error_header(text: str) -> Header:
-    """The reply to a header that does not match; the connection is closed behind it."""
+    """The reply to a header that does not match; the connection is closed after it."""
     return {"error": text}
 
 

@@ -1,4 +1,4 @@
-"""XML-RPC calls and responses as bytes (xmlrpc.com/spec, and what ROS makes of it).
+"""XML-RPC calls and responses as bytes (xmlrpc.com/spec, and ROS's use of it).
 
 The standard library parses; ``defusedxml`` refuses entity declarations; this module bounds depth and size and allows
 only the types that ROS has. Long documents are read and written piece by piece.
@@ -25,7 +25,7 @@ from rmpa.ros.wire.xmlrpc_writer import legal_text, pieces
 XmlRpcValue: TypeAlias = Union[  # noqa: UP007 - | does not take the forward references of a recursive type
     bool, int, float, str, bytes, datetime, Sequence["XmlRpcValue"], Mapping[str, "XmlRpcValue"], None
 ]
-"""A value of XML-RPC. Parsed values are made of lists and dicts; ``None`` is read, never written."""
+"""A value of XML-RPC. Parsed containers are lists and dicts; ``None`` is read, never written."""
 
 _T = TypeVar("_T")
 _DECLARATION: Final = "<?xml version='1.0'?>\n"
@@ -60,7 +60,7 @@ class RosReply(NamedTuple):
 
     @classmethod
     def of(cls, value: XmlRpcValue) -> RosReply:
-        """Read the triple out of a parsed response.
+        """Convert the value of a parsed response.
 
         Raises:
             RemoteProtocolError: The value is not such a triple.
@@ -125,7 +125,7 @@ class _BoundedUnmarshaller(Unmarshaller):
 
 
 class DocumentReader(ABC, Generic[_T]):
-    """Reads one document piece by piece, so that something else can be done between two pieces."""
+    """Reads one document piece by piece, so that other work can be done between two pieces."""
 
     def __init__(self) -> None:
         self._unmarshaller = _BoundedUnmarshaller()
@@ -140,14 +140,15 @@ class DocumentReader(ABC, Generic[_T]):
         """Parse the next piece.
 
         Raises:
-            RemoteProtocolError: It is malformed, too deep or too large, declares entities, or holds an integer beyond
-                32 bits.
+            RemoteProtocolError: The document is malformed, too deep or too large, declares entities, or holds an
+                integer beyond 32 bits.
         """
         self._size += len(data)
         if self._size > limits.HTTP_BODY_MAX:
             raise LimitExceeded("XML-RPC body", self._size, limits.HTTP_BODY_MAX)
         self._waiting += data
-        # expat scans an unfinished token (a comment of megabytes) from its start again each time it is fed.
+        # expat scans an unfinished token (such as a comment of megabytes) from its start each time that it is fed:
+        # bytes are fed again when there are as many as the unfinished token had.
         if len(self._waiting) < self._token:
             return
         with self._errors():
@@ -155,7 +156,7 @@ class DocumentReader(ABC, Generic[_T]):
         self._token = self._size - self._expat.CurrentByteIndex
 
     def abandon(self) -> None:
-        """Stop reading: breaks a reference cycle, which would wait for the garbage collector."""
+        """Stop reading; this breaks a reference cycle, which would wait for the garbage collector."""
         with contextlib.suppress(Exception):
             self._parser.close()
 
@@ -164,10 +165,10 @@ class DocumentReader(ABC, Generic[_T]):
         """The content of the document, once all pieces were fed."""
 
     def _end(self) -> tuple[str | None, tuple[XmlRpcValue, ...]]:
-        """The method's name, if it is a call, and the values.
+        """Finish the document; return the method's name, or ``None`` for a response, and the values.
 
         Raises:
-            Fault: It is a fault.
+            Fault: The document is a fault.
             RemoteProtocolError: As for ``feed``, or the document is incomplete.
         """
         with self._errors():
@@ -209,7 +210,7 @@ class CallReader(DocumentReader["tuple[str, tuple[XmlRpcValue, ...]]"]):
         """The method's name and its parameters, once all pieces were fed.
 
         Raises:
-            RemoteProtocolError: As for ``feed``, or the document is incomplete or no call.
+            RemoteProtocolError: As for ``feed``, or the document is incomplete or not a call.
         """
         try:
             method, params = self._end()
@@ -256,7 +257,7 @@ def parse_response(data: bytes) -> XmlRpcValue:
 
 
 def call_pieces(method: str, params: Sequence[XmlRpcValue]) -> Iterator[bytes]:
-    """Write a ``methodCall`` document in pieces of some KiB, so that something else can be done in between.
+    """Write a ``methodCall`` document in pieces of some KiB, so that other work can be done in between.
 
     Raises:
         LocalProtocolError: A value cannot be written: ``None``, an integer beyond 32 bits, a control character.

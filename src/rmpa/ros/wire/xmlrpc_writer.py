@@ -1,4 +1,4 @@
-"""Writes values as XML-RPC, piece by piece, so that something else can be done between two pieces.
+"""Writes values as XML-RPC, piece by piece, so that other work can be done between two pieces.
 
 The text is exactly that of Python's ``xmlrpc.client``, because XmlRpc++ (roscpp) is known to read it: that parser
 compares strings, and stops without an error at ``<string/>`` or ``<i8>``.
@@ -28,15 +28,15 @@ _SLICE: Final = 57 * 128
 
 
 def legal_text(text: str) -> str:
-    """The text with ``?`` for characters that XML cannot hold."""
+    """Replace characters that XML cannot hold by ``?``."""
     return _ILLEGAL.sub("?", text)
 
 
 def pieces(what: str, value: object) -> Iterator[bytes]:
-    """``<value>…</value>`` in pieces of some KiB; the value must not change meanwhile.
+    """Yield ``<value>…</value>`` in pieces of some KiB; the value must not change meanwhile.
 
     Args:
-        what: The document, for errors: ``the response``.
+        what: The document, for the text of errors, such as ``the response``.
         value: Of the types that ROS has; lists and tuples alike, dicts with strings as keys.
 
     Raises:
@@ -49,7 +49,7 @@ def pieces(what: str, value: object) -> Iterator[bytes]:
 
 
 class _NotXmlRpcError(Exception):
-    """Why a value cannot be written."""
+    """A value cannot be written; the text has the reason, without a subject."""
 
 
 def _pieces(value: object) -> Iterator[bytes]:
@@ -94,7 +94,7 @@ def _flush(out: list[str]) -> bytes:
 
 
 def _open(item: object, end: str) -> tuple[Iterator[object], str, str]:
-    """The elements of a list or dict, and the text around them; ``end`` comes behind it."""
+    """Return the elements of a list or dict, the text before them and the text after them, which ends in ``end``."""
     if type(item) is dict:
         return iter(item.items()), "<value><struct>\n", f"</struct></value>\n{end}"
     if type(item) in {list, tuple}:

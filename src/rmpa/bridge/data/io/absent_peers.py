@@ -1,4 +1,4 @@
-"""Peers without a link for longer than their routes wait: what is kept of them in case they come back."""
+"""Peers that have been away for longer than their routes wait, and the loss counts kept for their return."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ class Absent:
     """A peer whose proxies were removed from the local graph.
 
     Args:
-        peer: Its number, under which the outbound side counts what it misses.
+        peer: Its number, under which the outbound side counts the messages that it misses.
         identity: The run of the module.
         since: When its last link ended, monotonic seconds.
-        pasts: What is known of its reliable sources.
+        pasts: The histories of its reliable sources.
         counted: Whether the outbound side still counts.
     """
 
@@ -39,7 +39,7 @@ class AbsentPeers:
     """Up to ``limits.ABSENT_PEERS_MAX`` absent peers; the one that has been away longest is forgotten first.
 
     Args:
-        uncount: Called with a peer's number when what it misses is not counted any more.
+        uncount: Called with a peer's number when its missed messages are no longer counted.
         forget: Called with a peer's number when it is forgotten.
     """
 
@@ -61,7 +61,7 @@ class AbsentPeers:
             self._forget(peer)
 
     def number_of(self, identity: Identity) -> int | None:
-        """The number of this very run of a peer, if ``back`` is going to return it."""
+        """The number of this very run of a peer, if ``back`` would return it; else ``None``."""
         for peer, absent in self._absent.items():
             if absent.identity.instance == identity.instance:
                 return peer
@@ -70,7 +70,7 @@ class AbsentPeers:
         return None
 
     def back(self, identity: Identity) -> Absent | None:
-        """Take out a peer that has a link again: the same run, or the run before of the same module."""
+        """Remove and return the absent peer of a new link: the same run, or an earlier run of its module."""
         for peer, absent in list(self._absent.items()):
             was = absent.identity
             if was.instance == identity.instance:

@@ -1,4 +1,4 @@
-"""The data path from one local publisher to the peers: what happens to each message, and nothing else.
+"""The data path from one local publisher to the peers; only what each message needs is done here.
 
 An ``ExportFlow`` is called from a socket's read callback with a view of its buffer, and passes it on with one system
 call for each receiver, a large message in parts while it still arrives. It takes routes as commands and shares no
@@ -48,46 +48,46 @@ class ExportFlow:
         self.by_peer: dict[int, RouteSender] = {}
         self._senders: tuple[RouteSender, ...] = ()
         self._history: deque[tuple[bytes, int]] = deque(maxlen=1)
-        """Message and stamp of the last messages, for peers that come later."""
+        """Bytes and stamps of the last messages, for routes that are opened later."""
         self._keeping = False
         self._streaming: list[RouteSender] = []
-        """The senders that get the present message in parts."""
+        """The senders that pass on the present message in parts."""
         self._whole: bytearray | None = None
         """The present message so far, where a sender or the history needs it whole."""
         self._size = self._received = self._stamp = 0
         self.latching = False
-        """Whether the publisher latches: a peer that comes later gets its last message, whatever the contract."""
+        """Whether the publisher latches: a route opened later gets its last message, whatever the contract."""
         self.large = False
-        """Whether the publisher has sent messages that come in parts."""
+        """Whether the publisher has sent a message that came in parts."""
         self.messages = 0
         self.bytes = 0
         self.dropped = 0
         self.oversized = self.oversized_bytes = 0
-        """Messages of the publisher that were left out because they are too long; bytes of the last one."""
+        """Messages that were left out because they are too long; size of the last one, in bytes."""
 
     def left_out(self, size: int) -> None:
-        """A message of so many bytes was too long."""
+        """Count a message of ``size`` bytes that was too long."""
         self.oversized += 1
         self.oversized_bytes = size
 
     def latch(self) -> None:
-        """The publisher latches."""
+        """Keep the last message: the publisher latches."""
         self.latching = True
         self.keep(1)
 
     def keep(self, depth: int) -> None:
-        """Keep the last ``depth`` messages for peers that come later."""
+        """Keep at least the last ``depth`` messages, at most ``ros.limits.LATCHED_MAX``, for routes opened later."""
         self._keeping = True
         if depth > (self._history.maxlen or 0):
             self._history = deque(self._history, maxlen=min(depth, ros_limits.LATCHED_MAX))
 
     def add(self, peer: int, link: DataLink, route: int, contract: Contract, epoch: int) -> RouteSender:
-        """Send to one more peer from now on; first what its contract, or the publisher, has kept for it."""
+        """Send to one more peer; first the kept messages that its contract, or the latching publisher, allows."""
         self.remove(peer)
         sender = make_route_sender(link, route, contract, epoch, large=self.large)
         if contract.durability is Durability.TRANSIENT_LOCAL:
             self.keep(contract.kept)
-        # What is kept because another peer asked for it is old data, and may be an old command, to this one.
+        # Messages kept only for another peer's contract are old data here, perhaps old commands.
         kept = contract.kept if contract.durability is Durability.TRANSIENT_LOCAL else int(self.latching)
         for framed, stamp in islice(self._history, max(0, len(self._history) - kept), None):
             sender.message(stamp, framed)
@@ -96,20 +96,20 @@ class ExportFlow:
         return sender
 
     def suspend(self, peer: int, keep: Callable[[bytes, int], object] | None = None) -> None:
-        """A peer's link is gone: keep its messages; see ``ReliableRouteSender.suspend``."""
+        """Suspend the reliable route of a peer whose link is gone; see ``ReliableRouteSender.suspend``."""
         sender = self.by_peer.get(peer)
         if isinstance(sender, ReliableRouteSender):
             sender.suspend(keep)
 
     def inherit(self, old: int, new: int) -> RouteSender | None:
-        """Keep for peer ``new``, which has no sender yet, what was kept for peer ``old``."""
+        """Hand the sender of peer ``old`` to peer ``new``, which has none yet; return it."""
         sender = self.by_peer.pop(old, None)
         if sender is not None:
             self.by_peer[new] = sender
         return sender
 
     def remove(self, peer: int) -> None:
-        """Send to that peer no longer."""
+        """Stop sending to a peer."""
         sender = self.by_peer.pop(peer, None)
         if sender is not None:
             sender.close()
@@ -118,7 +118,7 @@ class ExportFlow:
                 self._streaming.remove(sender)
 
     def close(self) -> None:
-        """The publisher is not subscribed any more: release what was kept of it, which may be large."""
+        """Remove all peers, and free the kept messages, which may be large."""
         for peer in tuple(self.by_peer):
             self.remove(peer)
         self._history.clear()
@@ -137,7 +137,7 @@ class ExportFlow:
             self._history.append((bytes(framed), stamp))
 
     def begin(self, size: int) -> None:
-        """A message of ``size`` bytes, its length in front, begins to come."""
+        """Begin a message of ``size`` bytes, length field included, that comes in parts."""
         self._stamp = time.time_ns()
         self._size, self._received = size, 0
         self.large = True
@@ -145,7 +145,7 @@ class ExportFlow:
         self._whole = bytearray() if self._keeping or len(self._streaming) < len(self._senders) else None
 
     def part(self, part: memoryview) -> None:
-        """Pass a part of it on; valid during the call only."""
+        """Pass on a part of the message; ``part`` is valid during the call only."""
         for sender in self._streaming:
             self.dropped += sender.part(part)
         if self._whole is not None:
@@ -155,7 +155,7 @@ class ExportFlow:
             self._complete()
 
     def abort(self) -> None:
-        """The rest will not come: the publisher closed its connection."""
+        """Abort the message that comes in parts: the publisher closed its connection."""
         for sender in self._streaming:
             sender.abort()
         self._streaming = []

@@ -1,4 +1,4 @@
-"""The data path from one peer's route to the local subscribers: what happens to each message, and nothing else.
+"""The data path from one peer's route to the local subscribers; only what each message needs is done here.
 
 An ``ImportFlow`` is called from a socket's read callback with a view of its buffer, and passes it on with one system
 call for each subscriber, a large message in parts while it still arrives.
@@ -34,26 +34,26 @@ if TYPE_CHECKING:
 
 _LENGTH: Final = 4
 _NONE: Final = -1
-"""In place of the expected sequence: none came yet, or a message in parts is coming, so each is looked at closely."""
+"""No expected sequence: no message came yet, or one is coming in parts, so each sequence is checked closely."""
 
 
 class LocalOutput(Protocol):
-    """What the data path needs of a publication: the local subscribers behind it."""
+    """What the data path needs of a publication, to reach its local subscribers."""
 
     def publish_framed(self, framed: Buffer) -> object:
         """Send one message, with its length in front, to each subscriber."""
         ...
 
     def begin(self, size: int) -> None:
-        """Begin a message of ``size`` bytes that come in parts."""
+        """Begin a message of ``size`` bytes that comes in parts."""
         ...
 
     def extend(self, part: Buffer) -> None:
-        """Send a part of it to each subscriber that has its beginning."""
+        """Send a part of the message to each subscriber that has its beginning."""
         ...
 
     def abort(self) -> int:
-        """The rest will not come; return how many subscribers were disconnected because they have the beginning."""
+        """Abort the message; return how many subscribers were disconnected because they have its beginning."""
         ...
 
 
@@ -62,13 +62,14 @@ class ImportFlow:
 
     Args:
         output: The local subscribers.
-        contract: What holds for the route.
+        contract: The contract of the route.
         link_time: The time base of the route's link.
-        on_ack: ``(sequence)``: tell the sender that everything up to this message has come.
-        on_torn: Subscribers were disconnected in the middle of a message: let them connect again.
-        on_broken: A reliable route has lost messages all the same.
-        counters: Outlive the route: ``message.lost``, ``message.late``, ``message.stale``, ``message.expired``.
-        past: What is known of a reliable source from before this route.
+        on_ack: ``(sequence)``: acknowledges everything up to this message to the sender.
+        on_torn: Called when subscribers were disconnected in the middle of a message, so that they connect again.
+        on_broken: Called with an event when a reliable route has lost messages, or may have.
+        counters: Counts, beyond this route, ``message.lost``, ``message.lost_unknown``, ``message.late``,
+            ``message.stale`` and ``message.expired``.
+        past: The history of a reliable source from before this route.
     """
 
     def __init__(
@@ -95,7 +96,7 @@ class ImportFlow:
         self._expected = _NONE
         self._next = 1
         self._replay: deque[bytes] | None = None
-        """Kept messages that the subscribers have, and that the new route may bring again."""
+        """Kept messages that the subscribers already have, and that the new route may repeat."""
         self._receiver: ReliableReceiver | None = None
         if contract.reliability is Reliability.RELIABLE:
             known = past.receiver if past is not None else None
@@ -103,13 +104,13 @@ class ImportFlow:
         self._epoch = 0
         self._plain = self._receiver is None
         self._stale_ns = round((contract.lifespan or runtime_limits.STALE_AGE) * 1e9)
-        # The first messages of a route may be old ones that were kept, of a latching publisher at least one.
+        # The first messages of a route may be kept, old ones: at least one if the publisher latches.
         self._kept = contract.kept if contract.durability is Durability.TRANSIENT_LOCAL else 1
         self._size = self._received = 0
         self._parts: bytearray | None = None
-        """The message that comes in parts so far, where it is only delivered whole."""
+        """The bytes so far of the message that comes in parts, if it must be delivered whole."""
         self._sequence: int | None = None
-        """The number of the message that comes in parts."""
+        """The sequence of the message that comes in parts; ``None``: there is none."""
         self._held: tuple[int, bytes] | None = None
         """Stamp and bytes of a stale message that waits for a newer one."""
         self._hold_timer: asyncio.TimerHandle | None = None
@@ -125,51 +126,51 @@ class ImportFlow:
         self.lost = past.lost if past is not None else 0
         """Messages that never came: lost in the sender's queue, or with a link."""
         self.late = 0
-        """Messages that came behind newer ones, or again, and were not delivered."""
+        """Messages that came after newer ones, or twice, and were not delivered."""
         self.stale = 0
         """Best-effort messages that an outage had delayed, and that were dropped for newer ones."""
         self.expired = 0
         """Messages that came after their lifespan."""
         self.oversized = self.oversized_bytes = 0
-        """Messages that the publisher's agent left out because they are too long; bytes of the last one."""
+        """Messages that the publisher's agent left out because they are too long; size of the last one, in bytes."""
         self._last_size = 0
 
     @property
     def lane(self) -> str:
-        """The lane of its messages: ``express`` or ``bulk``; where size decides, that of the last one."""
+        """The lane of the messages, ``express`` or ``bulk``; where size decides, the lane of the last message."""
         if self.contract.priority is Priority.NORMAL:
             return "bulk" if self._last_size > mesh_limits.EXPRESS_MESSAGE_MAX else "express"
         return "express" if self.contract.priority is Priority.HIGH else "bulk"
 
     @property
     def position(self) -> tuple[int, int] | None:
-        """Epoch and sequence of the last reliable message, from which a new link goes on."""
+        """Epoch and sequence of the last reliable message, after which a new link continues; else ``None``."""
         return self._receiver.position() if self._receiver is not None else None
 
     def begin_epoch(self, epoch: int, first: int) -> bool:
-        """The sender announces its numbering; return whether it is the one received before, or the first."""
+        """Begin the sender's numbering; return whether it is the one received before, or the first one."""
         self._epoch = epoch
         self._drop_parts()
         return self._receiver.begin(epoch, first) if self._receiver is not None else True
 
     def missed(self, count: int) -> None:
-        """The sender reports how many messages it has given up that will not show as a gap."""
+        """Count messages that the sender reports as given up and that will not show as a gap."""
         if count:
             self._missing(count)
 
     def skip(self, following: int) -> None:
-        """The sender announces which message comes next: those before it will not come."""
+        """Count the messages before ``following``, the next one that the sender announces, as missed."""
         self.missed(self._receiver.skip(following) if self._receiver is not None else 0)
 
     def missed_unknown(self, why: str) -> None:
-        """Messages may be lost, and no agent knows how many."""
+        """Record that an unknown number of messages may be lost; ``why`` is the reason."""
         self._counters.add("message.lost_unknown")
         occurred = self.watch.lost_unknown(why, self._loop.time())
         if self._on_broken is not None:
             self._on_broken(occurred)
 
     def past(self, topic: str, *, missed: bool) -> ReceptionHistory | None:
-        """What the source's next route needs to know of this one; ``None``: nothing."""
+        """Return the history for the source's next route; ``None`` for a best-effort route."""
         if self._receiver is None:
             return None
         return ReceptionHistory(
@@ -182,15 +183,21 @@ class ImportFlow:
         )
 
     def expect_replay(self, kept: Iterable[bytes]) -> None:
-        """The subscribers have these kept messages; leave out those that the new route brings again."""
+        """Leave out these messages, which the subscribers have, if the new route repeats them at its beginning."""
         self._replay = deque(kept) or None
 
     def rebind(self, on_ack: Callable[[int], None]) -> None:
-        """Go on over another link."""
+        """Acknowledge with ``on_ack`` from now on: the route continues over another link."""
         self._on_ack = on_ack
 
     def message(self, sequence: int, stamp_ns: int, framed: memoryview) -> None:
-        """Deliver one message; a gap in the sequence is what the sender's queue dropped."""
+        """Deliver one message, or drop or hold it; a gap in the sequence counts as lost.
+
+        Args:
+            sequence: The number of the message.
+            stamp_ns: When it came from its publisher, by the peer's wall clock, ns.
+            framed: The message, its 4-byte length in front; valid during the call only.
+        """
         now_ns = time.time_ns()
         if self._plain:
             if sequence != self._expected and not self._follows(sequence):
@@ -219,10 +226,10 @@ class ImportFlow:
         if flags & FIRST:
             self._begin(sequence, stamp_ns, part)
         if self._sequence is None:
-            return  # of a message that is not delivered
+            return  # a part of a message that is not delivered
         if self._sequence != sequence:
             if is_earlier(sequence, self._sequence):
-                return  # of an earlier one, by a lane that is about to end
+                return  # a part of an earlier message, over a lane that is about to end
             raise RemoteProtocolError(f"a part of message {sequence} comes in the middle of message {self._sequence}")
         if flags & ABORT:
             self._drop_parts(missing=False)
@@ -238,7 +245,7 @@ class ImportFlow:
             self._complete(sequence, stamp_ns)
 
     def close(self) -> None:
-        """No data comes any more."""
+        """Drop what is held or incomplete, and stop the timers."""
         self._drop_parts()
         self._held = None
         if self._hold_timer is not None:
@@ -248,7 +255,7 @@ class ImportFlow:
             self._ack_timer.close()
 
     def torn(self) -> None:
-        """The connection is gone: abort a message that came in part."""
+        """Abort a message that came in part: its connection is gone."""
         self._drop_parts()
 
     # --- inside ---------------------------------------------------------------------------------------------
@@ -260,19 +267,19 @@ class ImportFlow:
         self.quality.arrived(now, now_ns, stamp_ns, size)
 
     def _follows(self, sequence: int) -> bool:
-        """Look closely at a sequence that was not expected: count what is missing; return whether it is a new one."""
+        """Checks an unexpected sequence: counts missing messages; returns whether the message is a new one."""
         gap = sequence - (self._next if self._expected == _NONE else self._expected) & SERIAL_MASK
         if gap >= SERIAL_HALF:
             self._count_late()
             return False
-        # If half a message is here its lane is gone, though this side has not noticed yet.
+        # If a message is here in part, its lane is gone, though this side has not noticed yet.
         self._drop_parts()
         if gap:
             self._missing(gap)
         return True
 
     def _is_replay(self, framed: memoryview | bytearray) -> bool:
-        """Whether the subscribers have this message; the first one that they do not have ends the replay."""
+        """Whether the subscribers have this message already; the first new message ends the replay."""
         replay = self._replay
         while replay:
             if memoryview(replay.popleft()) == framed:
@@ -288,7 +295,7 @@ class ImportFlow:
             self._on_broken(occurred)
 
     def _hold_back(self, sequence: int, stamp_ns: int, framed: memoryview, age: int) -> bool:
-        """Whether a message that may be too old is not to be delivered now.
+        """Whether a message that may be too old is dropped or held instead of delivered.
 
         Beyond the contract's lifespan it is dropped. Without a lifespan, a message that an outage had delayed waits
         ``mesh.limits.STALE_HOLD`` for a newer one, and is delivered if none comes: the last command before a cable
@@ -314,7 +321,7 @@ class ImportFlow:
         return True
 
     def _drop_held(self) -> None:
-        """A newer message has come."""
+        """Drops the held message: a newer one has come."""
         self._held = None
         self._count_stale()
         if self._hold_timer is not None:
@@ -322,7 +329,7 @@ class ImportFlow:
             self._hold_timer = None
 
     def _deliver_held(self) -> None:
-        """No newer message has come."""
+        """Delivers the held message: no newer one has come."""
         self._hold_timer = None
         if self._held is not None:
             stamp_ns, framed = self._held
@@ -377,7 +384,7 @@ class ImportFlow:
             self._on_ack(sequence)
 
     def _begin(self, sequence: int, stamp_ns: int, part: memoryview) -> None:
-        """Take the first part of a message; its length is in front."""
+        """Takes the first part of a message, which begins with the message's length."""
         if len(part) < _LENGTH:
             raise RemoteProtocolError(f"a first part of {len(part)} bytes has no length")
         size = _LENGTH + int.from_bytes(part[:_LENGTH], "little")
@@ -388,7 +395,7 @@ class ImportFlow:
                 self._accept(sequence, 0, 0, 0)
                 return
             self._drop_parts()
-            # No subscriber may have half of a message that may come again.
+            # Delivered whole only: it may be sent again, so no subscriber may have a part of it.
             self._parts = bytearray()
         elif not self._begin_plain(sequence, stamp_ns, size):
             return
@@ -405,11 +412,11 @@ class ImportFlow:
         if self._held is not None:
             self._drop_held()
         if self._replay is not None and any(len(kept) == size for kept in self._replay):
-            self._parts = bytearray()  # only its end shows whether it is one of them
+            self._parts = bytearray()  # only the whole message shows whether it is a repeated one
         else:
             self._replay = None
             self._output.begin(size)
-        # Any other message that comes before the last part is looked at closely.
+        # Any other message that comes before the last part is checked closely.
         self._next, self._expected = sequence, _NONE
         return True
 

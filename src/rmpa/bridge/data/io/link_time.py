@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def _never() -> float:
-    """There was no silence so far."""
+    """Returns minus infinity: there was no silence yet."""
     return -math.inf
 
 
@@ -23,9 +23,9 @@ class LinkTime:
         self.resumed_at: Callable[[], float] = _never
         """Returns when the link's last silence was last seen, monotonic seconds; see ``runtime.stream``."""
         self.ahead_ns = 0
-        """The peer's wall clock less the local one, ns."""
+        """The peer's wall clock minus the local one, ns."""
         self.error_ns: int | None = None
-        """The offset is true within ± this many ns; ``None`` while nothing is known."""
+        """The bound of the offset's error, ± ns; ``None`` while the offset is unknown."""
 
     def set(self, offset: float | None, error: float | None) -> None:
         """Set the offset and its error bound, in seconds."""

@@ -1,4 +1,4 @@
-"""Hands the data frames that arrive on the links to the handlers of their routes: the path of every message."""
+"""Passes the data frames of the links to the handlers of their routes: the path of every message."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class DataHandler(Protocol):
     """Takes the data that arrives on one route."""
 
     def message(self, sequence: int, stamp_ns: int, framed: memoryview) -> None:
-        """A whole message, its 4-byte length in front; only valid during the call."""
+        """Take a whole message, its 4-byte length in front; ``framed`` is valid during the call only."""
         ...
 
     def part(self, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
-        """A part of a large one (``core.outbox`` FIRST, LAST, ABORT); only valid during the call."""
+        """Take a part of a large message (``core.outbox`` FIRST, LAST, ABORT); valid during the call only."""
         ...
 
 
@@ -32,7 +32,7 @@ class DataReceiver:
 
     Args:
         counters: Counts dropped frames as ``route.unknown``.
-        sender: ``(peer, route)``: finds the sender that an acknowledgement is for.
+        sender: ``(peer, route)``: returns the sender of a route, for acknowledgements and fences.
     """
 
     def __init__(self, counters: Counters, sender: Callable[[int, int], RouteSender | None]) -> None:
@@ -42,26 +42,26 @@ class DataReceiver:
         self._peers: dict[PeerLink, int] = {}
 
     def link_up(self, link: PeerLink, peer: int, handlers: Mapping[int, DataHandler]) -> None:
-        """Data may come on a link from now on.
+        """Accept data from a link.
 
         Args:
-            link: Which.
+            link: The link.
             peer: The number of its peer's session.
-            handlers: Of each open route, by its id; changes as routes are opened and closed.
+            handlers: The handler of each open route, by its id; changes as routes are opened and closed.
         """
         self._handlers[link] = handlers
         self._peers[link] = peer
 
     def link_down(self, link: PeerLink) -> None:
-        """A link is gone: what still comes on it is dropped."""
+        """Drop further data of a link that is gone."""
         self._handlers.pop(link, None)
         self._peers.pop(link, None)
 
     def data(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
-        """A data frame with a whole message came.
+        """Pass on a data frame with a whole message.
 
         Raises:
-            RemoteProtocolError: It does not hold one message; the link is to be closed.
+            RemoteProtocolError: The frame does not hold exactly one message; the caller closes the link.
         """
         handlers = self._handlers.get(link)
         handler = handlers.get(route) if handlers is not None else None
@@ -75,7 +75,7 @@ class DataReceiver:
         handler.message(sequence, stamp_ns, payload)
 
     def part(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
-        """A part of a large message came."""
+        """Pass on a part of a large message."""
         handlers = self._handlers.get(link)
         if handlers is None:
             return
@@ -86,7 +86,7 @@ class DataReceiver:
             handler.part(sequence, stamp_ns, flags, part)
 
     def mark(self, link: PeerLink, kind: FrameKind, route: int, sequence: int) -> None:
-        """An acknowledgement, or the answer to a fence, came."""
+        """Pass an acknowledgement, or the answer to a fence, to the route's sender."""
         peer = self._peers.get(link)
         sender = self._sender(peer, route) if peer is not None else None
         if sender is None:

@@ -1,4 +1,4 @@
-"""One route from here to a peer: the lane of its messages, queue bounds, down-sampling, and what is kept for replay.
+"""The sending end of a route: the lane of its messages, queue bounds, down-sampling, and messages kept for replay.
 
 A route sender is called for each message from the publisher's read callback. ``RouteSender.message`` has a short path
 for the usual case: a small message on the express lane, without down-sampling.
@@ -37,23 +37,23 @@ class DataLane(Protocol):
         ...
 
     def extend(self, parcel: QueuedMessage, data: Buffer) -> int:
-        """Send further bytes of it; return how many older messages were dropped for it."""
+        """Send further bytes of a message; return how many older messages were dropped for them."""
         ...
 
     def abandon(self, parcel: QueuedMessage) -> None:
-        """The rest will never come."""
+        """Abort a message that was opened: the rest will not come."""
         ...
 
     def fence(self, route: int, number: int) -> None:
-        """Send a fence behind the messages of a route."""
+        """Send a fence after the messages of a route."""
         ...
 
     def set_terms(self, route: int, depth: int, max_age: float | None, *, strict: bool) -> None:
-        """Bound what may wait of a route: ``depth`` messages, each for ``max_age`` seconds."""
+        """Bound the waiting messages of a route: ``depth`` of them, each for ``max_age`` seconds."""
         ...
 
     def discard(self, route: int) -> None:
-        """Drop what waits of a route, and its bounds."""
+        """Drop the waiting messages of a route, and its bounds."""
         ...
 
 
@@ -77,7 +77,7 @@ class RouteSender:
     Args:
         link: The link to the peer.
         route: The route's id.
-        contract: What holds for it.
+        contract: The route's contract.
         large: Whether the source is known to have large messages.
     """
 
@@ -104,13 +104,13 @@ class RouteSender:
         """Stamp and bytes of the message that down-sampling sends next."""
         self._timer: asyncio.TimerHandle | None = None
         self._direct = False
-        """Whether a small message needs no further look: see ``message``."""
+        """Whether ``message`` may take its short path for small messages."""
         self._set_bounds()
         self._use_lane()
 
     @property
     def lane(self) -> str:
-        """``express`` or ``bulk``, for people."""
+        """The present lane, ``express`` or ``bulk``, to show."""
         return self._switch.lane.name.lower()
 
     @property
@@ -137,7 +137,7 @@ class RouteSender:
         return self._send(stamp_ns, framed)
 
     def begin(self, stamp_ns: int, size: int) -> bool:
-        """Begin a message of ``size`` bytes; return whether its parts can be sent as they come, or only whole."""
+        """Begin a message of ``size`` bytes; return whether it can be sent in parts; otherwise it must come whole."""
         if self._downsampler is not None or not self._lane_for(size):
             return False
         self.sequence = self.sequence + 1 & SERIAL_MASK
@@ -149,21 +149,21 @@ class RouteSender:
         return self._lane.extend(self._open_message, part) if self._open_message is not None else 0
 
     def abort(self) -> None:
-        """The rest of the message that was begun will never come."""
+        """Abort the message that was begun: its rest will not come."""
         if self._open_message is not None:
             self._lane.abandon(self._open_message)
             self._open_message = None
 
     def fenced(self, number: int) -> None:
-        """The peer has answered a fence."""
+        """Take the peer's answer to a fence, and send the held messages over the new lane."""
         if self._switch.fenced(number):
             self._resume_lane()
 
     def acknowledged(self, sequence: int) -> None:
-        """The peer has everything up to a message; a best-effort route does not need to know."""
+        """Ignore an acknowledgement; only reliable routes need it."""
 
     def lane_lost(self) -> None:
-        """The bulk lane's connection is gone."""
+        """Handle the loss of the bulk lane's connection; it ends a change from that lane at once."""
         if self._switch.lane_lost():
             self._discard_bulk()
             self._resume_lane()
@@ -186,7 +186,7 @@ class RouteSender:
         return self._hold(sequence, stamp_ns, bytes(framed))
 
     def _lane_for(self, size: int) -> bool:
-        """Whether a message may be sent by the present lane now; begins to change the lane where it may not."""
+        """Whether a message may be sent over the present lane now; if not, begins the change of lane it needs."""
         if self.link is None or self._switch.fencing:
             return False
         if not self._switch.judge(size, self._loop.time()):
@@ -216,27 +216,27 @@ class RouteSender:
         held, self._held = self._held, deque()
         self._held_bytes = 0
         for sequence, stamp_ns, payload in held:
-            # A large one may have come while the way back to the express lane was fenced.
+            # A large message may have come during the change back to the express lane.
             if self._lane_for(len(payload)):
                 self._lane.send(self.route, sequence, stamp_ns, payload)
             else:
                 self._hold(sequence, stamp_ns, payload)
 
     def _discard_bulk(self) -> None:
-        """Drop what waits for the bulk lane's next connection: it would arrive behind what is sent now."""
+        """Drops messages that wait for the bulk lane's next connection: they would arrive after newer ones."""
         if self.link is not None:
             self.link.bulk.discard(self.route)
             self._set_bounds()
 
     def _use_lane(self) -> None:
-        """Use the lane that the switch is on; begin to change it at once where it is not the one that is wanted."""
+        """Uses the lane that the switch is on; begins a further change at once if the target is another lane."""
         if self.link is None:
             return
         self._lane = self.link.express if self._switch.lane is EXPRESS else self.link.bulk
         if self._switch.target is not self._switch.lane:
             self._begin_fence()
             return
-        # Messages on the bulk lane are counted for the way back, so only the express lane is direct.
+        # On the bulk lane small messages are counted for the return, so only the express lane is direct.
         self._direct = self._switch.lane is EXPRESS and self._downsampler is None
 
     def _set_bounds(self) -> None:
@@ -251,7 +251,7 @@ class RouteSender:
             lane.set_terms(self.route, self._depth, contract.lifespan if strict else stale, strict=strict)
 
     def _keep_newest(self, downsampler: Downsampler, stamp_ns: int, framed: Buffer) -> None:
-        """Keep a message, in place of an older one, until the rate allows it."""
+        """Keeps a message, in place of an older one, until the rate allows it."""
         if self._newest is not None:
             downsampler.skipped += 1
         self._newest = (stamp_ns, bytes(framed))
@@ -276,8 +276,8 @@ class ReliableRouteSender(RouteSender):
     Args:
         link: The link to the peer.
         route: The route's id.
-        contract: What holds for it.
-        epoch: Names this numbering; see ``mesh.reliable``.
+        contract: The route's contract.
+        epoch: Identifies this numbering; see ``mesh.reliable``.
         large: Whether the source is known to have large messages.
     """
 
@@ -298,19 +298,19 @@ class ReliableRouteSender(RouteSender):
         self._direct = False
 
     def begin(self, stamp_ns: int, size: int) -> bool:  # noqa: ARG002 - as the other kind
-        """A message that may have to be sent again is needed whole."""
+        """Return ``False``: a message that may have to be sent again is needed whole."""
         return False
 
     def acknowledged(self, sequence: int) -> None:
-        """The peer has everything up to a message."""
+        """Forget the messages up to ``sequence``, which the peer has, and send what the window allows."""
         self.sender.acknowledged(sequence)
         self._pump()
 
     def lane_lost(self) -> None:
-        """The bulk lane's connection is gone: send again what was on it; the peer leaves out what it has."""
+        """Send the messages again that were on the lost bulk lane; the peer drops those that it has."""
         if self._switch.lane is EXPRESS or self.link is None:
             return
-        # What still waits for the lane is sent again too: in front of the lost ones it would show as a gap.
+        # Messages that still wait for the lane are sent again too: ahead of the lost ones they would show as a gap.
         self._discard_bulk()
         self.sender.rewind()
         if self._switch.lane_lost():
@@ -319,7 +319,7 @@ class ReliableRouteSender(RouteSender):
             self._pump()
 
     def suspend(self, keep: Callable[[bytes, int], object] | None = None) -> None:
-        """The link is gone; messages are kept until ``resume``, or until it is given up.
+        """Keep messages while the link is gone, until ``resume`` or until they are given up.
 
         Args:
             keep: ``(payload, stamp_ns)``: offers a message to the sender within the bounds that all suspended
@@ -330,12 +330,13 @@ class ReliableRouteSender(RouteSender):
         self.sender.suspend()
 
     def resume(self, link: DataLink, route: int, after: int) -> None:
-        """There is a new link, and the peer has everything up to ``after``.
+        """Continue on a new link; the peer has everything up to ``after``.
 
-        A later acknowledgement counts more: of two links that came up at once, the older one's message came last.
+        If a later message is already acknowledged, that one counts: with two links at once, the older one's request
+        may come last.
 
         Raises:
-            RemoteProtocolError: It claims what was never sent, or less than it acknowledged.
+            RemoteProtocolError: ``after`` was never sent.
         """
         known = self.sender.confirmed
         self.sender.resume(known if is_earlier(after, known) else after)
@@ -348,7 +349,7 @@ class ReliableRouteSender(RouteSender):
         self._pump()
 
     def missed(self) -> int:
-        """Messages that the peer will never get, since the last call."""
+        """Return how many messages were lost for the peer since the last call."""
         missed, self._reported = self.sender.lost - self._reported, self.sender.lost
         return missed
 
@@ -366,7 +367,7 @@ class ReliableRouteSender(RouteSender):
         return lost
 
     def _pump(self) -> None:
-        """Send what the window allows."""
+        """Sends what the window allows."""
         while self.link is not None and not self._switch.fencing:
             for message in self.sender.take(1):
                 if not self._lane_for(len(message.payload)):
@@ -383,14 +384,14 @@ class ReliableRouteSender(RouteSender):
         self._pump()
 
     def _set_bounds(self) -> None:
-        """Bound nothing: what was numbered may not be dropped from a queue, and the window bounds it."""
+        """Sets no bounds: a numbered message may not be dropped from a queue; the window bounds the queue."""
         if self.link is not None:
             for lane in (self.link.express, self.link.bulk):
                 lane.set_terms(self.route, mesh_limits.KEEP_ALL_MESSAGES, None, strict=False)
 
 
 def make_route_sender(link: DataLink, route: int, contract: Contract, epoch: int, *, large: bool) -> RouteSender:
-    """The kind of sender that a contract asks for."""
+    """Make the kind of sender that the contract's reliability needs."""
     if contract.reliability is Reliability.RELIABLE:
         return ReliableRouteSender(link, route, contract, epoch, large=large)
     return RouteSender(link, route, contract, large=large)

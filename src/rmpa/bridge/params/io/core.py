@@ -1,4 +1,4 @@
-"""The local core's parameters as XML-RPC text: any core's, and never long at a time."""
+"""The parameters of the local core as XML-RPC text; long values are converted without blocking the event loop."""
 
 from __future__ import annotations
 
@@ -20,16 +20,21 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
 PEERS: Final = f"{OWN_NODE}/peers"
-"""Sets parameters for peers: a core does not tell a node of what it sets itself, and ours is to be told of these."""
+"""The caller's name when parameters are set for peers. A core does not notify a node of its own changes, and the
+agent's node has to be notified of these."""
 _PIECES: Final = 16
-"""Pieces of some KiB that are written before the loop has its turn."""
+"""Pieces, of some KiB each, that are written before the event loop goes on with other tasks."""
 
 
 async def write_text(what: str, value: XmlRpcValue) -> str:
-    """A value as the text of an XML-RPC response.
+    """Write a value as the text of an XML-RPC response.
+
+    Args:
+        what: The parameter's name, for the error.
+        value: Its value.
 
     Raises:
-        LocalProtocolError: It cannot be said, or is too large.
+        LocalProtocolError: XML-RPC cannot represent the value, or the text is above ``limits.PARAM_TEXT_MAX``.
     """
     parts: list[str] = []
     size = 0
@@ -44,10 +49,10 @@ async def write_text(what: str, value: XmlRpcValue) -> str:
 
 
 async def read_text(text: str) -> XmlRpcValue:
-    """The value of such a text.
+    """Read the value of a text that ``write_text`` has written.
 
     Raises:
-        RemoteProtocolError: It is none, or holds a nil, which ROS does not have.
+        RemoteProtocolError: The text is malformed, or contains a nil, which ROS does not have.
     """
     try:
         value = await read_large(ResponseReader(), (piece.encode() for piece in slices(text)))
@@ -59,11 +64,11 @@ async def read_text(text: str) -> XmlRpcValue:
 
 
 class ParamCore:
-    """What the parts for parameters ask of the local core.
+    """The requests of the parameter classes to the local core.
 
     Args:
-        core: Any.
-        node: The agent's own node, which is told of changes.
+        core: The local core, embedded or external.
+        node: The agent's own node, which the core notifies of changes.
     """
 
     def __init__(self, core: Core, node: SlaveNode) -> None:
@@ -71,12 +76,12 @@ class ParamCore:
         self._node = node
 
     async def get(self, key: str) -> tuple[bool, XmlRpcValue]:
-        """Whether there is a parameter or namespace, and its value, which is not to be changed."""
+        """Whether a parameter or namespace exists, and its value, which must not be modified."""
         reply = await self._ask("getParam", OWN_NODE, key)
         return reply.code == 1, reply.value
 
     async def get_text(self, key: str) -> str | None:
-        """Its value as text, or ``None``.
+        """The value of a parameter or namespace as text; ``None`` if it does not exist.
 
         Raises:
             LocalProtocolError: It is too large.
@@ -85,17 +90,17 @@ class ParamCore:
         return await write_text(key, value) if found else None
 
     async def set(self, key: str, value: XmlRpcValue, caller: str = OWN_NODE) -> None:
-        """Set a parameter, or a namespace as a whole; the value must not be changed afterwards.
+        """Set a parameter, or a namespace as a whole; the value must not be modified afterwards.
 
         Raises:
-            PeerRefused: The core does not take it.
+            PeerRefused: The core does not accept it.
         """
         reply = await self._ask("setParam", caller, key, value)
         if reply.code != 1:
             raise PeerRefused("the ROS core", f"{key}: {reply.status}")
 
     async def delete(self, key: str, caller: str = OWN_NODE) -> bool:
-        """Take a parameter or namespace away; whether there was one."""
+        """Delete a parameter or namespace; return whether it existed."""
         return (await self._ask("deleteParam", caller, key)).code == 1
 
     async def names(self) -> list[str]:
@@ -104,15 +109,15 @@ class ParamCore:
         return [str(name) for name in reply.value] if isinstance(reply.value, list) else []
 
     async def follow(self, key: str) -> None:
-        """Have the agent's node told of changes; again does no harm."""
+        """Have the core notify the agent's node of changes; a repeated call has no further effect."""
         await self._ask("subscribeParam", OWN_NODE, self._node.uri, key)
 
     async def leave(self, key: str) -> None:
-        """Have it told no longer."""
+        """End these notifications."""
         await self._ask("unsubscribeParam", OWN_NODE, self._node.uri, key)
 
     async def run_id(self) -> XmlRpcValue:
-        """Names this run of the core; another one knows nothing of what we set and follow."""
+        """The id of this run of the core; another run has none of the values and subscriptions of the one before."""
         return (await self.get("/run_id"))[1]
 
     async def _ask(self, method: str, *params: XmlRpcValue) -> RosReply:

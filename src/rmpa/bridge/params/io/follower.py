@@ -1,4 +1,4 @@
-"""Keeps the parameters that this module follows as their owners have them (``[[param]]``, ``[time]``)."""
+"""Keeps the parameters that this module follows equal to their owners' values (``[[param]]``, ``[time]``)."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _log = logging.getLogger(__name__)
 
 
 class ParamFollower:
-    """The side that has parameters of others.
+    """The follower's side: parameters that other modules own.
 
     Args:
         core: The local core.
-        rpc: Asks the owners; gets the handler of their news.
-        linked: The peers that are linked now.
+        rpc: Carries requests to the owners, and their notifications.
+        linked: Returns the sessions of the peers that are linked now.
         rules: What is followed.
-        counters: Counts ``param.put_back`` and ``param.refused``.
+        counters: Counts ``param.put_back``, ``param.refused``, ``param.failed`` and ``param.two_owners``.
     """
 
     def __init__(
@@ -55,10 +55,10 @@ class ParamFollower:
         self._left: set[str] = set()
         rpc.on_notification(transfer.VALUE, self._told)
 
-    # --- what the part tells -------------------------------------------------------------------------------------
+    # --- events from the part ------------------------------------------------------------------------------------
 
     def link_up(self, session: PeerSession) -> None:
-        """A peer is linked: follow what is its."""
+        """Follow the parameters that a linked peer owns."""
         mine, others = self.following.linked(session.peer, session.link.name)
         if others:
             text = (
@@ -69,7 +69,7 @@ class ParamFollower:
             self._ask(session)
 
     def link_down(self, peer: int) -> None:
-        """A link is gone: its parameters stay as they are, until their owner is back."""
+        """Keep a peer's parameters as they are; if another linked peer has its name, that one owns them now."""
         task = self._asking.pop(peer, None)
         if task is not None:
             task.cancel()
@@ -79,14 +79,18 @@ class ParamFollower:
                 self.link_up(session)
 
     def touched(self, key: str) -> bool:
-        """A local node has changed a parameter; return whether it is a followed one, in one, or around one."""
+        """Note a change of a local parameter, to be compared by ``look``.
+
+        Returns:
+            Whether it is a followed parameter, inside one, or a namespace around one.
+        """
         found = self.following.touched(key)
         for entry in found:
             entry.doubted = True
         return bool(found)
 
     def change(self, rules: Iterable[FollowRule]) -> None:
-        """Follow these from now on."""
+        """Replace the rules, and send the new sets of keys to the owners that they concern."""
         gone, _ = self.following.change(rules)
         self._left |= {entry.rule.to for entry in gone}
         for session in self._linked():
@@ -98,7 +102,7 @@ class ParamFollower:
         """Put back what was changed here, and ask again for what was refused.
 
         Args:
-            restarted: The core is another one than before, and knows nothing of what was set.
+            restarted: Whether the core was restarted: it has none of the values and subscriptions.
         """
         for key in [key for key in self._left if all(key != entry.rule.to for entry in self.following)]:
             await self._core.leave(key)
@@ -118,7 +122,7 @@ class ParamFollower:
         self._work_soon()
 
     async def close(self) -> None:
-        """Follow nothing any more; the values stay."""
+        """Stop following; the values stay."""
         tasks = [*self._asking.values(), *([self._working] if self._working is not None else [])]
         for task in tasks:
             task.cancel()
@@ -126,7 +130,7 @@ class ParamFollower:
 
     @property
     def subscribed(self) -> set[str]:
-        """The keys that the local core tells us of."""
+        """The keys of which the local core notifies the agent's node."""
         return self._subscribed
 
     # --- the owners ----------------------------------------------------------------------------------------------
@@ -183,7 +187,7 @@ class ParamFollower:
             self._working = asyncio.create_task(self._work(), name="follow parameters")
 
     async def _work(self) -> None:
-        """Ask for large values, and set what is due; what fails is tried again by ``look``."""
+        """Request large values, and set the values that are due; ``look`` tries again what failed."""
         failed: set[FollowRule] = set()
         try:
             while todo := [e for e in self.following if (e.ask or e.due) and e.rule not in failed]:
@@ -216,14 +220,14 @@ class ParamFollower:
         except StopIteration as done:
             text = done.value
         except RmpaError:
-            entry.ask = entry.peer is not None  # its owner may have deleted it meanwhile, and tells that next
+            entry.ask = entry.peer is not None  # if its owner has deleted it meanwhile, a notification follows
             raise
         if entry.ask or entry.peer != session.peer:
             return  # it has changed again since
         learn(entry, text)
 
     async def _apply(self, entry: Followed) -> None:
-        """Set a value here, unless it is there already. Nothing is changed by a text that does not parse."""
+        """Set a value here, unless it is there already; a malformed text changes nothing."""
         text, key = entry.text, entry.rule.to
         entry.due = False
         if self.following.size > limits.FOLLOWED_BYTES_MAX:
@@ -244,7 +248,7 @@ class ParamFollower:
         entry.problem = ""
 
     async def _bring(self, entry: Followed, value: XmlRpcValue) -> bool:
-        """Make the local value what the owner's is; whether it was another one."""
+        """Make the local value equal to the owner's; return whether it was different."""
         key, text = entry.rule.to, entry.text
         here = await self._core.get_text(key)
         if here == text:
@@ -257,7 +261,7 @@ class ParamFollower:
         return True
 
     async def _compare(self, entry: Followed) -> None:
-        """Look whether a local node has set what is another module's; then put it back and log it."""
+        """Put back, and log, a followed parameter that a local node has changed."""
         if entry.text is None and not entry.had:
             return
         entry.doubted = False

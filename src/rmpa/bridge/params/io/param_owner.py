@@ -1,4 +1,4 @@
-"""Answers the peers' questions about this module's parameters, and tells them of those that they follow."""
+"""Answers the peers' requests about this module's parameters, and notifies them of changes of those they follow."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ _log = logging.getLogger(__name__)
 
 
 class ParamOwner:
-    """The side that owns parameters.
+    """The owner's side: this module's parameters, for peers.
 
     Args:
         core: The local core.
         policy: What peers may do.
-        rpc: Gets the handlers.
+        rpc: Carries the peers' requests, and notifications to them.
         followed_max: How many parameters one peer may follow.
     """
 
@@ -48,7 +48,8 @@ class ParamOwner:
         self._transfers: dict[int, transfer.Transfers] = defaultdict(transfer.Transfers)
         self._followers: dict[int, tuple[PeerSession, set[str]]] = {}
         self._last: dict[str, str | None] = {}
-        """What was told last of each followed key: its text if it is small, or absent; empty for a large one."""
+        """The text that was last sent of each followed key: ``None`` if there was no value, empty if it is above
+        ``limits.PARAM_SMALL`` or nothing was sent yet."""
         self._left: set[str] = set()
         self._changed: dict[str, None] = {}
         self._telling: asyncio.Task[None] | None = None
@@ -60,25 +61,29 @@ class ParamOwner:
         rpc.on_request(transfer.DELETE, self._delete)
         rpc.on_request(transfer.FOLLOW, self._follow)
 
-    # --- what the part tells -------------------------------------------------------------------------------------
+    # --- events from the part ------------------------------------------------------------------------------------
 
     def link_down(self, peer: int) -> None:
-        """A peer's link is gone: what it was about is forgotten."""
+        """Forget what a peer follows and transfers."""
         self._transfers.pop(peer, None)
         if self._followers.pop(peer, None) is not None:
             self._forget_unfollowed()
 
     def touched(self, key: str) -> bool:
-        """A parameter has changed; return whether a peer follows it, what it is in, or something in it."""
+        """Notify the followers of a parameter that has changed.
+
+        Returns:
+            Whether a peer follows it, a namespace around it, or something inside it.
+        """
         found = [followed for followed in self._last if overlap(followed, key)]
         self._tell_soon(found)
         return bool(found)
 
     async def look(self, *, restarted: bool) -> None:
-        """Compare what was told with what is, and follow again: a core may have lost a notification.
+        """Compare the values with those that were sent, and subscribe again: a core may have lost a notification.
 
         Args:
-            restarted: The core is another one than before: it follows nothing for us.
+            restarted: Whether the core was restarted: it has none of the subscriptions.
         """
         for key in [key for key in self._left if key not in self._last]:
             await self._core.leave(key)
@@ -89,12 +94,12 @@ class ParamOwner:
                 self._tell_soon([key])
             elif last != "":
                 await self._core.follow(key)
-                with contextlib.suppress(LocalProtocolError):  # too large, which was said when it was told
+                with contextlib.suppress(LocalProtocolError):  # too large, which was reported when it was sent
                     if await self._small_text(key) != last:
                         self._tell_soon([key])
 
     def judge_again(self) -> None:
-        """The rules have changed: tell the peers that may not follow any more."""
+        """Notify the peers of parameters that the new rules no longer let them follow."""
         for session, keys in self._followers.values():
             for key in [key for key in keys if self.policy.why_not_follow(key)]:
                 keys.discard(key)
@@ -103,17 +108,17 @@ class ParamOwner:
         self._forget_unfollowed()
 
     async def close(self) -> None:
-        """Tell the peers nothing any more."""
+        """Stop the notifications to peers."""
         if self._telling is not None:
             self._telling.cancel()
             await asyncio.gather(self._telling, return_exceptions=True)
 
     @property
     def followed(self) -> Iterator[str]:
-        """The keys that some peer follows."""
+        """The keys that at least one peer follows."""
         return iter(self._last)
 
-    # --- questions ----------------------------------------------------------------------------------------------
+    # --- requests -----------------------------------------------------------------------------------------------
 
     async def _get(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         key = self._key(args.get("key"))
@@ -150,7 +155,7 @@ class ParamOwner:
         return {}
 
     async def _follow(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
-        """From now on a peer follows these keys, and none of those that it did before."""
+        """Replace the set of keys that a peer follows."""
         keys = args.get("keys")
         if not isinstance(keys, list) or len(keys) > config_limits.FOLLOW_RULES_MAX:
             raise RmpaError(f"keys is not a list of at most {config_limits.FOLLOW_RULES_MAX} parameters")
@@ -192,7 +197,7 @@ class ParamOwner:
         if why:
             raise RmpaError(why)
 
-    # --- news ----------------------------------------------------------------------------------------------------
+    # --- notifications -------------------------------------------------------------------------------------------
 
     def _tell_soon(self, keys: Iterable[str]) -> None:
         self._changed |= dict.fromkeys(keys)
@@ -222,7 +227,7 @@ class ParamOwner:
                 found = False
             text = await write_text(key, value) if found else None
         except RmpaError as error:
-            # The core does not answer, or the value is too large to cross: told when that has changed (``look``).
+            # The core does not answer, or the value is too large to cross; ``look`` sends it when that has changed.
             _log.warning("! peers are not told of %s: %s", key, error)
             args["refused"] = str(error)
             text = None

@@ -1,4 +1,4 @@
-"""Parameters across modules: asked for, set and followed (``docs/parameters.md``)."""
+"""The part of the bridge for parameters across modules: requests, changes and followed values."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ _log = logging.getLogger(__name__)
 
 
 class Params(Part):
-    """The part of the bridge that is about parameters.
+    """The part of the bridge for parameters.
 
     Args:
         core: The local core.
-        node: The agent's own node, which is told of changes.
+        node: The agent's own node, which the core notifies of changes.
         rpc: Carries the requests between the modules.
-        linked: The peers that have a link now.
-        counters: Counts ``param.put_back`` and ``param.refused``.
+        linked: Returns the sessions of the peers that are linked now.
+        counters: Counts ``param.put_back``, ``param.refused``, ``param.failed`` and ``param.two_owners``.
         params: What peers may do, and what is followed.
         time: Whether time is shared, and which peer's is followed.
         followed_max: How many parameters one peer may follow here.
@@ -64,16 +64,16 @@ class Params(Part):
 
     @property
     def followed(self) -> Iterable[Followed]:
-        """What is followed, and how that goes."""
+        """The parameters that this module follows, with the state of each."""
         return self._follower.following
 
     def notes(self) -> tuple[str, ...]:
-        """What the user should know of those that are not followed as the settings want it."""
+        """Messages to the user about parameters that are not followed although their owner is linked."""
         found = (e for e in self._follower.following if e.problem and e.peer is not None)
         return tuple(f"parameter {entry.rule} is not followed: {entry.problem}" for entry in found)
 
     def reload(self, settings: Settings) -> None:
-        """Other rules hold from now on; what they do not concern goes on untouched."""
+        """Apply other settings; parameters that they do not affect are not touched."""
         params, time = settings.params, settings.time
         self._server.policy = ParamPolicy(params, time)
         self._server.followed_max = settings.limits.params
@@ -81,25 +81,25 @@ class Params(Part):
         self._follower.change(follow_rules(params, time))
 
     def link_up(self, session: PeerSession) -> None:
-        """A peer is linked."""
+        """Follow the parameters that a linked peer owns."""
         self._follower.link_up(session)
 
     def link_down(self, session: PeerSession) -> None:
-        """A link is gone."""
+        """Forget what the peer follows; the values of parameters that it owns stay."""
         self._server.link_down(session.peer)
         self._follower.link_down(session.peer)
 
     def param_update(self, key: str) -> bool:
-        """A parameter has changed in the local core."""
+        """Handle a notification of the local core that a parameter has changed."""
         return any((self._server.touched(key), self._follower.touched(key)))
 
     def reconcile(self) -> None:
-        """Look whether all is as it should be."""
+        """Compare the values in the background, and mend differences."""
         if self._looking is None:
             self._looking = asyncio.create_task(self._look(), name="look at parameters")
 
     async def close(self) -> None:
-        """End; nothing of ours stays in a core that lives on but the values."""
+        """End all tasks, and unsubscribe from the local core, which may live on; the values stay there."""
         if self._looking is not None:
             self._looking.cancel()
             await asyncio.gather(self._looking, return_exceptions=True)
@@ -117,7 +117,7 @@ class Params(Part):
             await self._server.look(restarted=restarted)
             await self._follower.look(restarted=restarted)
         except UnreachableError:
-            pass  # the core itself says so
+            pass  # reported by the core itself
         except RmpaError as error:
             _log.warning("! parameters cannot be looked at: %s", error)
         except Exception:  # noqa: BLE001 - a task's top

@@ -1,7 +1,7 @@
 """How requests and replies cross a link: small ones by the express lane, larger ones by the bulk lane in fragments.
 
-Nothing of a call may be dropped without a word: what waits for a slow link is bounded by ``Budget``, and a call
-that would go beyond it fails with that reason.
+No part of a call may be dropped silently. ``Budget`` bounds what waits for a slow link, and a call that would exceed
+it fails with that reason.
 """
 
 from __future__ import annotations
@@ -26,63 +26,63 @@ if TYPE_CHECKING:
 
 _LENGTH: Final = 4
 _HEAD_MAX: Final = 1
-"""In front of a response: whether it went well."""
+"""Bytes in front of a reply that state whether the call succeeded."""
 _PORTION: Final = 256 * KIB
-"""Of a large body at once, some 50 microseconds; then others have their turn."""
+"""Bytes of a large body that are copied at once, in some 50 microseconds; then other tasks run."""
 _AHEAD: Final = 4 * MIB
-"""Of what is being sent, this much may wait for the link; the rest stays where it is."""
+"""Bytes waiting on the bulk lane above which no further portion is copied to it."""
 _WHOLE: Final = core_limits.FRAGMENT_BYTES - _LENGTH
-"""Up to here a body goes in one frame."""
+"""Bytes of a body, head included, up to which it is sent in one frame."""
 _PAUSE: Final = 0.005
-"""Between two looks whether the link has taken some of that."""
+"""Seconds between two checks of how much waits on the bulk lane."""
 
 
 class BodyLane(Protocol):
-    """What is needed of one lane of a link (``mesh.io.lane.LaneSender``)."""
+    """The methods of a link's lane that bodies are sent by (``mesh.io.lane.LaneSender``)."""
 
     outbox: Outbox
     ended: bool
 
     def send(self, route: int, sequence: int, stamp_ns: int, payload: Buffer) -> int:
-        """Send one message."""
+        """Send one message as a whole."""
         ...
 
     def open(self, route: int, size: int, sequence: int, stamp_ns: int) -> QueuedMessage:
-        """Begin one whose bytes follow."""
+        """Begin a message of ``size`` bytes, which ``extend`` sends."""
         ...
 
     def extend(self, parcel: QueuedMessage, data: Buffer) -> int:
-        """Send further bytes of it."""
+        """Send further bytes of a message that ``open`` began."""
         ...
 
     def set_terms(self, route: int, depth: int, max_age: float | None, *, strict: bool) -> None:
-        """Bound what may wait of a route."""
+        """Set how many messages of a route may wait, and for how many seconds (``None``: any time)."""
         ...
 
 
 class BodyLink(Protocol):
-    """What is needed of a link (``mesh.io.link.PeerLink``)."""
+    """The methods of a link that bodies are sent by (``mesh.io.link.PeerLink``)."""
 
     @property
     def express(self) -> BodyLane:
-        """For small ones."""
+        """The lane for small bodies."""
         ...
 
     @property
     def bulk(self) -> BodyLane:
-        """For large ones."""
+        """The lane for large bodies."""
         ...
 
     def close_route(self, route: int) -> int:
-        """Let go of what waits of a route."""
+        """Drop what waits of a route."""
         ...
 
 
 class Budget:
-    """Bytes that one peer's calls may hold at once.
+    """Counts the bytes that the calls of one peer hold, and limits them.
 
     Args:
-        limit: How many.
+        limit: How many bytes may be held at once.
     """
 
     def __init__(self, limit: int = limits.SERVICE_BYTES) -> None:
@@ -90,23 +90,25 @@ class Budget:
         self.used = 0
 
     def take(self, size: int) -> bool:
-        """Reserve some, if there is room; the first always has its room."""
+        """Reserve ``size`` bytes and return ``True``, if there is room; an empty budget has room for any size."""
         if self.used and self.used + size > self.limit:
             return False
         self.used += size
         return True
 
     def give(self, size: int) -> None:
-        """Give some back."""
+        """Return ``size`` reserved bytes."""
         self.used -= size
 
 
 class BodySender:
-    """Sends bodies on one route of a link, in order as far as they are of one size.
+    """Sends bodies on one route of a link.
+
+    Small bodies stay in order, and so do large ones; a small body may overtake a large one.
 
     Args:
-        link: The peer's.
-        route: The route's id, chosen by the receiver.
+        link: The link to the peer.
+        route: The route's number, chosen by the receiver.
     """
 
     def __init__(self, link: BodyLink, route: int) -> None:
@@ -118,13 +120,13 @@ class BodySender:
             lane.set_terms(route, mesh_limits.KEEP_ALL_MESSAGES, None, strict=False)
 
     def send(self, sequence: int, body: Buffer, head: bytes = b"", budget: Budget | None = None) -> bool:
-        """Send one body behind ``head``; whether it takes the bulk lane.
+        """Send one body; return whether it takes the bulk lane. After ``close`` it is dropped.
 
         Args:
-            sequence: Of the call.
-            body: It must not change until it has left.
-            head: In front of it.
-            budget: Gets the body's bytes back when it has left.
+            sequence: The number of the call.
+            body: The bytes; they must not change until they were sent.
+            head: Bytes in front of the body.
+            budget: Gets the body's bytes back when they were handed to the link, or dropped.
         """
         link = self._link
         size = len(head) + len(body)
@@ -144,7 +146,7 @@ class BodySender:
         return True
 
     def close(self) -> None:
-        """Send no more, and let go of what waits."""
+        """Send nothing more, and drop what waits."""
         link, self._link = self._link, None
         while self._large:
             self._left()
@@ -167,7 +169,7 @@ class BodySender:
         self._left()
 
     async def _drain(self) -> None:
-        """Send large ones a portion at a time: to copy one of 64 MiB at once holds everything up for 30 ms."""
+        """Send large bodies a portion at a time: copying 64 MiB at once would block the event loop for 30 ms."""
         while self._large and self._link is not None:
             lane = self._link.bulk
             sequence, head, body, _ = self._large[0]
@@ -189,10 +191,10 @@ class BodySender:
 
 
 class BodyReceiver:
-    """Takes the bodies that come on one route, as its ``bridge.data.io.receiver.DataHandler``; for subclasses.
+    """Reassembles the bodies that arrive on one route; a ``bridge.data.io.receiver.DataHandler``, for subclasses.
 
     Args:
-        budget: What the peer's bodies may hold while they are put together.
+        budget: Bounds the bytes of the peer's bodies while they are reassembled.
     """
 
     def __init__(self, budget: Budget) -> None:
@@ -202,23 +204,23 @@ class BodyReceiver:
         self._size = 0
 
     def body(self, sequence: int, body: bytes | bytearray) -> None:
-        """A whole one came; it belongs to the taker, and nothing of it is held in the budget any more."""
+        """Handle a complete body, which belongs to the callee; it no longer counts in the budget."""
         raise NotImplementedError
 
     def failed(self, sequence: int, reason: str) -> None:
-        """One that had begun will not come."""
+        """Handle the loss of a body whose first part had arrived."""
         raise NotImplementedError
 
     def message(self, sequence: int, _stamp_ns: int, framed: memoryview) -> None:
-        """A whole message."""
+        """Handle a body that arrived in one frame."""
         self.body(sequence, bytes(framed[_LENGTH:]))
 
     def part(self, sequence: int, _stamp_ns: int, flags: int, part: memoryview) -> None:
-        """A part of a large one.
+        """Handle a part of a large body.
 
         Raises:
-            LimitExceeded: It claims to be larger than a service's message may be.
-            RemoteProtocolError: It has no length, or more bytes than that said.
+            LimitExceeded: The body's stated size is above that of a service's message.
+            RemoteProtocolError: The size is missing, or the parts have more or fewer bytes than it states.
         """
         if flags & FIRST:
             part = self._begin(sequence, part)
@@ -241,7 +243,7 @@ class BodyReceiver:
                 self.body(sequence, buffer)
 
     def drop(self, reason: str) -> None:
-        """What came of a body in parts is not followed by the rest."""
+        """Give up a body of which only parts have arrived, if there is one; ``failed`` gets the reason."""
         sequence, self._sequence = self._sequence, None
         buffer, self._buffer = self._buffer, None
         if buffer is not None and sequence is not None:
@@ -259,7 +261,7 @@ class BodyReceiver:
         if self._budget.take(size):
             self._buffer = bytearray()
         else:
-            self._buffer = None  # its parts pass unkept
+            self._buffer = None  # its parts are not kept
             text = f"large calls hold {self._budget.used >> 20} MiB already: at most {self._budget.limit >> 20}"
             self.failed(sequence, text)
         return part[_LENGTH:]

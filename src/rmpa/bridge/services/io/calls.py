@@ -1,4 +1,4 @@
-"""Both ends of an open service: ``Caller`` where the clients are, ``Server`` where the server is."""
+"""Both ends of an open service: ``Caller`` at the clients' module, ``Server`` at the server's module."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ if TYPE_CHECKING:
 _OK: Final = b"\x01"
 _FAILED: Final = b"\x00"
 _RECENT: Final = 64
-"""Large replies that may be lost with the bulk lane; they leave within a lease, so only some can be."""
+"""How many of the latest replies by the bulk lane are reported as lost if its connection is lost. Replies leave
+within a link's lease, so only the latest can be lost."""
 
 
 def _text(body: Buffer) -> str:
-    """The text of an error, as far as it is kept."""
+    """The text of an error in a reply, up to ``limits.CONTROL_TEXT_MAX`` bytes."""
     return bytes(body[: limits.CONTROL_TEXT_MAX]).decode(errors="replace")
 
 
 class Budgets:
-    """What the calls of one link may hold.
+    """Bounds the bytes that the calls of one link hold, each way.
 
-    Args:
-        outgoing: Requests and replies that we send.
-        incoming: Those that are put together here, and requests that are being served.
+    ``outgoing`` counts requests and replies that this module sends; ``incoming`` counts those that are reassembled
+    here, and requests that are being served.
     """
 
     def __init__(self) -> None:
@@ -44,19 +44,19 @@ class Budgets:
 
 
 class CallStats:
-    """What became of a service's calls; shared by all sessions of one service."""
+    """Counts and latencies of the calls of one service, shared by all sessions."""
 
     def __init__(self) -> None:
         self.calls = 0
         self.failed = 0
         self.active = 0
         self.problem = ""
-        """Of the last call that failed on our way."""
+        """The error of the last call that failed, or empty."""
         self.latencies = SampleRing(limits.SERVICE_LATENCIES)
-        """Seconds from a request to its reply, of those that went well."""
+        """Seconds from request to reply, of calls that succeeded."""
 
     def fail(self, problem: str) -> None:
-        """A call failed."""
+        """Count a failed call, and store its error."""
         self.failed += 1
         self.problem = problem[: limits.CONTROL_TEXT_MAX]
 
@@ -65,11 +65,11 @@ class Caller(BodyReceiver):
     """Calls one service of a peer, for all clients of this module.
 
     Args:
-        link: The peer's.
-        requests: The route that requests go out on; the peer's.
+        link: The link to the peer.
+        requests: The route of requests; the peer has chosen its number.
         what: The service and its peer, for texts.
-        budgets: The peer's.
-        stats: Of the service.
+        budgets: The budgets of the peer's link.
+        stats: The counts of the service.
     """
 
     def __init__(self, link: BodyLink, requests: int, what: str, budgets: Budgets, stats: CallStats) -> None:
@@ -82,15 +82,15 @@ class Caller(BodyReceiver):
         self._serial = 0
         self._pending: dict[int, tuple[ServiceCall, float, bool]] = {}
         self.used_at = self._loop.time()
-        """When it was last used."""
+        """When a call was last begun or answered, in the event loop's seconds."""
 
     @property
     def active(self) -> int:
-        """Calls under way."""
+        """The number of calls under way."""
         return len(self._pending)
 
     def call(self, call: ServiceCall) -> None:
-        """Make a call; it is answered by the reply, or by an error."""
+        """Send a call's request; the call ends with the reply, or with an error."""
         stats = self._stats
         stats.calls += 1
         size = len(call.request)
@@ -107,7 +107,7 @@ class Caller(BodyReceiver):
         self._sender.send(serial, call.request)
 
     def body(self, sequence: int, body: bytes | bytearray) -> None:
-        """A reply came; one that is not waited for any more is dropped."""
+        """Handle a reply; it is dropped if its call has ended already."""
         call, began, _ = self._pending.pop(sequence, (None, 0.0, False))
         if call is None:
             return
@@ -125,11 +125,14 @@ class Caller(BodyReceiver):
             call.reply(ok, memoryview(body)[1:])
 
     def failed(self, sequence: int, reason: str) -> None:
-        """A reply had begun, and the rest does not come."""
+        """Fail the call of a reply whose rest was lost."""
         self._fail(sequence, f"{self._what}: its reply was lost on the way: {reason}")
 
     def lane_lost(self) -> None:
-        """The bulk lane's connection is gone, and it is unknown what was lost with it."""
+        """Fail the calls with large requests, and drop a reply in parts: the bulk lane's connection is gone.
+
+        It is unknown what was lost with it.
+        """
         self.drop("the connection for large messages was lost")
         for sequence, (_, _, bulk) in list(self._pending.items()):
             if bulk:
@@ -138,7 +141,7 @@ class Caller(BodyReceiver):
                 )
 
     def close(self, reason: str) -> None:
-        """No more calls can be made; those under way get an error."""
+        """Fail the calls under way with this reason, and send nothing more."""
         self._sequence = None
         if self._buffer is not None:
             self._buffer = None
@@ -155,7 +158,7 @@ class Caller(BodyReceiver):
             call.fail(text)
 
     def _gone(self, sequence: int) -> None:
-        """The client has left, or the deadline is over."""
+        """End a call whose client has left, or whose deadline is over."""
         call, _, _ = self._pending.pop(sequence, (None, 0.0, False))
         if call is not None:
             self._ended(call)
@@ -171,12 +174,12 @@ class Server(BodyReceiver):
     """Serves one service of this module to one peer.
 
     Args:
-        link: The peer's.
-        route: The route that replies go out on; the peer's.
+        link: The link to the peer.
+        route: The route of replies; the peer has chosen its number.
         pool: The connections to the server.
         timeout: Seconds that the peer waits for a reply.
-        budgets: The peer's.
-        stats: Of the service.
+        budgets: The budgets of the peer's link.
+        stats: The counts of the service.
     """
 
     def __init__(
@@ -192,7 +195,7 @@ class Server(BodyReceiver):
         self._recent: OrderedDict[int, None] = OrderedDict()
 
     def body(self, sequence: int, body: bytes | bytearray) -> None:
-        """A request came."""
+        """Pass a request to the server."""
         stats, size = self._stats, len(body)
         stats.calls += 1
         if not self._budget.take(size):
@@ -203,19 +206,19 @@ class Server(BodyReceiver):
         self._pool.call(body, timeout, partial(self._answered, sequence, size, self._loop.time()))
 
     def failed(self, sequence: int, reason: str) -> None:
-        """A request had begun, and the rest does not come."""
+        """Reply with an error to a request whose rest was lost."""
         self._stats.calls += 1
         self._reply_failed(sequence, f"the request was lost on its way: {reason}")
 
     def lane_lost(self) -> None:
-        """The bulk lane's connection is gone: calls fail whose replies may have been on it."""
+        """Send an error for each call whose reply may have been lost with the bulk lane's connection."""
         self.drop("the connection for large messages was lost")
         for sequence in self._recent:
             self._send(sequence, False, b"the connection for large messages was lost behind the call")
         self._recent.clear()
 
     def close(self) -> None:
-        """The peer calls no more; what is being served is not answered."""
+        """Send nothing more: the replies of calls that are being served are dropped."""
         sender, self._sender = self._sender, None
         if sender is not None:
             sender.close()
@@ -244,7 +247,14 @@ class Server(BodyReceiver):
         self._send(sequence, False, text.encode())
 
     def _send(self, sequence: int, ok: bool, body: Buffer, budget: Budget | None = None) -> bool:
-        """Send a reply, and give the budget its bytes back when it has left; whether it took the express lane."""
+        """Send a reply; return whether it took the express lane, or was dropped after ``close``.
+
+        Args:
+            sequence: The number of the call.
+            ok: Whether the call succeeded.
+            body: The response, or the text of the error.
+            budget: Gets the body's bytes back when they were sent or dropped.
+        """
         if self._sender is not None:
             return not self._sender.send(sequence, body, _OK if ok else _FAILED, budget)
         if budget is not None:

@@ -1,4 +1,4 @@
-"""The connections to one local server, for the calls of all peers: a few that stay, one call at a time over each."""
+"""Connections to one local server for the calls of all peers: a few are kept open, each with one call at a time."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 Done = Callable[[bool, "Buffer"], None]
-"""``(ok, response or text of the error)``."""
+"""Called with ``(ok, body)``: the response, or the text of the error."""
 
 
 @dataclass(slots=True)
 class _Waiting:
-    """A call that has no connection yet."""
+    """A call that waits for a free connection."""
 
     body: Buffer
     until: float
@@ -36,12 +36,12 @@ class _Waiting:
 
 
 class ServicePool:
-    """Calls one server.
+    """Calls one local server over up to ``limits.SERVICE_POOL`` connections.
 
     Args:
-        service: The service's name in this graph.
-        server: Where it is.
-        on_lost: Called when the server hung up, or does not answer at its address: it may be dead.
+        service: The service's name in the local graph.
+        server: Its server.
+        on_lost: Called when the server closed a connection, or does not answer at its address: it may be dead.
     """
 
     def __init__(self, service: str, server: LocalService, on_lost: Callable[[], None]) -> None:
@@ -57,19 +57,19 @@ class ServicePool:
 
     @property
     def size(self) -> int:
-        """Connections, those that are being made included."""
+        """The number of connections, including those that are being opened."""
         return len(self._idle) + len(self._busy) + len(self._opening)
 
     @property
     def unused(self) -> bool:
-        """Whether nothing is open and no call waits."""
+        """Whether there is no connection and no call waits."""
         return not self.size and not self._queue
 
     async def describe(self) -> ServiceDescription:
-        """What the server says of its service; the connection stays for the first call.
+        """Ask the server for its service's types and MD5 sum; the connection is kept for the first call.
 
         Raises:
-            RmpaError: It does not answer, or says no.
+            RmpaError: The server does not answer, or refuses.
         """
         try:
             connection = await self._connect()
@@ -83,12 +83,12 @@ class ServicePool:
         return connection.description
 
     def call(self, body: Buffer, timeout: float, done: Done) -> None:
-        """Make a call; ``done`` is called once, perhaps at once.
+        """Make a call; ``done`` is called once, perhaps before this method returns.
 
         Args:
-            body: The request; it must not change until the answer is there.
-            timeout: Seconds until the caller has given up.
-            done: Gets the answer.
+            body: The request; it must not change until the call is done.
+            timeout: Seconds until the caller gives up.
+            done: Called with the response or the error.
         """
         if len(self._queue) >= limits.SERVICE_QUEUE:
             text = f"service [{self.service}]: {len(self._queue)} calls wait for its server already"
@@ -107,7 +107,7 @@ class ServicePool:
         self._idle = kept
 
     def close(self, reason: str) -> None:
-        """Close all; calls under way and those that wait get an error."""
+        """Close all connections; the calls under way and those that wait fail with the reason."""
         self._closed = True
         text = f"service [{self.service}]: {reason}".encode()
         for task in self._opening:
@@ -119,7 +119,7 @@ class ServicePool:
             self._queue.popleft().done(False, text)
 
     async def closed(self) -> None:
-        """Behind ``close``: wait until nothing is left."""
+        """Wait until attempts to connect have ended; call after ``close``."""
         await asyncio.gather(*self._opening, return_exceptions=True)
 
     # --- inside ---------------------------------------------------------------------------------------------
@@ -133,7 +133,7 @@ class ServicePool:
         self._open_more()
 
     def _open_more(self) -> None:
-        """One connection for each call that waits, as far as there may be more."""
+        """Open a connection for each call that waits, up to ``limits.SERVICE_POOL`` in all."""
         while len(self._opening) < len(self._queue) and self.size < limits.SERVICE_POOL:
             task = self._loop.create_task(self._open(), name=f"connect to {self.service}")
             self._opening.add(task)
@@ -143,7 +143,7 @@ class ServicePool:
         try:
             connection = await self._connect()
         except RmpaError as error:
-            # What waits would fail as this attempt did; the next call makes a new one.
+            # The waiting calls would fail as this attempt did; the next call makes a new attempt.
             self._on_lost()
             while self._queue and not self._busy:
                 self._queue.popleft().done(False, str(error).encode(errors="replace"))
@@ -154,7 +154,7 @@ class ServicePool:
         return await ServiceConnection.open(self.server.uri, self.service, OWN_NODE, on_closed=self._on_lost)
 
     def _request(self, connection: ServiceConnection, call: _Waiting) -> bool:
-        """Send a call's request; ``False`` if the connection turns out to be closed, and nothing was sent."""
+        """Send a call's request; ``False`` if the connection was closed already, and nothing was sent."""
         rest = call.until - self._loop.time()
         try:
             connection.request(call.body, partial(self._answered, connection, call.done), rest)
@@ -186,7 +186,7 @@ class ServicePool:
             self._free(connection)
 
     def _free(self, connection: ServiceConnection) -> None:
-        """A connection has nothing to do: the next call that waits has it."""
+        """Give a connection that has become free to the next waiting call, or keep it."""
         while self._queue:
             call = self._queue.popleft()
             if call.until <= self._loop.time():

@@ -1,7 +1,7 @@
-"""Services across the mesh: what this module provides is called by peers, and what they provide stands here.
+"""Services across modules: peers call the services of this module, and their services appear in the local graph.
 
-The two plans are pure (``services.imports``, ``services.exports``); this part of the bridge carries
-them out. A call takes this way::
+The two plans are pure (``services.imports``, ``services.exports``); this part of the bridge carries out their
+actions. A call takes this way::
 
     client → proxy's ServiceEndpoint → Caller ⇢ link ⇢ Server → ServicePool → server
                                               ⇠      ⇠
@@ -73,16 +73,16 @@ class ShownService:
 
     Args:
         peer: The peer's number.
-        service: Its name here.
+        service: The service's name here.
         node: Its node, in the peer's graph.
         peer_name: The peer's name.
-        stats: What became of its calls.
-        proxy: The node that stands for that one, once it is there.
-        endpoint: What clients connect to, likewise.
-        caller: Where calls go, while the service is open.
-        waiting: Calls that wait until it is.
-        asking: Clients that want to know its type.
-        mismatch: What a client was told whose md5 sum did not fit; empty if none was.
+        stats: Counts and latencies of its calls.
+        proxy: The proxy of its node; ``None`` until that exists.
+        endpoint: The endpoint that clients connect to; ``None`` until the proxy exists.
+        caller: Makes the calls while the service is open.
+        waiting: Calls that wait until the service is open.
+        asking: Requests for its types that wait until the service is open.
+        mismatch: The error that the last client with another MD5 sum got; empty if there was none.
     """
 
     peer: int
@@ -99,15 +99,15 @@ class ShownService:
 
 
 class Services(Part):
-    """Both directions, for all peers.
+    """Both directions of services, for all peers.
 
     Args:
         core: The local core.
-        sessions: The peers.
-        rpc: Brings news to the peers, and from them.
-        relay: Offers what comes from one peer to others.
+        sessions: The peers' sessions.
+        rpc: Carries notifications to and from the peers.
+        relay: Offers the services of one peer to others.
         rules: What may cross, under which names, and for how long.
-        limit_settings: How much of one peer is taken, and how much is offered.
+        limit_settings: How much is taken of one peer, and how much is offered.
         counters: Counts what happens, by name.
     """
 
@@ -129,11 +129,11 @@ class Services(Part):
         self._rpc = rpc
         self._relay = relay
         self.rules = rules
-        """What may cross, also for snapshots."""
+        """What may cross; read by snapshots too."""
         self.exports = ServiceExports(rules, self._limit_settings)
-        """The outbound plan, for snapshots."""
+        """The outbound plan; read by snapshots too."""
         self.imports = ServiceImports(rules, self._limit_settings)
-        """The inbound plan, for snapshots."""
+        """The inbound plan; read by snapshots too."""
         self._budgets: dict[int, Budgets] = {}
         self._shown: dict[tuple[int, str], ShownService] = {}
         self._callers: dict[tuple[int, int], ShownService] = {}
@@ -156,27 +156,27 @@ class Services(Part):
         return iter(self._shown.values())
 
     def shown(self, peer: int, service: str) -> ShownService | None:
-        """One of them."""
+        """A peer's service in the local graph, by its name here; ``None`` if it is not shown."""
         return self._shown.get((peer, service))
 
     @property
     def idle(self) -> bool:
-        """Whether every change of the local graph was looked at."""
+        """Whether every change of the local graph was processed."""
         return self._driver.idle
 
     @property
     def served(self) -> Mapping[str, CallStats]:
-        """What became of the calls of our services by peers."""
+        """Counts and latencies of the peers' calls, by service of this module."""
         return self._serving.stats
 
     def reload(self, settings: Settings) -> None:
-        """Other settings hold from now on."""
+        """Apply other settings."""
         policy, names = Policy(settings.policy, settings.peers, settings.time), Names(settings.peers)
         self._limit_settings = settings.limits
         self.apply_rules(ServiceRules(settings.services, policy, names))
 
     def apply_rules(self, rules: ServiceRules) -> None:
-        """Other rules hold from now on; what they do not touch goes on."""
+        """Replace the rules; services that they do not affect stay shown and open."""
         self.rules = rules
         self._driver.rejudge(
             chain(
@@ -189,23 +189,23 @@ class Services(Part):
             if endpoint is not None and endpoint.timeout != timeout:
                 endpoint.timeout = timeout
                 if shown.caller is not None and not shown.caller.active:
-                    # The next call opens it anew, and tells how long it waits now.
+                    # The next call opens it again, with the new timeout in its request.
                     self._act(self.imports.release(shown.peer, shown.service, "its timeout has changed"))
 
     # --- the bridge's part -------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Follow the local graph."""
+        """Begin with the services of the local graph, and with the checks that their servers live."""
         self._driver.look(self._core.state().services)
         self._serving.start()
 
     async def close(self) -> None:
-        """End every call, and every connection to a server."""
+        """End all calls and all connections to servers."""
         self._driver.close()
         await self._serving.close()
 
     def link_up(self, session: PeerSession) -> None:
-        """Tell what this module has; what the peer has is told by the peer."""
+        """Advertise this module's services to the peer, and open the services of the peer that calls wait for."""
         peer, link = session.peer, session.link
         self._budgets[peer] = Budgets()
         instance = link.identity.instance.hex()
@@ -217,29 +217,29 @@ class Services(Part):
         self._driver.schedule()
 
     def link_down(self, session: PeerSession) -> None:
-        """Calls under way fail; the services stay for a moment if the link just fell silent."""
+        """Fail the calls under way; the peer's services stay in the graph until ``grace_over`` or ``gone``."""
         self._driver.link_down(session)
         self._act(self.imports.link_down(session.peer))
         self._act(self.exports.link_down(session.peer))
 
     def grace_over(self, session: PeerSession) -> bool:
-        """No service waits for its peer."""
+        """Remove the peer's services: no service is kept for a peer that stays away."""
         self._act(self.imports.gone(session.peer))
         return False
 
     def gone(self, session: PeerSession) -> None:
-        """The peer will not come back."""
+        """Remove the peer's services, and what else is known of the peer."""
         self._act(self.imports.gone(session.peer))
         self._act(self.imports.unlinked(session.peer))
         self._budgets.pop(session.peer, None)
         self._driver.gone(session)
 
     def advertised(self, session: PeerSession, payload: bytes) -> None:
-        """A peer says what it provides."""
+        """Queue an advertisement of a peer's services."""
         self._driver.advertised(session, payload)
 
     def message(self, session: PeerSession, message: Message) -> bool:
-        """Take what is said of services and their routes."""
+        """Handle a control message about services; ``False`` for other messages."""
         peer = session.peer
         match message:
             case AdvertiseServices():
@@ -265,12 +265,12 @@ class Services(Part):
         return (self.imports.take_in(session.peer, change) for change in self.imports.portions(session.peer, message))
 
     def graph_changed(self, change: GraphChange) -> None:
-        """A node provides a service, or no longer does."""
+        """Have a service examined for which a node was registered or unregistered."""
         if change.kind is RegistrationKind.SERVICE:
             self._driver.look((change.name,))
 
     def lane_lost(self, session: PeerSession) -> None:
-        """Calls that used the bulk lane may never be answered."""
+        """Report calls that the loss of the bulk lane's connection may have left without an answer."""
         peer = session.peer
         for (owner, _), shown in list(self._callers.items()):
             if owner == peer and shown.caller is not None:
@@ -278,7 +278,7 @@ class Services(Part):
         self._serving.lane_lost(peer)
 
     def reconcile(self) -> None:
-        """Register again what is missing, and close what is not used."""
+        """Register missing services again, and close routes and connections that are not used."""
         services = self._core.state().services
         self._driver.look((*self.exports.seen, *services))
         before = asyncio.get_running_loop().time() - limits.SERVICE_IDLE
@@ -297,18 +297,18 @@ class Services(Part):
         for service in names:
             providers = services.get(service, {})
             local = next((LocalService(node, uri) for node, uri in providers.items() if not is_own(node)), None)
-            # That it is taken is known before it is told on: no peer may be shown two of a name.
+            # Imports first: a peer's service of this name is hidden before the local one is offered.
             self._act(self.imports.local(service, local.node if local is not None else None))
             offered = local if local is not None and not self._withdrawn(service, local.node) else None
             self._act(self.exports.graph(service, offered or self._to_relay(service, providers)))
 
     def _withdrawn(self, service: str, node: str) -> bool:
-        """Whether nothing can connect to a server; one that a peer has open answers, whatever the core found."""
+        """Whether the core found a server unreachable and withdrew it, and no peer has its service open."""
         found = self._core.unreachable().get(node)
         return found is not None and found.withdrawn and not self.exports.callers(service)
 
     def _to_relay(self, service: str, providers: Mapping[str, str]) -> LocalService | None:
-        """What of a service is passed on for another module."""
+        """The server of a service that is relayed for another module; ``None`` if there is none."""
         for node, uri in providers.items():
             if (origin := self._relay.origin(_relayed(service, node))) is not None:
                 return LocalService(node, uri, origin)
@@ -355,7 +355,7 @@ class Services(Part):
         session.proxies.hold(action.node, f"service {action.service}", lambda proxy: self._expose(shown, proxy))
 
     def _expose(self, shown: ShownService, proxy: SlaveNode) -> None:
-        """The proxy is there: register the service, unless it is gone again."""
+        """Register a service at its proxy, which exists now; do nothing if the service was withdrawn meanwhile."""
         if self._shown.get((shown.peer, shown.service)) is not shown or shown.endpoint is not None:
             return
         shown.proxy = proxy
@@ -373,7 +373,7 @@ class Services(Part):
     def _register(self, shown: ShownService, proxy: SlaveNode) -> None:
         providers = self._core.state().services.get(shown.service, {})
         if any(node != proxy.name for node in providers):
-            return  # another node came first: the scan hides this one, or did so already
+            return  # another node was first: the scan hides this service, or did so already
         code, status, _ = self._core.call("registerService", proxy.name, shown.service, proxy.service_uri, proxy.uri)
         if code != 1:
             _log.error("! the local core does not take %s of %s: %s", shown.service, proxy.name, status)
@@ -394,7 +394,7 @@ class Services(Part):
             session.proxies.release(action.node, f"service {action.service}")
 
     def _call(self, shown: ShownService, call: ServiceCall) -> None:
-        """A client's request; the hot path."""
+        """Make a client's call, or have it wait until the service is open; the hot path."""
         if shown.caller is not None:
             shown.caller.call(call)
             return
@@ -412,7 +412,7 @@ class Services(Part):
         return await answer
 
     def _want(self, shown: ShownService) -> None:
-        """Open a service; if its peer has no link at this moment, its next link or its end will go on from here."""
+        """Open a service, unless its peer has no link now: then the next ``link_up``, or ``gone``, ends the wait."""
         remote = self.imports.get(shown.peer, shown.service)
         if remote is None or not remote.shown:
             self._fail_waiting(shown, f"service [{shown.service}] of {shown.peer_name} has just gone")
@@ -461,7 +461,7 @@ class Services(Part):
             call.fail(text)
 
     def _mismatched(self, shown: ShownService, fields: Mapping[str, str], text: str) -> None:
-        """A client was refused, here and at once; said on both sides."""
+        """Report a client that was refused for its MD5 sum, here and at the peer."""
         caller_id = printable(fields.get("callerid", ""))
         shown.mismatch = text
         shown.stats.calls += 1
@@ -478,7 +478,7 @@ class Services(Part):
 
 
 def _relayed(service: str, node: str) -> tuple[str, str]:
-    """A service's place among what is relayed: a topic may have its name."""
+    """The key of a service in ``Relay``, which also holds topics: a topic may have the same name."""
     return f"service {service}", node
 
 

@@ -1,4 +1,4 @@
-"""Our services, called by peers: a pool of connections to each server, and the servers' lives."""
+"""Serves services of this module to peers: a pool of connections to each server, and checks that servers live."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ if TYPE_CHECKING:
 
 _MD5_LENGTH: Final = 32
 _LOOK_SHARE: Final = 50
-"""A look at the servers' ports takes at most one of so many parts of a processor."""
+"""The checks of the servers' ports take at most one in this many seconds of processor time."""
 
 
 class Serving:
-    """Carries out what the outbound plan decides.
+    """Carries out the actions of the outbound plan.
 
     Args:
         core: The local core.
-        exports: The plan; it is told what servers say.
-        sessions: The peers.
-        budgets: What their calls may hold, likewise.
-        act: Carries out what the plan makes of that.
+        exports: The outbound plan; it gets the servers' answers.
+        sessions: The peers' sessions.
+        budgets: The budgets of the links, by peer number.
+        act: Carries out the actions that the plan returns for a server's answer.
     """
 
     def __init__(
@@ -68,11 +68,11 @@ class Serving:
         self._tasks: set[asyncio.Task[None]] = set()
 
     def start(self) -> None:
-        """Look after the servers from now on."""
+        """Begin to check that servers live."""
         self._spawn(self._look_after(), "servers' liveness")
 
     async def close(self) -> None:
-        """End every call, and every connection to a server."""
+        """End all calls and all connections to servers."""
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -101,13 +101,16 @@ class Serving:
                     pool.close("its server has gone")
 
     def lane_lost(self, peer: int) -> None:
-        """The bulk lane's connection to a peer is gone."""
+        """Report the calls whose replies may be lost: the bulk lane's connection to a peer is gone."""
         for (owner, _), server in list(self._servers.items()):
             if owner == peer:
                 server.lane_lost()
 
     def close_idle(self, before: float) -> None:
-        """Close the connections that were not used since ``before`` (``loop.time()``)."""
+        """Close the connections to servers that were not used since ``before`` (``loop.time()``).
+
+        The counts of services that have left the local graph are dropped too.
+        """
         for service, pool in list(self._pools.items()):
             pool.close_idle(before)
             if pool.unused and not self._exports.callers(service):
@@ -160,7 +163,7 @@ class Serving:
         session.handlers[action.requests] = server
 
     async def _look_after(self) -> None:
-        """Notice servers that were killed: a node with a service that does not listen any more is suspected."""
+        """Find killed servers: a node with an offered service whose port has no listener is suspected."""
         while True:
             servers = dict(self._exports.offered)
             cost = 0.0
@@ -173,17 +176,23 @@ class Serving:
 
 
 def _listening() -> tuple[set[int] | None, frozenset[str], float]:
-    """The ports with a listener, this machine's addresses, and the processor's seconds; for a thread."""
+    """Returns the listening ports, this machine's addresses, and the processor seconds that it took; for a thread.
+
+    The ports are ``None`` if the kernel cannot be asked.
+    """
     began = time.thread_time()
     try:
         ports, here = listening_ports(), frozenset(local_addresses())
-    except OSError:  # no file descriptor is left to ask the kernel: nothing is known this time
+    except OSError:  # no file descriptor is left to ask the kernel; the next check may succeed
         ports, here = None, frozenset()
     return ports, here, time.thread_time() - began
 
 
 def _is_deaf(server: LocalService, ports: set[int] | None, here: Collection[str]) -> bool:
-    """Whether a server of this machine does not listen; of others nothing is known."""
+    """Whether a server on this machine does not listen.
+
+    ``False`` for servers on other machines, and when the ports are unknown.
+    """
     try:
         host, port = parse_service_uri(server.uri)
     except ConfigError:

@@ -1,1 +1,1 @@
-"""TODO room."""
+"""Carries out the plans of ``bridge.topics``: publications, subscriptions, routes and reports."""

@@ -1,4 +1,4 @@
-"""The publishers of a topic in the local graph, each with its type: what the exports are told."""
+"""The publishers of a topic in the local graph, each with its own type, as input of the exports."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 
 class LocalSources:
-    """The core's publishers, each with the type that it said itself.
+    """The core's publishers, each with the type that it registered itself.
 
-    The master keeps one type a topic, the last that anybody said; peers need each publisher's own.
+    The master keeps one type for each topic, the last one registered; peers need the type of each publisher.
 
     Args:
         core: The local core.
-        relay: What of the proxies here is passed on for other modules.
-        flows: Whether the agent is connected to a source: that one can be reached, whatever the core found.
+        relay: Knows which proxies are offered to other modules.
+        flows: Whether the agent is connected to a source; such a source counts as reachable, whatever the core found.
     """
 
     def __init__(self, core: Core, relay: Relay, flows: Callable[[Source], bool] = lambda _: False) -> None:
@@ -37,7 +37,7 @@ class LocalSources:
         self._types: dict[Source, str] = {}
 
     def changed(self, change: GraphChange) -> None:
-        """Hear of a change in the local graph."""
+        """Remembers the type of a publisher that registers; forgets it when the publisher leaves."""
         if change.kind is RegistrationKind.PUBLISHER:
             source = Source(change.name, change.node)
             if not change.added:
@@ -46,7 +46,7 @@ class LocalSources:
                 self._types[source] = change.type
 
     def of(self, topic: str) -> dict[str, LocalSource]:
-        """This module's own publishers of a topic, by node, but for those that nothing can connect to."""
+        """This module's own publishers of a topic, by node, without those that cannot be reached."""
         unreachable = self._core.unreachable()
         nodes = {
             node: uri
@@ -57,7 +57,7 @@ class LocalSources:
         return {node: LocalSource(self._type(topic, node, said), uri) for node, uri in nodes.items()}
 
     def relayed(self, topic: str) -> dict[str, LocalSource]:
-        """Proxies of a topic that are offered on, with their origin; empty unless this agent is a relay."""
+        """The proxies of a topic that this agent relays, by node, with their origin; empty if it is no relay."""
         if not self._relay.enabled:
             return {}
         said = self._core.type_of(topic)

@@ -1,4 +1,4 @@
-"""Drives the exports: one subscription to each local publisher that some peer wants."""
+"""Carries out the export plan: one subscription to each local publisher that a peer wants."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ class LocalSubscriptions:
     """Subscriptions to local publishers, as the agent's own node.
 
     Args:
-        core: The local core; the agent's subscriptions are registered there, so that the stock tools show them.
+        core: The local core; the agent's subscriptions are registered there, so that ROS tools show them.
         node: The agent's own node.
         on_described: Called with a source and its publisher's header.
         on_lost: Called with a source and a reason when its publisher is no longer connected.
-        on_given_up: Called with a source and a peer that is away when what it misses cannot even be counted any more.
-        on_let_go: Called with (peer that is away, source) of which messages are not kept any more, only counted.
-        on_missed: Called with a source, a peer, the number of messages that it has missed, and why.
-        on_oversized: Called with a source and its flow when a message was left out that is too long.
-        on_malformed: Called with a source and a text when its publisher has sent what cannot be; ``on_lost`` follows.
+        on_given_up: Called with a source and an absent peer when its missed messages cannot be counted any more.
+        on_let_go: Called with each (absent peer, source) whose messages are no longer kept, only counted.
+        on_missed: Called with a source, a peer, the number of messages that it has missed, and the reason.
+        on_oversized: Called with a source and its flow when a message that is too long was left out.
+        on_malformed: Called with a source and a text when its publisher breaks TCPROS; ``on_lost`` follows.
     """
 
     def __init__(
@@ -72,28 +72,28 @@ class LocalSubscriptions:
         self._flows: dict[Source, ExportFlow] = {}
         self._senders: dict[tuple[int, int], RouteSender] = {}
         self._parked: ResumeTable[tuple[int, Source]] = ResumeTable()
-        # What is kept goes when its outage has lasted for too long.
+        # Kept messages are dropped when their outage is over.
         self._timer = MachineTimer(self._parked.next_timer, lambda now: self._give_up(self._parked.expire(now)))
         self._on_given_up = on_given_up
         self._on_let_go = on_let_go
         self._on_missed = on_missed
         self._heirs: set[int] = set()
-        """Peers whose modules had another run before, and which may still ask for what that has missed."""
+        """Peers that follow an earlier run of their module, and may still ask for what that run has missed."""
         self.losses = LossRecords()
-        """What peers have missed of reliable sources whose routes have ended."""
+        """How many messages peers have missed of reliable sources whose routes have ended."""
 
     @property
     def flows(self) -> Mapping[Source, ExportFlow]:
-        """What flows, for snapshots."""
+        """The flow of each connected source, for snapshots."""
         return self._flows
 
     @property
     def connections(self) -> Iterable[PublisherConnection]:
-        """To the local publishers."""
+        """The connections to local publishers."""
         return self._connections.values()
 
     def connect(self, action: Connect) -> None:
-        """Subscribe to one publisher; its answer comes by ``on_described`` or ``on_lost``."""
+        """Subscribe to one publisher; ``on_described`` or ``on_lost`` reports the outcome."""
         source = action.source
         flow = self._flows[source] = ExportFlow()
         if sum(s.topic == source.topic for s in self._flows) == 1:
@@ -115,14 +115,18 @@ class LocalSubscriptions:
         connection.start()
 
     def disconnect(self, source: Source) -> None:
-        """Leave one publisher."""
+        """Disconnect one publisher, and drop its routes."""
         connection = self._connections.pop(source, None)
         if connection is not None:
             connection.close()
         self._drop(source)
 
     def add_route(self, action: AddRoute, link: DataLink) -> None:
-        """Send a source to one more peer, or go on where its last link ended."""
+        """Send a source to one more peer, or resume its suspended route.
+
+        Raises:
+            RemoteProtocolError: The peer resumes after a message that was never sent.
+        """
         flow = self._flows[action.source]
         route_sender = flow.by_peer.get(action.peer)
         self._claim(action.peer, action.source)
@@ -134,7 +138,7 @@ class LocalSubscriptions:
             try:
                 route_sender.resume(link, action.route, action.after)
             except RemoteProtocolError:
-                flow.remove(action.peer)  # the link is closed for it; the next one begins a numbering of its own
+                flow.remove(action.peer)  # the caller closes the link; the next one gets a new numbering
                 raise
             if missed := route_sender.missed():
                 self._on_missed(action.source, action.peer, missed, _TOO_LONG)
@@ -144,7 +148,7 @@ class LocalSubscriptions:
         self._senders[action.peer, action.route] = route_sender
 
     def suspend_route(self, action: SuspendRoute) -> None:
-        """Keep a source's messages for a peer whose link is gone."""
+        """Keep a reliable source's messages for a peer whose link is gone; does nothing for best effort."""
         flow = self._flows.get(action.source)
         if flow is not None:
             route_sender = flow.by_peer.get(action.peer)
@@ -157,11 +161,11 @@ class LocalSubscriptions:
                 self._timer.arm()
 
     def _keeper(self, key: tuple[int, Source]) -> Callable[[bytes, int], object]:
-        """What takes the messages of a source for a peer that is away."""
+        """Returns the function that keeps a source's messages for an absent peer."""
         return lambda payload, stamp: self._give_up(self._parked.offer(key, payload, stamp))
 
     def inherit(self, old: int, new: int) -> None:
-        """A module has another run: what the old one missed until now is told to the new one if it asks."""
+        """Hand on the losses and kept messages of a module's old run to its new run, which may ask for the count."""
         for source, flow in self._flows.items():
             route_sender = flow.inherit(old, new)
             if isinstance(route_sender, ReliableRouteSender):
@@ -171,32 +175,32 @@ class LocalSubscriptions:
         self._heirs.add(new)
 
     def unclaimed(self, peer: int) -> None:
-        """A peer has not asked for what it, or the run before it, has missed: it does not want that."""
+        """Settle the losses that a peer did not ask for within its claim deadline."""
         self._heirs.discard(peer)
         self.losses.unclaimed(peer)
 
     def forget(self, peer: int) -> None:
-        """A peer will not come back."""
+        """Forget the losses of a peer that will not come back."""
         self._heirs.discard(peer)
         self.losses.forget(peer)
 
     def remove_route(self, action: RemoveRoute) -> None:
-        """Send a source to a peer no longer."""
+        """End a source's route to a peer, and record what the peer misses."""
         self._claim(action.peer, action.source)
         self._end(action.source, action.peer, wished=action.wished, at_least=not action.over)
 
     def following(self, source: Source, peer: int, after: int) -> int | None:
-        """The sequence of the next message of a suspended route; see ``bridge.data.losses.Kept``."""
+        """The sequence of the next message of a suspended route; see ``bridge.data.losses.KeptMessages``."""
         flow = self._flows.get(source)
         route_sender = flow.by_peer.get(peer) if flow is not None else None
         if not isinstance(route_sender, ReliableRouteSender):
             return None
         waiting = route_sender.sender.following
-        # What is kept may have come: what the peer has is not sent again.
+        # The peer may have kept messages whose acknowledgement was lost; these are not sent again.
         return waiting if is_later(waiting, after) else serial_add(after, 1)
 
     def settle(self, source: Source, peer: int, epoch: int, after: int) -> Missed | None:
-        """A peer asks for a source anew; see ``bridge.data.losses.Kept``."""
+        """Account for a peer's losses when it opens a source anew; see ``bridge.data.losses.KeptMessages``."""
         self._claim(peer, source)
         self._end(source, peer)
         missed = self.losses.settle(source, peer, epoch, after, inherited=peer in self._heirs)
@@ -205,7 +209,7 @@ class LocalSubscriptions:
         return missed
 
     def lost(self, source: Source, peer: int) -> int:
-        """Messages that a peer has missed of a reliable source, as far as is known."""
+        """The number of messages of a reliable source that a peer has missed, as far as it is known."""
         flow = self._flows.get(source)
         route_sender = flow.by_peer.get(peer) if flow is not None else None
         return self.losses.count(source, peer) + (
@@ -213,7 +217,7 @@ class LocalSubscriptions:
         )
 
     def _end(self, source: Source, peer: int, *, wished: bool = False, at_least: bool = False) -> None:
-        """Let go of the way to a peer, if there is one, and write down what the peer misses."""
+        """Removes a source's sender to a peer, if there is one, and records what the peer misses."""
         flow = self._flows.get(source)
         route_sender = flow.by_peer.get(peer) if flow is not None else None
         if flow is None or route_sender is None:
@@ -228,7 +232,7 @@ class LocalSubscriptions:
         self._timer.arm()
 
     def _give_up(self, keys: list[tuple[int, Source]]) -> None:
-        """What was kept for peers that are away has gone: from now on it is only counted."""
+        """Reports that messages are no longer kept for absent peers, and ends routes that are not even counted."""
         if keys:
             self._on_let_go(keys)
         for peer, source in self._parked.forget():
@@ -236,11 +240,11 @@ class LocalSubscriptions:
             self._on_given_up(source, peer)
 
     def sender(self, peer: int, route: int) -> RouteSender | None:
-        """One peer's route."""
+        """The sender of a peer's route; ``None`` if the route is not open."""
         return self._senders.get((peer, route))
 
     def lane_lost(self, peer: int) -> None:
-        """The connection of a peer's bulk lane is gone."""
+        """Report the loss of a peer's bulk lane to its routes."""
         for (owner, _), route_sender in list(self._senders.items()):
             if owner == peer:
                 route_sender.lane_lost()
@@ -250,7 +254,7 @@ class LocalSubscriptions:
             del self._senders[peer, route_sender.route]
 
     def close(self) -> None:
-        """Leave all publishers."""
+        """Disconnect all publishers."""
         for source in list(self._connections):
             self.disconnect(source)
         self._timer.close()
@@ -274,7 +278,7 @@ class LocalSubscriptions:
         if self._connections.get(source) is not connection:
             return
         self._connections.pop(source).close()
-        short = DESCRIPTORS.short  # told for the process; and the node may be well
+        short = DESCRIPTORS.short  # reported once for the process; the node itself may be well
         _log.log(logging.DEBUG if short else logging.INFO, "= %s: %s", source, reason)
         if connection.malformed:
             self._on_malformed(source, reason)

@@ -1,6 +1,6 @@
-"""What of a source does not reach its listeners, said in the log and to the agent at the other end.
+"""Reports messages that do not reach their listeners, in the log and to the agent at the other end.
 
-Reliable messages that were given up, and messages that are too long to cross.
+These are reliable messages that were given up, and messages that are too long to cross.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ if TYPE_CHECKING:
     from rmpa.core.counters import Counters, RefusalLog
 
 OVERSIZED: Final = "message.oversized"
-"""The news that a publisher sends messages that are too long."""
+"""The notification that a publisher sends messages that are too long."""
 _NAMED: Final = 3
-"""Sources of several that a line of the log names."""
+"""Sources that one line of the log names; further ones are only counted."""
 
 
 class LossReports:
-    """Both ends of it, for all peers.
+    """The reports of losses, sent and received, for all peers.
 
     Args:
         exports: Finds the peers that a source goes to.
         sessions: The peers.
-        topics: Their topics in the local graph, by the numbers of their sessions.
-        absent: Those that were given up.
-        rpc: Brings news to the peers, and from them.
-        counters: ``message.given_up``, ``route.given_up``.
-        refusals: Says and counts ``route.missed``, ``message.oversized`` and ``message.oversized_there``.
+        topics: The peers' topics in the local graph, by the numbers of their sessions.
+        absent: The peers whose session has ended.
+        rpc: Sends and receives notifications.
+        counters: Counts ``message.given_up`` and ``route.given_up``.
+        refusals: Logs and counts ``route.missed``, ``message.oversized`` and ``message.oversized_there``.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class LossReports:
         rpc.on_notification(OVERSIZED, self._oversized_there)
 
     def away(self, peer: int) -> tuple[str, float]:
-        """A peer that is away: its name, and for how many seconds it has been."""
+        """The name of an absent peer, and for how many seconds it has been away."""
         now = asyncio.get_running_loop().time()
         if (session := self._sessions.get(peer)) is not None:
             return session.link.name, now - session.away_since
@@ -74,11 +74,11 @@ class LossReports:
         return "a peer", 0.0
 
     def let_go(self, keys: list[tuple[int, Source]], lost: Callable[[Source, int], int]) -> None:
-        """Messages are not kept any more for peers that are away, only counted.
+        """Report that messages are no longer kept for absent peers, only counted.
 
         Args:
-            keys: Each peer with a source.
-            lost: Says how many messages of a source a peer misses.
+            keys: Each (peer, source) concerned.
+            lost: ``(source, peer)``: returns how many messages of a source a peer misses.
         """
         for peer in dict.fromkeys(peer for peer, _ in keys):
             sources = [source for one, source in keys if one == peer]
@@ -96,21 +96,21 @@ class LossReports:
             self._say("route.given_up", name, text)
 
     def missed(self, source: Source, peer: int, count: int, why: str) -> None:
-        """It is known for good how many messages of a reliable source a peer has missed."""
+        """Report the final number of messages of a reliable source that a peer has missed."""
         session = self._sessions.get(peer)
         name = session.link.name if session is not None else "a peer"
         self._counters.add("message.given_up", count)
         self._say("route.missed", f"{name} {source}", f"{source}: {name} has missed {count} messages: {why}")
 
     def uncounted(self, source: Source) -> None:
-        """Too many routes are counted for peers that are away."""
+        """Report a route whose losses are not counted, because too many routes of absent peers are."""
         text = (
             f"what peers that are away miss is counted for {mesh_limits.RESUMES_COUNTED_MAX} routes, and no more for"
         )
         self._say("route.uncounted", str(source), f"{text} {source}")
 
     def oversized(self, source: Source, flow: ExportFlow) -> None:
-        """A local publisher sends messages that are too long: say it here, and to those that listen to it."""
+        """Report a message that is too long, in the log and to the peers to which its source flows."""
         bound = ros_limits.TCPROS_MESSAGE_MAX
         text = f"{source}: a message of {flow.oversized_bytes} bytes is left out, at most {bound} cross"
         self._say("message.oversized", str(source), f"{text}; others do: send it in parts, or compressed")
@@ -118,14 +118,18 @@ class LossReports:
             self.tell_oversized(source, flow, peer)
 
     def tell_oversized(self, source: Source, flow: ExportFlow, peer: int) -> None:
-        """Say to one of them what was left out until now, if anything was."""
+        """Report to one peer how many messages of a source were left out until now, if any."""
         session, offer = self._sessions.get(peer), self._exports.offer(peer, source)
         if flow.oversized and session is not None and session.linked and offer is not None:
             told = {"topic": offer.topic, "node": offer.node, "count": flow.oversized, "size": flow.oversized_bytes}
             self._rpc.notify(session, OVERSIZED, told)
 
     def _oversized_there(self, session: PeerSession, args: dict[str, Any]) -> None:
-        """A peer has left out messages of its publisher."""
+        """Takes a peer's report of messages that it left out.
+
+        Raises:
+            RemoteProtocolError: The report names no source, or no numbers above 0.
+        """
         names = (args.get("topic"), args.get("node"))
         numbers = (args.get("count"), args.get("size"))
         match names, numbers:

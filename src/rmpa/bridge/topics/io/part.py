@@ -1,7 +1,6 @@
-"""Topics across the mesh: what this module publishes goes to peers, and what they publish stands here.
+"""The part of the bridge for topics: local sources are sent to peers, and sources of peers are published here.
 
-The two plans are pure (``topics.imports``, ``topics.exports``); this part of the bridge carries them out. A message
-takes this way::
+The two plans are pure (``topics.imports``, ``topics.exports``); this part carries them out. The path of a message::
 
     publisher → ExportFlow (LocalSubscriptions) → RouteSender ⇢ link
          link ⇢ DataReceiver → ImportFlow (PeerTopics) → Publication → subscribers
@@ -68,18 +67,18 @@ _log = logging.getLogger(__name__)
 
 
 class Topics(Part):
-    """Both directions, for all peers.
+    """The topics of all peers, in both directions.
 
     Args:
         core: The local core.
         node: The agent's own node, which subscribes to what peers want.
         sessions: The peers.
-        rpc: Brings news to the peers, and from them.
-        relay: Offers what comes from one peer to others.
-        policy: What may cross.
-        contracts: What the topics of this module need.
-        names: How names read at the peers, and theirs here.
-        limit_settings: How much of one peer is taken, and how much is offered.
+        rpc: Sends and receives notifications.
+        relay: Offers the sources of one peer to others.
+        policy: Decides which sources may cross.
+        contracts: The contracts of this module's topics.
+        names: Translates names between this module and its peers.
+        limit_settings: Bounds what is taken from one peer, and what is offered.
         rng: Uniform numbers in [0, 1) for back-off jitter.
         counters: Counts what happens, by name.
     """
@@ -106,7 +105,7 @@ class Topics(Part):
         self._relay = relay
         self._counters = counters
         self.names = names
-        """How names read at the peers, and theirs here; another one after ``reload``."""
+        """Translates names between this module and its peers; replaced by ``reload``."""
         self._peers: dict[int, PeerTopics] = {}
         self.imports = Imports(policy, rng, contracts, self._position, names, limit_settings)
         """The inbound plan."""
@@ -136,7 +135,7 @@ class Topics(Part):
             advertisement=Advertise,
             apply=self._apply,
             do=self._do,
-            # Data may be right behind it, and nothing that waits belongs before it.
+            # The route's data may follow at once, and no waiting action has to precede it.
             is_urgent=lambda action: isinstance(action, act.Describe),
             on_told=self._told,
             on_idle=self._forget_mismatches,
@@ -147,23 +146,23 @@ class Topics(Part):
         self._claims_timer = MachineTimer(self._claims.next_timer, self._claims_over)
         self._mismatches = Mismatches()
         self.losses = LossReports(self.exports, sessions, self._peers, self._absent, rpc, counters, refusals)
-        """What does not reach its listeners, for snapshots."""
+        """Reports messages that do not reach their listeners."""
         self._subscribers = RemoteSubscribers(self.exports, self.imports, sessions, self._peers, refusals)
         self._local = LocalSources(core, relay, lambda source: self.exports.description(source) is not None)
         self._ticker: asyncio.TimerHandle | None = None
         self._closed = False
 
     def of(self, session: PeerSession) -> PeerTopics:
-        """The topics of a peer as they stand in the local graph."""
+        """The topics of a peer in the local graph."""
         return self._peers[session.peer]
 
     def mismatches(self, source: Source) -> tuple[str, ...]:
-        """Definitions that did not fit a source's, here or over there, ready to read; forgotten with the source."""
+        """Texts about subscribers, here or at peers, whose definition does not fit a source's."""
         return self._mismatches.texts(source)
 
     @property
     def idle(self) -> bool:
-        """Whether every change of the local graph was looked at."""
+        """Whether all changes of the local graph have been processed."""
         return self._driver.idle
 
     # --- the bridge's part -------------------------------------------------------------------------------------
@@ -183,7 +182,7 @@ class Topics(Part):
         self.outbound.close()
 
     def reload(self, settings: Settings) -> None:
-        """Other rules hold from now on; what they leave as it is goes on untouched."""
+        """Takes new settings; sources and routes that they do not change go on untouched."""
         policy, contracts = Policy(settings.policy, settings.peers, settings.time), Contracts(settings.contracts)
         self.names = Names(settings.peers)
         limit_settings, now = settings.limits, asyncio.get_running_loop().time()
@@ -192,11 +191,11 @@ class Topics(Part):
         self._look_at_all()
 
     def remembered(self, identity: Identity) -> int | None:
-        """The number under which is known what this run of a peer has missed, and what it has sent."""
+        """The number of an absent peer of this very run, under which losses in both directions are remembered."""
         return self._absent.number_of(identity)
 
     def link_up(self, session: PeerSession) -> None:
-        """Tell what this module has; what the peer has is told by the peer."""
+        """Begins the advertisement to a peer, and waits for the peer's own; suspended routes may go on."""
         peer, identity = session.peer, session.link.identity
         now = asyncio.get_running_loop().time()
         if peer in self._peers:
@@ -234,25 +233,25 @@ class Topics(Part):
         )
 
     def link_down(self, session: PeerSession) -> None:
-        """Retract what came over the link, but for what a reliable route brings back."""
+        """Suspends the peer's routes; after silence its sources stay in the local graph for ``AWAY_GRACE``."""
         peer = session.peer
         self._claims.forget(peer)
         self._claims_timer.arm()
         interrupted = self._peers[peer].link_down()
         if interrupted:
-            # What is published until the next link stands is sent to no peer, and has no number that could be missed.
+            # Best-effort messages published until the next link get no sequence: their loss cannot be counted.
             self._counters.add("route.interrupted", interrupted)
         self._subscribers.link_down(peer)
         self._driver.link_down(session)
         exports, _ = self.exports.link_away(peer)
         self._act(exports)
         if session.link.silent:
-            # Most silences end soon, by a new link: until then nothing leaves the local graph.
+            # Most silences end soon with a new link, so nothing leaves the local graph yet.
             imports, _ = self.imports.link_away(peer, briefly=True)
             self._act(imports)
 
     def grace_over(self, session: PeerSession) -> bool:
-        """Only what a reliable route needs stays and waits for the peer."""
+        """Drops the peer's sources that do not outlive their link; return whether any route waits for the peer."""
         peer = session.peer
         if not self.exports.waits_for(peer) and not self.imports.waits_for(peer):
             self._act(self.imports.detached(peer))
@@ -264,14 +263,14 @@ class Topics(Part):
         return True
 
     def outlasted(self, session: PeerSession, seconds: float) -> float | None:
-        """Give up what was kept for the contract's ``outage``."""
+        """Drops sources whose contract's ``outage`` is over; return the next outage that is longer, in seconds."""
         peer = session.peer
         self._act(self.imports.outlasted(peer, seconds))
         outages = {*self.imports.outages(peer), self.exports.outage(peer)}
         return min((outage for outage in outages if outage > seconds), default=None)
 
     def gone(self, session: PeerSession) -> None:
-        """Retract all that is left of a peer; what it misses, and what it was known by, is remembered for a while."""
+        """Retracts the rest of a peer's sources; losses in both directions are remembered in ``AbsentPeers``."""
         peer = session.peer
         topics = self._peers.pop(peer)
         self._claims.forget(peer)
@@ -281,7 +280,7 @@ class Topics(Part):
         counting = self.exports.waits_for(peer)
         for action in self.exports.link_down(peer, counting=True):
             self._act([action])
-        # Its actions are what closing the proxies does at once.
+        # The actions are not carried out: closing the proxies does the same at once.
         self._driver.free(self.imports.link_down(peer))
         self._driver.gone(session)
         self._relay.peer_gone(peer)
@@ -293,7 +292,7 @@ class Topics(Part):
             self.outbound.forget(peer)
 
     def lane_lost(self, session: PeerSession) -> None:
-        """Messages on the bulk lane may be torn, in both directions."""
+        """Aborts messages that came in part over a lost bulk lane, and lets the senders repeat or drop theirs."""
         for flow in self._peers[session.peer].flows.values():
             if flow.contract.priority is not Priority.HIGH:
                 flow.torn()
@@ -302,11 +301,11 @@ class Topics(Part):
     # --- messages ----------------------------------------------------------------------------------------------
 
     def advertised(self, session: PeerSession, payload: bytes) -> None:
-        """A peer says what it publishes."""
+        """Queues an advertisement of a peer."""
         self._driver.advertised(session, payload)
 
     def message(self, session: PeerSession, message: Message) -> bool:
-        """Take what is said of topics and their routes."""
+        """Handles the control messages about topics and their routes."""
         peer, now = session.peer, asyncio.get_running_loop().time()
         match message:
             case Advertise():
@@ -341,7 +340,7 @@ class Topics(Part):
     # --- peers that are back ------------------------------------------------------------------------------------
 
     def _told(self) -> None:
-        """Some peers that are back may have been told everything: then they claim soon what waits for them."""
+        """Starts the short claim deadline of each peer that has received the full advertisement."""
         now = asyncio.get_running_loop().time()
         for peer in self._claims.untold:
             if not self.exports.beginning(peer):
@@ -370,7 +369,7 @@ class Topics(Part):
     # --- the local graph ---------------------------------------------------------------------------------------
 
     def graph_changed(self, change: GraphChange) -> None:
-        """A node publishes or subscribes, or no longer does."""
+        """Queues the topic of a registration that came or went, to be looked at."""
         self._local.changed(change)
         if change.kind is RegistrationKind.SUBSCRIBER and self._mismatches:
             self._forget_mismatch(change.name, change.node)
@@ -387,7 +386,7 @@ class Topics(Part):
             self._act(self.imports.local_type(topic, next((one.type for one in reversed(local.values())), None)))
 
     def reconcile(self) -> None:
-        """Register again what is missing, and forget what no node listens to any more."""
+        """Registers missing publications again, and stops counting losses of topics without local subscribers."""
         self._look_at_all()
         self._absent.expire(asyncio.get_running_loop().time())
         state = self._core.state()
@@ -428,13 +427,13 @@ class Topics(Part):
         self._driver.warn("mismatch.remote", where, f"{where}: {message.text}")
 
     def _forget_mismatch(self, topic: str, subscriber: str) -> None:
-        """A local subscriber has gone, or begins again: that it did not fit before is over, here and over there."""
+        """Forgets a local subscriber's mismatch, here and at the peers: it has gone or has registered again."""
         for peer, source in list(self.imports.at(topic)):
             if self._mismatches.mended(source, subscriber):
                 self._act([act.Send(peer, Mismatch(source.topic, source.node, subscriber, ""))])
 
     def _forget_mismatches(self) -> None:
-        """Forget those of sources that are gone."""
+        """Forgets the mismatches of sources that are gone."""
         if self._mismatches:
             self._mismatches.keep(lambda source: source in self.exports.offered or self.imports.knows(source))
 
@@ -468,7 +467,7 @@ class Topics(Part):
             self.outbound.add_route(action, session.link)
             self.losses.tell_oversized(action.source, self.outbound.flows[action.source], action.peer)
         except RemoteProtocolError as error:
-            # Here, for what waits to be done has other causes. The next link begins a new numbering.
+            # Caught here: the caller may be handling another peer's event. The next link gets a new numbering.
             self._driver.refuse(session, error)
             if session.linked:
                 self._act(self.exports.closed(action.peer, CloseRoute(action.route)))
@@ -490,7 +489,7 @@ class Topics(Part):
                 self._relay.gone(action.peer, action.source)
                 topics.retract(action)
             case act.Describe():
-                # This link: of the next one the same number is another source's route.
+                # Bound to this link: on the next one the same route id may belong to another source.
                 route, link = action.route, session.link
                 if self._ticker is None:
                     self._tick_later()
@@ -503,7 +502,7 @@ class Topics(Part):
         self._ticker = asyncio.get_running_loop().call_later(mesh_limits.STALE_TICK, self._tick)
 
     def _tick(self) -> None:
-        """Wake up now and then while data comes: a link that was silent is told from an agent that slept."""
+        """Wakes up regularly while routes are open, to distinguish a silent link from an agent that slept."""
         self._ticker = None
         if not self._closed and any(topics.flows for topics in self._peers.values()):
             self._tick_later()

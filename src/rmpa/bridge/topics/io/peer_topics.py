@@ -1,4 +1,4 @@
-"""The topics of one peer: their publications at the proxies, and what arrives on their routes."""
+"""The topics of one peer: their publications at the proxies, and the flows of their routes."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Published:
-    """A topic of the peer at its proxy: its local end, whose ``topic`` is its name here, and its message type."""
+    """A topic of the peer at its proxy: the publication, whose ``topic`` is the local name, and the message type."""
 
     node: SlaveNode
     publication: Publication
@@ -43,17 +43,17 @@ class _Published:
 
 
 class PeerTopics:
-    """The topics that one peer publishes, as they stand in the local graph.
+    """The topics of one peer in the local graph.
 
     Args:
         core: The local core, in which the proxies are registered as publishers.
         session: The peer: its proxies, the handlers of its routes and the time of its link.
         counters: Counts messages that reach no subscriber.
         on_demand: Called with a source and whether a local node listens to it.
-        on_mismatch: Called with a source, the caller id of a refused subscriber and the text it was told.
+        on_mismatch: Called with a source, the caller id of a refused subscriber and the text of the refusal.
         on_occurred: Called with a source and an event of its contract.
-        on_listeners: Called with a source when other nodes than before are served with it.
-        pasts: The histories of reliable sources that ``leave`` of another one returned.
+        on_listeners: Called with a source when the set of its local listeners changes.
+        pasts: The histories of reliable sources that an earlier session's ``leave`` returned.
     """
 
     def __init__(
@@ -77,16 +77,16 @@ class PeerTopics:
         self._on_listeners = on_listeners
         self._published: dict[Source, _Published] = {}
         self.flows: dict[int, ImportFlow] = {}
-        """Of each open route, by its id."""
+        """The flow of each open route, by its id."""
         self._latest: dict[Source, ImportFlow] = {}
-        """Of each source: the flow of its route, or of the one that its last link had."""
+        """The flow of each source's route: the open one, or the one that outlived its link."""
         self._watches: dict[Source, MachineTimer] = {}
-        """Of each of these: the timer of its contract."""
+        """The contract timer of each of these sources."""
         self._pasts: OrderedDict[Source, ReceptionHistory] = OrderedDict(pasts or {})
-        """Of each reliable source without a flow that had one: what its next one must know."""
+        """The history of each reliable source that had a flow and has none now, for its next flow."""
 
     def publication(self, source: Source) -> Publication | None:
-        """The local end of a source, if it is there."""
+        """The publication of a source, if it is in the local graph."""
         published = self._published.get(source)
         return published.publication if published is not None else None
 
@@ -95,7 +95,7 @@ class PeerTopics:
         return self.flows.get(route) or self._latest.get(source)
 
     def publish(self, action: Publish) -> None:
-        """Let a source appear; takes a moment."""
+        """Publish a source at its proxy, in a later turn of the loop."""
         self._session.proxies.hold(
             action.source.node,
             _key(action.source),
@@ -104,16 +104,16 @@ class PeerTopics:
         )
 
     def retract(self, action: Retract) -> None:
-        """Let a source disappear: its data stops at once, its registration a moment later."""
+        """Retract a source: its data stops at once, its registration in a later turn of the loop."""
         self._over(action.source, missed=True)
         self._session.proxies.release(action.source.node, _key(action.source))
 
     def describe(self, action: Describe, on_ack: Callable[[int], None]) -> None:
-        """Data of a source will come on a route; its subscribers learn what it is.
+        """Prepare for data on a newly opened route, and answer the waiting subscribers with its description.
 
         Args:
-            action: What is known of it.
-            on_ack: Acknowledges the messages of a reliable route.
+            action: The route, its description and its contract.
+            on_ack: ``(sequence)``: acknowledges the messages of a reliable route.
         """
         publication = self.publication(action.source)
         if publication is None:
@@ -128,7 +128,7 @@ class PeerTopics:
             flow.expect_replay(publication.latched)
 
     def position(self, source: Source) -> tuple[int, int] | None:
-        """Where a reliable source goes on that outlived its link, or that lost its route though a node listens."""
+        """Epoch and last sequence from which a reliable source's next route continues; ``None``: it begins anew."""
         flow = self._latest.get(source)
         if flow is not None:
             return flow.position
@@ -136,16 +136,16 @@ class PeerTopics:
         return past.receiver.position() if past is not None and past.receiver is not None else None
 
     def past(self, source: Source) -> ReceptionHistory | None:
-        """What is known of a reliable source without a route."""
+        """The history of a reliable source without a flow."""
         return self._pasts.get(source)
 
     def left_out(self, source: Source, count: int, size: int) -> bool:
-        """A source's agent says how many of its messages were too long; whether that is news of an open route.
+        """Take the peer's count of messages that were too long; return whether it has changed for a known flow.
 
         Args:
-            source: Which.
-            count: Messages, since that agent connected to the publisher.
-            size: The last one's bytes.
+            source: The source.
+            count: Messages since the peer's agent connected to the publisher.
+            size: The size of the last one, in bytes.
         """
         flow = self._latest.get(source)
         if flow is None or (count, size) == (flow.oversized, flow.oversized_bytes):
@@ -154,10 +154,10 @@ class PeerTopics:
         return True
 
     def unheard(self, subscribed: Callable[[str], bool]) -> None:
-        """Messages of topics without a local subscriber are not missed any more.
+        """Stop counting messages as missed for topics without local subscribers.
 
         Args:
-            subscribed: Whether a local node subscribes to a topic.
+            subscribed: ``(topic)``: whether a local node subscribes to it.
         """
         for past in self._pasts.values():
             if past.missed and not subscribed(past.topic):
@@ -166,7 +166,7 @@ class PeerTopics:
     def _flow(
         self, action: Describe, publication: Publication, on_ack: Callable[[int], None]
     ) -> tuple[ImportFlow, bool]:
-        """The flow of a route, and whether it goes on exactly where it was when its link fell."""
+        """The flow of a newly opened route, and whether it continues exactly where the last link ended."""
         source, contract = action.source, action.contract
         reliable = contract.reliability is Reliability.RELIABLE
         flow = self._latest.pop(source, None)
@@ -207,12 +207,12 @@ class PeerTopics:
 
     @staticmethod
     def _count_missed(flow: ImportFlow, action: Describe, *, missed: bool, same: bool) -> None:
-        """Count what the peer says that it has given up.
+        """Counts the messages that the peer reports as given up.
 
         Args:
-            flow: The source's.
-            action: What the peer says.
-            missed: Whether a node listened before, so that nothing may be lost unseen.
+            flow: The source's flow.
+            action: The peer's report: ``following``, ``lost`` and ``at_least``.
+            missed: Whether local nodes listened before, so that an unknown number of losses must be reported.
             same: Whether the numbering goes on.
         """
         if same:
@@ -235,11 +235,11 @@ class PeerTopics:
         flow.close()
 
     def _over(self, source: Source, *, missed: bool) -> None:
-        """No flow of a source goes on; its proxy may go with it, so the lease is not waited for.
+        """Ends a source's flow and remembers its history; lost liveliness is reported without waiting for the lease.
 
         Args:
-            source: Which.
-            missed: Whether a local node listens all the same.
+            source: The source.
+            missed: Whether a local node still listens, so that later messages are missed.
         """
         flow = self._latest.pop(source, None)
         if flow is None:
@@ -260,15 +260,16 @@ class PeerTopics:
                 self._pasts.popitem(last=False)
 
     def leave(self) -> dict[Source, ReceptionHistory]:
-        """The peer has been away for too long: what is to be known when it is back."""
+        """Return the histories of all reliable sources, for the next session of a peer that was away for too long."""
         for source, flow in self._latest.items():
             self._remember(source, flow, missed=True)
         return dict(self._pasts)
 
     def _call_back_soon(self, source: Source, publication: Publication) -> None:
-        """Subscribers were hung up on: they come again when the master names the proxy.
+        """Registers the proxy again, so that subscribers that were disconnected connect again.
 
-        rospy only then, and only if it has noticed the end by that time.
+        rospy connects only when the master names the publisher, and only if it has noticed the end by then. Hence
+        the repetition after ``limits.CALL_BACK_DELAYS``.
         """
         for delay in limits.CALL_BACK_DELAYS:
             asyncio.get_running_loop().call_later(delay, self._call_back, source, publication)
@@ -279,10 +280,10 @@ class PeerTopics:
             self._register(published)
 
     def link_down(self) -> int:
-        """The link is gone: what it brought in part is dropped, and the sources are not known to live any more.
+        """Abort messages that came in part, and start the liveliness lease of all sources: the link is gone.
 
         Returns:
-            How many best-effort routes were open: what they miss from now on cannot be counted.
+            The number of open best-effort routes, whose further losses cannot be counted.
         """
         now = asyncio.get_running_loop().time()
         for flow in self.flows.values():
@@ -291,7 +292,7 @@ class PeerTopics:
         return sum(flow.contract.reliability is not Reliability.RELIABLE for flow in self.flows.values())
 
     def detach(self, action: Detach) -> None:
-        """No data comes on a route any more, or not until its peer is back."""
+        """End a route's data; with ``keep`` its flow waits for the peer's next link."""
         flow = self.flows.pop(action.route, None)
         self._session.handlers.pop(action.route, None)
         if action.keep:
@@ -304,7 +305,7 @@ class PeerTopics:
             publication.forget_latched()
 
     def reconcile(self, publishers: Mapping[str, Mapping[str, str]]) -> int:
-        """Register again what is missing from the local graph; return how many that were."""
+        """Register publications again that are missing from the local graph; return their number."""
         missing = [
             published
             for published in yielding_to_data(list(self._published.values()))
@@ -342,10 +343,10 @@ class PeerTopics:
     def _unpublish(self, source: Source, node: SlaveNode) -> None:
         published = self._published.pop(source, None)
         if published is None:
-            return  # the node did not take it
+            return  # it was never published
         topic = published.publication.topic
         self._core.call("unregisterPublisher", node.name, topic, node.uri)
-        # rospy never leaves a publisher because the master says so: it must be hung up on.
+        # rospy does not leave a publisher when the master removes it, so its connection is closed.
         node.remove_publication(topic)
 
     def _register(self, published: _Published) -> None:
@@ -356,5 +357,5 @@ class PeerTopics:
 
 
 def _key(source: Source) -> str:
-    """What a source is called among the things of its node."""
+    """The key under which a source holds its node's proxy."""
     return f"topic {source.topic}"

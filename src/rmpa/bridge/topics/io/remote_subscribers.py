@@ -1,4 +1,4 @@
-"""Names the local subscribers to a peer, and lets a peer's subscribers be seen by publishers here.
+"""Names local subscribers to the publishing peer, and connects to local publishers for a peer's subscribers.
 
 See ``bridge.topics.audience`` for the topics that need it.
 """
@@ -31,14 +31,14 @@ _log = logging.getLogger(__name__)
 
 
 def _ignore(_: memoryview) -> None:
-    """The messages come by the bridge's own connection."""
+    """Drops a message: the bridge gets it by its own connection."""
 
 
 class _IgnoreParts:
-    """Lets large messages pass unkept."""
+    """Drops messages that come in parts."""
 
     def begin(self, size: int) -> None:
-        """One begins."""
+        """A message of ``size`` bytes begins."""
 
     def part(self, part: memoryview) -> None:
         """A part of it."""
@@ -48,14 +48,14 @@ class _IgnoreParts:
 
 
 class RemoteSubscribers:
-    """Both ends of it, for all peers.
+    """The names of listeners, sent and received, for all peers.
 
     Args:
         exports: Finds the source of a peer's route.
         imports: Finds the route of a peer's source.
         sessions: The peers.
-        topics: Their topics in the local graph, by the numbers of their sessions.
-        refusals: Says and counts ``audience.too_many``.
+        topics: The peers' topics in the local graph, by the numbers of their sessions.
+        refusals: Logs and counts ``audience.too_many``.
     """
 
     def __init__(
@@ -72,11 +72,11 @@ class RemoteSubscribers:
         self._topics = topics
         self._refusals = refusals
         self._told: dict[tuple[int, Source], tuple[int, tuple[str, ...]]] = {}
-        """What each peer was last told: the route, and the listeners."""
+        """Route id and listeners as they were last sent to each peer, by source."""
         self._changed: dict[tuple[int, Source], None] = {}
         self._soon: asyncio.Handle | None = None
         self._shown: dict[tuple[int, Source], dict[str, PublisherConnection]] = {}
-        """The connections that stand for a peer's listeners, by their names here."""
+        """The connections that stand for a peer's listeners, by the listeners' local names."""
 
     def shown(self, peer: int, source: Source) -> tuple[str, ...]:
         """The names under which a peer's listeners are connected to a local publisher."""
@@ -85,13 +85,13 @@ class RemoteSubscribers:
     # --- our listeners, to the peer that publishes ------------------------------------------------------------------
 
     def changed(self, peer: int, source: Source) -> None:
-        """A local node has begun or ceased to listen to a peer's source, or its route is open."""
+        """Send the listeners of a peer's source again soon: they have changed, or its route was opened."""
         entry = self._imports.get(peer, source)
         if entry is None or not is_watched(entry.type):
             return
         self._changed[peer, source] = None
         if self._soon is None:
-            # Behind what is being done: the last of several changes counts, and a listener's header is answered.
+            # In the next turn: several changes become one message, and a listener's header is answered first.
             self._soon = asyncio.get_running_loop().call_soon(self._tell)
 
     def _tell(self) -> None:
@@ -112,7 +112,7 @@ class RemoteSubscribers:
     # --- the peer's listeners, to our publisher ---------------------------------------------------------------------
 
     def message(self, session: PeerSession, message: Message) -> bool:
-        """A peer names the listeners of one of its routes; one that was closed meanwhile is left alone."""
+        """Takes the listeners that a peer names for a route; ignored if the route was closed meanwhile."""
         if not isinstance(message, Audience):
             return False
         source = self._exports.source(session.peer, message.route)
@@ -120,7 +120,7 @@ class RemoteSubscribers:
         if source is None or local is None or not is_watched(local.type):
             return True
         if self._exports.description(source) is None:
-            return True  # its publisher has just gone
+            return True  # its publisher is not connected
         names = {name for node in message.nodes if (name := self._name(session, node))}
         shown = self._shown.setdefault((session.peer, source), {})
         for name in shown.keys() - names:
@@ -137,7 +137,7 @@ class RemoteSubscribers:
         return True
 
     def _name(self, session: PeerSession, node: str) -> str:
-        """What a listener is here; one that a relay names for another module is what stands for that; else empty."""
+        """The local name of a peer's listener; empty for a proxy of a module that the peer does not relay."""
         whose = proxied_node(node)
         if whose is None:
             return proxy_name(session.proxies.prefix, node)
@@ -154,19 +154,19 @@ class RemoteSubscribers:
         return connection
 
     def route_over(self, peer: int, source: Source) -> None:
-        """A source goes to a peer no longer: what stood for its listeners leaves."""
+        """Close the connections for a source's listeners at a peer, since its route has ended."""
         for connection in self._shown.pop((peer, source), {}).values():
             connection.close()
 
     def link_down(self, peer: int) -> None:
-        """A link is gone: the peer's listeners leave."""
+        """Close the connections for all listeners of a peer whose link is gone."""
         for owner, source in [key for key in self._shown if key[0] == peer]:
             self.route_over(owner, source)
         for key in [key for key in self._told if key[0] == peer]:
             del self._told[key]
 
     def close(self) -> None:
-        """Leave all publishers."""
+        """Close all connections."""
         if self._soon is not None:
             self._soon.cancel()
         for peer, source in list(self._shown):

@@ -49,7 +49,7 @@ class DoctorInput:
     Args:
         environ: The shell's variables.
         settings: What an agent that is started here would have; the defaults where they cannot be read.
-        settings_checks: What reading the settings brought.
+        settings_checks: The results of reading the settings.
         agents: The snapshot of each agent of this machine by its name, or why it does not answer.
         interfaces: All network interfaces.
     """

@@ -147,7 +147,7 @@ def hear_ourselves(interfaces: Iterable[Interface], group: str, port: int) -> tu
         until = time.monotonic() + limits.DOCTOR_HEAR
         while sent and (rest := until - time.monotonic()) > 0:
             packet = receiver.wait(rest)
-            # Where two interfaces share a network, the packet comes in on the other one too.
+            # If two interfaces share a network, the packet is received on the other one too.
             if packet is not None and packet.data in sent and sent[packet.data][0].name == packet.interface:
                 interface, when = sent.pop(packet.data)
                 found[interface.name] = MulticastEcho(interface.name, after=time.monotonic() - when)

@@ -43,7 +43,7 @@ class ServiceEvidence:
         self.reload(settings)
 
     def reload(self, settings: Settings) -> None:
-        """Other settings hold from now on."""
+        """Use other settings from now on."""
         policy, names = Policy(settings.policy, settings.peers, settings.time), Names(settings.peers)
         self._rules = ServiceRules(settings.services, policy, names)
 

@@ -49,7 +49,7 @@ class TopicEvidence:
         self.reload(settings)
 
     def reload(self, settings: Settings) -> None:
-        """Other settings hold from now on."""
+        """Use other settings from now on."""
         self._policy = Policy(settings.policy, settings.peers, settings.time)
 
     def own(self, topic: str) -> dict[str, str]:

@@ -62,7 +62,7 @@ class WhyService:
         bridge.rpc.on_request(HERE, self._answer_here)
 
     def reload(self, settings: Settings) -> None:
-        """Other settings hold from now on."""
+        """Use other settings from now on."""
         self._topics.reload(settings)
         self._services.reload(settings)
 
@@ -160,7 +160,7 @@ class WhyService:
         ends = await self._both_ends(peer, topic)
         later = None
         if any(r.state in _MOVING for t in ends.here.snapshot.topics for r in t.routes if r.direction == "in"):
-            # Only a second look shows whether messages move.
+            # Only a second count shows whether messages flow.
             await asyncio.sleep(observe_limits.WHY_WINDOW)
             later = await self._both_ends(peer, topic)
         return diagnose_topic(ends, peer.guid, later, wire)
