@@ -81,14 +81,6 @@ def test_without_rules_for_it_a_peer_is_plain() -> None:
     assert not names.of("robot2").plain
 
 
-def test_the_rule_that_decided_is_named() -> None:
-    names = Names((ROBOT,)).of("robot1")
-    assert names.explain_in("/arm/x") == 'remap_in has "/arm/**" = "/{peer}/left/**"'
-    assert names.explain_in("/odom") == names.explain_out("/robot1/odom") == 'prefix = "/robot1"'
-    assert names.explain_out("/goals/robot1") == 'remap_out has "/goals/{peer}" = "/goal"'
-    assert names.explain_out("/map") == ""
-
-
 @given(NAMES)
 def test_a_prefix_leads_there_and_back(name: str) -> None:
     names = PeerNames("r", (PeerRule("r", "/{peer}"),))

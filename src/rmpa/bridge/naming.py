@@ -53,19 +53,23 @@ class PeerNames:
             wire: Its wire name.
             type_name: The message type of a topic; rules with ``types`` fit only topics of these types.
         """
-        return self._incoming(wire, type_name)[0]
+        if wire == CLOCK:
+            return wire  # nodes read the time from no other topic
+        for remap, source, target in self._in:
+            if (new := _renamed(wire, type_name, remap, source, target)) is not None:
+                return new
+        return self.prefix + wire
 
     def wire_name(self, local: str, type_name: str = "") -> str:
         """The wire name, for this peer, of a local topic or service; see ``local_name`` for the arguments."""
-        return self._outgoing(local, type_name)[0]
-
-    def explain_in(self, wire: str, type_name: str = "") -> str:
-        """The rule that ``local_name`` applies, as text; empty if the name stays the same."""
-        return self._incoming(wire, type_name)[1]
-
-    def explain_out(self, local: str, type_name: str = "") -> str:
-        """The rule that ``wire_name`` applies, as text; empty if the name stays the same."""
-        return self._outgoing(local, type_name)[1]
+        if local == CLOCK:
+            return local
+        for remap, source, target in self._out:
+            if (new := _renamed(local, type_name, remap, source, target)) is not None:
+                return new
+        if self.prefix and local.startswith(self.prefix + "/"):
+            return local[len(self.prefix) :]
+        return local
 
     def wires_of(self, local: str) -> tuple[str, ...]:
         """The wire names that may become this local name, best first; rules with ``types`` may not fit all."""
@@ -80,24 +84,6 @@ class PeerNames:
         names += [self.prefix + wire, wire]
         typed = any(remap.types for remap, _, _ in self._out)
         return tuple(n for n in dict.fromkeys(names) if typed or self.wire_name(n) == wire)
-
-    def _incoming(self, name: str, type_name: str) -> tuple[str, str]:
-        if name == CLOCK:
-            return name, ""  # nodes read the time from no other topic
-        for remap, source, target in self._in:
-            if (new := _renamed(name, type_name, remap, source, target)) is not None:
-                return new, f'remap_in has "{remap.source}" = "{remap.target}"'
-        return (self.prefix + name, f'prefix = "{self.prefix}"') if self.prefix else (name, "")
-
-    def _outgoing(self, name: str, type_name: str) -> tuple[str, str]:
-        if name == CLOCK:
-            return name, ""
-        for remap, source, target in self._out:
-            if (new := _renamed(name, type_name, remap, source, target)) is not None:
-                return new, f'remap_out has "{remap.source}" = "{remap.target}"'
-        if self.prefix and name.startswith(self.prefix + "/"):
-            return name[len(self.prefix) :], f'prefix = "{self.prefix}"'
-        return name, ""
 
 
 class Names:
