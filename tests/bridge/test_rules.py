@@ -138,7 +138,7 @@ def test_no_name_over_there_is_one_that_never_crosses() -> None:
     assert offered(exports.link_up(1, "robot1")) == [("+", "/ok")]
 
 
-def test_of_two_topics_that_would_be_one_over_there_the_first_is_offered_until_it_goes() -> None:
+def test_of_two_topics_with_one_wire_name_the_first_is_offered() -> None:
     exports = Side(ROBOT).exports()
     exports.link_up(1, "robot1")
     actions = say(exports, "/robot1/cmd", "/cmd")
@@ -193,7 +193,7 @@ def test_the_policy_for_all_can_change_too() -> None:
 
 
 @pytest.mark.parametrize("asked", [Contract(), Contract(reliability=Reliability.RELIABLE)])
-def test_a_route_whose_contract_changes_here_is_closed_so_that_its_peer_asks_again(asked: Contract) -> None:
+def test_a_route_with_a_changed_contract_is_closed_and_asked_for_again(asked: Contract) -> None:
     exports = Side().exports()
     exports.link_up(1, "base")
     say(exports, "/a", "/b")
@@ -250,7 +250,7 @@ def test_policy_types_and_contracts_go_by_the_name_here() -> None:
     ]
 
 
-def test_of_two_topics_that_would_be_one_here_the_first_is_shown_until_it_goes() -> None:
+def test_of_two_topics_with_one_local_name_the_first_is_shown() -> None:
     imports = Side(PeerRule("p", "/p", (Remap("/x", "/p/y"),))).imports()
     imports.link_up(1, "p")
     assert learn(imports, "/x", "/y") == [Publish(1, Source("/x", "/n"), TYPE, "/p/y")]
@@ -463,7 +463,7 @@ _WHAT = ("publish", "publish", "want", "far rules", "near rules", "tell", "descr
 
 @settings(max_examples=300, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(_WHAT), st.integers(0, 11)), max_size=50))
-def test_after_it_settles_exactly_what_the_last_rules_say_is_there_and_flows(steps: list[tuple[str, int]]) -> None:
+def test_after_reloads_exactly_the_last_rules_hold(steps: list[tuple[str, int]]) -> None:
     world = World()
     for what, number in steps:
         world.step(what, number)

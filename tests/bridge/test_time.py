@@ -59,7 +59,7 @@ def test_it_comes_from_the_peer_that_is_followed_alone() -> None:
     assert "[time] follow names the peer" in hidden(nobody, 1, FIRST)
 
 
-def test_a_second_source_is_refused_on_both_sides_and_takes_over_when_the_first_goes() -> None:
+def test_a_second_source_is_refused_until_the_first_goes() -> None:
     machine = imports("sim", "sim")
     advertise(machine, 1, FIRST)
     actions = advertise(machine, 1, SECOND)

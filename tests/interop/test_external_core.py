@@ -55,7 +55,7 @@ def notes(agent: Agent) -> str:
     return output
 
 
-def test_roscore_and_embedded_core_exchange_topics_and_the_roscore_is_left_clean(
+def test_roscore_and_embedded_core_exchange_topics(
     joined: Callable[..., Joined],
 ) -> None:
     a, b, _ = joined()

@@ -135,7 +135,7 @@ def test_ratio_is_of_medians_with_bounds_that_hold_it() -> None:
     assert made == ratio([2.0, 2.2, 1.8, 100.0, 2.1], [1.0, 1.1, 0.9, 1.0, 1.0])  # the same draws
 
 
-def test_the_bounds_of_a_ratio_cover_the_true_one_about_as_often_as_they_say() -> None:
+def test_the_bounds_of_a_ratio_cover_the_true_one() -> None:
     chance = random.Random(7)
     within = 0
     for _ in range(60):

@@ -61,7 +61,7 @@ def test_nodes_beyond_the_limit_are_hidden_counted_and_named() -> None:
     assert published(made.advertised(1, Advertise(added=(more,)))) == ["/late"], "its node has a place"
 
 
-def test_a_node_that_leaves_gives_its_place_to_the_one_that_waits_for_longest() -> None:
+def test_a_leaving_node_gives_its_place_to_the_longest_waiting() -> None:
     made = imports(nodes=2)
     made.advertised(1, Advertise(added=offers(range(4), topics=2)))
     assert published(made.advertised(1, Advertise(removed=(Source("/n0/t0", "/n0"),)))) == []
@@ -126,7 +126,7 @@ def test_a_peer_that_comes_back_begins_anew() -> None:
     assert (len(made.crowded(1)), made.beyond(1).hidden) == (2, 2)
 
 
-def test_a_link_that_was_away_for_a_moment_keeps_who_stands_and_who_waits() -> None:
+def test_a_short_loss_of_the_link_keeps_all_places() -> None:
     made = imports(nodes=1, topics=3)
     made.advertised(1, Advertise(added=offers(range(5))))
     made.link_away(1, briefly=True)
@@ -141,7 +141,7 @@ _events = st.lists(st.tuples(st.booleans(), st.integers(0, 6), st.integers(0, 2)
 
 
 @given(_events, st.integers(1, 4), st.integers(1, 12))
-def test_whatever_comes_and_goes_the_limits_hold_and_no_place_stays_empty(
+def test_the_limits_hold_and_no_place_stays_empty(
     events: list[tuple[bool, int, int]], nodes: int, topics: int
 ) -> None:
     made = imports(nodes=nodes, topics=topics)
@@ -176,7 +176,7 @@ def of_nodes(nodes: str, *topics: str) -> tuple[TopicOffer, ...]:
 
 
 @pytest.mark.timeout(10)
-def test_a_node_that_a_reload_both_crowds_out_and_makes_room_for_stays_whole() -> None:
+def test_a_reload_that_crowds_out_a_node_and_makes_room_keeps_it_whole() -> None:
     made = imports(nodes=10)
     made.advertised(1, Advertise(added=of_nodes("abc", "t1", "t2")))
     steps = list(islice(reload_nodes(made, 2, "/a", "/b"), 50))
@@ -204,7 +204,7 @@ def test_a_reload_that_lowers_the_limit_and_denies_leaves_no_place_empty() -> No
 
 
 @pytest.mark.timeout(10)
-def test_nodes_that_leave_while_a_reload_is_under_way_give_their_places_to_those_in_surplus() -> None:
+def test_nodes_that_leave_during_a_reload_free_their_places() -> None:
     made = imports(nodes=10)
     made.advertised(1, Advertise(added=of_nodes("abcd", "t1", "t2")))
     under_way = reload_nodes(made, 2)
@@ -225,7 +225,7 @@ _Step = tuple[bool, int, int] | tuple[int, set[int]] | int
 
 @pytest.mark.timeout(60)
 @given(st.lists(st.sampled_from(offers(range(7), 3)), unique=True), _steps)
-def test_whatever_is_reloaded_while_nodes_come_and_go_the_places_are_taken_and_the_rest_is_counted(
+def test_after_reloads_the_places_are_taken_and_the_rest_is_counted(
     first: list[TopicOffer], steps: list[_Step]
 ) -> None:
     made = imports(nodes=6)
@@ -309,7 +309,7 @@ def reload_services(made: ServiceImports, nodes: int, *denied: str) -> Iterator[
 
 
 @pytest.mark.timeout(10)
-def test_a_reload_that_denies_services_and_lowers_the_limit_leaves_no_place_empty() -> None:
+def test_a_reload_that_denies_and_lowers_the_limit_leaves_no_place_empty() -> None:
     made = services(nodes=10)
     for service in ("s1", "s2"):
         for node in "abcd":
@@ -319,7 +319,7 @@ def test_a_reload_that_denies_services_and_lowers_the_limit_leaves_no_place_empt
     assert made.crowded(1) == {}
 
 
-def test_a_place_that_becomes_free_costs_who_takes_it_and_not_all_who_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_freed_place_costs_no_pass_over_all_waiting_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
     made = services(nodes=8, count=1000)
     for number in range(200):
         made.advertised(1, provided(f"/s{number}", node=f"/n{number}"))
@@ -342,7 +342,7 @@ _services_come_or_go = st.tuples(st.booleans(), st.integers(0, 5), st.integers(0
 
 @pytest.mark.timeout(60)
 @given(st.lists(_services_come_or_go | _reloads | st.integers(1, 9), max_size=40))
-def test_whatever_is_reloaded_each_service_has_one_provider_and_no_place_stays_empty(
+def test_after_reloads_each_service_has_one_provider(
     steps: list[tuple[bool, int, int, int] | tuple[int, set[int]] | int],
 ) -> None:
     made = services(nodes=3)
@@ -376,7 +376,7 @@ def test_whatever_is_reloaded_each_service_has_one_provider_and_no_place_stays_e
             assert waits or remote.name in visible
 
 
-def test_our_own_services_beyond_the_limit_are_offered_when_there_is_room() -> None:
+def test_own_services_beyond_the_limit_are_offered_later() -> None:
     made = ServiceExports(rules(), LimitSettings(services=1))
     made.link_up(1, "far")
     add, mul = LocalService("/adder", "rosrpc://127.0.0.1:5"), LocalService("/multiplier", "rosrpc://127.0.0.1:6")
@@ -447,7 +447,7 @@ def test_places_of_a_lower_limit_are_left_by_those_that_came_last() -> None:
     assert [places.free(node) for node in ("/a", "/b", "/c", "/d")] == [True, True, True, True]
 
 
-def test_a_place_of_a_node_that_leaves_is_kept_by_the_first_one_in_surplus() -> None:
+def test_the_first_node_in_surplus_keeps_a_freed_place() -> None:
     places: NodePlaces[str] = NodePlaces(9)
     for node in ("/a", "/b", "/c", "/d"):
         places.show(node)

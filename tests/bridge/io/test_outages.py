@@ -175,7 +175,7 @@ def test_beyond_the_bytes_of_all_routes_too(monkeypatch: pytest.MonkeyPatch) -> 
     play(5, scene, outage=600.0, depth=100_000)
 
 
-def test_an_outage_is_told_when_it_ends_though_nothing_is_published_any_more() -> None:
+def test_an_outage_is_reported_without_further_messages() -> None:
     async def scene(world: World) -> None:
         speaker, listener = await begin(world)
         await outage(world, speaker, 60.0)
@@ -234,7 +234,7 @@ def test_a_receivers_agent_that_was_restarted_meanwhile_is_told(window: float, s
 
 
 @pytest.mark.parametrize("seconds", [10.0, 300.0])
-def test_where_the_senders_agent_was_restarted_it_is_said_that_nobody_knows(seconds: float) -> None:
+def test_a_restarted_sender_makes_the_loss_unknown(seconds: float) -> None:
     async def scene(world: World) -> None:
         a, b = world.sides
         speaker, _ = await begin(world)
@@ -299,7 +299,7 @@ def test_what_is_kept_waits_until_the_peer_was_told_of_its_topic() -> None:
     play(11, scene, outage=600.0, depth=100_000)
 
 
-def test_what_nobody_asks_for_after_it_was_told_goes_the_usual_time_later() -> None:
+def test_unclaimed_messages_go_after_the_usual_time() -> None:
     async def scene(world: World) -> None:
         a, _ = world.sides
         speaker, listener = await begin_at_the_end(world, 1.5 * mesh_limits.RESUME_CLAIM)
@@ -314,7 +314,7 @@ def test_what_nobody_asks_for_after_it_was_told_goes_the_usual_time_later() -> N
     play(12, scene, outage=600.0, depth=100_000)
 
 
-def test_a_peer_that_is_never_told_everything_is_not_waited_for_without_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_peer_that_never_gets_the_whole_graph_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     async def scene(world: World) -> None:
         a, _ = world.sides
         speaker, _ = await begin_at_the_end(world, 1.0)
@@ -394,7 +394,7 @@ def test_the_count_outlives_the_route() -> None:
     play(10, scene, outage=2.0)
 
 
-def test_a_publisher_that_restarts_takes_what_was_not_received_along_and_that_is_counted() -> None:
+def test_unreceived_messages_of_a_restarted_publisher_are_counted_lost() -> None:
     async def scene(world: World) -> None:
         a, b = world.sides
         speaker, listener = await begin(world)

@@ -177,7 +177,7 @@ async def a_lie(world: World) -> None:
     world.check_nothing_is_left()
 
 
-def test_a_peer_that_goes_on_where_it_never_was_loses_its_link_and_nothing_else() -> None:
+def test_a_resume_at_an_unknown_number_closes_the_link_only() -> None:
     play(0, a_lie)
 
 

@@ -137,7 +137,7 @@ def test_a_refusal_ends_the_attempt(imports: ServiceImports) -> None:
     assert (remote.state, remote.problem) == (ServiceRouteState.IDLE, "no")
 
 
-def test_a_link_that_falls_ends_calls_and_keeps_services_until_the_peer_is_gone(imports: ServiceImports) -> None:
+def test_a_lost_link_ends_calls_and_keeps_services_until_the_peer_is_gone(imports: ServiceImports) -> None:
     opened(imports)
     assert imports.link_down(1) == [EndedService(1, "/add", ROUTE, REQUESTS, "the link to base was lost")]
     assert imports.is_away(1)

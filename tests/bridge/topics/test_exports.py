@@ -80,7 +80,7 @@ def test_a_changed_type_is_offered_again_and_a_changed_address_is_not(exports: E
     ]
 
 
-def test_nothing_is_connected_before_somebody_asks_and_one_connection_serves_all(exports: Exports) -> None:
+def test_one_connection_on_demand_serves_all_subscribers(exports: Exports) -> None:
     graph(exports, {CMD: JOY})
     exports.link_up(1)
     exports.link_up(2)
@@ -317,7 +317,7 @@ def test_the_stronger_of_both_sides_words_holds_and_both_are_told() -> None:
     assert exports.description(CMD) == ABOUT
 
 
-def test_each_peer_has_the_contract_that_it_asked_for_and_each_reliable_route_a_numbering_of_its_own(
+def test_each_route_has_its_peers_contract_and_a_numbering_of_its_own(
     exports: Exports,
 ) -> None:
     graph(exports, {CMD: JOY})
@@ -332,7 +332,7 @@ def test_each_peer_has_the_contract_that_it_asked_for_and_each_reliable_route_a_
     ]
 
 
-def test_a_reliable_route_outlives_its_link_and_goes_on_where_the_peer_says(flowing: Exports) -> None:
+def test_a_reliable_route_outlives_its_link_and_resumes(flowing: Exports) -> None:
     assert flowing.link_away(1) == ([SuspendRoute(CMD, 1)], True)
     assert flowing.waits_for(1)
     assert flowing.flowing(CMD) == ()
@@ -385,7 +385,7 @@ def test_a_suspended_route_that_nobody_asks_for_is_given_up(flowing: Exports, ho
     assert flowing.link_down(1) == []
 
 
-def test_what_the_peer_asked_for_again_is_not_unclaimed_and_other_peers_stay(flowing: Exports) -> None:
+def test_what_the_peer_asked_for_again_is_claimed(flowing: Exports) -> None:
     flowing.link_up(2)
     flowing.opened(2, SURE)
     for peer in (1, 2):

@@ -131,7 +131,7 @@ def test_a_full_advertisement_removes_what_it_does_not_name(imports: Imports) ->
     assert imports.advertised(1, Advertise(added=(OFFER,), full=True)) == [Retract(1, Source("/odom", "/base"))]
 
 
-def test_a_link_that_falls_retracts_all_that_came_over_it_and_nothing_else(imports: Imports) -> None:
+def test_a_lost_link_retracts_only_its_own_topics(imports: Imports) -> None:
     imports.link_up(2)
     imports.advertised(1, Advertise(added=(OFFER,)))
     imports.advertised(2, Advertise(added=(OFFER,)))
@@ -152,7 +152,7 @@ def test_a_changed_type_is_retracted_and_published_anew(imports: Imports) -> Non
     ]
 
 
-def test_another_type_than_the_local_one_is_refused_loudly_on_both_sides_until_it_goes(imports: Imports) -> None:
+def test_another_type_than_the_local_one_is_refused_at_both_ends(imports: Imports) -> None:
     imports.local_type("/cmd", "std_msgs/String")
     warn, told = imports.advertised(1, Advertise(added=(OFFER,)))
     assert isinstance(warn, Warn)
@@ -168,7 +168,7 @@ def test_another_type_than_the_local_one_is_refused_loudly_on_both_sides_until_i
     assert [type(action) for action in loud] == [Warn, Send]
 
 
-def test_a_publisher_that_sends_another_type_than_offered_is_not_described(imports: Imports) -> None:
+def test_a_publisher_with_another_type_than_offered_is_not_described(imports: Imports) -> None:
     imports.advertised(1, Advertise(added=(OFFER,)))
     imports.demand(1, CMD, 0.0, wanted=True)
     odd = Description("a/B", "5a9ea5f83505693b71e785041e67a8bb", "", False)

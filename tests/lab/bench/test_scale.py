@@ -81,7 +81,7 @@ def master() -> Iterator[tuple[str, list[tuple[str, ...]]]]:
     server.server_close()
 
 
-def test_a_crowd_registers_as_many_publishers_as_it_is_told_and_answers_for_them(
+def test_a_crowd_registers_its_publishers_and_answers_for_them(
     master: tuple[str, list[tuple[str, ...]]],
 ) -> None:
     uri, calls = master

@@ -27,7 +27,7 @@ def test_nothing_sent_is_nothing_lost() -> None:
     assert lost_between(Count(0, 5, 7), Count(1, 5, 7)) == 0.0
 
 
-def test_the_figure_is_the_median_round_and_what_stands_beside_it_is_of_that_round() -> None:
+def test_the_figures_are_those_of_the_median_round() -> None:
     score = ThroughputScore([window(30.0), window(10.0), window(20.0)])
     assert score.received == 20.0
     assert score.middle.received == 20.0

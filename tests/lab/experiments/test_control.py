@@ -69,7 +69,7 @@ def test_systems_take_turns_and_another_one_begins_each_round() -> None:
     assert pairs[0] != pairs[1]
 
 
-def test_both_systems_get_the_same_phase_in_a_round_and_another_one_in_the_next() -> None:
+def test_both_systems_get_the_same_phase_in_a_round() -> None:
     given: dict[object, set[object]] = {}
     for cell in EXPERIMENT.cells(Plan()):
         if cell.settings["mode"] == "polled":
@@ -129,7 +129,7 @@ def test_the_claims_hold_each_round_against_its_neighbour() -> None:
     assert polled.paper == pytest.approx(0.59)
 
 
-def test_relays_are_no_classic_ros_and_are_what_rmpa_must_not_be_slower_than() -> None:
+def test_relays_are_the_bound_that_rmpa_must_not_exceed() -> None:
     def measure(cell: Cell) -> Measured:
         if cell.settings.get("relays"):
             return made(0.3, 0.3, 0.8)

@@ -76,7 +76,7 @@ def test_a_flow_that_nothing_happens_to_loses_nothing() -> None:
     assert all(one.after_start is None for one in found)
 
 
-def test_what_was_due_while_a_host_was_away_is_lost_and_the_time_until_it_runs_is_told() -> None:
+def test_messages_due_while_a_host_was_away_are_lost() -> None:
     rows = run(("cmd-velocity", range(100, 320)))
     found = outcome_of("cmd-velocity", outcomes(cell("host"), measured(rows, on=300 * STEP, on_up=315 * STEP)))
     assert found.lost == 220
@@ -86,7 +86,7 @@ def test_what_was_due_while_a_host_was_away_is_lost_and_the_time_until_it_runs_i
     assert found.outage == pytest.approx(220 / RATE, abs=2 / RATE)
 
 
-def test_messages_from_before_the_failure_and_from_the_last_moment_do_not_count() -> None:
+def test_messages_before_the_failure_and_of_the_last_moment_do_not_count() -> None:
     rows = run(("cmd-pc", range(100)), ("vel-pc", range(585, 600)))
     found = outcomes(cell("host"), measured(rows))
     assert outcome_of("cmd-pc", found).lost == 0

@@ -64,7 +64,7 @@ def test_no_size_asks_more_of_the_link_than_it_carries() -> None:
         assert 8 * size * rate <= 0.7 * 100e6
 
 
-def test_only_batches_of_a_thousand_are_cut_short_and_to_a_hundred_at_the_least() -> None:
+def test_only_batches_of_a_thousand_are_cut_short() -> None:
     assert {count for _, count in steps(FULL, "100mbit", 100).values()} == {100}
     long = {size: count for size, (_, count) in steps(FULL, "100mbit", 1000).items()}
     assert long[KB] == 1000

@@ -81,7 +81,7 @@ def test_too_few_messages_say_nothing_of_the_width() -> None:
     assert claim.reached is None
 
 
-def test_relays_are_no_classic_ros_and_are_what_rmpa_must_not_be_slower_than() -> None:
+def test_relays_are_the_bound_that_rmpa_must_not_exceed() -> None:
     def measure(cell: Cell) -> Measured:
         if cell.settings.get("relays"):
             return made(LADDER, lambda _rate, _number: 400)

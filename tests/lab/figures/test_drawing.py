@@ -123,7 +123,7 @@ def test_panels_that_share_an_axis_have_room_for_the_values_of_all() -> None:
         assert high >= 2.2
 
 
-def test_values_that_would_flatten_the_others_are_told_of_in_place_of_shown() -> None:
+def test_values_that_would_flatten_the_others_are_named_only() -> None:
     values = [100.0 + i % 10 / 10 for i in range(200)] + [900.0, 950.0, 3.0]
     (drawn,) = _drawn(Panel("", "", "ms", (Series("a", [*range(203)], values),), distribution=True))
     low, high = drawn.axes.get_ylim()
@@ -193,7 +193,7 @@ def test_panels_that_say_different_things_have_legends_of_their_own(tmp_path: Pa
     assert [_said(legend) for legend in together.legends] == [["a", "b"]]
 
 
-def test_a_line_through_points_with_their_label_is_told_of_once_as_points(tmp_path: Path) -> None:
+def test_a_line_through_labelled_points_has_one_legend_entry(tmp_path: Path) -> None:
     points, fit = Series("a", UP, UP, "points", "rmpa"), Series("a", [1, 8], [1, 8], "line", "rmpa")
     other = Series("b", UP, UP, "line", "classic")
     with _kept_canvas() as canvases:

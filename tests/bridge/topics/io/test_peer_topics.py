@@ -147,7 +147,7 @@ def test_a_source_appears_flows_and_disappears() -> None:
     play(scene)
 
 
-def test_what_is_described_before_its_proxy_is_there_or_after_it_went_is_left_alone() -> None:
+def test_a_description_without_a_proxy_has_no_effect() -> None:
     async def scene(proxied: Proxied) -> None:
         about = Description("a/B", MD5, "", False)
         proxied.topics.describe(Describe(1, CMD, 1, about, Contract()), proxied.acks.append)
@@ -156,7 +156,7 @@ def test_what_is_described_before_its_proxy_is_there_or_after_it_went_is_left_al
     play(scene)
 
 
-def test_the_contract_bounds_what_waits_for_a_subscriber_and_says_what_is_kept() -> None:
+def test_the_contract_bounds_the_queue_and_the_latched_messages() -> None:
     async def scene(proxied: Proxied) -> None:
         publication = await proxied.publish()
         proxied.describe(Contract(durability=Durability.TRANSIENT_LOCAL, depth=2), latching=True)
@@ -168,7 +168,7 @@ def test_the_contract_bounds_what_waits_for_a_subscriber_and_says_what_is_kept()
     play(scene)
 
 
-def test_hung_up_on_in_the_middle_the_proxy_is_named_twice_and_not_at_once() -> None:
+def test_subscribers_cut_off_in_a_message_are_called_back_later() -> None:
     async def scene(proxied: Proxied) -> None:
         listener = Heard(await proxied.publish())
         flow = proxied.describe(Contract())
@@ -187,7 +187,7 @@ def test_hung_up_on_in_the_middle_the_proxy_is_named_twice_and_not_at_once() -> 
     play(scene)
 
 
-def test_another_header_hangs_up_on_the_old_subscribers_and_calls_them_back() -> None:
+def test_a_changed_header_reconnects_the_subscribers() -> None:
     async def scene(proxied: Proxied) -> None:
         publication = await proxied.publish()
         listener = Heard(publication)
@@ -281,7 +281,7 @@ def test_where_a_numbering_goes_on_a_gap_is_counted_once() -> None:
     play(scene)
 
 
-def test_a_contract_that_changed_meanwhile_makes_a_new_flow_that_loses_nothing() -> None:
+def test_a_changed_contract_makes_a_new_flow_without_loss() -> None:
     async def scene(proxied: Proxied) -> None:
         listener = Heard(await proxied.publish())
         old = proxied.describe(SURE, epoch=5)
@@ -324,7 +324,7 @@ def test_what_is_not_to_go_on_any_more_is_forgotten(how: str) -> None:
     play(scene)
 
 
-def test_a_short_silence_of_a_latched_source_brings_its_message_to_nobody_twice() -> None:
+def test_a_short_silence_repeats_no_latched_message() -> None:
     async def scene(proxied: Proxied) -> None:
         publication = await proxied.publish()
         listener = Heard(publication)
@@ -379,7 +379,7 @@ def test_while_its_peer_is_away_a_source_misses_its_deadlines() -> None:
 
 
 @pytest.mark.parametrize("silent", [False, True])
-def test_a_source_that_leaves_with_its_peer_is_lost_at_once_however_the_link_ended(silent: bool) -> None:
+def test_a_source_that_leaves_with_its_peer_is_lost_at_once(silent: bool) -> None:
     async def scene(proxied: Proxied) -> None:
         await proxied.publish()
         proxied.describe(ALIVE)
@@ -429,7 +429,7 @@ def test_a_source_whose_peer_stays_away_is_lost_when_its_lease_is_over() -> None
     play(scene)
 
 
-def test_one_that_must_say_itself_that_it_lives_is_watched_by_its_messages() -> None:
+def test_manual_liveliness_is_judged_by_messages() -> None:
     async def scene(proxied: Proxied) -> None:
         await proxied.publish()
         flow = proxied.describe(Contract(liveliness=Liveliness.MANUAL_BY_TOPIC, liveliness_lease=1.0))
