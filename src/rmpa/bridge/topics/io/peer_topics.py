@@ -170,9 +170,10 @@ class PeerTopics:
         source, contract = action.source, action.contract
         reliable = contract.reliability is Reliability.RELIABLE
         flow = self._latest.pop(source, None)
-        outlived = flow is not None and flow.contract == contract and reliable
+        outlived = flow is not None and flow.contract.same_route(contract) and reliable
         past = self._pasts.pop(source, None)
         if flow is not None and outlived:
+            flow.contract = contract
             flow.rebind(on_ack)
             flow.watch.link_up(asyncio.get_running_loop().time())
             missed = True
