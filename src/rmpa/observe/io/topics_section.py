@@ -16,6 +16,7 @@ from rmpa.bridge.topics.remote_topic import RouteState
 from rmpa.config.param_rules import CLOCK
 from rmpa.core import limits
 from rmpa.core.contract import KEYS, Contract
+from rmpa.observe.io.direct_section import DirectSection
 from rmpa.observe.snapshot import EventInfo, LatencyInfo, RouteInfo, SampleSpread, TopicInfo, UnreachableInfo
 from rmpa.ros.wire.tcpros import LENGTH
 from rmpa.runtime.event_loop import sorted_yielding, yield_to_data, yielding_to_data
@@ -70,6 +71,7 @@ class TopicsSection:
         self._core = core
         self._clocks = clocks
         self._bridge = bridge
+        self._direct = DirectSection(bridge)
         self._clock = SystemClock()
         self.reload(settings)
 
@@ -185,6 +187,7 @@ class TopicsSection:
             limit="nodes" if entry.crowded else "",
             **_events(flow.watch if flow is not None else past, now),
         )
+        info = self._direct.inbound(info, at.peer, source, self._contracts.of(entry.topic, entry.type), now)
         if flow is None:
             return info
         return msgspec.structs.replace(
@@ -206,9 +209,16 @@ class TopicsSection:
                 continue
             yield_to_data()
             yield source, None, list(self._bridge.topics.mismatches(source))
-            for peer in list(self._bridge.topics.exports.flowing(source)):
+            flowing = list(self._bridge.topics.exports.flowing(source))
+            for peer in flowing:
                 contract = self._bridge.topics.exports.contract(source, peer)
-                yield source, self._export(source, local, peer, names.get(peer, ""), contract), []
+                info = self._export(source, local, peer, names.get(peer, ""), contract)
+                yield source, self._direct.outbound(info, peer, source), []
+            for peer in self._direct.granted(source):
+                session = self._bridge.sessions.get(peer)
+                if peer not in flowing and session is not None:
+                    info = self._export(source, local, peer, session.link.name, None)
+                    yield source, self._direct.outbound(msgspec.structs.replace(info, state="idle"), peer, source), []
             for peer, away in self._bridge.topics.exports.absent(source).items():
                 if peer not in names or self._bridge.topics.exports.contract(source, peer) is None:
                     yield source, self._away(self._export(source, local, peer, "", away), peer), []

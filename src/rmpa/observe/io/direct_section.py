@@ -1,0 +1,116 @@
+"""Direct transport in the snapshot: which subscribers of a route are direct, and why others are relayed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from rmpa.bridge.direct.conditions import Condition
+from rmpa.bridge.direct.subscriber_side import DirectState, Path
+from rmpa.bridge.topics.io.direct_exporter import unmet_by_contract
+from rmpa.core.contract import Transport
+from rmpa.observe.snapshot import RouteInfo, SubscriberTransport
+
+if TYPE_CHECKING:
+    from rmpa.bridge.direct.subscriber_side import DirectRoute
+    from rmpa.bridge.io.bridge import Bridge
+    from rmpa.bridge.messages import Source
+    from rmpa.core.contract import Contract
+
+_PATHS = {Path.NONE: "", Path.RELAY: "relay", Path.DIRECT: "direct"}
+
+
+class DirectSection:
+    """Reads what the bridge knows of direct transport; changes nothing.
+
+    Args:
+        bridge: The agent's bridge.
+    """
+
+    def __init__(self, bridge: Bridge) -> None:
+        self._bridge = bridge
+
+    def inbound(self, info: RouteInfo, peer: int, source: Source, contract: Contract, now: float) -> RouteInfo:
+        """Add the transport to a route from a peer.
+
+        Args:
+            info: The route.
+            peer: The number of the peer's session.
+            source: The source, by its wire name.
+            contract: This module's for the topic.
+            now: Monotonic seconds.
+        """
+        topics = self._bridge.topics
+        session = self._bridge.sessions.get(peer)
+        publication = topics.of(session).publication(source) if session is not None else None
+        relayed = publication is not None and publication.subscribers > 0
+        routes = topics.direct_imports.routes.of(peer, source)
+        subscribers = tuple(_subscriber(name, route, now) for name, route in routes)
+        direct = any(one.transport == "direct" for one in subscribers)
+        condition, text = _condition(subscribers)
+        if relayed and not condition and contract.transport is Transport.RELAY:
+            unmet = unmet_by_contract(contract, "this module")
+            condition, text = (unmet.condition.value, unmet.text) if unmet is not None else ("", "")
+        return msgspec.structs.replace(
+            info,
+            transport=_transport(direct=direct, relayed=relayed),
+            condition=condition,
+            condition_text=text,
+            subscribers=subscribers,
+        )
+
+    def outbound(self, info: RouteInfo, peer: int, source: Source) -> RouteInfo:
+        """Add the transport to a route to a peer that is relayed at present."""
+        subscribers = self._granted(source, peer)
+        transport = _transport(direct=bool(subscribers), relayed=info.state == "open")
+        return msgspec.structs.replace(info, transport=transport, subscribers=subscribers)
+
+    def granted(self, source: Source) -> list[int]:
+        """The peers that have subscribers with a direct connection to a local source."""
+        grants = self._bridge.topics.direct_exports.grants
+        return list(dict.fromkeys(peer for peer, _, _ in grants.of(source)))
+
+    def _granted(self, source: Source, peer: int) -> tuple[SubscriberTransport, ...]:
+        grants = self._bridge.topics.direct_exports.grants
+        return tuple(
+            SubscriberTransport(node=name, transport="direct", state="granted", endpoint=str(granted.port))
+            for owner, name, granted in sorted(grants.of(source), key=lambda grant: grant[:2])
+            if owner == peer
+        )
+
+    def counts(self, peer: int) -> tuple[int, int]:
+        """The number of direct connections to a peer's publishers, and of the grants that it has here."""
+        topics = self._bridge.topics
+        there = sum(1 for key, _ in topics.direct_imports.routes.connected() if key.peer == peer)
+        return there, sum(1 for _, owner, _, _ in topics.direct_exports.grants if owner == peer)
+
+
+def _transport(*, direct: bool, relayed: bool) -> str:
+    if direct:
+        return "both" if relayed else "direct"
+    return "relay" if relayed else ""
+
+
+def _condition(subscribers: tuple[SubscriberTransport, ...]) -> tuple[str, str]:
+    """The condition by which a route's subscribers are relayed; RMPA's own tools count only if there is no other."""
+    relayed = [one for one in subscribers if one.state == "relayed"]
+    relayed.sort(key=lambda one: one.condition == Condition.MEASURES)
+    return (relayed[0].condition, relayed[0].text) if relayed else ("", "")
+
+
+def _subscriber(name: str, route: DirectRoute, now: float) -> SubscriberTransport:
+    direct = route.path is Path.DIRECT
+    unmet = route.unmet if route.state is DirectState.RELAYED else None
+    return SubscriberTransport(
+        node=name,
+        transport=_PATHS[route.path],
+        state=route.state.name.lower(),
+        since_ago=now - (route.answered_at if direct else route.since),
+        wanted=route.wanted.value,
+        endpoint=f"{route.endpoint[0]}:{route.endpoint[1]}" if direct and route.endpoint is not None else "",
+        condition=unmet.condition.value if unmet is not None else "",
+        text=unmet.text if unmet is not None else "",
+        missed=route.missed,
+        stuck=route.stuck,
+    )
