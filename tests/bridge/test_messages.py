@@ -36,14 +36,23 @@ from rmpa.bridge.messages import (
 )
 from rmpa.config import limits as config_limits
 from rmpa.core import limits as core_limits
-from rmpa.core.contract import Contract, Durability, History, Liveliness, Priority, Reliability
+from rmpa.core.contract import (
+    Contract,
+    Durability,
+    History,
+    Liveliness,
+    Priority,
+    Reliability,
+    Transport,
+    combine,
+)
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.mesh import limits as mesh_limits
 
 DEFAULT = (
     b'"contract":{"reliability":"best_effort","durability":"volatile","history":"keep_last","depth":1000,'
     b'"deadline":null,"lifespan":null,"liveliness":"automatic","liveliness_lease":null,"priority":"normal",'
-    b'"max_rate":null,"outage":30.0}'
+    b'"max_rate":null,"outage":30.0,"transport":"relay"}'
 )
 STRICT = Contract(
     Reliability.RELIABLE,
@@ -57,6 +66,7 @@ STRICT = Contract(
     priority=Priority.HIGH,
     max_rate=30.0,
     outage=300.0,
+    transport=Transport.AUTO,
 )
 PAD, R = "0" * 31 + "1", "f" * 32
 ADD_MD5 = "6a2e34150c00229791cc89ff309fff21"
@@ -107,8 +117,8 @@ GOLDEN: list[tuple[Message, bytes]] = [
         (
             b'{"op":"open","route":7,"topic":"/cmd","node":"/joy","contract":{"reliability":"reliable",'
             b'"durability":"transient_local","history":"keep_all","depth":5,"deadline":0.5,"lifespan":2.0,'
-            b'"liveliness":"manual_by_topic","liveliness_lease":1.0,"priority":"high","max_rate":30.0,"outage":300.0},'
-            b'"epoch":3,"after":4711}'
+            b'"liveliness":"manual_by_topic","liveliness_lease":1.0,"priority":"high","max_rate":30.0,"outage":300.0,'
+            b'"transport":"auto"},"epoch":3,"after":4711}'
         ),
     ),
     (
@@ -125,7 +135,7 @@ GOLDEN: list[tuple[Message, bytes]] = [
             b'"definition":"","latching":false},"contract":{"reliability":"reliable",'
             b'"durability":"transient_local","history":"keep_all","depth":5,"deadline":0.5,"lifespan":2.0,'
             b'"liveliness":"manual_by_topic","liveliness_lease":1.0,"priority":"high","max_rate":30.0,'
-            b'"outage":300.0},"epoch":3,"first":1,"following":4711}'
+            b'"outage":300.0,"transport":"auto"},"epoch":3,"first":1,"following":4711}'
         ),
     ),
     (
@@ -360,6 +370,27 @@ def test_numberings_have_32_bits(numbers: bytes) -> None:
         decode(numbers + b"}")
 
 
+OF_BEFORE_TRANSPORTS = DEFAULT.replace(b',"transport":"relay"', b"")
+
+
+def test_a_peer_of_before_transports_relays() -> None:
+    assert b"transport" not in OF_BEFORE_TRANSPORTS
+    message = decode(OPEN + b"," + OF_BEFORE_TRANSPORTS + b"}")
+    assert isinstance(message, OpenRoute)
+    assert message.contract.transport is Transport.RELAY
+    assert combine(Contract(transport=Transport.DIRECT), message.contract).transport is Transport.RELAY
+
+
+def test_a_peer_of_before_a_term_reads_the_others() -> None:
+    later = DEFAULT.replace(b'"outage":30.0', b'"outage":60.0,"term_of_a_later_version":[1,{"a":"b"}]')
+    assert decode(OPEN + b"," + later + b"}") == OpenRoute(1, "/a", "/b", Contract(outage=60.0))
+
+
+def test_an_unknown_transport_is_the_peers_error() -> None:
+    with pytest.raises(RemoteProtocolError, match=r"Invalid enum value 'drect' - at `\$.contract.transport`"):
+        decode(OPEN + b',"contract":{"transport":"drect"}}')
+
+
 def test_a_peer_of_before_contracts_gets_the_default_one() -> None:
     assert decode(OPEN + b"}") == OpenRoute(1, "/a", "/b", Contract(), epoch=0, after=0)
 
@@ -399,6 +430,8 @@ _contracts = st.builds(
     _times,
     st.sampled_from(Priority),
     st.none() | st.floats(config_limits.CONTRACT_RATE_MIN, config_limits.CONTRACT_RATE_MAX),
+    st.floats(config_limits.OUTAGE_MIN, config_limits.OUTAGE_MAX),
+    st.sampled_from(Transport),
 )
 _service_routes = st.integers(1 << 31, (1 << 32) - 1)
 _services = st.builds(ServiceOffer, _names, _names)

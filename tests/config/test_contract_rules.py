@@ -29,6 +29,7 @@ from rmpa.core.contract import (
     Liveliness,
     Priority,
     Reliability,
+    Transport,
 )
 from rmpa.core.errors import ConfigError
 from tests.core.example import EXAMPLE, uncommented
@@ -63,6 +64,7 @@ liveliness_lease_duration = 2
 priority = "high"
 max_rate = "50Hz"
 outage = "5 min"
+transport = "relay"
 
 [[contract]]
 topics = ["/camera/**"]
@@ -81,12 +83,21 @@ priority = "low"
         "priority": Priority.HIGH,
         "max_rate": 50.0,
         "outage": 300.0,
+        "transport": Transport.RELAY,
     }
     assert set(values) == set(KEYS)
     first = ContractRule(("/cmd/**",), ("geometry_msgs/*",), values)
     assert loaded.settings.contracts == (first, ContractRule(("/camera/**",), (), {"priority": Priority.LOW}))
     assert loaded.notes == ()
     assert Contracts(loaded.settings.contracts).of("/cmd/a", "geometry_msgs/Twist") == Contract(**values)  # type: ignore[arg-type]
+
+
+def test_the_default_transport_is_that_of_the_bridge(load: Load) -> None:
+    settings = load('[bridge]\ntransport = "auto"\n' + RULE + "transport = 'relay'").settings
+    contracts = settings.make_contracts()
+    assert settings.transport is Transport.AUTO
+    assert [contracts.of(topic, "a/B").transport for topic in ("/a", "/b")] == [Transport.RELAY, Transport.AUTO]
+    assert load(RULE + "transport = 'auto'").settings.make_contracts().of("/b", "a/B") == Contract()
 
 
 def test_inline_tables_are_rules_too(load: Load) -> None:
@@ -200,6 +211,10 @@ RULE = '[[contract]]\ntopics = ["/a"]\n'
         ),
         (RULE + "outage = '5Hz'", "3: contract.outage: '5Hz' is a rate, not a duration; did you mean"),
         (RULE + "outage = true", "3: contract.outage: true is not a duration"),
+        (
+            RULE + "transport = 'drect'",
+            "3: contract.transport: 'drect' is not a transport; it is one of relay, direct, auto; did you mean ",
+        ),
         (RULE + "max_rate = false", "3: contract.max_rate: false is not a rate"),
         (
             RULE + "# a comment\n\nliveliness_lease_duration = 1",
@@ -242,6 +257,10 @@ def test_the_probable_value_is_offered(load: Load, line: str, better: str) -> No
         (
             RULE + "outage = '5 min'",
             '3: contract.outage: has no effect without reliability = "reliable"',
+        ),
+        (
+            RULE + "transport = 'direct'\npriority = 'high'",
+            "3: contract.transport: direct has no effect: only agents can keep priority high, so the topic is",
         ),
         (
             RULE + "deadline = '100 ms'\nmax_rate = 5",

@@ -19,7 +19,9 @@ from rmpa.core.contract import (
     Liveliness,
     Priority,
     Reliability,
+    Transport,
     combine,
+    needs_agents,
 )
 from rmpa.core.names import matches
 
@@ -36,6 +38,7 @@ VALUES: dict[str, st.SearchStrategy[object]] = {
     "priority": st.sampled_from(Priority),
     "max_rate": st.one_of(st.none(), st.sampled_from([1.0, 10.0])),
     "outage": st.sampled_from([31.0, 300.0]),
+    "transport": st.sampled_from(Transport),
 }
 CONTRACTS = st.builds(Contract, **VALUES)
 GLOBS = st.lists(st.sampled_from(["/a", "/a/**", "/*", "/**", "/b/?"]), max_size=2, unique=True).map(tuple)
@@ -64,6 +67,8 @@ def test_no_rules_ask_for_nothing() -> None:
         None,
         Priority.NORMAL,
         None,
+        limits.RESUME_WINDOW,
+        Transport.RELAY,
     )
 
 
@@ -72,6 +77,7 @@ def test_the_words_are_those_of_ros_2() -> None:
         *("best_effort", "reliable", "volatile", "transient_local", "keep_last", "keep_all"),
         *("automatic", "manual_by_topic", "high", "normal", "low"),
     ]
+    assert [*Transport] == ["relay", "direct", "auto"]
 
 
 @pytest.mark.parametrize(
@@ -107,6 +113,17 @@ def test_what_decided_is_explained() -> None:
     assert explained["priority"] == (Priority.LOW, "rule 1: topics /**")
     assert explained["deadline"] == (None, "default")
     assert contracts.explain("/cmd/vel", "b/B")["depth"] == (2, "rule 1: topics /**")
+
+
+def test_the_default_transport_holds_where_no_rule_sets_one() -> None:
+    rules = (rule("/cmd/**", depth=1), rule("/image", transport=Transport.DIRECT))
+    contracts = Contracts(rules, Transport.AUTO)
+    found = {topic: contracts.of(topic, "a/B").transport for topic in ("/cmd", "/image", "/odom")}
+    assert found == {"/cmd": Transport.AUTO, "/image": Transport.DIRECT, "/odom": Transport.AUTO}
+    assert Contracts((), Transport.AUTO).of("/odom", "a/B") == Contract(transport=Transport.AUTO)
+    assert contracts.explain("/odom", "a/B")["transport"] == (Transport.AUTO, "[bridge] transport")
+    assert contracts.explain("/image", "a/B")["transport"] == (Transport.DIRECT, "rule 2: topics /image")
+    assert Contracts(rules).explain("/odom", "a/B")["transport"] == (Transport.RELAY, "default")
 
 
 @given(RULES, TOPICS, TYPES)
@@ -153,6 +170,19 @@ def test_invented_topics_do_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch)
         (Contract(outage=2.0), Contract(), Contract(outage=2.0)),
         (Contract(), Contract(outage=2.0), Contract(outage=2.0)),
         (Contract(outage=1.0), Contract(outage=2.0), Contract(outage=2.0)),
+        (Contract(transport=Transport.AUTO), Contract(), Contract()),
+        (Contract(), Contract(transport=Transport.DIRECT), Contract()),
+        (Contract(transport=Transport.AUTO), Contract(transport=Transport.AUTO), Contract(transport=Transport.AUTO)),
+        (
+            Contract(transport=Transport.AUTO),
+            Contract(transport=Transport.DIRECT),
+            Contract(transport=Transport.DIRECT),
+        ),
+        (
+            Contract(transport=Transport.DIRECT),
+            Contract(transport=Transport.AUTO),
+            Contract(transport=Transport.DIRECT),
+        ),
         (Contract(deadline=1.0), Contract(), Contract(deadline=1.0)),
         (Contract(deadline=1.0), Contract(deadline=2.0), Contract(deadline=2.0)),
         (Contract(lifespan=1.0), Contract(lifespan=2.0), Contract(lifespan=1.0)),
@@ -199,3 +229,43 @@ def test_what_is_agreed_needs_no_second_agreement(offered: Contract, requested: 
     assert combine(agreed, agreed) == agreed
     assert combine(agreed, requested) == agreed
     assert combine(offered, agreed) == agreed
+
+
+@pytest.mark.parametrize(
+    ("contract", "terms"),
+    [
+        (Contract(), ""),
+        (Contract(outage=300.0, transport=Transport.DIRECT, liveliness=Liveliness.MANUAL_BY_TOPIC), ""),
+        (Contract(reliability=Reliability.RELIABLE), "reliability reliable"),
+        (Contract(durability=Durability.TRANSIENT_LOCAL), "durability transient_local"),
+        (Contract(history=History.KEEP_ALL), "history keep_all"),
+        (Contract(depth=5), "depth 5"),
+        (Contract(deadline=0.2), "deadline 0.2 s"),
+        (Contract(lifespan=0.5), "lifespan 0.5 s"),
+        (Contract(liveliness_lease=2.0), "liveliness lease 2 s"),
+        (Contract(priority=Priority.HIGH), "priority high"),
+        (Contract(priority=Priority.LOW), "priority low"),
+        (Contract(max_rate=10.0), "max_rate 10 Hz"),
+        (
+            Contract(max_rate=10.0, lifespan=0.5, reliability=Reliability.RELIABLE),
+            "reliability reliable, lifespan 0.5 s, max_rate 10 Hz",
+        ),
+    ],
+)
+def test_terms_that_only_agents_keep_are_named(contract: Contract, terms: str) -> None:
+    assert needs_agents(contract) == terms
+
+
+@given(CONTRACTS, CONTRACTS)
+def test_a_route_needs_agents_if_either_end_does(offered: Contract, requested: Contract) -> None:
+    needs = [bool(needs_agents(contract)) for contract in (offered, requested)]
+    assert bool(needs_agents(combine(offered, requested))) is any(needs)
+
+
+@given(CONTRACTS, st.sampled_from(Transport), st.sampled_from(sorted(VALUES)), st.data())
+def test_only_another_transport_leaves_the_route_the_same(
+    contract: Contract, transport: Transport, key: str, data: st.DataObject
+) -> None:
+    value = data.draw(VALUES[key])
+    changed = dataclasses.replace(contract, **{"transport": transport, key: value})  # type: ignore[arg-type]
+    assert contract.same_route(changed) is (key == "transport" or value == getattr(contract, key))

@@ -23,7 +23,6 @@ from rmpa.bridge.params.io.part import Params
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.services.io.part import Services
 from rmpa.bridge.services.rules import ServiceRules
-from rmpa.core.contract import Contracts
 from rmpa.core.counters import Counters
 from rmpa.core.errors import StartError
 from rmpa.core.open_files import remedy
@@ -79,7 +78,7 @@ class Agent:
             self.core,
             policy,
             rng=random.random,
-            contracts=Contracts(settings.contracts),
+            contracts=settings.make_contracts(),
             names=names,
             relay=settings.relay,
             limit_settings=settings.limits,

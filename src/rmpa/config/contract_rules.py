@@ -9,34 +9,31 @@ from rmpa.config import limits
 from rmpa.config.quantities import OUTAGE, RATE, duration_of
 from rmpa.config.values import (
     TOPIC_GLOB,
+    TRANSPORT,
     TYPE_GLOB,
     BadValue,
     Place,
     RuleKey,
-    ValueType,
-    did_you_mean,
     list_of,
+    member_of,
     read_keys,
     tables_of,
     whole_number,
 )
-from rmpa.core.contract import ContractRule, Durability, History, Liveliness, Priority, Reliability
+from rmpa.core.contract import (
+    Contract,
+    ContractRule,
+    Durability,
+    History,
+    Liveliness,
+    Priority,
+    Reliability,
+    Transport,
+    needs_agents,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
-    from enum import StrEnum
-
-
-def _member_of(kind: type[StrEnum], what: str) -> ValueType[StrEnum]:
-    words = [word.value for word in kind]
-
-    def read(raw: object) -> StrEnum:
-        text = str(raw).strip().lower()
-        if text not in words:
-            raise BadValue(f"{raw!r} is not {what}", f"it is one of {', '.join(words)}", did_you_mean(text, words))
-        return kind(text)
-
-    return ValueType(read, {"type": "string", "enum": words})
 
 
 KEYS: Final = (
@@ -50,13 +47,13 @@ KEYS: Final = (
         list_of(TYPE_GLOB, if_empty="leave types out, or name some"),
         "Globs over message types, one of which must fit; without it: any type.",
     ),
-    RuleKey("reliability", _member_of(Reliability, "a reliability"), "Whether messages survive the loss of a link."),
+    RuleKey("reliability", member_of(Reliability, "a reliability"), "Whether messages survive the loss of a link."),
     RuleKey(
         "durability",
-        _member_of(Durability, "a durability"),
+        member_of(Durability, "a durability"),
         "Whether a late subscriber gets each source's last ones.",
     ),
-    RuleKey("history", _member_of(History, "a history"), "What a full queue keeps."),
+    RuleKey("history", member_of(History, "a history"), "What a full queue keeps."),
     RuleKey(
         "depth",
         whole_number(1, limits.CONTRACT_DEPTH_MAX, "a depth"),
@@ -66,7 +63,7 @@ KEYS: Final = (
     RuleKey("lifespan", duration_of("a lifespan"), "A message that is older is dropped."),
     RuleKey(
         "liveliness",
-        _member_of(Liveliness, "a liveliness"),
+        member_of(Liveliness, "a liveliness"),
         "What shows that a source is alive: its link, or its own messages.",
     ),
     RuleKey(
@@ -74,11 +71,10 @@ KEYS: Final = (
         duration_of("a lease"),
         "Without a sign of life for so long a source counts as dead; needs liveliness.",
     ),
-    RuleKey(
-        "priority", _member_of(Priority, "a priority"), "The lane: high is express, low is bulk, normal by size."
-    ),
+    RuleKey("priority", member_of(Priority, "a priority"), "The lane: high is express, low is bulk, normal by size."),
     RuleKey("max_rate", RATE, "Messages a second that cross at most; the newest are kept."),
     RuleKey("outage", OUTAGE, "How long a reliable topic is kept when its link is gone."),
+    RuleKey("transport", TRANSPORT, "relay: through the agents; direct, auto: from node to node where it can be."),
 )
 """The keys that one ``[[contract]]`` may have."""
 _FIELDS: Final = {"liveliness_lease_duration": "liveliness_lease"}
@@ -128,6 +124,11 @@ def contract_warnings(rules: Sequence[ContractRule]) -> Iterator[ConfigWarning]:
             yield ConfigWarning((index, "liveliness"), "has no effect without a liveliness_lease_duration")
         if "outage" in values and not reliable:
             yield ConfigWarning((index, "outage"), 'has no effect without reliability = "reliable"')
+        if values.get("transport") == Transport.DIRECT:
+            terms = needs_agents(Contract(**values))  # type: ignore[arg-type] # as ContractRule.values promises
+            if terms:
+                text = f"direct has no effect: only agents can keep {terms}, so the topic is relayed"
+                yield ConfigWarning((index, "transport"), text)
         deadline, rate = values.get("deadline"), values.get("max_rate")
         if isinstance(deadline, float) and isinstance(rate, float) and deadline * rate < 1:
             text = f"{rate:g} messages a second miss the deadline of {deadline:g} s every time"

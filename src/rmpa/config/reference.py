@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, is_dataclass
+from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config.settings import SETTINGS, TABLES
@@ -69,7 +70,7 @@ def json_value(value: object) -> object:
         return str(value) if value != Multicast(enabled=False) else False
     if is_dataclass(value) and not isinstance(value, type):
         return asdict(value)
-    return value
+    return value.value if isinstance(value, StrEnum) else value
 
 
 def settings_tables() -> str:

@@ -40,10 +40,12 @@ from rmpa.config.values import (
     PORT_OR_ANY,
     SERVICE_GLOB,
     TEXT,
+    TRANSPORT,
     HostPort,
     Multicast,
     list_of,
 )
+from rmpa.core.contract import DEFAULT_TRANSPORT, Contracts, Transport
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -286,6 +288,15 @@ class Settings:
         option="--multicast",
     )
     policy: PolicySettings = table(PolicySettings, "bridge", live=True)
+    transport: Transport = setting(
+        DEFAULT_TRANSPORT,
+        TRANSPORT,
+        "The path of topics' messages, unless a [[contract]] says another. relay: through the agents; "
+        "auto: from node to node where it can be; direct: likewise, with a warning where it cannot.",
+        key="bridge.transport",
+        env="RMPA_TRANSPORT",
+        live=True,
+    )
     peers: tuple[PeerRule, ...] = setting(
         (),
         PEER_RULES,
@@ -348,6 +359,10 @@ class Settings:
     def discovery_port(self) -> int:
         """The port of this domain's beacons."""
         return self.multicast.port + self.domain
+
+    def make_contracts(self) -> Contracts:
+        """The contracts of this module's topics, by ``[[contract]]`` and ``[bridge] transport``."""
+        return Contracts(self.contracts, self.transport)
 
 
 SETTINGS: Final = tuple(settings_of(Settings))

@@ -14,13 +14,16 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 from rmpa.config import limits
 from rmpa.core import limits as core_limits
+from rmpa.core.contract import Transport
 from rmpa.core.identity import peer_name_from, peer_name_problem
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
+    from enum import StrEnum
 
 _T = TypeVar("_T")
 _T_co = TypeVar("_T_co", covariant=True)
+_Word = TypeVar("_Word", bound="StrEnum")
 Place = tuple[str | int, ...]
 """A key of the file, or an element below it: ``("contract", 1, "topics", 0)``."""
 JsonSchema = dict[str, Any]
@@ -159,6 +162,22 @@ LOG_LEVEL: Final = word_of(_LOG_LEVELS, "a log level", f"the levels are {', '.jo
 CORE_MODE: Final = word_of(
     _CORE_MODES, "a kind of core", "embedded: the agent's own; external: a roscore that runs already", "MODE"
 )
+
+
+def member_of(kind: type[_Word], what: str) -> ValueType[_Word]:
+    """A word of an enumeration; ``what`` names one with its article, for the text of errors."""
+    words = [word.value for word in kind]
+
+    def read(raw: object) -> _Word:
+        text = str(raw).strip().lower()
+        if text not in words:
+            raise BadValue(f"{raw!r} is not {what}", f"it is one of {', '.join(words)}", did_you_mean(text, words))
+        return kind(text)
+
+    return ValueType(read, {"type": "string", "enum": words})
+
+
+TRANSPORT: Final = member_of(Transport, "a transport")
 
 # --- switches and numbers -------------------------------------------------------------------------------------------
 

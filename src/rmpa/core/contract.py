@@ -5,7 +5,7 @@ Both ends of a route have rules; ``combine`` of both contracts holds for the rou
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final, TypeVar
 
@@ -55,6 +55,20 @@ class Priority(StrEnum):
     LOW = "low"
 
 
+class Transport(StrEnum):
+    """The path of the messages: through both agents, or from node to node where that can be (docs/contracts.md)."""
+
+    RELAY = "relay"
+    DIRECT = "direct"
+    """From node to node; a warning where a condition fails and the agents relay instead."""
+    AUTO = "auto"
+    """As ``DIRECT``, without a warning."""
+
+
+DEFAULT_TRANSPORT: Final = Transport.RELAY
+"""``[bridge] transport`` and ``[services] transport`` where nothing sets them."""
+
+
 @dataclass(frozen=True, slots=True)
 class Contract:
     """The QoS of one topic; the defaults hold for a topic without any rule.
@@ -71,6 +85,8 @@ class Contract:
         priority: The lane.
         max_rate: The most messages a second; above it the newest ones are sent. ``None``: no bound.
         outage: Seconds for which a reliable route keeps its messages when its link is lost.
+        transport: The path of the messages. The default is what agents mean that do not send this field, whatever
+            ``DEFAULT_TRANSPORT`` is.
     """
 
     reliability: Reliability = Reliability.BEST_EFFORT
@@ -84,18 +100,27 @@ class Contract:
     priority: Priority = Priority.NORMAL
     max_rate: float | None = None
     outage: float = limits.RESUME_WINDOW
+    transport: Transport = Transport.RELAY
 
     @property
     def kept(self) -> int:
         """Messages kept for late subscribers with ``transient_local``: one, as latching does, or ``depth`` if set."""
         return 1 if self.depth == limits.ROUTE_QUEUE_MESSAGES else self.depth
 
+    def same_route(self, other: Contract) -> bool:
+        """Whether a relayed route of this contract can go on with the other: they differ at most in the transport."""
+        return replace(self, transport=other.transport) == other
+
 
 KEYS: Final = tuple(item.name for item in fields(Contract))
 """The names of a contract's fields, in order."""
 _DEFAULT: Final = Contract()
+_AGENTS_WORDS: Final = ("reliability", "durability", "history", "depth")
+"""Fields that only agents can keep where they differ from the default; the others are ``needs_agents``' own."""
 _URGENCY: Final = {Priority.NORMAL: 0, Priority.LOW: 1, Priority.HIGH: 2}
 """Normal is weaker than either other word."""
+_TRANSPORTS: Final = (Transport.RELAY, Transport.DIRECT, Transport.AUTO)
+"""The strongest first: one end's ``relay`` keeps the messages with the agents; ``direct`` wants its warning."""
 
 
 def combine(offered: Contract, requested: Contract) -> Contract:
@@ -119,7 +144,36 @@ def combine(offered: Contract, requested: Contract) -> Contract:
         priority=max(offered.priority, requested.priority, key=_URGENCY.__getitem__),
         max_rate=_smaller(offered.max_rate, requested.max_rate),
         outage=_larger(offered.outage, requested.outage, limits.RESUME_WINDOW),
+        transport=combine_transport(offered.transport, requested.transport),
     )
+
+
+def combine_transport(offered: Transport, requested: Transport) -> Transport:
+    """The stronger of both ends' words: ``relay`` before ``direct`` before ``auto``."""
+    return min(offered, requested, key=_TRANSPORTS.index)
+
+
+def needs_agents(contract: Contract) -> str:
+    """The terms of a contract that only agents can keep, as text for users; empty if there are none.
+
+    A route with such a term is relayed whatever its transport says. ``outage`` alone is no such term: it only says
+    something about reliable routes.
+
+    Returns:
+        The terms in the order of the fields, such as ``reliability reliable, max_rate 10 Hz``.
+    """
+    seconds = (
+        ("deadline", contract.deadline),
+        ("lifespan", contract.lifespan),
+        ("liveliness lease", contract.liveliness_lease),
+    )
+    terms = [f"{key} {value}" for key in _AGENTS_WORDS if (value := getattr(contract, key)) != getattr(_DEFAULT, key)]
+    terms += [f"{name} {value:g} s" for name, value in seconds if value is not None]
+    if contract.priority is not Priority.NORMAL:
+        terms.append(f"priority {contract.priority}")
+    if contract.max_rate is not None:
+        terms.append(f"max_rate {contract.max_rate:g} Hz")
+    return ", ".join(terms)
 
 
 def _larger(one: _Number, other: _Number, default: _Number) -> _Number:
@@ -171,16 +225,20 @@ class Contracts:
 
     Args:
         rules: In the order of the file.
+        default_transport: The transport of topics for which no rule sets one (``[bridge] transport``).
     """
 
-    def __init__(self, rules: tuple[ContractRule, ...] = ()) -> None:
+    def __init__(
+        self, rules: tuple[ContractRule, ...] = (), default_transport: Transport = DEFAULT_TRANSPORT
+    ) -> None:
         self._rules = rules
+        self._default = replace(_DEFAULT, transport=default_transport)
         self._known: dict[tuple[str, str], Contract] = {}
 
     def of(self, topic: str, type_name: str) -> Contract:
         """The contract of a topic. ``type_name`` may be empty or ``*`` while it is not known."""
         if not self._rules:
-            return _DEFAULT
+            return self._default
         found = self._known.get((topic, type_name))
         if found is None:
             values = {key: value for key, (value, _) in self.explain(topic, type_name).items()}
@@ -191,8 +249,14 @@ class Contracts:
         return found
 
     def explain(self, topic: str, type_name: str) -> dict[str, tuple[object, str]]:
-        """Each key's value and where it comes from: ``rule 2: topics /cmd/**`` (counted from 1) or ``default``."""
-        found: dict[str, tuple[object, str]] = {key: (getattr(_DEFAULT, key), "default") for key in KEYS}
+        """Each key's value and where it comes from.
+
+        Returns:
+            By key: the value, and ``rule 2: topics /cmd/**`` (counted from 1), ``[bridge] transport`` or ``default``.
+        """
+        found: dict[str, tuple[object, str]] = {key: (getattr(self._default, key), "default") for key in KEYS}
+        if self._default.transport is not DEFAULT_TRANSPORT:
+            found["transport"] = (self._default.transport, "[bridge] transport")
         for number, rule in enumerate(self._rules, 1):
             fitting = rule.fitting(topic, type_name)
             if fitting is not None:

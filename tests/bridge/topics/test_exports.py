@@ -15,10 +15,11 @@ from rmpa.bridge.messages import (
     Source,
     TopicOffer,
 )
+from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy, PolicyDecision
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.config.settings import LimitSettings, PolicySettings
-from rmpa.core.contract import Contract, ContractRule, Contracts, Durability, Priority, Reliability
+from rmpa.core.contract import Contract, ContractRule, Contracts, Durability, Priority, Reliability, Transport
 
 CMD = Source("/cmd", "/joy")
 JOY = LocalSource("sensor_msgs/Joy", "http://127.0.0.1:4000/")
@@ -329,6 +330,28 @@ def test_each_route_has_its_peers_contract_and_a_numbering_of_its_own(
         (1, RELIABLE, 1, None),
         (2, Contract(), 0, None),
         (3, RELIABLE, 2, None),
+    ]
+
+
+def test_another_transport_alone_leaves_routes_open(flowing: Exports) -> None:
+    policy, asked = Policy(PolicySettings()), Contract(reliability=Reliability.RELIABLE, transport=Transport.AUTO)
+    flowing.link_up(2)
+    flowing.opened(2, OpenRoute(7, "/cmd", "/joy", asked))
+    assert flowing.apply_rules(policy, Contracts((), Transport.AUTO), Names()) == []
+    assert flowing.flowing(CMD) == (1, 2)
+    assert [flowing.contract(CMD, peer) for peer in (1, 2)] == [RELIABLE, asked]
+    slower = Contracts((ContractRule((), (), {"max_rate": 5.0}),), Transport.AUTO)
+    assert [type(message) for message in sends(flowing.apply_rules(policy, slower, Names()))] == [RouteClosed] * 2
+
+
+def test_a_route_resumes_with_another_transport(flowing: Exports) -> None:
+    flowing.apply_rules(Policy(PolicySettings()), Contracts((), Transport.AUTO), Names())
+    flowing.link_away(1)
+    flowing.link_up(1)
+    asked = Contract(reliability=Reliability.RELIABLE, transport=Transport.DIRECT)
+    assert flowing.opened(1, OpenRoute(2, "/cmd", "/joy", asked, epoch=1, after=41)) == [
+        Send(1, RouteOpened(2, ABOUT, asked, 1)),
+        AddRoute(CMD, 1, 2, asked, 1, 41),
     ]
 
 

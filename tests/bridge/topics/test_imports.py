@@ -17,11 +17,12 @@ from rmpa.bridge.messages import (
     Source,
     TopicOffer,
 )
+from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.topics.imports import Imports
 from rmpa.bridge.topics.remote_topic import TRANSITIONS, RouteState
 from rmpa.config.settings import PolicySettings
-from rmpa.core.contract import Contract, ContractRule, Contracts, Reliability
+from rmpa.core.contract import Contract, ContractRule, Contracts, Reliability, Transport
 
 CMD = Source("/cmd", "/joy")
 OFFER = TopicOffer("/cmd", "/joy", "sensor_msgs/Joy")
@@ -311,6 +312,19 @@ def test_our_contract_is_asked_for_and_what_holds_is_what_was_answered() -> None
     entry = machine.get(1, CMD)
     assert entry is not None
     assert entry.contract == holds
+
+
+def test_another_transport_alone_leaves_routes_open(flowing: Imports) -> None:
+    rule = ContractRule(("/cmd",), (), {"reliability": Reliability.RELIABLE})
+    changed = ContractRule(("/cmd",), (), {"reliability": Reliability.RELIABLE, "depth": 5})
+
+    def applied(rules: Contracts) -> list[Action]:
+        return [a for some in flowing.apply_rules(Policy(PolicySettings()), rules, Names(), 0.0) for a in some]
+
+    assert applied(Contracts((rule,), Transport.AUTO)) == []
+    assert applied(Contracts((rule,), Transport.DIRECT)) == []
+    (asked,) = opens(applied(Contracts((changed,), Transport.DIRECT)))
+    assert asked.contract == Contract(reliability=Reliability.RELIABLE, depth=5, transport=Transport.DIRECT)
 
 
 def test_only_what_is_reliable_and_listened_to_waits_for_its_peer(flowing: Imports) -> None:

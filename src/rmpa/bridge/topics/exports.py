@@ -242,7 +242,10 @@ class Exports:
         for source, flow in list(self._flows.items()):
             offered = contracts.of(source.topic, self.offered[source].type)
             for (peer_number, _), route in list(flow.routes.items()):
-                if combine(offered, route.asked) != route.contract:
+                contract = combine(offered, route.asked)
+                if contract.same_route(route.contract):
+                    route.contract = contract
+                else:
                     actions += self._end_for(source, peer_number, "its contract has changed here")
         return actions
 
@@ -452,7 +455,7 @@ class Exports:
         contract = combine(self._contracts.of(topic, local.type), asked)
         if contract.reliability is not Reliability.RELIABLE:
             return _Route(contract, asked, named=named)
-        if away is not None and away.epoch == message.epoch and away.contract == contract:
+        if away is not None and away.epoch == message.epoch and away.contract.same_route(contract):
             return _Route(contract, asked, epoch=away.epoch, after=message.after)
         self._epochs += 1
         return _Route(contract, asked, epoch=self._epochs, named=named)

@@ -217,7 +217,8 @@ class Imports:
             entry.topic = topic
             known.topics.setdefault(topic, {})[source] = None
         actions += self._show_or_hide(peer, source, entry)
-        if entry.route and entry.asked != self._contracts.of(entry.topic, entry.type):
+        contract = self._contracts.of(entry.topic, entry.type)
+        if entry.route and not (entry.asked is not None and entry.asked.same_route(contract)):
             actions += self._routes.close(peer, source, entry, missed=entry.wanted)
             actions += self._routes.open(peer, source, entry, now) if entry.wanted else []
         return actions

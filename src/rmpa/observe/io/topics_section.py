@@ -15,7 +15,7 @@ from rmpa.bridge.policy import Policy, PolicyDecision, is_own
 from rmpa.bridge.topics.remote_topic import RouteState
 from rmpa.config.param_rules import CLOCK
 from rmpa.core import limits
-from rmpa.core.contract import KEYS, Contract, Contracts
+from rmpa.core.contract import KEYS, Contract
 from rmpa.observe.snapshot import EventInfo, LatencyInfo, RouteInfo, SampleSpread, TopicInfo, UnreachableInfo
 from rmpa.ros.wire.tcpros import LENGTH
 from rmpa.runtime.event_loop import sorted_yielding, yield_to_data, yielding_to_data
@@ -76,7 +76,7 @@ class TopicsSection:
     def reload(self, settings: Settings) -> None:
         """Use other settings from now on."""
         self._policy = Policy(settings.policy, settings.peers, settings.time)
-        self._contracts = Contracts(settings.contracts)
+        self._contracts = settings.make_contracts()
         self._follow = settings.time.follow
 
     def infos(self, wanted: Collection[str] | None = None) -> tuple[TopicInfo, ...]:

@@ -16,7 +16,7 @@ from rmpa.bridge.session.peer_proxies import PeerProxies
 from rmpa.bridge.session.peer_session import PeerSession
 from rmpa.bridge.session.proxy_nodes import ProxyNodes
 from rmpa.bridge.topics.io.peer_topics import PeerTopics
-from rmpa.core.contract import Contract, Durability, Liveliness, Reliability
+from rmpa.core.contract import Contract, Durability, Liveliness, Reliability, Transport
 from rmpa.core.outbox import FIRST
 from rmpa.mesh import limits as mesh_limits
 from tests.bridge.io.nodes import MD5, Core, Ear, stages
@@ -277,6 +277,19 @@ def test_where_a_numbering_goes_on_a_gap_is_counted_once() -> None:
         assert (new.lost, proxied.kinds()) == (6, [QosEventKind.MESSAGES_LOST])
         new.message(9, 0, framed("nine"))
         assert (new.lost, listener.texts, again.texts) == (7, ["one"], ["nine"])
+
+    play(scene)
+
+
+def test_another_transport_continues_the_flow() -> None:
+    async def scene(proxied: Proxied) -> None:
+        await proxied.publish()
+        old = proxied.describe(SURE, epoch=5)
+        proxied.topics.link_down()
+        proxied.topics.detach(Detach(1, CMD, 1, keep=True))
+        changed = Contract(reliability=Reliability.RELIABLE, transport=Transport.AUTO)
+        assert proxied.describe(changed, epoch=5) is old
+        assert old.contract == changed
 
     play(scene)
 
