@@ -32,8 +32,8 @@ def asked(made: Agent) -> dict[str, str]:
     with Process(MACHINE.command(words), env=made.env) as process:
         process.wait()
         answers = json.loads(process.output[process.output.index("[") :])
-    (found,) = [answer for answer in answers if answer["check"] == "stale connections"]
-    assert found["subject"] == made.name
+    name = "stale connections"
+    (found,) = [answer for answer in answers if (answer["check"], answer["subject"]) == (name, made.name)]
     return dict(found)
 
 
