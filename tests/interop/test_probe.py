@@ -7,36 +7,21 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.http.client import call_api
 from rmpa.ros.node.probe import probe
 from rmpa.ros.wire.services import parse_service_uri
+from tests.interop.test_service_nodes import core, ros
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from tests.interop.conftest import ShellFactory
+    from rmpa.ros.core.embedded import RosCore
     from tests.interop.ros import Ros
+
+__all__ = ["core", "ros"]
 
 pytestmark = pytest.mark.ros
 libraries = pytest.mark.parametrize("library", ["rospy", "roscpp"])
 DEADLINE: Final = 40.0
 SERVICE: Final = "/talker/get_loggers"
-
-
-@pytest.fixture
-async def core() -> AsyncIterator[RosCore]:
-    made = RosCore("127.0.0.1", 0)
-    await made.start()
-    yield made
-    await made.close()
-
-
-@pytest.fixture
-async def ros(core: RosCore, shell: ShellFactory) -> AsyncIterator[Ros]:
-    made = shell(port=core.port)
-    yield made
-    await asyncio.to_thread(made.close)  # while the core answers them: rospy waits for it
 
 
 async def publisher_at(core: RosCore) -> tuple[str, int]:
