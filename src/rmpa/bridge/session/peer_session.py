@@ -62,6 +62,16 @@ class PeerSession:
         return self.state is PeerState.LINKED
 
     @property
+    def same_machine(self) -> bool:
+        """Whether the peer's agent runs on this machine, so that both modules share its loopback device."""
+        return self.link.local_address == self.link.remote_endpoint[0]
+
+    @property
+    def address(self) -> str:
+        """The address at which the peer's nodes are reached: that of its link, or loopback on this machine."""
+        return "127.0.0.1" if self.same_machine else self.link.remote_endpoint[0]
+
+    @property
     def due(self) -> float | None:
         """When something kept for the absent peer expires next, monotonic seconds; ``None`` while it has a link."""
         return None if self.wait is None else self.away_since + self.wait

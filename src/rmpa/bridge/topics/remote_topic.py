@@ -77,6 +77,7 @@ class RemoteTopic:
         serial: Identifies the timer among earlier ones.
         origin: Its module and node, if its peer only relays it.
         crowded: Whether it is hidden because of ``limits.nodes``.
+        direct: Whether a local node is connected to its publisher directly, and only the peer's agent has died.
     """
 
     type: str
@@ -96,6 +97,7 @@ class RemoteTopic:
     serial: int = 0
     origin: Origin | None = None
     crowded: bool = False
+    direct: bool = False
 
     def enter(self, state: RouteState, timer: float | None = None) -> None:
         """Change the route's state.
@@ -114,8 +116,10 @@ class RemoteTopic:
         Only a source with a listener does. A reliable one stays, so that no message is lost. A latched one stays if
         the link fell silent (``silent``): its subscribers stay connected and do not get the same message again when
         the peer is back, and new subscribers get it meanwhile. A relayed one does not stay, because another relay may
-        offer it.
+        offer it. A source with direct subscribers stays if only its agent has died: its messages go on.
         """
+        if self.direct:
+            return True
         if not self.wanted or self.origin is not None or self.state not in _LISTENED:
             return False
         if silent and self.description is not None and self.description.latching:

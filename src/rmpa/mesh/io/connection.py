@@ -131,6 +131,10 @@ class Connection:
         self.id = connection_id
         self.sock = sock
         self.remote_endpoint = endpoint
+        self.local_address: str = sock.getsockname()[0]
+        """The address of this side."""
+        self.crashed = False
+        """Once ended: whether the remote kernel ended it without a bye, so that only the agent's process has died."""
         self.since: float | None = None
         """Monotonic seconds at which the handshake ended."""
         self.malformed = False
@@ -379,6 +383,8 @@ class Connection:
 
     def _lost(self, error: Exception | None) -> None:
         self.silent = isinstance(error, OSError) and error.errno in _SILENCE
+        reset = isinstance(error, OSError) and error.errno == errno.ECONNRESET
+        self.crashed = self._machine.state is ConnectionState.UP and (error is None or reset)
         reason = f"{self.name} closed the connection" if error is None else f"connection to {self.name} lost: {error}"
         self._machine.lost(reason)
 

@@ -56,6 +56,7 @@ class PeerLink:
         self.guid: Final = connection.identity.guid
         self.name: Final = connection.identity.name
         self.remote_endpoint: Final = connection.remote_endpoint
+        self.local_address: Final = connection.local_address
         self.dialled: Final = connection.dialled
         self.since: Final = connection.since
         """Monotonic seconds at which it came up."""
@@ -67,6 +68,8 @@ class PeerLink:
         self.bulk: Final = LaneSender("bulk")
         self.silent = False
         """Once the link is down: whether it ended without a bye, so that the peer may soon be linked again."""
+        self.crashed = False
+        """Once the link is down: whether the peer's agent died, or a better link took over; its nodes go on."""
         self.mark: Final = connection.send_mark
         """``(kind, route, sequence)``: acknowledges messages of a route, before all waiting data."""
         self._clock = clock

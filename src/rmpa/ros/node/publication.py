@@ -17,11 +17,12 @@ from rmpa.ros.wire.tcpros import TopicDescription, check_subscriber, printable, 
 from rmpa.runtime import limits as runtime_limits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Awaitable, Callable, Mapping
 
     from rmpa.core.outbox import QueuedMessage
     from rmpa.ros.node.accepted_connection import AcceptedConnection
     from rmpa.ros.wire.tcpros import Buffer
+    from rmpa.ros.wire.xmlrpc import RosReply
 
 _log = logging.getLogger(__name__)
 
@@ -44,6 +45,8 @@ class Publication:
         on_last_subscriber: Called when demand returns to 0.
         on_mismatch: ``(fields, text)``: a subscriber was refused; its header and the text of the error header.
         on_listeners: ``listeners`` has changed.
+        on_request: ``(caller id) -> reply``: awaited for the answer to a subscriber's ``requestTopic``; its reply of
+            ``None`` is this publication's own address. ``None`` instead of an awaitable: no need to wait.
         queue_messages: Messages queued for one slow subscriber; above it the oldest is dropped.
         queue_bytes: Bytes queued for one slow subscriber; one message always fits.
     """
@@ -58,6 +61,7 @@ class Publication:
         on_last_subscriber: Callable[[], None] = _ignore,
         on_mismatch: Callable[[Mapping[str, str], str], None] = _ignore,
         on_listeners: Callable[[], None] = _ignore,
+        on_request: Callable[[str], Awaitable[RosReply | None] | None] | None = None,
         queue_messages: int = limits.SUBSCRIBER_QUEUE_MESSAGES,
         queue_bytes: int = limits.SUBSCRIBER_QUEUE_BYTES,
     ) -> None:
@@ -73,6 +77,10 @@ class Publication:
         self._on_last = on_last_subscriber
         self._on_mismatch = on_mismatch
         self._on_listeners = on_listeners
+        self.on_request = on_request
+        """See above; read by the node that serves this publication."""
+        self._had: dict[str, tuple[bytes, ...]] = {}
+        """Latched messages that a subscriber has had by another path, by its caller id."""
         self._queue_messages = queue_messages
         self._queue_bytes = queue_bytes
         self._held: tuple[AcceptedConnection, ...] = ()
@@ -265,6 +273,26 @@ class Publication:
         """Drop the latched messages, because their source is gone or will send them again."""
         self._latched.clear()
 
+    def hang_up(self, caller_id: str) -> bool:
+        """Close the connections of one subscriber; return whether there was one."""
+        gone = [connection for connection in (*self._open, *self._held) if connection.caller_id == caller_id]
+        for connection in gone:
+            connection.close()
+            self._gone(connection, None)
+        return bool(gone)
+
+    def spare(self, caller_id: str, had: tuple[bytes, ...]) -> None:
+        """Send a subscriber none of these latched messages when it connects next: it has had them by another path.
+
+        Args:
+            caller_id: The subscriber.
+            had: As ``latched`` returned them; empty: it gets all again.
+        """
+        if had:
+            self._had[caller_id] = had
+        else:
+            self._had.pop(caller_id, None)
+
     async def drained(self, timeout: float = runtime_limits.DRAIN_TIMEOUT) -> None:  # noqa: ASYNC109 - for all together
         """Wait until all published messages are sent, at most ``timeout`` seconds."""
         if self._open:
@@ -286,8 +314,10 @@ class Publication:
             "> %s: serves subscriber %s at %s", self.topic, printable(connection.caller_id), connection.peer[0]
         )
         connection.accept(self._reply, self._queue_messages, self._queue_bytes)
+        had = self._had.pop(connection.caller_id, ())
         for framed in self._latched:
-            connection.send(framed)
+            if framed not in had:
+                connection.send(framed)
         if not connection.stream.closed:
             self._open += (connection,)
             self._on_listeners()

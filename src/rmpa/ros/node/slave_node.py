@@ -243,7 +243,17 @@ class SlaveNode:
         if method == "shutdown" and reply.code == 1 and self._on_kill is not None:
             caller, reason = [*map(str, params), ""][:2]
             return self._answer(self._on_kill(caller, reason))
+        if method == "requestTopic" and reply.code == 1:
+            publication = self._publications.get(str(params[1]))
+            if publication is not None and publication.on_request is not None:
+                other = publication.on_request(str(params[0]))
+                if other is not None:
+                    return self._answer_other(other, reply)
         return list(reply)
+
+    @staticmethod
+    async def _answer_other(other: Awaitable[RosReply | None], own: RosReply) -> XmlRpcValue:
+        return list(await other or own)
 
     @staticmethod
     async def _answer(reply: Awaitable[RosReply]) -> XmlRpcValue:

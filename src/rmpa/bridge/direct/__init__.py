@@ -1,0 +1,1 @@
+"""Direct transport: connections from node to node between two modules, arranged by their agents."""

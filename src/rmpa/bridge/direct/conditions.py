@@ -1,0 +1,118 @@
+"""The conditions of direct transport: each one that fails is a reason to relay. Pure.
+
+docs/contracts.md lists them for users.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from rmpa.core.errors import RemoteProtocolError
+
+_TEXT_MAX: Final = 300
+"""Characters of a peer's text that are kept."""
+
+
+class Condition(StrEnum):
+    """A condition of direct transport; its value is the word in ``--json`` and between agents."""
+
+    TRANSPORT = "transport"
+    """The transport of the contract, or of the service's rule, is not ``relay``."""
+    CONTRACT = "contract"
+    """The contract asks for nothing that only agents do."""
+    NAME = "name"
+    """The topic or service has the same name in both modules: TCPROS headers carry it."""
+    OWN_SOURCE = "own_source"
+    """The source is the peer's own, and does not come by a relay."""
+    ACTION = "action"
+    """It is no topic whose publisher compares the names of its subscribers."""
+    RELEASE = "release"
+    """The peer's agent knows direct transport."""
+    OFFERED = "offered"
+    """The peer offers the topic or service now."""
+    NODE = "node"
+    """The publisher's node answers its agent."""
+    LISTENING = "listening"
+    """The publisher's node listens where the subscriber's module can reach it, not only on loopback."""
+    REACHABLE = "reachable"
+    """A connection from the subscriber's module to the publisher's node works."""
+    CALLER_ID = "caller_id"
+    """No other subscriber of the same name is connected to the publisher."""
+    SUBSCRIBER = "subscriber"
+    """The subscriber's node connects to other machines (ROS_IP and ROS_HOSTNAME do not bind it to loopback)."""
+    MEASURES = "measures"
+    """The subscriber is no tool that measures by the agents."""
+    LATCHED = "latched"
+    """No latched message would be delivered twice by the move."""
+    STABLE = "stable"
+    """Direct connections of this subscriber have not broken repeatedly."""
+    LIMIT = "limit"
+    """The peer's direct connections are within ``limits.DIRECT_MAX``."""
+    CORE = "core"
+    """The local core can answer each node by itself: services only."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unmet:
+    """A condition that does not hold, and the fact as text for the user."""
+
+    condition: Condition
+    text: str
+
+    @property
+    def lasting(self) -> bool:
+        """Whether only a change that is noticed can make it hold, so that trying again by time is of no use."""
+        return self.condition not in {Condition.NODE, Condition.REACHABLE, Condition.STABLE, Condition.LIMIT}
+
+
+@dataclass(frozen=True, slots=True)
+class Grant:
+    """A peer's permission to connect to one of its nodes.
+
+    Args:
+        port: The node's TCPROS port; the address is that of the link.
+        node: The node's name in the peer's graph.
+        probe: A service of the node, by which it is probed; empty: none is known.
+    """
+
+    port: int
+    node: str
+    probe: str = ""
+
+
+def read_reply(value: object, node: str) -> Grant | Unmet:
+    """Read the response of a peer to ``direct.open`` or ``direct.service``.
+
+    Args:
+        value: What the peer sent.
+        node: The node that was asked for.
+
+    Raises:
+        RemoteProtocolError: It is neither a port nor a reason.
+    """
+    if isinstance(value, dict):
+        port, probe = value.get("port"), value.get("probe", "")
+        if isinstance(port, int) and not isinstance(port, bool) and 0 < port < 1 << 16 and isinstance(probe, str):
+            return Grant(port, node, probe if len(probe) <= _TEXT_MAX else "")
+        why, text = value.get("why"), value.get("text", "")
+        if isinstance(why, str) and isinstance(text, str):
+            return read_unmet(why, text)
+    raise RemoteProtocolError("the answer about a direct connection has neither a port nor a reason")
+
+
+def read_unmet(why: str, text: str) -> Unmet:
+    """Read a condition that a peer names; one of a later release counts as ``RELEASE``."""
+    try:
+        condition = Condition(why)
+    except ValueError:
+        condition = Condition.RELEASE
+    return Unmet(condition, text[:_TEXT_MAX])
+
+
+def reply_of(found: Grant | Unmet) -> dict[str, object]:
+    """The response to a peer's ``direct.open`` or ``direct.service``."""
+    if isinstance(found, Grant):
+        return {"port": found.port, "probe": found.probe}
+    return {"why": found.condition.value, "text": found.text}

@@ -1,0 +1,1 @@
+"""What direct transport asks of nodes and of the kernel."""

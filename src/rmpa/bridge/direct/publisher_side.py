@@ -1,0 +1,205 @@
+"""Which subscribers of peers may connect to local publishers directly. Pure.
+
+A rospy publisher keeps one connection for each caller id: a second subscriber of that name closes the first one's
+connection without a word (docs/design/ros-traps.md, trap 12). Therefore a name is granted once for each source, and
+not at all while a local node of that name subscribes to the topic.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from rmpa.bridge import limits
+from rmpa.bridge.direct.conditions import Condition, Unmet
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterator
+
+    from rmpa.bridge.messages import Source
+    from rmpa.core.contract import Contract
+
+
+@dataclass(frozen=True, slots=True)
+class Granted:
+    """A grant in force.
+
+    Args:
+        asked: The contract that the peer asked for.
+        port: The TCPROS port of the publisher's node.
+        uri: The slave API of that node.
+    """
+
+    asked: Contract
+    port: int
+    uri: str
+
+
+@dataclass(frozen=True, slots=True)
+class Withdraw:
+    """Tell a peer that its subscribers of a source have to be relayed.
+
+    Args:
+        peer: The peer.
+        source: The source, by its local name, which is its wire name too.
+        subscriber: The subscriber; empty: all of them.
+        unmet: Why; ``Condition.NODE`` makes the peer ask again.
+    """
+
+    peer: int
+    source: Source
+    subscriber: str
+    unmet: Unmet
+
+
+@dataclass(frozen=True, slots=True)
+class Retry:
+    """Tell a peer that a source that it was refused may be granted now."""
+
+    peer: int
+    source: Source
+
+
+@dataclass(frozen=True, slots=True)
+class EndConnections:
+    """End the connections from a local publisher's port to a peer's address: the peer cannot be reached."""
+
+    peer: int
+    port: int
+
+
+GrantAction = Withdraw | Retry | EndConnections
+
+
+class DirectGrants:
+    """The grants of this module's publishers."""
+
+    def __init__(self) -> None:
+        self._grants: dict[Source, dict[tuple[int, str], Granted]] = {}
+        self._count: dict[int, int] = {}
+        self._refused: dict[Source, dict[int, None]] = {}
+        """Peers to tell when something changes that made a source be refused (a dict, for its order)."""
+
+    def __iter__(self) -> Iterator[tuple[Source, int, str, Granted]]:
+        """Every grant: source, peer, subscriber."""
+        for source, grants in list(self._grants.items()):
+            for (peer, subscriber), granted in list(grants.items()):
+                yield source, peer, subscriber, granted
+
+    def of(self, source: Source) -> list[tuple[int, str, Granted]]:
+        """The grants for one source: peer and subscriber of each."""
+        return [(peer, name, granted) for (peer, name), granted in self._grants.get(source, {}).items()]
+
+    def judge(self, peer: int, source: Source, subscriber: str, local: Collection[str]) -> Unmet | None:
+        """Check whether the caller id of a subscriber is free, and the peer's number of grants within its bound.
+
+        A refusal is remembered: ``Retry`` follows when it may be granted.
+
+        Args:
+            peer: The peer.
+            source: The source.
+            subscriber: The subscriber's name, in the peer's graph.
+            local: The local nodes that subscribe to the topic.
+        """
+        grants = self._grants.get(source, {})
+        unmet = None
+        if subscriber in local:
+            unmet = Unmet(Condition.CALLER_ID, f"a node {subscriber} of the publisher's module subscribes too")
+        elif any(name == subscriber and other != peer for other, name in grants):
+            unmet = Unmet(Condition.CALLER_ID, f"a node {subscriber} of another module is connected already")
+        elif (peer, subscriber) not in grants and self._count.get(peer, 0) >= limits.DIRECT_MAX:
+            unmet = Unmet(Condition.LIMIT, f"more than {limits.DIRECT_MAX} direct connections to this module")
+        if unmet is not None:
+            self.refuse(peer, source)
+        return unmet
+
+    def refuse(self, peer: int, source: Source) -> None:
+        """Remember that a peer was refused a source, for ``Retry``."""
+        self._refused.setdefault(source, {})[peer] = None
+
+    def grant(self, peer: int, source: Source, subscriber: str, granted: Granted) -> None:
+        """Note a grant; one of the same subscriber is replaced."""
+        grants = self._grants.setdefault(source, {})
+        if (peer, subscriber) not in grants:
+            self._count[peer] = self._count.get(peer, 0) + 1
+        grants[peer, subscriber] = granted
+
+    def release(self, peer: int, source: Source, subscriber: str) -> list[GrantAction]:
+        """Forget a grant that its subscriber does not use any more."""
+        if not self._drop(peer, source, subscriber):
+            return []
+        return self.changed(source)
+
+    def local_subscriber(self, topic: str, node: str) -> list[GrantAction]:
+        """Withdraw the grants whose caller id a local subscriber of the topic has from now on."""
+        actions: list[GrantAction] = []
+        text = f"a node {node} of the publisher's module subscribes too"
+        for source, peer, subscriber, _ in list(self):
+            if source.topic == topic and subscriber == node:
+                self._drop(peer, source, subscriber)
+                self.refuse(peer, source)
+                actions.append(Withdraw(peer, source, subscriber, Unmet(Condition.CALLER_ID, text)))
+        return actions
+
+    def local_subscriber_gone(self, topic: str) -> list[GrantAction]:
+        """Let the refused peers of a topic try again: a local subscriber has gone."""
+        return [action for source in list(self._refused) if source.topic == topic for action in self.changed(source)]
+
+    def changed(self, source: Source) -> list[GrantAction]:
+        """Let the peers that were refused a source try again: something has changed."""
+        return [Retry(peer, source) for peer in self._refused.pop(source, {})]
+
+    def withdraw(self, source: Source, unmet: Unmet) -> list[GrantAction]:
+        """Withdraw every grant for a source."""
+        peers = dict.fromkeys(peer for peer, _, _ in self.of(source))
+        for peer, subscriber, _ in self.of(source):
+            self._drop(peer, source, subscriber)
+            self.refuse(peer, source)
+        return [Withdraw(peer, source, "", unmet) for peer in peers]
+
+    def gone(self, source: Source) -> None:
+        """Forget a source that is not offered any more; the peers learn it by the advertisement."""
+        for peer, subscriber, _ in self.of(source):
+            self._drop(peer, source, subscriber)
+        self._refused.pop(source, None)
+
+    def judge_again(self, unmet: Callable[[Source, int, Granted], Unmet | None]) -> list[GrantAction]:
+        """Withdraw the grants that new rules do not allow, and let every refused peer try again.
+
+        Args:
+            unmet: ``(source, peer, grant)``: the condition that does not hold by the new rules, if any.
+        """
+        actions: list[GrantAction] = [one for source in list(self._refused) for one in self.changed(source)]
+        for source, peer, subscriber, granted in list(self):
+            why = unmet(source, peer, granted)
+            if why is not None:
+                self._drop(peer, source, subscriber)
+                self.refuse(peer, source)
+                actions.append(Withdraw(peer, source, subscriber, why))
+        return actions
+
+    def unreachable(self, peer: int) -> list[GrantAction]:
+        """Handle the loss of a peer's link by silence: a publisher may block on a connection to it."""
+        ports = dict.fromkeys(granted.port for _, owner, _, granted in self if owner == peer)
+        return [EndConnections(peer, port) for port in ports]
+
+    def peer_gone(self, peer: int) -> list[GrantAction]:
+        """Forget a peer for good; names that it held are free."""
+        freed: list[GrantAction] = []
+        for waiting in self._refused.values():
+            waiting.pop(peer, None)
+        for source, owner, subscriber, _ in list(self):
+            if owner == peer:
+                self._drop(peer, source, subscriber)
+                freed += self.changed(source)
+        self._count.pop(peer, None)
+        return freed
+
+    def _drop(self, peer: int, source: Source, subscriber: str) -> bool:
+        grants = self._grants.get(source, {})
+        if grants.pop((peer, subscriber), None) is None:
+            return False
+        if not grants:
+            del self._grants[source]
+        self._count[peer] -= 1
+        return True

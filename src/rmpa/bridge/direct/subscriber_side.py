@@ -1,0 +1,495 @@
+"""Decides for each local subscriber of a remote source whether it connects to the publisher directly. Pure.
+
+One ``DirectRoute`` is kept for each subscriber of each source::
+
+           ┌───────── asked again: link up, retry, a broken connection ────────┐
+           ▼                                                                   │
+        ASKING ──granted──► PROBING ──reached──► DIRECT ──withdrawn, broken────┤
+           │ refused           │ not reached        │ a condition fails        │
+           └───────────────────┴────────────────────┴──────► RELAYED ──────────┘
+
+The decision is one thing, the subscriber's present connection another (``Path``): TCPROS lets a publisher's side
+only answer ``requestTopic``. Where both differ, the driver *moves* the subscriber: it makes it hang up, and calls it
+back.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from enum import Enum, auto
+from typing import TYPE_CHECKING, NamedTuple
+
+from rmpa.bridge import limits
+from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
+from rmpa.bridge.messages import Source
+from rmpa.core.contract import Transport
+from rmpa.core.timer_queue import TimerQueue
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+
+class DirectKey(NamedTuple):
+    """One local subscriber of one remote source.
+
+    Args:
+        peer: The number of the peer's session.
+        source: The source, by its wire name.
+        subscriber: The subscribing node.
+    """
+
+    peer: int
+    source: Source
+    subscriber: str
+
+
+class DirectState(Enum):
+    """The decision about a subscriber."""
+
+    ASKING = auto()
+    """The peer's agent is asked."""
+    PROBING = auto()
+    """The peer allows it; the publisher's port is probed."""
+    DIRECT = auto()
+    """It may connect to the publisher."""
+    RELAYED = auto()
+    """A condition does not hold."""
+
+
+class Path(Enum):
+    """The answer that a subscriber's last ``requestTopic`` got."""
+
+    NONE = auto()
+    """None yet, or it has hung up since."""
+    RELAY = auto()
+    """The proxy's own address."""
+    DIRECT = auto()
+    """The publisher's address."""
+
+
+@dataclass(slots=True)
+class DirectRoute:
+    """The state of one subscriber.
+
+    Args:
+        wanted: The transport that this module's contract asks for.
+        state: The decision.
+        unmet: Why it is relayed; ``None`` in other states.
+        local: Whether ``unmet`` was found here, not at the peer.
+        grant: The peer's permission, from ``PROBING`` on.
+        path: What the subscriber was last answered.
+        endpoint: The address and port of that answer, if it was direct.
+        stranded: Whether it was made to hang up, so that it must be called back.
+        attempt: Counts the requests to the peer, to tell their responses apart.
+        since: When the state began, monotonic seconds.
+        breaks: When its direct connections broke, monotonic seconds.
+        answered_at: When it was last answered, monotonic seconds.
+        missed: Messages that passed while it was moved, as far as they were seen.
+        stuck: Why its direct connection cannot be ended although it has to be relayed; empty: it can.
+    """
+
+    wanted: Transport
+    state: DirectState
+    unmet: Unmet | None = None
+    local: bool = False
+    grant: Grant | None = None
+    path: Path = Path.NONE
+    endpoint: tuple[str, int] | None = None
+    stranded: bool = False
+    attempt: int = 0
+    since: float = 0.0
+    breaks: deque[float] = field(default_factory=lambda: deque(maxlen=limits.DIRECT_BREAKS))
+    answered_at: float = 0.0
+    missed: int = 0
+    stuck: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Ask:
+    """Ask the peer for a grant; pass the response to ``replied`` with this attempt."""
+
+    key: DirectKey
+    attempt: int
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """Try to connect to the node of a grant; pass the outcome to ``probed``."""
+
+    peer: int
+    grant: Grant
+
+
+@dataclass(frozen=True, slots=True)
+class Decided:
+    """Answer the subscriber's ``requestTopic`` if it waits."""
+
+    key: DirectKey
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """Make the subscriber hang up if it is connected, and call it back; see ``hung_up``."""
+
+    key: DirectKey
+
+
+@dataclass(frozen=True, slots=True)
+class HangUp:
+    """End the subscriber's direct connection; it is called back by a later ``Move``.
+
+    Args:
+        key: The subscriber.
+        endpoint: The address and port of its connection.
+    """
+
+    key: DirectKey
+    endpoint: tuple[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Release:
+    """Tell the peer that the subscriber does not use its grant any more.
+
+    Args:
+        key: The subscriber.
+        broken: Whether its connection broke, so that the publisher may be dead.
+    """
+
+    key: DirectKey
+    broken: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Fallback:
+    """Warn: this module's contract says ``direct``, and a condition does not hold."""
+
+    key: DirectKey
+    unmet: Unmet
+
+
+DirectAction = Ask | Probe | Decided | Move | HangUp | Release | Fallback
+
+
+class DirectSubscriptions:
+    """The direct connections of this module's subscribers to nodes of its peers.
+
+    Args:
+        is_latched: ``(key)``: whether the publisher is known to latch.
+        is_relayed: ``(key)``: whether a subscriber that is not known yet is connected to the proxy already.
+    """
+
+    def __init__(
+        self,
+        is_latched: Callable[[DirectKey], bool] = lambda _: False,
+        is_relayed: Callable[[DirectKey], bool] = lambda _: False,
+    ) -> None:
+        self._is_latched = is_latched
+        self._is_relayed = is_relayed
+        self._routes: dict[DirectKey, DirectRoute] = {}
+        self._of: dict[tuple[int, Source], dict[str, DirectKey]] = {}
+        self._reached: set[tuple[int, int]] = set()
+        """Peers and ports that were probed with success over the present link."""
+        self._probing: set[tuple[int, int]] = set()
+        self._timers: TimerQueue[DirectKey] = TimerQueue()
+
+    def __iter__(self) -> Iterator[tuple[DirectKey, DirectRoute]]:
+        """Every subscriber with its state; changes during the iteration are allowed."""
+        return iter(list(self._routes.items()))
+
+    def get(self, key: DirectKey) -> DirectRoute | None:
+        """The state of one subscriber; ``None`` if it is not known."""
+        return self._routes.get(key)
+
+    def of(self, peer: int, source: Source) -> list[tuple[str, DirectRoute]]:
+        """The subscribers of one source, by name."""
+        return [(name, self._routes[key]) for name, key in sorted(self._of.get((peer, source), {}).items())]
+
+    def connected(self) -> list[tuple[DirectKey, DirectRoute]]:
+        """The subscribers whose last answer was the publisher's address."""
+        return [(key, route) for key, route in self._routes.items() if route.path is Path.DIRECT]
+
+    # --- the local graph -------------------------------------------------------------------------------------------
+
+    def consider(self, key: DirectKey, wanted: Transport, unmet: Unmet | None, now: float) -> list[DirectAction]:
+        """Judge a subscriber that is new, or for which something changed here.
+
+        Args:
+            key: The subscriber.
+            wanted: The transport that this module's contract asks for.
+            unmet: The condition that does not hold here, if any.
+            now: Monotonic seconds.
+        """
+        route = self._routes.get(key)
+        if route is None:
+            route = self._routes[key] = DirectRoute(wanted, DirectState.RELAYED, since=now)
+            self._of.setdefault((key.peer, key.source), {})[key.subscriber] = key
+            route.local = True  # so that it is asked for below
+            route.path = Path.RELAY if self._is_relayed(key) else Path.NONE
+        route.wanted = wanted
+        if unmet is not None:
+            if route.unmet == unmet:
+                return []
+            return self._relay(key, route, unmet, now, local=True)
+        return self._ask(key, route, now) if route.local else []
+
+    def remove(self, key: DirectKey, *, hang_up: bool = True) -> list[DirectAction]:
+        """Forget a subscriber: it has unsubscribed, or its source has left the local graph.
+
+        Args:
+            key: The subscriber.
+            hang_up: End its direct connection. Otherwise the connection goes on, and a new run of the peer's agent
+                finds it.
+        """
+        route = self._routes.pop(key, None)
+        if route is None:
+            return []
+        names = self._of[key.peer, key.source]
+        del names[key.subscriber]
+        if not names:
+            del self._of[key.peer, key.source]
+        self._timers.set(key, None)
+        held = self._held(route)
+        actions: list[DirectAction] = [Decided(key)]
+        if hang_up and route.path is Path.DIRECT and route.endpoint is not None:
+            actions.append(HangUp(key, route.endpoint))
+        return [Release(key), *actions] if held else actions
+
+    # --- its requests ------------------------------------------------------------------------------------------------
+
+    def decision(self, key: DirectKey) -> Grant | Unmet | None:
+        """The answer for a subscriber: a grant, or why it is relayed; ``None`` while it is not decided."""
+        route = self._routes.get(key)
+        if route is None:
+            return Unmet(Condition.SUBSCRIBER, "its node is not registered as a subscriber here")
+        if route.state is DirectState.DIRECT:
+            return route.grant
+        return route.unmet if route.state is DirectState.RELAYED else None
+
+    def answered(self, key: DirectKey, endpoint: tuple[str, int] | None, now: float) -> None:
+        """Note what a subscriber's ``requestTopic`` was answered.
+
+        Args:
+            key: The subscriber.
+            endpoint: The publisher's address and port; ``None``: the proxy's own.
+            now: Monotonic seconds.
+        """
+        route = self._routes.get(key)
+        if route is not None:
+            route.path = Path.DIRECT if endpoint is not None else Path.RELAY
+            route.endpoint, route.answered_at = endpoint, now
+            route.stranded, route.stuck = False, ""
+
+    def hung_up(self, key: DirectKey) -> None:
+        """Note that a subscriber has no connection to the source any more, and waits for being called back."""
+        route = self._routes.get(key)
+        if route is not None:
+            route.path, route.endpoint, route.stranded = Path.NONE, None, True
+
+    def left(self, key: DirectKey, now: float) -> list[DirectAction]:
+        """Note that a subscriber has closed its connection to the proxy; a latched source may be direct now."""
+        route = self._routes.get(key)
+        if route is None or route.path is not Path.RELAY:
+            return []
+        route.path = Path.NONE
+        latched = route.unmet is not None and route.unmet.condition is Condition.LATCHED
+        return self._ask(key, route, now) if latched else []
+
+    # --- the peer ------------------------------------------------------------------------------------------------
+
+    def replied(self, key: DirectKey, attempt: int, found: Grant | Unmet, now: float) -> list[DirectAction]:
+        """Take the response to ``Ask``; one to an earlier attempt is ignored."""
+        route = self._routes.get(key)
+        if route is None or route.state is not DirectState.ASKING or route.attempt != attempt:
+            return []
+        if isinstance(found, Unmet):
+            return self._relay(key, route, found, now)
+        route.grant = found
+        if (key.peer, found.port) in self._reached:
+            return self._direct(key, route, now)
+        self._enter(route, DirectState.PROBING, now)
+        if (key.peer, found.port) in self._probing:
+            return []
+        self._probing.add((key.peer, found.port))
+        return [Probe(key.peer, found)]
+
+    def probed(self, peer: int, port: int, problem: str, now: float) -> list[DirectAction]:
+        """Take the outcome of a probe.
+
+        Args:
+            peer: The peer.
+            port: The probed port.
+            problem: Why the port cannot be reached; empty: it can.
+            now: Monotonic seconds.
+        """
+        if (peer, port) not in self._probing:
+            return []  # of an earlier link
+        self._probing.remove((peer, port))
+        if not problem:
+            self._reached.add((peer, port))
+        actions: list[DirectAction] = []
+        for key, route in self:
+            waits = route.state is DirectState.PROBING and key.peer == peer
+            if not waits or route.grant is None or route.grant.port != port:
+                continue
+            if problem:
+                actions += self._relay(key, route, Unmet(Condition.REACHABLE, problem), now)
+            else:
+                actions += self._direct(key, route, now)
+        return actions
+
+    def closed(self, peer: int, source: Source, subscriber: str, unmet: Unmet, now: float) -> list[DirectAction]:
+        """Take a peer's withdrawal of its grants for a source.
+
+        Args:
+            peer: The peer.
+            source: The source.
+            subscriber: The subscriber; empty: all of them.
+            unmet: Why. ``Condition.NODE``: the publisher has restarted, so the peer is asked again at once.
+            now: Monotonic seconds.
+        """
+        actions: list[DirectAction] = []
+        for name, route in self.of(peer, source):
+            key = DirectKey(peer, source, name)
+            if subscriber not in {"", name} or not self._held(route):
+                continue
+            if route.grant is not None:
+                self._reached.discard((peer, route.grant.port))
+            route.grant = None
+            if unmet.condition is Condition.NODE:
+                actions += self._hang_up(key, route)
+                actions += self._ask(key, route, now)
+            else:
+                actions += self._relay(key, route, unmet, now)
+        return actions
+
+    def retry(self, peer: int, source: Source, now: float) -> list[DirectAction]:
+        """Ask again for the subscribers of a source that the peer refused: something has changed there."""
+        return [
+            action
+            for name, route in self.of(peer, source)
+            if route.state is DirectState.RELAYED and not route.local
+            for action in self._ask(DirectKey(peer, source, name), route, now)
+        ]
+
+    def broken(self, key: DirectKey, now: float) -> list[DirectAction]:
+        """Handle a direct connection that is gone although its subscriber and its source are still there."""
+        route = self._routes.get(key)
+        if route is None or route.path is not Path.DIRECT:
+            return []
+        self.hung_up(key)
+        if route.grant is not None:
+            self._reached.discard((key.peer, route.grant.port))
+        route.breaks.append(now)
+        many = len(route.breaks) == limits.DIRECT_BREAKS and now - route.breaks[0] < limits.DIRECT_BREAKS_SPAN
+        if many:
+            text = f"its direct connection broke {limits.DIRECT_BREAKS} times in {limits.DIRECT_BREAKS_SPAN:g} s"
+            actions = self._relay(key, route, Unmet(Condition.STABLE, text), now)
+            return [Release(key, broken=True), *(one for one in actions if not isinstance(one, Release))]
+        route.grant = None
+        return [Release(key, broken=True), *self._ask(key, route, now)]
+
+    # --- links ---------------------------------------------------------------------------------------------------
+
+    def link_down(self, peer: int, now: float, *, crashed: bool) -> list[DirectAction]:
+        """Handle the loss of a peer's link.
+
+        Args:
+            peer: The peer.
+            now: Monotonic seconds.
+            crashed: Whether only the peer's agent has died: direct connections go on then. Otherwise the peer cannot
+                be reached, or has left, and they are ended.
+        """
+        self._reached = {one for one in self._reached if one[0] != peer}
+        self._probing = {one for one in self._probing if one[0] != peer}
+        actions: list[DirectAction] = []
+        for key, route in self:
+            if key.peer != peer:
+                continue
+            self._timers.set(key, None)
+            route.attempt += 1
+            if crashed and route.state is DirectState.DIRECT:
+                continue
+            actions += self._hang_up(key, route)
+            if not (route.state is DirectState.RELAYED and route.local):
+                self._enter(route, DirectState.RELAYED, now)
+                route.unmet, route.grant = Unmet(Condition.OFFERED, "its module has no link"), None
+                actions.append(Decided(key))
+        return actions
+
+    def link_up(self, peer: int, now: float) -> list[DirectAction]:
+        """Ask again for every subscriber of a peer that has a link again, those that are direct included."""
+        return [
+            action
+            for key, route in self
+            if key.peer == peer and not (route.state is DirectState.RELAYED and route.local)
+            for action in self._ask(key, route, now)
+        ]
+
+    # --- timers --------------------------------------------------------------------------------------------------
+
+    def next_timer(self) -> float | None:
+        """When ``handle_timer`` is due, monotonic seconds; ``None`` if no timer runs."""
+        return self._timers.next()
+
+    def handle_timer(self, now: float) -> list[DirectAction]:
+        """Ask again for subscribers that were refused for a reason that may have passed."""
+        actions: list[DirectAction] = []
+        for key in self._timers.take(now):
+            route = self._routes.get(key)
+            if route is not None and route.state is DirectState.RELAYED:
+                actions += self._ask(key, route, now)
+        return actions
+
+    # --- inside --------------------------------------------------------------------------------------------------
+
+    @staticmethod
+    def _held(route: DirectRoute) -> bool:
+        """Whether the peer may hold a grant for this subscriber."""
+        return route.state is not DirectState.RELAYED
+
+    @staticmethod
+    def _enter(route: DirectRoute, state: DirectState, now: float) -> None:
+        route.state, route.since = state, now
+        if state is not DirectState.RELAYED:
+            route.unmet, route.local = None, False
+
+    def _ask(self, key: DirectKey, route: DirectRoute, now: float) -> list[DirectAction]:
+        self._timers.set(key, None)
+        self._enter(route, DirectState.ASKING, now)
+        route.attempt += 1
+        return [Ask(key, route.attempt)]
+
+    def _hang_up(self, key: DirectKey, route: DirectRoute) -> list[DirectAction]:
+        """Makes a subscriber leave its direct connection, at once as far as this machine is concerned."""
+        if route.path is not Path.DIRECT or route.endpoint is None:
+            return []
+        endpoint = route.endpoint
+        self.hung_up(key)
+        return [HangUp(key, endpoint)]
+
+    def _direct(self, key: DirectKey, route: DirectRoute, now: float) -> list[DirectAction]:
+        if route.path is Path.RELAY and self._is_latched(key):
+            text = "it latches, and a move would deliver its last message twice: subscribe again"
+            return self._relay(key, route, Unmet(Condition.LATCHED, text), now)
+        self._enter(route, DirectState.DIRECT, now)
+        if route.path is Path.DIRECT and route.grant is not None and route.endpoint is not None:
+            same = route.endpoint[1] == route.grant.port
+        else:
+            same = route.path is Path.NONE and not route.stranded
+        return [Decided(key)] if same else [Decided(key), Move(key)]
+
+    def _relay(
+        self, key: DirectKey, route: DirectRoute, unmet: Unmet, now: float, *, local: bool = False
+    ) -> list[DirectAction]:
+        granted = route.grant is not None or (local and self._held(route))
+        self._enter(route, DirectState.RELAYED, now)
+        route.unmet, route.local, route.grant = unmet, local, None
+        route.attempt += 1
+        self._timers.set(key, None if unmet.lasting else now + limits.DIRECT_RETRY)
+        actions: list[DirectAction] = [Release(key)] if granted else []
+        if route.wanted is Transport.DIRECT and unmet.condition is not Condition.TRANSPORT:
+            actions.append(Fallback(key, unmet))
+        actions.append(Decided(key))
+        return [*actions, Move(key)] if route.stranded or route.path is Path.DIRECT else actions
