@@ -5,7 +5,7 @@ docs/design/protocol.md has examples.
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import msgspec
 
@@ -20,6 +20,8 @@ CLOSE: Final = "direct.close"
 """Notification: a subscriber does not use its grant any more."""
 CLOSED: Final = "direct.closed"
 """Notification: the publisher's agent withdraws grants."""
+_Kind = TypeVar("_Kind")
+
 RETRY: Final = "direct.retry"
 """Notification: what was refused may be granted now."""
 
@@ -123,7 +125,7 @@ def read_retry(args: dict[str, Any]) -> RetryDirect:
     return found
 
 
-def _read(args: dict[str, Any], kind: type[Any]) -> Any:
+def _read(args: dict[str, Any], kind: type[_Kind]) -> _Kind:
     try:
         return msgspec.convert(args, kind)
     except (msgspec.ValidationError, RecursionError) as error:

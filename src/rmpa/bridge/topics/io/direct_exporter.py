@@ -70,6 +70,7 @@ class DirectExporter:
     def reload(self, contracts: Contracts) -> None:
         """Take new contracts, and withdraw the grants that they do not allow."""
         self._contracts = contracts
+        self._act(self.grants.retry_all())
         self._act(self.grants.judge_again(self._unmet_by_rules))
 
     def graph_changed(self, change: GraphChange) -> None:
@@ -87,6 +88,8 @@ class DirectExporter:
             elif any(granted.uri != change.api for _, _, granted in self.grants.of(source)):
                 unmet = Unmet(Condition.NODE, f"{change.node} has restarted")
                 self._act(self.grants.withdraw(source, unmet))
+            else:
+                self._act(self.grants.changed(source))
 
     def policy_changed(self) -> None:
         """Withdraw the grants for sources that are not offered any more to their peers."""

@@ -168,9 +168,7 @@ class DirectImporter:
         unmet = self._unmet(session, source, entry, node, uri)
         self._act(self.routes.consider(key, contract.transport, unmet, self._now()))
 
-    def _unmet(
-        self, session: PeerSession, source: Source, entry: RemoteTopic, node: str, uri: str
-    ) -> Unmet | None:
+    def _unmet(self, session: PeerSession, source: Source, entry: RemoteTopic, node: str, uri: str) -> Unmet | None:
         unmet = unmet_by_contract(self._contracts.of(entry.topic, entry.type), "this module")
         if unmet is not None:
             return unmet
@@ -329,9 +327,7 @@ class DirectImporter:
         if session is None:
             return
         address = session.address
-        problem = await probe(
-            address, grant.port, grant.probe, node=grant.node, timeout=limits.DIRECT_PROBE_TIMEOUT
-        )
+        problem = await probe(address, grant.port, grant.probe, node=grant.node, timeout=limits.DIRECT_PROBE_TIMEOUT)
         if problem:
             problem = f"no connection to {address}:{grant.port}: {problem}"
         self._act(self.routes.probed(peer, grant.port, problem, self._now()))
@@ -453,9 +449,7 @@ class DirectImporter:
             if held and not publication.subscribers:
                 self._on_demand(key.peer, key.source, False)
 
-    async def _leave(
-        self, key: DirectKey, route: Any, publication: Publication, uri: str, proxy: str
-    ) -> bool:
+    async def _leave(self, key: DirectKey, route: Any, publication: Publication, uri: str, proxy: str) -> bool:
         """Ends a subscriber's present connection to a source; return whether it has none any more."""
         topic = publication.topic
         endpoint = route.endpoint if route.path is Path.DIRECT else None
@@ -507,7 +501,9 @@ class DirectImporter:
         settled = [
             (key, route.endpoint)
             for key, route in connected
-            if route.endpoint is not None and now - route.answered_at > limits.DIRECT_SETTLE and key not in self._moves
+            if route.endpoint is not None
+            and now - route.answered_at > limits.DIRECT_SETTLE
+            and key not in self._moves
         ]
         wanted = Counter(endpoint for _, endpoint in settled)
         short = {endpoint for endpoint, count in wanted.items() if len(standing(endpoint)) < count}
