@@ -16,9 +16,15 @@ if TYPE_CHECKING:
     from rmpa.observe.snapshot import DirectFigures, LatencyInfo, RouteInfo, TopicInfo
 
 
-def ask_agent(master: Master, topic: str) -> TopicInfo | None:
-    """What the master's agent knows of a topic; ``None`` without an agent, or if it does not answer."""
-    snapshot = master.snapshot(topics=(topic,))
+def ask_agent(master: Master, topic: str, *, figures: bool = False) -> TopicInfo | None:
+    """What the master's agent knows of a topic; ``None`` without an agent, or if it does not answer.
+
+    Args:
+        master: The master.
+        topic: The topic.
+        figures: Wait for the figures of direct connections.
+    """
+    snapshot = master.snapshot(topics=(topic,), figures=figures)
     return next((info for info in snapshot.topics if info.name == topic), None) if snapshot is not None else None
 
 
@@ -95,23 +101,21 @@ def transport_lines(route: RouteInfo) -> Iterator[tuple[str, str]]:
         missed = f"; {one.missed} messages missed while it was moved" if one.missed else ""
         yield "transport", subscriber_text(one, since) + missed
         if one.figures is not None:
-            yield "", figures_text(one.figures)
+            yield "", figures_text(one.figures, route.node if one.state == "granted" else one.node)
         elif one.unmeasured:
             yield "", one.unmeasured
 
 
-def figures_text(figures: DirectFigures) -> str:
-    """The figures of a direct connection, by the node's own statistics."""
-    parts = []
-    if figures.rate is not None:
-        parts.append(f"{figures.rate:.1f} Hz")
+def figures_text(figures: DirectFigures, node: str) -> str:
+    """The figures of a direct connection, by the statistics of a node at its end."""
+    flow = [f"{figures.rate:.1f} Hz"] if figures.rate is not None else []
     if figures.bandwidth is not None:
-        parts.append(f"{size(figures.bandwidth)}/s over {duration(figures.window)}")
+        flow.append(f"{size(figures.bandwidth)}/s over {duration(figures.window)}")
     if figures.messages is not None:
-        parts.append(f"{figures.messages} messages")
+        flow.append(f"{figures.messages} messages")
     if figures.dropped is not None:
-        parts.append(f"{figures.dropped} dropped by its queue")
-    return ", ".join(parts)
+        flow.append(f"{figures.dropped} dropped by its queue")
+    return f"{', '.join(flow)}, as {node} counts"
 
 
 def facts(route: RouteInfo) -> Iterator[tuple[str, str]]:

@@ -91,7 +91,7 @@ def info(topic: str, options: GraphOptions) -> None:
     wanted = read_name(topic)
     master, graph = options.graph()
     graph.require_topic(wanted.name)
-    crossing = ask_agent(master, wanted.name)
+    crossing = ask_agent(master, wanted.name, figures=True)
     if options.as_json:
         print_json(_topic_json(graph, wanted.name) | {"mesh": crossing})
         return

@@ -6,17 +6,22 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from rmpa.bridge.direct.conditions import Condition
+from rmpa.bridge.direct.conditions import Condition, unmet_by_contract
 from rmpa.bridge.direct.subscriber_side import DirectState, Path
-from rmpa.bridge.topics.io.direct_exporter import unmet_by_contract
 from rmpa.core.contract import Transport
+from rmpa.observe.io.direct_sampler import DirectFlow, DirectSampler
 from rmpa.observe.snapshot import RouteInfo, SubscriberTransport
 
 if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator
+
+    from rmpa.bridge.direct.publisher_side import Granted
     from rmpa.bridge.direct.subscriber_side import DirectRoute
     from rmpa.bridge.io.bridge import Bridge
     from rmpa.bridge.messages import Source
     from rmpa.core.contract import Contract
+    from rmpa.observe.io.direct_sampler import DirectSample
+    from rmpa.ros.core.api import Core
 
 _PATHS = {Path.NONE: "", Path.RELAY: "relay", Path.DIRECT: "direct"}
 
@@ -25,19 +30,41 @@ class DirectSection:
     """Reads what the bridge knows of direct transport; changes nothing.
 
     Args:
-        bridge: The agent's bridge.
+        core: The agent's ROS core.
+        bridge: Its bridge.
     """
 
-    def __init__(self, bridge: Bridge) -> None:
+    def __init__(self, core: Core, bridge: Bridge) -> None:
+        self._core = core
         self._bridge = bridge
+        self.sampler = DirectSampler(self._flows)
+        """The figures of direct connections."""
 
-    def inbound(self, info: RouteInfo, peer: int, source: Source, contract: Contract, now: float) -> RouteInfo:
+    def _flows(self, topics: Collection[str] | None) -> Iterator[DirectFlow]:
+        """The direct connections of local nodes, of some topics or of all."""
+        part = self._bridge.topics
+        for key, route in part.direct_imports.routes.connected():
+            entry = part.imports.get(key.peer, key.source)
+            if entry is not None and (topics is None or entry.topic in topics):
+                yield self._flow_in(entry.topic, key.subscriber, route)
+        for source, _, name, granted in part.direct_exports.grants:
+            if topics is None or source.topic in topics:
+                yield _flow_out(source, name, granted)
+
+    def _flow_in(self, topic: str, subscriber: str, route: DirectRoute) -> DirectFlow:
+        uri = self._core.state().subscribers.get(topic, {}).get(subscriber, "")
+        return DirectFlow(subscriber, uri, topic, subscriber, route.endpoint or ("", 0))
+
+    def inbound(
+        self, info: RouteInfo, peer: int, source: Source, topic: str, contract: Contract, now: float
+    ) -> RouteInfo:
         """Add the transport to a route from a peer.
 
         Args:
             info: The route.
             peer: The number of the peer's session.
             source: The source, by its wire name.
+            topic: Its local name.
             contract: This module's for the topic.
             now: Monotonic seconds.
         """
@@ -46,7 +73,7 @@ class DirectSection:
         publication = topics.of(session).publication(source) if session is not None else None
         relayed = publication is not None and publication.subscribers > 0
         routes = topics.direct_imports.routes.of(peer, source)
-        subscribers = tuple(_subscriber(name, route, now) for name, route in routes)
+        subscribers = tuple(self._measured(_subscriber(name, route, now), topic, route) for name, route in routes)
         direct = any(one.transport == "direct" for one in subscribers)
         condition, text = _condition(subscribers)
         if relayed and not condition and contract.transport is Transport.RELAY:
@@ -59,6 +86,9 @@ class DirectSection:
             condition_text=text,
             subscribers=subscribers,
         )
+
+    def _measured(self, one: SubscriberTransport, topic: str, route: DirectRoute) -> SubscriberTransport:
+        return _with(one, self.sampler[self._flow_in(topic, one.node, route)]) if route.path is Path.DIRECT else one
 
     def outbound(self, info: RouteInfo, peer: int, source: Source) -> RouteInfo:
         """Add the transport to a route to a peer that is relayed at present."""
@@ -74,16 +104,28 @@ class DirectSection:
     def _granted(self, source: Source, peer: int) -> tuple[SubscriberTransport, ...]:
         grants = self._bridge.topics.direct_exports.grants
         return tuple(
-            SubscriberTransport(node=name, transport="direct", state="granted", endpoint=str(granted.port))
+            _with(
+                SubscriberTransport(node=name, transport="direct", state="granted", endpoint=str(granted.port)),
+                self.sampler[_flow_out(source, name, granted)],
+            )
             for owner, name, granted in sorted(grants.of(source), key=lambda grant: grant[:2])
             if owner == peer
         )
 
-    def counts(self, peer: int) -> tuple[int, int]:
-        """The number of direct connections to a peer's publishers, and of the grants that it has here."""
-        topics = self._bridge.topics
-        there = sum(1 for key, _ in topics.direct_imports.routes.connected() if key.peer == peer)
-        return there, sum(1 for _, owner, _, _ in topics.direct_exports.grants if owner == peer)
+
+def direct_counts(bridge: Bridge, peer: int) -> tuple[int, int]:
+    """The number of direct connections to a peer's publishers, and of the grants that it has here."""
+    there = sum(1 for key, _ in bridge.topics.direct_imports.routes.connected() if key.peer == peer)
+    return there, sum(1 for _, owner, _, _ in bridge.topics.direct_exports.grants if owner == peer)
+
+
+def _flow_out(source: Source, subscriber: str, granted: Granted) -> DirectFlow:
+    return DirectFlow(source.node, granted.uri, source.topic, subscriber)
+
+
+def _with(one: SubscriberTransport, sample: DirectSample) -> SubscriberTransport:
+    """A subscriber with what its node, or its publisher, said last."""
+    return msgspec.structs.replace(one, connected=sample.connected, figures=sample.figures, unmeasured=sample.problem)
 
 
 def _transport(*, direct: bool, relayed: bool) -> str:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import msgspec
 
-from rmpa.observe.io.direct_section import DirectSection
+from rmpa.observe.io.direct_section import direct_counts
 from rmpa.observe.shared_address import mark_shared_addresses
 from rmpa.observe.snapshot import BoundInfo, LinkInfo, PeerInfo
 from rmpa.runtime.event_loop import yield_to_data
@@ -50,7 +50,6 @@ class PeersSection:
     def __init__(self, bridge: Bridge, bounds: LimitReports) -> None:
         self._bridge = bridge
         self._bounds = bounds
-        self._direct = DirectSection(bridge)
         self._clock = SystemClock()
 
     def infos(self, endpoint: EndpointView) -> tuple[PeerInfo, ...]:
@@ -72,7 +71,7 @@ class PeersSection:
                 ours = self._bridge.topics.exports.topics_for(session.peer)
                 yield_to_data()
                 beyond = self._beyond(session)
-                to_it, from_it = self._direct.counts(session.peer)
+                to_it, from_it = direct_counts(self._bridge, session.peer)
                 info = msgspec.structs.replace(
                     info, topics_in=theirs, topics_out=ours, beyond=beyond, direct_in=to_it, direct_out=from_it
                 )

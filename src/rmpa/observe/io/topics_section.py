@@ -16,7 +16,6 @@ from rmpa.bridge.topics.remote_topic import RouteState
 from rmpa.config.param_rules import CLOCK
 from rmpa.core import limits
 from rmpa.core.contract import KEYS, Contract
-from rmpa.observe.io.direct_section import DirectSection
 from rmpa.observe.snapshot import EventInfo, LatencyInfo, RouteInfo, SampleSpread, TopicInfo, UnreachableInfo
 from rmpa.ros.wire.tcpros import LENGTH
 from rmpa.runtime.event_loop import sorted_yielding, yield_to_data, yielding_to_data
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.topics.exports import LocalSource
     from rmpa.bridge.topics.remote_topic import RemoteTopic
     from rmpa.config.settings import Settings
+    from rmpa.observe.io.direct_section import DirectSection
     from rmpa.observe.io.peer_clocks import PeerClocks
     from rmpa.ros.core.api import Core
 
@@ -65,13 +65,16 @@ class TopicsSection:
         core: Its ROS core.
         bridge: Its bridge.
         clocks: Those of its peers.
+        direct: Reads what is known of direct transport.
     """
 
-    def __init__(self, settings: Settings, core: Core, bridge: Bridge, clocks: PeerClocks) -> None:
+    def __init__(
+        self, settings: Settings, core: Core, bridge: Bridge, clocks: PeerClocks, direct: DirectSection
+    ) -> None:
         self._core = core
         self._clocks = clocks
         self._bridge = bridge
-        self._direct = DirectSection(bridge)
+        self._direct = direct
         self._clock = SystemClock()
         self.reload(settings)
 
@@ -187,7 +190,8 @@ class TopicsSection:
             limit="nodes" if entry.crowded else "",
             **_events(flow.watch if flow is not None else past, now),
         )
-        info = self._direct.inbound(info, at.peer, source, self._contracts.of(entry.topic, entry.type), now)
+        own = self._contracts.of(entry.topic, entry.type)
+        info = self._direct.inbound(info, at.peer, source, entry.topic, own, now)
         if flow is None:
             return info
         return msgspec.structs.replace(
