@@ -48,6 +48,8 @@ DIRECT_SAMPLE_FIRST: Final = 0.4
 """Time between the first two samples: somebody waits for the figures."""
 DIRECT_FIRST_LOOK: Final = 0.6
 """A look waits at most this long for figures; then it shows what is known."""
+DIRECT_SAMPLE_TIMEOUT: Final = 0.5
+"""Time-out of a question to a node, which is on this machine."""
 DIRECT_SAMPLES: Final = 11
 """Samples of a connection that are kept: rate and bandwidth are those of the last ten seconds."""
 DIRECT_SAMPLE_NODES: Final = 8

@@ -293,6 +293,7 @@ class SubscriberTransport(msgspec.Struct, kw_only=True, frozen=True):
         connected: Whether its direct connection stands, by the node and the kernel; ``None``: nobody looked.
         figures: Of its direct connection, while somebody looks; see ``unmeasured``.
         unmeasured: Why there are no figures although somebody looks, ready to read.
+        silent: Whether the node that was asked for them did not answer.
     """
 
     node: str
@@ -308,6 +309,7 @@ class SubscriberTransport(msgspec.Struct, kw_only=True, frozen=True):
     connected: bool | None = None
     figures: DirectFigures | None = None
     unmeasured: str = ""
+    silent: bool = False
 
 
 class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):

@@ -11,6 +11,18 @@ BY_TOOL: Final = "measures"
 """``Condition.MEASURES``: the subscriber is a tool of RMPA, and relayed on purpose."""
 BY_RULE: Final = "transport"
 """``Condition.TRANSPORT``: the contract of one end says ``relay``."""
+_REMEDIES: Final = {
+    "contract": 'take these terms out of [[contract]], or set its transport to "relay"',
+    "name": "let it have one name in both modules ([[peer]] names of both)",
+    "listening": "start the publisher's node with ROS_IP of an address of its network, not of loopback",
+    "subscriber": "start the subscriber with ROS_IP of an address of its network, not of loopback",
+    "caller_id": "give one of both nodes another name",
+    "reachable": "see that TCP gets through from this machine to the ports of nodes over there (a firewall?)",
+    "latched": "start the subscriber again",
+}
+"""What a user may do about some of the conditions; the others say it themselves, or pass."""
+REMEDY: Final = "docs/contracts.md explains the conditions"
+STUCK_REMEDY: Final = "give the agent CAP_NET_ADMIN (docs/systemd.md), or start that subscriber again"
 _WAITS: Final = {
     "asking": "the peer's agent is asked for a direct connection",
     "probing": "the port of the publisher's node is tried",
@@ -54,6 +66,11 @@ def route_texts(route: RouteInfo) -> list[str]:
     if route.transport == "relay" and route.condition:
         return [f"relayed: {route.condition_text}"]
     return []
+
+
+def remedy(one: SubscriberTransport) -> str:
+    """What to do about a subscriber that is relayed, or cannot be."""
+    return STUCK_REMEDY if one.stuck else _REMEDIES.get(one.condition, REMEDY)
 
 
 def fallbacks(route: RouteInfo) -> list[SubscriberTransport]:

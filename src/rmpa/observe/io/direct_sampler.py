@@ -9,9 +9,8 @@ from __future__ import annotations
 import asyncio
 import logging
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.policy import OWN_NODE
 from rmpa.core.errors import RmpaError
 from rmpa.observe import limits
@@ -28,6 +27,8 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.bus import BusLink, BusTraffic
 
 _log = logging.getLogger(__name__)
+_BEYOND: Final = "exceeds XML-RPC limits"
+"""In the fault of a rospy node once a connection has carried 2 GiB (``ros.wire.bus``)."""
 
 
 class DirectFlow(NamedTuple):
@@ -55,11 +56,13 @@ class DirectSample:
     Args:
         connected: Whether it has the connection, and the kernel too; ``None``: not known.
         problem: Why there are no figures, ready to read; empty if there are, or will be.
+        silent: Whether the node did not answer.
         meter: The readings.
     """
 
     connected: bool | None = None
     problem: str = ""
+    silent: bool = False
     meter: TrafficMeter = field(default_factory=TrafficMeter)
 
     @property
@@ -172,19 +175,19 @@ class DirectSampler:
 
     async def _ask(self, uri: str, flows: list[DirectFlow]) -> None:
         """Ask one node for its connections and their traffic."""
-        node, timeout = flows[0].node, bridge_limits.DIRECT_NODE_TIMEOUT
+        node, timeout = flows[0].node, limits.DIRECT_SAMPLE_TIMEOUT
         links: list[BusLink] | None = None
-        traffic: dict[int, BusTraffic] = {}
+        stats: list[BusTraffic] = []
         problem = ""
         try:
             links = read_bus_info(await call(uri, "getBusInfo", OWN_NODE, timeout=timeout))
             stats = read_bus_stats(await call(uri, "getBusStats", OWN_NODE, timeout=timeout))
         except RosFault as fault:
-            stats, problem = [], f"{node} does not tell its figures: {fault.text}"
-            if "exceeds XML-RPC limits" in fault.text:
+            problem = f"{node} does not tell its figures: {fault.text}"
+            if _BEYOND in fault.text:
                 problem = f"{node} cannot tell its figures: rospy's counters end at 2 GiB"
         except RmpaError as error:
-            stats, problem = [], f"{node} does not tell its figures: {error}"
+            problem = f"{node} does not tell its figures: {error}"
         now = asyncio.get_running_loop().time()
         for flow in flows:
             inbound = flow.endpoint is not None
@@ -203,7 +206,7 @@ def _take(
     now: float,
 ) -> None:
     """Judge what a node said of one of its flows."""
-    sample.problem = problem
+    sample.problem, sample.silent = problem, links is None
     if links is None:
         # The node may be stopped, or too busy; the kernel still knows whether it has a connection.
         sample.connected = _stands(flow.endpoint)

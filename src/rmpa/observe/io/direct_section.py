@@ -92,7 +92,7 @@ class DirectSection:
 
     def outbound(self, info: RouteInfo, peer: int, source: Source) -> RouteInfo:
         """Add the transport to a route to a peer that is relayed at present."""
-        subscribers = self._granted(source, peer)
+        subscribers = self.granted_to(peer, source)
         transport = _transport(direct=bool(subscribers), relayed=info.state == "open")
         return msgspec.structs.replace(info, transport=transport, subscribers=subscribers)
 
@@ -101,7 +101,8 @@ class DirectSection:
         grants = self._bridge.topics.direct_exports.grants
         return list(dict.fromkeys(peer for peer, _, _ in grants.of(source)))
 
-    def _granted(self, source: Source, peer: int) -> tuple[SubscriberTransport, ...]:
+    def granted_to(self, peer: int, source: Source) -> tuple[SubscriberTransport, ...]:
+        """A peer's subscribers that may connect to a local source directly, by name."""
         grants = self._bridge.topics.direct_exports.grants
         return tuple(
             _with(

@@ -83,10 +83,11 @@ class SnapshotBuilder:
         self._cpu: float | None = None
         self._cpu_known = time.monotonic()
         self._peers = PeersSection(sources.bridge, sources.limit_reports)
-        direct = DirectSection(sources.core, sources.bridge)
-        self.sampler = direct.sampler
+        self.direct = DirectSection(sources.core, sources.bridge)
+        """What is known of direct transport."""
+        self.sampler = self.direct.sampler
         """The figures of direct connections, which are read only while somebody looks."""
-        self._topics = TopicsSection(settings, sources.core, sources.bridge, sources.clocks, direct)
+        self._topics = TopicsSection(settings, sources.core, sources.bridge, sources.clocks, self.direct)
         self._services = ServicesSection(sources.services)
 
     @property
