@@ -42,11 +42,11 @@ def pair(modules: ModuleFactory, subscriber: str, publisher: str) -> tuple[Modul
 
 
 @pytest.mark.parametrize(("subscriber", "publisher"), [("roscpp", "rospy"), ("rospy", "roscpp")])
-def test_a_cable_that_is_out_for_a_moment_costs_nothing(
+def test_a_network_that_drops_all_for_a_moment_costs_nothing(
     modules: ModuleFactory, subscriber: str, publisher: str
 ) -> None:
     _, b, talker, listener = pair(modules, subscriber, publisher)
-    b.host.outage(0.3)
+    b.host.dropout(0.3)
     unbroken(flows(listener, 100))
     assert links(listener, talker) == 1
 
