@@ -96,6 +96,11 @@ class DirectSampler:
         """What is known of a flow; nothing if nobody has looked."""
         return self._samples.get(flow) or DirectSample()
 
+    @property
+    def idle(self) -> bool:
+        """Whether no node is asked."""
+        return self._task is None
+
     def look(self, topics: Collection[str] | None) -> None:
         """Sample the direct connections of topics, or of all with ``None``, for ``limits.DIRECT_LOOK`` seconds."""
         until = asyncio.get_running_loop().time() + limits.DIRECT_LOOK
