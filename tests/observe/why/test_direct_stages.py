@@ -198,16 +198,20 @@ RELAYED = {"transport": "relay", "state": "relayed", "endpoint": "", "connected"
 @pytest.mark.parametrize(
     ("changes", "level", "text"),
     [
-        ({"condition": "caller_id", "text": "taken"}, CheckLevel.OK, "relayed for /base: taken"),
+        (
+            {"condition": "caller_id", "text": "taken"},
+            CheckLevel.OK,
+            "relayed for /base: taken (condition caller_id)",
+        ),
         (
             {"condition": "caller_id", "text": "taken", "wanted": "direct"},
             CheckLevel.WARN,
-            "relayed for /base: taken",
+            "relayed for /base: taken (condition caller_id)",
         ),
         (
             {"condition": "transport", "text": 'it is "relay"', "wanted": "direct"},
             CheckLevel.OK,
-            'relayed for /base: it is "relay"',
+            'relayed for /base: it is "relay" (condition transport)',
         ),
     ],
 )
