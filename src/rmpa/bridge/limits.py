@@ -159,6 +159,12 @@ DIRECT_MAX: Final = 1024
 DIRECT_ADOPT: Final = 10.0
 """Seconds that a new run of a peer's agent has to offer again what its earlier run left connected directly; after that the
 connections are ended."""
+DIRECT_ASKS: Final = 16
+"""Services of one peer for which direct calls are asked for, or whose servers are probed, at a time; a peer answers
+``ASKS_AT_ONCE``."""
+DIRECT_KEEP: Final = 30.0
+"""Seconds that services which are called directly stay in the graph after their agent has crashed, as topics do
+(``core.limits.RESUME_WINDOW``). Their servers are probed each `DIRECT_CHECK` meanwhile."""
 DIRECT_BREAKS: Final = 3
 """A direct connection that broke so many times within `DIRECT_BREAKS_SPAN` seconds is relayed for `DIRECT_RETRY`."""
 DIRECT_BREAKS_SPAN: Final = 10.0
