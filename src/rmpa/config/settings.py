@@ -376,6 +376,12 @@ class Settings:
         """The contracts of this module's topics, by ``[[contract]]`` and ``[bridge] transport``."""
         return Contracts(self.contracts, self.transport)
 
+    @property
+    def allows_direct(self) -> bool:
+        """Whether any topic may go from node to node, past the agents."""
+        words = (self.transport, *(rule.values.get("transport") for rule in self.contracts))
+        return any(word in (Transport.DIRECT, Transport.AUTO) for word in words)
+
 
 SETTINGS: Final = tuple(settings_of(Settings))
 """Every setting, in the order of the documentation."""

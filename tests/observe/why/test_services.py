@@ -117,8 +117,8 @@ def test_the_first_stage_that_fails(
     assert remedy in found.failed.remedy
 
 
-def test_every_stage_behind_the_link_can_fail_but_the_calls() -> None:
-    assert {stage for _, _, stage, _, _ in FAILURES.values()} == set(ORDER) - {"peer", "link", "calls"}
+def test_every_stage_behind_the_link_can_fail_but_transport_and_calls() -> None:
+    assert {stage for _, _, stage, _, _ in FAILURES.values()} == set(ORDER) - {"peer", "link", "transport", "calls"}
 
 
 def test_without_a_link_nothing_else_is_judged() -> None:
