@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
+import time
 from typing import TYPE_CHECKING
 
 import pytest
 
 from lab.bed.processes import eventually
+from tests.interop.modules import Module
 from tests.interop.ros import PYTHON
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from lab.bed.namespaces import Lab
     from lab.bed.processes import Event, Process
-    from tests.interop.conftest import ModuleFactory
-    from tests.interop.modules import Module
+    from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
@@ -94,3 +98,189 @@ def test_calls_go_from_node_to_node(modules: ModuleFactory, server: str, client:
     info = known(b)
     assert info["calls"] == 0, "no call went through the agents"
     assert int(str(info["lookups"])) >= 11
+
+
+def test_the_graph_does_not_change(modules: ModuleFactory) -> None:
+    a, b = modules("a", "b", config=AUTO)
+    on_network(a, b)
+    worker(a)
+    own = a.ros.tool("rosservice", "uri", "/work").strip()
+    wait_transport(b, "direct")
+    client = caller(b, name="client")
+    assert b.ros.tool("rosservice", "uri", "/work").startswith("rosrpc://127.")
+    assert b.ros.tool("rosservice", "node", "/work").strip() == "/rmpa/a/worker_work"
+    assert "/rmpa/a/worker_work" in b.ros.tool("rosservice", "info", "/work")
+    assert b.ros.tool("rosservice", "type", "/work").strip() == "rmpa_test/Work"
+    assert lookup(b, "/client") == own, "a node of this module is told the server's own address"
+    assert lookup(b, "/unknown").startswith("rosrpc://127."), "a tool that is no node is told the proxy's"
+    code, output = b.agent.rmpa("why", "/work")
+    assert code == 0
+    assert f"direct: clients call the server itself, at {own}" in output
+    assert "direct for b" in a.agent.rmpa("service", "info", "/work")[1]
+    assert calls(client, "echo 0 10 2 once")["same"] == 2
+
+
+def test_a_server_that_restarts_on_another_port_is_found_again(modules: ModuleFactory) -> None:
+    a, b = modules("a", "b", config=AUTO)
+    on_network(a, b)
+    for kind in CLIENTS:
+        server = worker(a, kind)
+        first = wait_transport(b, "direct")["address"]
+        client = caller(b, kind)
+        assert calls(client, "echo 0 10 2 once")["same"] == 2
+        server.kill()
+        server.wait()
+        server = worker(a, kind)  # at another port, before or after the core has missed the first one
+        eventually(lambda before=first: known(b).get("address", before) != before, what="another address")
+        wait_transport(b, "direct")
+        assert calls(client, "echo 0 10 2 once")["same"] == 2
+        assert calls(client, "echo 0 10 2 persistent")["same"] == 2
+        assert known(b)["calls"] == 0
+        server.interrupt()
+        eventually(lambda: not known(b), what="the service has left")
+
+
+@pytest.mark.parametrize("kind", CLIENTS)
+def test_a_call_under_way_fails_within_the_lease_when_the_cable_is_cut(modules: ModuleFactory, kind: str) -> None:
+    a, b = modules("a", "b", config=AUTO)
+    on_network(a, b)
+    server = worker(a, kind)
+    wait_transport(b, "direct")
+    client = caller(b, kind)
+    since = client.mark_events()
+    client.tell("sleep 60 10 1 persistent")
+    server.wait_event("call", where=lambda event: event["op"] == "sleep")
+    a.host.cut()
+    began = time.monotonic()
+    done = client.wait_event("done", since=since)
+    assert done["ok"] == 0
+    assert time.monotonic() - began < 10.0, "the lease of 1 s, and what a shared machine adds; TCP takes minutes"
+    eventually(lambda: "/work" not in b.ros.tool("rosservice", "list").split(), what="the service has left")
+    a.host.restore()
+    wait_transport(b, "direct")
+    fresh = worker(a, kind, "/fresh")  # rospy's server is busy with the call of before
+    wait_transport(b, "direct", service="/fresh")
+    assert calls(caller(b, kind, "/fresh"), "echo 0 10 2 once")["same"] == 2
+    assert fresh.returncode is None
+
+
+def test_calls_go_on_while_the_agent_of_the_server_is_dead(modules: ModuleFactory) -> None:
+    a, b = modules("a", "b", config=AUTO)
+    on_network(a, b)
+    worker(a)
+    wait_transport(b, "direct")
+    client = caller(b)
+    local = caller_at_loopback(b)
+    since = client.mark_events()
+    client.tell("sleep 3 10 1 persistent")
+    a.agent.kill()
+    b.agent.process.wait_for("link down: a")
+    assert calls(local, "echo 0 10 1 once")["ok"] == 0, "what would be relayed fails at once"
+    assert client.wait_event("done", since=since)["same"] == 1, "a call under way is answered"
+    assert calls(client, "echo 0 10 3 once")["same"] == 3
+    a.agent.restart()
+    b.agent.wait_peer("a")
+    eventually(lambda: known(b).get("transport") == "direct", what="direct again")
+    assert calls(client, "echo 0 10 3 persistent")["same"] == 3
+    assert calls(local, "echo 0 10 1 once")["same"] == 1
+
+
+def caller_at_loopback(module: Module) -> Process:
+    """A client that connects within its machine only."""
+    before, module.ros.env["ROS_HOSTNAME"] = module.ros.env.pop("ROS_IP"), "localhost"
+    started = caller(module, name="local")
+    del module.ros.env["ROS_HOSTNAME"]
+    module.ros.env["ROS_IP"] = before
+    return started
+
+
+def test_a_server_killed_with_its_agent_leaves_the_graph(modules: ModuleFactory) -> None:
+    a, b = modules("a", "b", config=AUTO)
+    on_network(a, b)
+    server = worker(a)
+    wait_transport(b, "direct")
+    a.agent.kill()
+    b.agent.process.wait_for("link down: a")
+    assert "/work" in b.ros.tool("rosservice", "list").split()
+    server.kill()
+    eventually(lambda: "/work" not in b.ros.tool("rosservice", "list").split(), what="the service has left")
+
+
+def test_a_persistent_call_outlives_the_agent_of_the_client(modules: ModuleFactory) -> None:
+    a, b = modules("a", "b", config=AUTO)
+    on_network(a, b)
+    server = worker(a)
+    wait_transport(b, "direct")
+    client = caller(b)
+    since = client.mark_events()
+    client.tell("sleep 3 10 2 persistent")
+    server.wait_event("call", where=lambda event: event["op"] == "sleep")
+    b.agent.kill()
+    assert client.wait_event("done", since=since)["same"] == 2
+    b.agent.restart()
+    wait_transport(b, "direct")
+    assert calls(client, "echo 0 10 2 once")["same"] == 2
+    assert known(b)["calls"] == 0
+
+
+def test_the_transport_follows_the_rules_of_both_modules(modules: ModuleFactory, tmp_path: Path) -> None:
+    a, b = modules("a", "b", config=AUTO)
+    on_network(a, b)
+    server = worker(a)
+    wait_transport(b, "direct")
+    client = caller(b)
+    since = client.mark_events()
+    client.tell("sleep 1.5 10 3 persistent")
+    server.wait_event("call", where=lambda event: event["op"] == "sleep")
+
+    def rule(module: Module, text: str) -> None:
+        (tmp_path / f"{module.name}.toml").write_text(text, encoding="utf-8")
+        assert module.agent.rmpa("reload")[0] == 0
+
+    rule(a, '[[service]]\nnames = ["/work"]\ntransport = "relay"\n' + AUTO)
+    info = wait_transport(b, "relay", "transport")
+    assert "the server's module" in str(info["relayed_because"])
+    assert client.wait_event("done", since=since)["same"] == 3, "a persistent client keeps its connection"
+    assert known(b)["calls"] == 0
+    assert calls(client, "echo 0 10 2 once")["same"] == 2
+    assert known(b)["calls"] == 2
+    rule(a, AUTO)
+    wait_transport(b, "direct")
+    rule(b, "")
+    wait_transport(b, "relay", "transport")
+    rule(b, AUTO + "timeout = 5\n")
+    assert "5 s" in str(wait_transport(b, "relay", "contract")["relayed_because"])
+    rule(b, '[services]\ntransport = "direct"\n[[peer]]\nname = "a"\nprefix = "/robot"\n')
+    wait_transport(b, "relay", "name", "/robot/work")
+    b.agent.process.wait_for(r'! /robot/work of a: relayed although transport is "direct"')
+    assert "[name" in b.agent.rmpa("why", "/robot/work")[1] or "(name)" in b.agent.rmpa("why", "/robot/work")[1]
+
+
+def test_nodes_that_are_bound_to_loopback_are_relayed(modules: ModuleFactory) -> None:
+    a, b = modules("a", "b", config='[services]\ntransport = "direct"\n')
+    worker(a)  # listens at 127.0.0.1
+    info = wait_transport(b, "relay", "listening")
+    assert "loopback" in str(info["relayed_because"])
+    a.agent.process.wait_for('although transport is "direct".*loopback')
+    b.agent.process.wait_for('although transport is "direct".*loopback')
+    on_network(a, b)
+    worker(a, "roscpp", "/there")
+    wait_transport(b, "direct", service="/there")
+    local = caller_at_loopback(b)
+    assert calls(local, "echo 0 10 3 once")["same"] == 3
+    assert known(b)["calls"] == 3
+    assert lookup(b, "/local", "/there").startswith("rosrpc://127.")
+
+
+def test_modules_of_one_machine_call_over_loopback(lab: Lab, agent: AgentFactory, shell: ShellFactory) -> None:
+    host = lab.host("both")
+    a = Module(host, agent(host, name="a", config=AUTO, core_port=11311), shell(host, port=11311))
+    b = Module(host, agent(host, name="b", config=AUTO, core_port=11411), shell(host, port=11411))
+    a.agent.wait_peer("b")
+    worker(a)  # at 127.0.0.1
+    info = wait_transport(b, "direct")
+    assert str(info["address"]).startswith("rosrpc://127.0.0.1:")
+    client = caller(b)
+    for how in ("once", "persistent", "parallel"):
+        assert calls(client, f"echo 0 1000 4 {how}")["same"] == 4
+    assert known(b)["calls"] == 0

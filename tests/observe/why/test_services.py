@@ -40,7 +40,7 @@ TRANSPORTS: dict[str, tuple[ServiceTransport, CheckLevel, str]] = {
     "auto": (
         ServiceTransport("auto", "", "listening", "on loopback only"),
         CheckLevel.OK,
-        "relayed .listening.*only",
+        "relayed.*listening.*only",
     ),
     "direct in vain": (
         ServiceTransport("direct", "", "listening", "on loopback only"),

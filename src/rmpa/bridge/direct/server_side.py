@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
 
 if TYPE_CHECKING:
@@ -65,6 +66,13 @@ class ServiceGrants:
     def ports(self, peer: int) -> set[int]:
         """The ports that were granted to a peer."""
         return {told.port for _, number, told in self if number == peer and told.port is not None}
+
+    def full(self, peer: int, service: str) -> Unmet | None:
+        """Why a peer can have no further grant for a service, if so."""
+        granted = [name for name, number, told in self if number == peer and told.port is not None]
+        if service in granted or len(granted) < limits.DIRECT_MAX:
+            return None
+        return Unmet(Condition.LIMIT, f"more than {limits.DIRECT_MAX} services are called directly from there")
 
     def answered(self, peer: int, service: str, node: str, uri: str, found: Grant | Unmet) -> None:
         """Note what a peer is answered."""

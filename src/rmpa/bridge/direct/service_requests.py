@@ -25,7 +25,7 @@ _Kind = TypeVar("_Kind", "AskService", "ServiceDirectClosed", "RetryService")
 
 
 class AskService(msgspec.Struct, frozen=True):
-    """``direct.service``: a service by its name on the wire, its node, and the transport that the asking module wants."""
+    """``direct.service``: a service by its name on the wire, its node, and the transport that is asked for."""
 
     service: str
     node: str

@@ -102,7 +102,7 @@ class DirectServiceExporter:
         return reply_of(found)
 
     def _find(self, session: PeerSession, service: str, node: str) -> Grant | Unmet:
-        unmet = self._unmet(service, session.peer)
+        unmet = self._unmet(service, session.peer) or self.grants.full(session.peer, service)
         if unmet is not None:
             return unmet
         server = self._exports.offered[service]

@@ -107,7 +107,8 @@ class DirectServiceImporter:
         self._used: dict[str, set[tuple[str, int]]] = {}
         """By the peer's name: the addresses to which clients may have connections."""
         self._timer = MachineTimer(self.services.next_timer, lambda now: self._act(self.services.handle_timer(now)))
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks: dict[ServiceKey, asyncio.Task[None]] = {}
+        """The question or the probe for each service: the latest one, so that floods of notifications add none."""
         self._closed = False
         self._able = core.on_lookup(self._lookup)
         rpc.on_notification(requests.SERVICE_CLOSED, self._closed_there)
@@ -166,6 +167,7 @@ class DirectServiceImporter:
 
     def hidden(self, peer: int, service: str) -> None:
         """Forget a service that leaves the local graph; clients keep the connections that they have."""
+        self._stop(ServiceKey(peer, service))
         self._act(self.services.remove(ServiceKey(peer, service)))
 
     def renewed(self, peer: int, service: str) -> None:
@@ -280,9 +282,9 @@ class DirectServiceImporter:
         for action in actions:
             match action:
                 case AskPeer(key, attempt):
-                    self._start(self._ask(key, attempt), f"ask for {key.service}")
+                    self._start(key, self._ask(key, attempt), f"ask for {key.service}")
                 case ProbeServer(key, attempt, grant):
-                    self._start(self._probe(key, attempt, grant), f"probe {key.service}")
+                    self._start(key, self._probe(key, attempt, grant), f"probe {key.service}")
                 case AnswerDirect(key, grant):
                     self._answer(key, grant)
                 case AnswerRelay(key):
@@ -312,17 +314,22 @@ class DirectServiceImporter:
             del self.answers[key.service]
             _log.info("= %s of %s is relayed", key.service, self._imports.peer_name(key.peer))
 
-    def _start(self, work: Coroutine[Any, Any, None], name: str) -> None:
-        task = asyncio.create_task(work, name=name)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+    def _start(self, key: ServiceKey, work: Coroutine[Any, Any, None], name: str) -> None:
+        self._stop(key)
+        task = self._tasks[key] = asyncio.create_task(work, name=name)
+        task.add_done_callback(lambda done: self._tasks.pop(key) if self._tasks.get(key) is done else None)
+
+    def _stop(self, key: ServiceKey) -> None:
+        task = self._tasks.get(key)
+        if task is not None and task is not asyncio.current_task():
+            task.cancel()
 
     async def close(self) -> None:
         """Stop everything; direct connections go on."""
         self._closed = True
         self._timer.close()
         self.answers.clear()
-        tasks = list(self._tasks)
+        tasks = list(self._tasks.values())
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
