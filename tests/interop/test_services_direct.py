@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from lab.bed.processes import eventually
+from lab.bed.processes import CommandFailed, eventually
 from tests.interop.modules import Module
 from tests.interop.ros import PYTHON
 
@@ -23,6 +23,18 @@ pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
 AUTO = '[services]\ntransport = "auto"\n'
 CLIENTS = ["rospy", "roscpp"]
+SWITCH = """
+import rospy
+from std_srvs.srv import SetBool
+def switch(request):
+    if not request.data:
+        raise rospy.ServiceException("it sticks")
+    return True, "on"
+rospy.init_node("switch")
+service = rospy.Service("/switch", SetBool, switch)
+print("up", flush=True)
+rospy.spin()
+"""
 
 
 def on_network(*modules: Module) -> None:
@@ -80,6 +92,16 @@ def wait_transport(module: Module, transport: str, condition: str = "", service:
     return eventually(seen, what=f"{service} of {module.name} by {transport} {condition}") or {}
 
 
+def wait_address(module: Module, *, other_than: object) -> None:
+    """Wait until a service is called directly at another address."""
+
+    def seen() -> bool:
+        info = known(module)
+        return info.get("transport") == "direct" and info["address"] != other_than
+
+    eventually(seen, what=f"another address than {other_than}")
+
+
 @pytest.mark.parametrize("client", CLIENTS)
 @pytest.mark.parametrize("server", CLIENTS)
 def test_calls_go_from_node_to_node(modules: ModuleFactory, server: str, client: str) -> None:
@@ -109,7 +131,6 @@ def test_the_graph_does_not_change(modules: ModuleFactory) -> None:
     client = caller(b, name="client")
     assert b.ros.tool("rosservice", "uri", "/work").startswith("rosrpc://127.")
     assert b.ros.tool("rosservice", "node", "/work").strip() == "/rmpa/a/worker_work"
-    assert "/rmpa/a/worker_work" in b.ros.tool("rosservice", "info", "/work")
     assert b.ros.tool("rosservice", "type", "/work").strip() == "rmpa_test/Work"
     assert lookup(b, "/client") == own, "a node of this module is told the server's own address"
     assert lookup(b, "/unknown").startswith("rosrpc://127."), "a tool that is no node is told the proxy's"
@@ -118,6 +139,22 @@ def test_the_graph_does_not_change(modules: ModuleFactory) -> None:
     assert f"direct: clients call the server itself, at {own}" in output
     assert "direct for b" in a.agent.rmpa("service", "info", "/work")[1]
     assert calls(client, "echo 0 10 2 once")["same"] == 2
+    assert known(b)["calls"] == 0
+
+
+def test_the_stock_tools_call_directly_too(modules: ModuleFactory) -> None:
+    a, b = modules("a", "b", config=AUTO)
+    on_network(a, b)
+    a.ros.start(PYTHON, "-c", SWITCH).wait_for("up")
+    wait_transport(b, "direct", service="/switch")
+    assert "Node: /rmpa/a/switch" in b.ros.tool("rosservice", "info", "/switch")
+    assert "success: True" in b.ros.tool("rosservice", "call", "/switch", "true")
+    assert known(b, "/switch")["calls"] == 0
+    with pytest.raises(CommandFailed, match="it sticks"):
+        b.ros.tool("rosservice", "call", "/switch", "false")
+    code, output = b.agent.rmpa("service", "call", "/switch", "data: true")
+    assert (code, "success: True" in output) == (0, True), output
+    assert known(b, "/switch")["calls"] == 1, "rmpa's own calls go by the agents, which measure them"
 
 
 def test_a_server_that_restarts_on_another_port_is_found_again(modules: ModuleFactory) -> None:
@@ -131,8 +168,7 @@ def test_a_server_that_restarts_on_another_port_is_found_again(modules: ModuleFa
         server.kill()
         server.wait()
         server = worker(a, kind)  # at another port, before or after the core has missed the first one
-        eventually(lambda before=first: known(b).get("address", before) != before, what="another address")
-        wait_transport(b, "direct")
+        wait_address(b, other_than=first)
         assert calls(client, "echo 0 10 2 once")["same"] == 2
         assert calls(client, "echo 0 10 2 persistent")["same"] == 2
         assert known(b)["calls"] == 0
@@ -220,7 +256,9 @@ def test_a_persistent_call_outlives_the_agent_of_the_client(modules: ModuleFacto
     b.agent.restart()
     wait_transport(b, "direct")
     assert calls(client, "echo 0 10 2 once")["same"] == 2
-    assert known(b)["calls"] == 0
+    assert known(b)["calls"] == 2, "the new core does not know this node, and where it connects from"
+    assert calls(caller(b), "echo 0 10 2 once")["same"] == 2
+    assert known(b)["calls"] == 2
 
 
 def test_the_transport_follows_the_rules_of_both_modules(modules: ModuleFactory, tmp_path: Path) -> None:
