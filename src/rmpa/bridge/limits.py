@@ -156,6 +156,9 @@ DIRECT_SETTLE: Final = 2.0
 """Seconds that a subscriber has to connect after it was answered the publisher's address."""
 DIRECT_MAX: Final = 1024
 """Direct connections that one peer may have to publishers of this module, and as many to its services."""
+DIRECT_ADOPT: Final = 10.0
+"""Seconds that a new run of a peer's agent has to offer again what its earlier run left connected directly; after that the
+connections are ended."""
 DIRECT_BREAKS: Final = 3
 """A direct connection that broke so many times within `DIRECT_BREAKS_SPAN` seconds is relayed for `DIRECT_RETRY`."""
 DIRECT_BREAKS_SPAN: Final = 10.0

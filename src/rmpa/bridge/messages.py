@@ -486,11 +486,25 @@ def _validate_agent(message: AgentMessage) -> None:
 
 
 def _check_terms(message: OpenRoute | RouteOpened) -> None:
-    """Checks that a peer's contract has only values that ``rmpa.toml`` allows, and its numbers have 32 bits."""
-    contract = message.contract
+    """Checks a peer's contract, and that its numbers have 32 bits."""
+    check_contract(message.contract, f"route {message.route}")
     numbers = [message.epoch, message.after if isinstance(message, OpenRoute) else message.first]
     if isinstance(message, RouteOpened):
         numbers += [n for n in (message.following, message.lost) if not isinstance(n, msgspec.UnsetType)]
+    if any(not 0 <= number <= UINT32_MAX for number in numbers):
+        raise RemoteProtocolError(f"route {message.route}: a contract with the numbers {numbers} cannot be")
+
+
+def check_contract(contract: Contract, what: str) -> None:
+    """Check that a peer's contract has only values that ``rmpa.toml`` allows.
+
+    Args:
+        contract: The contract.
+        what: What it is for, as text for the error.
+
+    Raises:
+        RemoteProtocolError: A value is out of its range.
+    """
     times = (contract.deadline, contract.lifespan, contract.liveliness_lease)
     lowest, highest = config_limits.CONTRACT_TIME_MIN, config_limits.CONTRACT_TIME_MAX
     lowest_rate = config_limits.CONTRACT_RATE_MIN
@@ -502,11 +516,9 @@ def _check_terms(message: OpenRoute | RouteOpened) -> None:
         problem = f"a rate of {contract.max_rate}"
     elif not config_limits.OUTAGE_MIN <= contract.outage <= config_limits.OUTAGE_MAX:
         problem = f"an outage of {contract.outage} seconds"
-    elif any(not 0 <= number <= UINT32_MAX for number in numbers):
-        problem = f"the numbers {numbers}"
     else:
         return
-    raise RemoteProtocolError(f"route {message.route}: a contract with {problem} cannot be")
+    raise RemoteProtocolError(f"{what}: a contract with {problem} cannot be")
 
 
 def _check_names(*names: str) -> None:

@@ -51,6 +51,12 @@ COLLECT_GROWTH_MAX: Final = 500_000
 COLLECT_QUIET_BYTES: Final = 16 * KIB
 """Bytes a second, over all links, below which the agent counts as idle: keepalives or very slow streams."""
 
+# --- the kernel's TCP sockets -----------------------------------------------------------------------------------
+SOCK_DIAG_BUFFER: Final = 64 * KIB
+"""One part of a dump; the kernel makes parts of at most 32 KiB."""
+SOCK_DIAG_DUMPS: Final = 3
+"""Dumps that are tried one after the other while each is interrupted by a change of the kernel's table."""
+
 # --- mesh -------------------------------------------------------------------------------------------------------
 STALE_AGE: Final = 0.1
 """Delay beyond which a best-effort message (held up by an outage) is dropped if a newer one of its topic follows."""

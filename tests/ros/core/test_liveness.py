@@ -11,7 +11,7 @@ import pytest
 from rmpa.core.errors import UnreachableError
 from rmpa.ros.core import liveness
 from rmpa.ros.core.liveness import listening_ports, read_tables
-from rmpa.ros.core.sock_diag import ask_listening_ports, read_ports
+from rmpa.runtime.tcp_connections import ask_listening_ports
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -35,18 +35,6 @@ def test_listening_ports_are_found(listening: socket.socket, look: Callable[[], 
         assert client.getsockname()[1] not in ports
     listening.close()
     assert port not in (look() or ())
-
-
-def test_answers_of_the_kernel() -> None:
-    ports: set[int] = set()
-    found = b"\x48\0\0\0\x14\0\2\0\2\0\0\0\0\0\0\0\2\x0a\0\0\x2c\x2f" + bytes(50)
-    done = b"\x14\0\0\0\3\0\2\0\2\0\0\0\0\0\0\0\0\0\0\0"
-    assert read_ports(found, ports)
-    assert not read_ports(found + done, ports)
-    assert ports == {11311}
-    for wrong in (b"\x10\0\0\0\2\0" + bytes(10), found[:40], b"\x05\0\0\0\x14\0" + bytes(66)):
-        with pytest.raises(ValueError, match="an answer of kind"):
-            read_ports(wrong, ports)
 
 
 @pytest.mark.parametrize("piece", [1, 7, 100, 4096])

@@ -164,12 +164,12 @@ class DirectGrants:
         self._refused.pop(source, None)
 
     def judge_again(self, unmet: Callable[[Source, int, Granted], Unmet | None]) -> list[GrantAction]:
-        """Withdraw the grants that new rules do not allow, and let every refused peer try again.
+        """Withdraw the grants that the rules do not allow any more.
 
         Args:
             unmet: ``(source, peer, grant)``: the condition that does not hold by the new rules, if any.
         """
-        actions: list[GrantAction] = [one for source in list(self._refused) for one in self.changed(source)]
+        actions: list[GrantAction] = []
         for source, peer, subscriber, granted in list(self):
             why = unmet(source, peer, granted)
             if why is not None:
@@ -177,6 +177,10 @@ class DirectGrants:
                 self.refuse(peer, source)
                 actions.append(Withdraw(peer, source, subscriber, why))
         return actions
+
+    def retry_all(self) -> list[GrantAction]:
+        """Let every refused peer try again: the rules have changed."""
+        return [action for source in list(self._refused) for action in self.changed(source)]
 
     def unreachable(self, peer: int) -> list[GrantAction]:
         """Handle the loss of a peer's link by silence: a publisher may block on a connection to it."""

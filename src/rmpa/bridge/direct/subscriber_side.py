@@ -177,10 +177,16 @@ class DirectSubscriptions:
 
     Args:
         is_latched: ``(key)``: whether the publisher is known to latch.
+        is_relayed: ``(key)``: whether a subscriber that is not known yet is connected to the proxy already.
     """
 
-    def __init__(self, is_latched: Callable[[DirectKey], bool] = lambda _: False) -> None:
+    def __init__(
+        self,
+        is_latched: Callable[[DirectKey], bool] = lambda _: False,
+        is_relayed: Callable[[DirectKey], bool] = lambda _: False,
+    ) -> None:
         self._is_latched = is_latched
+        self._is_relayed = is_relayed
         self._routes: dict[DirectKey, DirectRoute] = {}
         self._of: dict[tuple[int, Source], dict[str, DirectKey]] = {}
         self._reached: set[tuple[int, int]] = set()
@@ -220,6 +226,7 @@ class DirectSubscriptions:
             route = self._routes[key] = DirectRoute(wanted, DirectState.RELAYED, since=now)
             self._of.setdefault((key.peer, key.source), {})[key.subscriber] = key
             route.local = True  # so that it is asked for below
+            route.path = Path.RELAY if self._is_relayed(key) else Path.NONE
         route.wanted = wanted
         if unmet is not None:
             if route.unmet == unmet:

@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.errors import OutOfDescriptors, UnreachableError
 from rmpa.core.sizes import KIB
 from rmpa.ros import limits
-from rmpa.ros.core.sock_diag import ask_listening_ports
 from rmpa.ros.http.client import connect, is_own_name, split_uri
 from rmpa.ros.master.reachability import Reachability
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.descriptors import Use, is_shortage
+from rmpa.runtime.tcp_connections import ask_listening_ports
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Mapping

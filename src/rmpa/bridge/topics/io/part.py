@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from rmpa.bridge import actions as act
 from rmpa.bridge.data.io.absent_peers import Absent, AbsentPeers
 from rmpa.bridge.data.qos_events import shown_seconds
+from rmpa.bridge.direct.io.endpoints import LocalEndpoints
 from rmpa.bridge.messages import (
     Advertise,
     CloseRoute,
@@ -32,6 +33,8 @@ from rmpa.bridge.session.part import Part
 from rmpa.bridge.topics.claims import ClaimDeadlines
 from rmpa.bridge.topics.exports import Exports
 from rmpa.bridge.topics.imports import Imports
+from rmpa.bridge.topics.io.direct_exporter import DirectExporter
+from rmpa.bridge.topics.io.direct_importer import DirectImporter
 from rmpa.bridge.topics.io.local_sources import LocalSources
 from rmpa.bridge.topics.io.local_subscriptions import LocalSubscriptions
 from rmpa.bridge.topics.io.loss_reports import LossReports
@@ -138,7 +141,7 @@ class Topics(Part):
             # The route's data may follow at once, and no waiting action has to precede it.
             is_urgent=lambda action: isinstance(action, act.Describe),
             on_told=self._told,
-            on_idle=self._forget_mismatches,
+            on_idle=self._settled,
         )
         self._act = self._driver.act
         self._absent = AbsentPeers(lambda peer: self._act(self.exports.unclaimed(peer)), self.outbound.forget)
@@ -148,6 +151,22 @@ class Topics(Part):
         self.losses = LossReports(self.exports, sessions, self._peers, self._absent, rpc, counters, refusals)
         """Reports messages that do not reach their listeners."""
         self._subscribers = RemoteSubscribers(self.exports, self.imports, sessions, self._peers, refusals)
+        self.direct_exports = DirectExporter(
+            core, self.exports, contracts, LocalEndpoints(core), sessions, rpc, counters
+        )
+        """Direct connections of peers' nodes to local publishers."""
+        self.direct_imports = DirectImporter(
+            core,
+            self.imports,
+            self._peers,
+            contracts,
+            sessions,
+            rpc,
+            on_demand=lambda peer, source, wanted: self._demand(peer, source, wanted=wanted),
+            on_warning=self._driver.warn,
+            counters=counters,
+        )
+        """Direct connections of local nodes to peers' publishers."""
         self._local = LocalSources(core, relay, lambda source: self.exports.description(source) is not None)
         self._ticker: asyncio.TimerHandle | None = None
         self._closed = False
@@ -177,6 +196,8 @@ class Topics(Part):
         if self._ticker is not None:
             self._ticker.cancel()
         self._driver.close()
+        await self.direct_imports.close()
+        await self.direct_exports.close()
         self._claims_timer.close()
         self._subscribers.close()
         self.outbound.close()
@@ -188,6 +209,8 @@ class Topics(Part):
         limit_settings, now = settings.limits, asyncio.get_running_loop().time()
         self._act(self.exports.apply_rules(policy, contracts, self.names, limit_settings))
         self._driver.rejudge(self.imports.apply_rules(policy, contracts, self.names, now, limit_settings))
+        self.direct_exports.reload(contracts)
+        self.direct_imports.reload(contracts)
         self._look_at_all()
 
     def remembered(self, identity: Identity) -> int | None:
@@ -207,6 +230,7 @@ class Topics(Part):
         linked = LinkedPeer(identity.name, identity.instance.hex(), identity.guid)
         self._act(self.imports.link_up(peer, identity.name, linked))
         self._act(self.exports.link_up(peer, identity.name, linked.instance))
+        self.direct_imports.link_up(session)
         self._told()
         self._driver.schedule()
 
@@ -228,13 +252,16 @@ class Topics(Part):
             on_demand=lambda source, wanted: self._demand(peer, source, wanted=wanted),
             on_mismatch=lambda source, subscriber, text: self._mismatched(peer, source, subscriber, text),
             on_occurred=lambda source, occurred: self._occurred(session, source, occurred),
-            on_listeners=lambda source: self._subscribers.changed(peer, source),
+            on_listeners=lambda source: self._listeners_changed(peer, source),
+            on_request=lambda source, caller: self.direct_imports.request(peer, source, caller),
             pasts=absent.pasts if absent is not None else None,
         )
 
     def link_down(self, session: PeerSession) -> None:
         """Suspends the peer's routes; after silence its sources stay in the local graph for ``AWAY_GRACE``."""
-        peer = session.peer
+        peer, crashed = session.peer, session.link.crashed
+        self.direct_imports.link_down(session, crashed=crashed)
+        self.direct_exports.link_down(session, crashed=crashed)
         self._claims.forget(peer)
         self._claims_timer.arm()
         interrupted = self._peers[peer].link_down()
@@ -272,6 +299,8 @@ class Topics(Part):
     def gone(self, session: PeerSession) -> None:
         """Retracts the rest of a peer's sources; losses in both directions are remembered in ``AbsentPeers``."""
         peer = session.peer
+        self.direct_imports.gone(session, hang_up=not session.link.crashed)
+        self.direct_exports.gone(session)
         topics = self._peers.pop(peer)
         self._claims.forget(peer)
         self._claims_timer.arm()
@@ -371,6 +400,8 @@ class Topics(Part):
     def graph_changed(self, change: GraphChange) -> None:
         """Queues the topic of a registration that came or went, to be looked at."""
         self._local.changed(change)
+        self.direct_exports.graph_changed(change)
+        self.direct_imports.graph_changed(change)
         if change.kind is RegistrationKind.SUBSCRIBER and self._mismatches:
             self._forget_mismatch(change.name, change.node)
         if change.kind is not RegistrationKind.SERVICE:
@@ -432,6 +463,15 @@ class Topics(Part):
             if self._mismatches.mended(source, subscriber):
                 self._act([act.Send(peer, Mismatch(source.topic, source.node, subscriber, ""))])
 
+    def _listeners_changed(self, peer: int, source: Source) -> None:
+        self._subscribers.changed(peer, source)
+        self.direct_imports.listeners_changed(peer, source)
+
+    def _settled(self) -> None:
+        """Drops what belongs to sources that are gone, or that new rules keep home."""
+        self._forget_mismatches()
+        self.direct_exports.policy_changed()
+
     def _forget_mismatches(self) -> None:
         """Forgets the mismatches of sources that are gone."""
         if self._mismatches:
@@ -485,8 +525,10 @@ class Topics(Part):
                 place = (action.topic or source.topic, name)
                 self._relay.pass_on(session.peer, session.link.identity, source, place, action.origin)
                 topics.publish(action)
+                self.direct_imports.shown(action.peer, source)
             case act.Retract():
                 self._relay.gone(action.peer, action.source)
+                self.direct_imports.hidden(action.peer, action.source)
                 topics.retract(action)
             case act.Describe():
                 # Bound to this link: on the next one the same route id may belong to another source.

@@ -19,7 +19,7 @@ from rmpa.runtime.event_loop import yielding_to_data
 from rmpa.runtime.machine_timer import MachineTimer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Awaitable, Callable, Mapping
 
     from rmpa.bridge.actions import Describe, Detach, Publish, Retract
     from rmpa.bridge.data.losses import ReceptionHistory
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from rmpa.core.counters import Counters
     from rmpa.ros.core.api import Core
     from rmpa.ros.node.slave_node import SlaveNode
+    from rmpa.ros.wire.xmlrpc import RosReply
 
 _log = logging.getLogger(__name__)
 
@@ -53,6 +54,7 @@ class PeerTopics:
         on_mismatch: Called with a source, the caller id of a refused subscriber and the text of the refusal.
         on_occurred: Called with a source and an event of its contract.
         on_listeners: Called with a source when the set of its local listeners changes.
+        on_request: ``(source, caller id)``: answers a subscriber's ``requestTopic``; see ``Publication``.
         pasts: The histories of reliable sources that an earlier session's ``leave`` returned.
     """
 
@@ -66,6 +68,7 @@ class PeerTopics:
         on_mismatch: Callable[[Source, str, str], None],
         on_occurred: Callable[[Source, QosEvent], None],
         on_listeners: Callable[[Source], None] = lambda _: None,
+        on_request: Callable[[Source, str], Awaitable[RosReply | None] | None] = lambda *_: None,
         pasts: Mapping[Source, ReceptionHistory] | None = None,
     ) -> None:
         self._core = core
@@ -75,6 +78,7 @@ class PeerTopics:
         self._on_mismatch = on_mismatch
         self._on_occurred = on_occurred
         self._on_listeners = on_listeners
+        self._on_request = on_request
         self._published: dict[Source, _Published] = {}
         self.flows: dict[int, ImportFlow] = {}
         """The flow of each open route, by its id."""
@@ -336,6 +340,7 @@ class PeerTopics:
             on_last_subscriber=lambda: self._on_demand(source, False),
             on_mismatch=lambda fields, text: self._on_mismatch(source, printable(fields.get("callerid", "")), text),
             on_listeners=lambda: self._on_listeners(source),
+            on_request=lambda caller: self._on_request(source, caller),
         )
         node.add_publication(publication)
         published = self._published[source] = _Published(node, publication, action.type)

@@ -1,0 +1,213 @@
+"""The publisher's side of direct transport for topics: grants subscribers of peers a connection to a local node."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any
+
+from rmpa.bridge.direct import requests
+from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, reply_of
+from rmpa.bridge.direct.io.nodes import end_from
+from rmpa.bridge.direct.publisher_side import DirectGrants, EndConnections, Granted, Retry, Withdraw
+from rmpa.bridge.direct.requests import DirectClosed, RetryDirect
+from rmpa.bridge.messages import Source
+from rmpa.bridge.policy import is_own
+from rmpa.bridge.topics.audience import is_watched
+from rmpa.core.contract import Contract, Transport, combine, needs_agents
+from rmpa.ros.master.effects import GraphChange, RegistrationKind
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from rmpa.bridge.direct.io.endpoints import LocalEndpoints
+    from rmpa.bridge.direct.publisher_side import GrantAction
+    from rmpa.bridge.session.peer_rpc import PeerRpc
+    from rmpa.bridge.session.peer_session import PeerSession
+    from rmpa.bridge.session.peer_sessions import PeerSessions
+    from rmpa.bridge.topics.exports import Exports
+    from rmpa.core.contract import Contracts
+    from rmpa.core.counters import Counters
+    from rmpa.ros.core.api import Core
+
+_log = logging.getLogger(__name__)
+
+
+class DirectExporter:
+    """Answers the peers' requests for direct connections, and withdraws what was granted.
+
+    Args:
+        core: The local core.
+        exports: Knows what is offered to each peer.
+        contracts: The contracts of this module; replaced by ``reload``.
+        endpoints: Finds the ports of local nodes.
+        sessions: The peers.
+        rpc: Carries the requests.
+        counters: Count ``direct.granted``, ``direct.withdrawn``, ``direct.ended``.
+    """
+
+    def __init__(
+        self,
+        core: Core,
+        exports: Exports,
+        contracts: Contracts,
+        endpoints: LocalEndpoints,
+        sessions: PeerSessions,
+        rpc: PeerRpc,
+        counters: Counters,
+    ) -> None:
+        self._core = core
+        self._exports = exports
+        self._contracts = contracts
+        self._endpoints = endpoints
+        self._sessions = sessions
+        self._rpc = rpc
+        self._counters = counters
+        self.grants = DirectGrants()
+        """The grants in force."""
+        rpc.on_request(requests.OPEN, self._open)
+        rpc.on_notification(requests.CLOSE, self._close)
+
+    def reload(self, contracts: Contracts) -> None:
+        """Take new contracts, and withdraw the grants that they do not allow."""
+        self._contracts = contracts
+        self._act(self.grants.retry_all())
+        self._act(self.grants.judge_again(self._unmet_by_rules))
+
+    def graph_changed(self, change: GraphChange) -> None:
+        """Compare the grants with a registration that came or went; the exports have not looked at it yet."""
+        if change.kind is RegistrationKind.SUBSCRIBER and not is_own(change.node):
+            if change.added:
+                self._act(self.grants.local_subscriber(change.name, change.node))
+            else:
+                self._act(self.grants.local_subscriber_gone(change.name))
+        elif change.kind is RegistrationKind.PUBLISHER:
+            source = Source(change.name, change.node)
+            if not change.added:
+                self._endpoints.forget(change.api)
+                self.grants.gone(source)
+            elif any(granted.uri != change.api for _, _, granted in self.grants.of(source)):
+                unmet = Unmet(Condition.NODE, f"{change.node} has restarted")
+                self._act(self.grants.withdraw(source, unmet))
+            else:
+                self._act(self.grants.changed(source))
+
+    def policy_changed(self) -> None:
+        """Withdraw the grants for sources that are not offered any more to their peers."""
+        self._act(self.grants.judge_again(self._unmet_by_rules))
+
+    def link_down(self, session: PeerSession, *, crashed: bool) -> None:
+        """End the publishers' connections to a peer that cannot be reached; unless only its agent has died."""
+        if not crashed:
+            self._act(self.grants.unreachable(session.peer))
+
+    def gone(self, session: PeerSession) -> None:
+        """Forget the grants of a peer."""
+        self._act(self.grants.peer_gone(session.peer))
+
+    async def close(self) -> None:
+        """Cancel the questions to local nodes; direct connections go on."""
+        await self._endpoints.close()
+
+    # --- requests --------------------------------------------------------------------------------------------------
+
+    async def _open(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
+        asked = requests.read_open(args)
+        found = await self._find(session, asked)
+        if isinstance(found, Unmet):
+            _log.debug("< %s: %s of %s is relayed: %s", session.link.name, asked.source, asked.subscriber, found.text)
+        return reply_of(found)
+
+    async def _find(self, session: PeerSession, asked: requests.OpenDirect) -> Grant | Unmet:
+        source = asked.source
+        unmet = self._unmet(session, source, asked)
+        if unmet is not None:
+            return unmet
+        local = self._exports.offered[source]
+        found = await self._endpoints.of_topic(session, source.node, local.uri, source.topic)
+        if isinstance(found, Unmet):
+            self.grants.refuse(session.peer, source)
+            return found
+        # The graph may have changed meanwhile.
+        unmet = self._unmet(session, source, asked)
+        if unmet is not None:
+            return unmet
+        if self._exports.offered[source].uri != local.uri:
+            return Unmet(Condition.NODE, f"{source.node} has restarted just now")
+        granted = Granted(asked.contract, found.port, local.uri)
+        self.grants.grant(session.peer, source, asked.subscriber, granted)
+        self._counters.add("direct.granted")
+        _log.debug("< %s: %s connects to %s directly", session.link.name, asked.subscriber, source)
+        return found
+
+    def _unmet(self, session: PeerSession, source: Source, asked: requests.OpenDirect) -> Unmet | None:
+        unmet = self._unmet_by_rules(source, session.peer, Granted(asked.contract, 0, ""))
+        if unmet is not None:
+            self.grants.refuse(session.peer, source)
+            return unmet
+        subscribers = self._core.state().subscribers.get(source.topic, {})
+        return self.grants.judge(session.peer, source, asked.subscriber, subscribers)
+
+    def _unmet_by_rules(self, source: Source, peer: int, granted: Granted) -> Unmet | None:
+        """The condition that a source does not meet for a peer, whatever the subscriber's name is."""
+        local = self._exports.local(peer, source)
+        if local is None:
+            return Unmet(Condition.OFFERED, f"{source} is not offered")
+        if local != source:
+            return Unmet(Condition.NAME, f"it is {local.topic} in the publisher's module")
+        offered = self._exports.offered[source]
+        if offered.origin is not None:
+            return Unmet(Condition.OWN_SOURCE, "it comes by a relay")
+        if is_watched(offered.type):
+            return Unmet(Condition.ACTION, f"publishers of {offered.type} compare the names of their subscribers")
+        return unmet_by_contract(
+            combine(self._contracts.of(source.topic, offered.type), granted.asked), "the publisher's module"
+        )
+
+    def _close(self, session: PeerSession, args: dict[str, Any]) -> None:
+        closed = requests.read_close(args)
+        if closed.broken and (local := self._exports.offered.get(closed.source)) is not None:
+            self._endpoints.forget(local.uri)
+            self._core.suspect(closed.node)
+        self._act(self.grants.release(session.peer, closed.source, closed.subscriber))
+
+    # --- carrying out ----------------------------------------------------------------------------------------------
+
+    def _act(self, actions: Iterable[GrantAction]) -> None:
+        for action in actions:
+            session = self._sessions.get(action.peer)
+            if session is None:
+                continue
+            match action:
+                case EndConnections():
+                    self._counters.add("direct.ended")
+                    if problem := end_from(action.port, session.address):
+                        text = "! %s: connections of local nodes to it may hang: they cannot be ended (%s)"
+                        _log.info(text, session.link.name, problem)
+                case Withdraw(source=source) if session.linked:
+                    self._counters.add("direct.withdrawn")
+                    closed = DirectClosed(
+                        source.topic,
+                        source.node,
+                        action.subscriber,
+                        action.unmet.condition.value,
+                        action.unmet.text,
+                    )
+                    self._rpc.notify(session, requests.CLOSED, requests.write(closed))
+                case Retry(source=source) if session.linked:
+                    again = RetryDirect(source.topic, source.node)
+                    self._rpc.notify(session, requests.RETRY, requests.write(again))
+                case _:
+                    pass
+
+
+def unmet_by_contract(contract: Contract, where: str) -> Unmet | None:
+    """The condition that a contract does not meet, if any.
+
+    Args:
+        contract: The contract.
+        where: Whose it is, as text.
+    """
+    if contract.transport is Transport.RELAY:
+        return Unmet(Condition.TRANSPORT, f'transport is "relay" in {where}')
+    terms = needs_agents(contract)
+    return Unmet(Condition.CONTRACT, f"the contract asks for what only agents do: {terms}") if terms else None

@@ -1,0 +1,538 @@
+"""The subscriber's side of direct transport for topics: answers, moves and watches the subscribers of this module."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import Counter
+from typing import TYPE_CHECKING, Any, Final
+
+from rmpa.bridge import limits
+from rmpa.bridge.direct import requests
+from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, read_unmet
+from rmpa.bridge.direct.io.nodes import direct_links, end_to, publisher_update, standing
+from rmpa.bridge.direct.requests import CloseDirect, OpenDirect
+from rmpa.bridge.direct.subscriber_side import (
+    Ask,
+    Decided,
+    DirectKey,
+    DirectState,
+    DirectSubscriptions,
+    Fallback,
+    HangUp,
+    Move,
+    Path,
+    Probe,
+    Release,
+)
+from rmpa.bridge.policy import is_own
+from rmpa.bridge.topics.audience import is_watched
+from rmpa.bridge.topics.io.direct_exporter import unmet_by_contract
+from rmpa.bridge.topics.remote_topic import RouteState
+from rmpa.core.contract import Transport
+from rmpa.core.errors import RmpaError
+from rmpa.ros.environment import host_of, is_loopback
+from rmpa.ros.master.effects import GraphChange, RegistrationKind
+from rmpa.ros.node.probe import probe
+from rmpa.ros.wire.slave_api import TCPROS
+from rmpa.ros.wire.xmlrpc import RosReply
+from rmpa.runtime.machine_timer import MachineTimer
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping
+
+    from rmpa.bridge.direct.subscriber_side import DirectAction
+    from rmpa.bridge.messages import Source
+    from rmpa.bridge.session.peer_rpc import PeerRpc
+    from rmpa.bridge.session.peer_session import PeerSession
+    from rmpa.bridge.session.peer_sessions import PeerSessions
+    from rmpa.bridge.topics.imports import Imports
+    from rmpa.bridge.topics.io.peer_topics import PeerTopics
+    from rmpa.bridge.topics.remote_topic import RemoteTopic
+    from rmpa.core.contract import Contracts
+    from rmpa.core.counters import Counters
+    from rmpa.ros.core.api import Core
+    from rmpa.ros.node.publication import Publication
+
+_log = logging.getLogger(__name__)
+MEASURING: Final = "/rmpa_topic_"
+"""The names of the nodes of ``rmpa topic hz|bw|delay|echo`` begin so; they are relayed, so that the agents measure."""
+
+
+class DirectImporter:
+    """Direct connections of local subscribers to nodes of peers.
+
+    Args:
+        core: The local core.
+        imports: The remote sources.
+        topics: The peers' topics in the local graph, by the numbers of their sessions.
+        contracts: The contracts of this module; replaced by ``reload``.
+        sessions: The peers.
+        rpc: Carries the requests.
+        on_demand: ``(peer, source, wanted)``: opens the relayed route of a source, or lets it close.
+        on_warning: ``(kind, subject, text)``: logs and counts a warning.
+        counters: Count ``direct.moved`` and others.
+    """
+
+    def __init__(
+        self,
+        core: Core,
+        imports: Imports,
+        topics: Mapping[int, PeerTopics],
+        contracts: Contracts,
+        sessions: PeerSessions,
+        rpc: PeerRpc,
+        *,
+        on_demand: Callable[[int, Source, bool], None],
+        on_warning: Callable[[str, str, str], None],
+        counters: Counters,
+    ) -> None:
+        self._core = core
+        self._imports = imports
+        self._topics = topics
+        self._contracts = contracts
+        self._sessions = sessions
+        self._rpc = rpc
+        self._on_demand = on_demand
+        self._on_warning = on_warning
+        self._counters = counters
+        self.routes = DirectSubscriptions(self._is_latched, self._is_relayed)
+        """The state of each subscriber."""
+        self._timer = MachineTimer(self.routes.next_timer, lambda now: self._act(self.routes.handle_timer(now)))
+        self._waiting: dict[DirectKey, list[asyncio.Future[None]]] = {}
+        self._moves: dict[DirectKey, asyncio.Task[None]] = {}
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._adrift: list[RemoteTopic] = []
+        """The sources that are kept because of direct subscribers while their agent is gone."""
+        self._checking: asyncio.TimerHandle | None = None
+        self._closed = False
+        rpc.on_notification(requests.CLOSED, self._closed_there)
+        rpc.on_notification(requests.RETRY, self._retry)
+
+    @staticmethod
+    def _now() -> float:
+        return asyncio.get_running_loop().time()
+
+    # --- the local graph ---------------------------------------------------------------------------------------------
+
+    def reload(self, contracts: Contracts) -> None:
+        """Take new contracts, and judge every subscriber again."""
+        self._contracts = contracts
+        self.judge_all()
+
+    def judge_all(self) -> None:
+        """Judge the subscribers of every remote source."""
+        for topic in {entry.topic for _, _, entry in self._imports}:
+            self._judge(topic)
+
+    def graph_changed(self, change: GraphChange) -> None:
+        """Judge a local subscriber that came, or forget one that went."""
+        if change.kind is not RegistrationKind.SUBSCRIBER or is_own(change.node):
+            return
+        for peer, source in list(self._imports.at(change.name)):
+            if change.added:
+                self._consider(peer, source, change.node, change.api)
+            else:
+                self._act(self.routes.remove(DirectKey(peer, source, change.node)))
+
+    def shown(self, peer: int, source: Source) -> None:
+        """Judge the subscribers of a source that appears in the local graph."""
+        entry = self._imports.get(peer, source)
+        if entry is not None:
+            self._judge(entry.topic)
+
+    def hidden(self, peer: int, source: Source, *, hang_up: bool = True) -> None:
+        """Forget the subscribers of a source that leaves the local graph.
+
+        Args:
+            peer: The peer.
+            source: The source.
+            hang_up: End their direct connections.
+        """
+        for name, _ in self.routes.of(peer, source):
+            self._act(self.routes.remove(DirectKey(peer, source, name), hang_up=hang_up))
+
+    def _judge(self, topic: str) -> None:
+        subscribers = self._core.state().subscribers.get(topic, {})
+        for peer, source in list(self._imports.at(topic)):
+            for node, uri in subscribers.items():
+                self._consider(peer, source, node, uri)
+
+    def _consider(self, peer: int, source: Source, node: str, uri: str) -> None:
+        session, entry = self._sessions.get(peer), self._imports.get(peer, source)
+        if session is None or entry is None or not entry.shown or is_own(node):
+            return
+        key, contract = DirectKey(peer, source, node), self._contracts.of(entry.topic, entry.type)
+        if contract.transport is Transport.RELAY and self.routes.get(key) is None:
+            return  # nothing is kept of topics that are relayed by rule
+        unmet = self._unmet(session, source, entry, node, uri)
+        self._act(self.routes.consider(key, contract.transport, unmet, self._now()))
+
+    def _unmet(self, session: PeerSession, source: Source, entry: RemoteTopic, node: str, uri: str) -> Unmet | None:
+        unmet = unmet_by_contract(self._contracts.of(entry.topic, entry.type), "this module")
+        if unmet is not None:
+            return unmet
+        if entry.origin is not None:
+            return Unmet(Condition.OWN_SOURCE, f"it is {entry.origin.name}'s, and comes by a relay")
+        if entry.topic != source.topic:
+            return Unmet(Condition.NAME, f"it is {source.topic} in the publisher's module")
+        if is_watched(entry.type):
+            return Unmet(Condition.ACTION, f"publishers of {entry.type} compare the names of their subscribers")
+        if node.startswith(MEASURING):
+            return Unmet(Condition.MEASURES, "rmpa's own tools measure by the agents")
+        if is_loopback(host_of(uri)) and not session.same_machine:
+            text = f"{node} connects within its machine only (ROS_IP or ROS_HOSTNAME is {host_of(uri)})"
+            return Unmet(Condition.SUBSCRIBER, text)
+        return None
+
+    def _is_latched(self, key: DirectKey) -> bool:
+        entry = self._imports.get(key.peer, key.source)
+        return entry is not None and entry.description is not None and entry.description.latching
+
+    def _is_relayed(self, key: DirectKey) -> bool:
+        publication = self._publication(key.peer, key.source)
+        return publication is not None and key.subscriber in publication.listeners
+
+    # --- what subscribers ask ------------------------------------------------------------------------------------------
+
+    def request(self, peer: int, source: Source, subscriber: str) -> Awaitable[RosReply | None] | None:
+        """Answer a subscriber's ``requestTopic`` at the proxy of a source; see ``Publication.on_request``."""
+        key = DirectKey(peer, source, subscriber)
+        if self.routes.get(key) is None:
+            return None
+        return self._answer(key)
+
+    async def _answer(self, key: DirectKey) -> RosReply | None:
+        decision = self.routes.decision(key)
+        if decision is None:
+            decision = await self._decision(key)
+        entry, session = self._imports.get(key.peer, key.source), self._sessions.get(key.peer)
+        if entry is None or session is None:
+            return None
+        if not isinstance(decision, Grant):
+            self.routes.answered(key, None, self._now())
+            return None
+        endpoint = (session.address, decision.port)
+        uri = self._uri(key, entry)
+        adopted = bool(uri and standing(endpoint) and await direct_links(uri, entry.topic, endpoint))
+        self.routes.answered(key, endpoint, self._now())
+        self._changed(key)
+        if adopted:
+            # It has been connected since an earlier run of this agent; a second connection would double messages.
+            _log.info("= %s: %s is connected directly already", session.link.name, key.subscriber)
+            return RosReply(0, "connected to the publisher already", [])
+        return RosReply(1, f"ready on {endpoint[0]}:{endpoint[1]}", [TCPROS, endpoint[0], endpoint[1]])
+
+    async def _decision(self, key: DirectKey) -> Grant | Unmet | None:
+        future: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._waiting.setdefault(key, []).append(future)
+        try:
+            async with asyncio.timeout(limits.DIRECT_HOLD):
+                await future
+        except TimeoutError:
+            self._counters.add("direct.undecided")
+        finally:
+            waiting = self._waiting.get(key, [])
+            if future in waiting:
+                waiting.remove(future)
+            if not waiting:
+                self._waiting.pop(key, None)
+        return self.routes.decision(key)
+
+    def listeners_changed(self, peer: int, source: Source) -> None:
+        """Note which subscribers have left the proxy of a source."""
+        routes = self.routes.of(peer, source)
+        if not routes:
+            return
+        publication = self._publication(peer, source)
+        there = set(publication.listeners) if publication is not None else set()
+        for name, route in routes:
+            key = DirectKey(peer, source, name)
+            if route.path is Path.RELAY and name not in there and key not in self._moves:
+                self._act(self.routes.left(key, self._now()))
+
+    # --- links ---------------------------------------------------------------------------------------------------------
+
+    def link_up(self, session: PeerSession) -> None:
+        """Ask again for the subscribers of a peer that was without a link."""
+        for key, route in self.routes.connected():
+            if key.peer == session.peer and route.endpoint is not None and route.endpoint[0] != session.address:
+                self._act([Move(key)])  # the peer has another address now
+        for entry in self._adrift:
+            entry.direct = False
+        self._adrift.clear()
+        self._act(self.routes.link_up(session.peer, self._now()))
+
+    def link_down(self, session: PeerSession, *, crashed: bool) -> None:
+        """End direct connections to a peer that cannot be reached; unless only its agent has died."""
+        self._act(self.routes.link_down(session.peer, self._now(), crashed=crashed))
+        for _, source in {(key.peer, key.source) for key, _ in self.routes if key.peer == session.peer}:
+            entry = self._imports.get(session.peer, source)
+            direct = any(route.path is Path.DIRECT for _, route in self.routes.of(session.peer, source))
+            if entry is not None and direct:
+                entry.direct = True  # they were made to hang up above unless only the agent has died
+                self._adrift.append(entry)
+
+    def gone(self, session: PeerSession, *, hang_up: bool) -> None:
+        """Forget every subscriber of a peer.
+
+        Args:
+            session: The peer.
+            hang_up: End their connections, rather than leave them to the peer's next agent.
+        """
+        left = set()
+        for key, route in self.routes:
+            if key.peer == session.peer:
+                if not hang_up and route.path is Path.DIRECT and route.endpoint is not None:
+                    left.add(route.endpoint)
+                self._act(self.routes.remove(key, hang_up=hang_up))
+        if left:
+            asyncio.get_running_loop().call_later(limits.DIRECT_ADOPT, self._end_strays, left)
+
+    def _end_strays(self, endpoints: set[tuple[str, int]]) -> None:
+        """Ends direct connections from before a crash of the peer's agent that its next run has not taken over."""
+        known = {route.endpoint for _, route in self.routes.connected()}
+        for endpoint in endpoints - known:
+            end_to(endpoint)
+
+    # --- the peer --------------------------------------------------------------------------------------------------------
+
+    def _closed_there(self, session: PeerSession, args: dict[str, Any]) -> None:
+        told = requests.read_closed(args)
+        unmet = read_unmet(told.why, told.text)
+        self._act(self.routes.closed(session.peer, told.source, told.subscriber, unmet, self._now()))
+
+    def _retry(self, session: PeerSession, args: dict[str, Any]) -> None:
+        self._act(self.routes.retry(session.peer, requests.read_retry(args).source, self._now()))
+
+    async def _ask(self, key: DirectKey, attempt: int) -> None:
+        session, entry = self._sessions.get(key.peer), self._imports.get(key.peer, key.source)
+        found: Grant | Unmet
+        if session is None or not session.linked or entry is None:
+            found = Unmet(Condition.OFFERED, "its module has no link")
+        else:
+            contract = self._contracts.of(entry.topic, entry.type)
+            asked = OpenDirect(key.source.topic, key.source.node, key.subscriber, contract)
+            try:
+                value = await self._rpc.request(
+                    session, requests.OPEN, requests.write(asked), limits.DIRECT_ASK_TIMEOUT
+                )
+                found = read_reply(value, key.source.node)
+            except RmpaError as error:
+                found = Unmet(Condition.RELEASE, f"{session.link.name} does not grant it: {error}")
+        self._act(self.routes.replied(key, attempt, found, self._now()))
+
+    async def _probe(self, peer: int, grant: Grant) -> None:
+        session = self._sessions.get(peer)
+        if session is None:
+            return
+        address = session.address
+        problem = await probe(address, grant.port, grant.probe, node=grant.node, timeout=limits.DIRECT_PROBE_TIMEOUT)
+        if problem:
+            problem = f"no connection to {address}:{grant.port}: {problem}"
+        self._act(self.routes.probed(peer, grant.port, problem, self._now()))
+
+    # --- carrying out ------------------------------------------------------------------------------------------------------
+
+    def _act(self, actions: Iterable[DirectAction]) -> None:
+        if self._closed:
+            return
+        for action in actions:
+            match action:
+                case Ask(key, attempt):
+                    self._start(self._ask(key, attempt), f"ask for {key.source}")
+                case Probe(peer, grant):
+                    self._start(self._probe(peer, grant), f"probe {grant.node}")
+                case Decided(key):
+                    for future in self._waiting.pop(key, ()):
+                        if not future.done():
+                            future.set_result(None)
+                    self._changed(key)
+                case Move(key):
+                    self._move_soon(key)
+                case HangUp(key, endpoint):
+                    self._counters.add("direct.hung_up")
+                    self._start(self._hang_up(key, endpoint), f"hang up {key.subscriber}")
+                case Release(key, broken):
+                    session = self._sessions.get(key.peer)
+                    if session is not None and session.linked:
+                        closed = CloseDirect(key.source.topic, key.source.node, key.subscriber, broken)
+                        self._rpc.notify(session, requests.CLOSE, requests.write(closed))
+                case Fallback(key, unmet):
+                    subject = f"{key.source} to {key.subscriber}"
+                    text = f'{subject}: relayed although transport is "direct": {unmet.text}'
+                    self._on_warning("direct.relayed", f"{key.peer} {subject} {unmet.condition}", text)
+        self._timer.arm()
+
+    def _start(self, work: Coroutine[Any, Any, None], name: str) -> asyncio.Task[None]:
+        task = asyncio.create_task(work, name=name)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
+    def _changed(self, key: DirectKey) -> None:
+        """Begins to watch direct connections."""
+        if self._checking is None and self.routes.connected():
+            self._checking = asyncio.get_running_loop().call_later(limits.DIRECT_CHECK, self._check)
+
+    def _publication(self, peer: int, source: Source) -> Publication | None:
+        topics = self._topics.get(peer)
+        return topics.publication(source) if topics is not None else None
+
+    def _uri(self, key: DirectKey, entry: RemoteTopic) -> str:
+        """The slave API of a subscriber; empty if it is not registered."""
+        return self._core.state().subscribers.get(entry.topic, {}).get(key.subscriber, "")
+
+    # --- moving a subscriber ---------------------------------------------------------------------------------------------
+
+    def _move_soon(self, key: DirectKey) -> None:
+        task = self._moves.get(key)
+        if task is not None:
+            return  # it looks at the decision when it calls the subscriber back
+        task = self._moves[key] = self._start(self._move(key), f"move {key.subscriber}")
+        task.add_done_callback(lambda _: self._moves.pop(key, None))
+
+    async def _hang_up(self, key: DirectKey, endpoint: tuple[str, int]) -> None:
+        """Makes a subscriber leave its direct connection: roscpp by the list of publishers, rospy by the kernel."""
+        state = self._core.state()
+        uri = state.nodes.get(key.subscriber, "")
+        proxy = self._proxy_uri(key)
+        topic = key.source.topic
+        if uri:
+            links = await direct_links(uri, topic, endpoint)
+            others = [one for one in self._core.publishers(topic).values() if one != proxy]
+            await publisher_update(uri, topic, others)
+            ports = {link.local_port for link in links or () if link.local_port is not None}
+            if ports & standing(endpoint) and (problem := end_to(endpoint, ports)):
+                self._cannot_end(key, endpoint, problem)
+
+    def _cannot_end(self, key: DirectKey, endpoint: tuple[str, int], problem: str) -> None:
+        text = (
+            f"{key.source}: {key.subscriber} stays connected to {endpoint[0]}:{endpoint[1]}: a rospy subscriber leaves "
+            f"only when its connection is ended, and this agent may not do that ({problem}); see rmpa doctor"
+        )
+        self._on_warning("direct.stuck", f"{key.peer} {key.source} {key.subscriber}", text)
+
+    def _proxy_uri(self, key: DirectKey) -> str:
+        session = self._sessions.get(key.peer)
+        proxy = session.proxies.get(key.source.node) if session is not None else None
+        return proxy.uri if proxy is not None else ""
+
+    async def _move(self, key: DirectKey) -> None:
+        """Makes a subscriber leave its present connection, and calls it back to get the other answer."""
+        entry, route = self._imports.get(key.peer, key.source), self.routes.get(key)
+        publication = self._publication(key.peer, key.source)
+        if entry is None or route is None or publication is None:
+            return
+        uri, proxy = self._uri(key, entry), self._proxy_uri(key)
+        if not uri or not proxy:
+            return
+        to_relay = route.state is DirectState.RELAYED
+        held = to_relay and route.path is Path.DIRECT
+        if held:
+            # Make before break: the relayed route flows, and its latched message is known, before the other ends.
+            self._on_demand(key.peer, key.source, True)
+            await self._opened(entry)
+        try:
+            had, begin = publication.latched if held else (), publication.messages
+            if not await self._leave(key, route, publication, uri, proxy):
+                return
+            publication.spare(key.subscriber, had)
+            self._counters.add("direct.moved")
+            await publisher_update(uri, entry.topic, list(self._core.publishers(entry.topic).values()))
+            if await self._arrived(key, publication):
+                route.missed += publication.messages - begin
+            elif self.routes.get(key) is route and route.path is Path.NONE:
+                # A list of publishers that the master sent at the same time may have overtaken this one.
+                await publisher_update(uri, entry.topic, list(self._core.publishers(entry.topic).values()))
+        finally:
+            if held and not publication.subscribers:
+                self._on_demand(key.peer, key.source, False)
+
+    async def _leave(self, key: DirectKey, route: Any, publication: Publication, uri: str, proxy: str) -> bool:
+        """Ends a subscriber's present connection to a source; return whether it has none any more."""
+        topic = publication.topic
+        endpoint = route.endpoint if route.path is Path.DIRECT else None
+        links = await direct_links(uri, topic, endpoint) if endpoint is not None else None
+        ports = {link.local_port for link in links or () if link.local_port is not None}
+        await publisher_update(uri, topic, [one for one in self._core.publishers(topic).values() if one != proxy])
+        publication.hang_up(key.subscriber)
+        if endpoint is not None and ports & standing(endpoint):
+            problem = end_to(endpoint, ports)
+            if not await self._until(lambda: not ports & standing(endpoint), limits.DIRECT_MOVE_WAIT):
+                route.stuck = problem or "the kernel does not end it"
+                self._cannot_end(key, endpoint, route.stuck)
+                return False
+        self.routes.hung_up(key)
+        return True
+
+    async def _opened(self, entry: RemoteTopic) -> None:
+        await self._until(lambda: entry.state is RouteState.OPEN, limits.DIRECT_MOVE_ROUTE)
+
+    async def _arrived(self, key: DirectKey, publication: Publication) -> bool:
+        """Waits until a subscriber that was called back is connected, by either transport."""
+
+        def there() -> bool:
+            route = self.routes.get(key)
+            if route is None or key.subscriber in publication.listeners:
+                return True
+            return route.path is Path.DIRECT and route.endpoint is not None and bool(standing(route.endpoint))
+
+        return await self._until(there, limits.DIRECT_SETTLE)
+
+    async def _until(self, condition: Callable[[], bool], seconds: float) -> bool:
+        deadline = self._now() + seconds
+        while not condition():
+            if self._now() >= deadline:
+                return False
+            await asyncio.sleep(limits.DIRECT_LOOK)
+        return True
+
+    # --- watching direct connections ---------------------------------------------------------------------------------------
+
+    def _check(self) -> None:
+        """Compares the direct connections with the kernel's table; asks the nodes only where some are missing."""
+        self._checking = None
+        connected = self.routes.connected()
+        if self._closed or not connected:
+            return
+        self._checking = asyncio.get_running_loop().call_later(limits.DIRECT_CHECK, self._check)
+        now = self._now()
+        settled = [
+            (key, route.endpoint)
+            for key, route in connected
+            if route.endpoint is not None
+            and now - route.answered_at > limits.DIRECT_SETTLE
+            and key not in self._moves
+        ]
+        wanted = Counter(endpoint for _, endpoint in settled)
+        short = {endpoint for endpoint, count in wanted.items() if len(standing(endpoint)) < count}
+        for key, endpoint in settled:
+            if endpoint in short:
+                self._start(self._check_one(key, endpoint), f"check {key.subscriber}")
+
+    async def _check_one(self, key: DirectKey, endpoint: tuple[str, int]) -> None:
+        entry = self._imports.get(key.peer, key.source)
+        uri = self._uri(key, entry) if entry is not None else ""
+        if entry is None or not uri:
+            return
+        links = await direct_links(uri, entry.topic, endpoint)
+        route = self.routes.get(key)
+        if links or route is None or route.endpoint != endpoint:
+            return
+        if links is None:
+            self._core.suspect(key.subscriber)
+        self._counters.add("direct.broken")
+        actions = self.routes.broken(key, self._now())
+        self._act(actions)
+
+    async def close(self) -> None:
+        """Stop everything; direct connections go on."""
+        self._closed = True
+        self._timer.close()
+        if self._checking is not None:
+            self._checking.cancel()
+        tasks = list(self._tasks)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)

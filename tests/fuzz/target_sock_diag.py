@@ -1,0 +1,51 @@
+"""Fuzz target: the kernel's answers about TCP sockets; another kernel, or an emulated one, may answer anything."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+
+from rmpa.runtime.sock_diag import FOUND_SIZE, InetSocket, MalformedAnswer, destroy_request, read_dump, read_status
+
+_HEADER = struct.Struct("=IHHII")
+
+
+def _answer(kind: int, flags: int, body: bytes) -> bytes:
+    return _HEADER.pack(_HEADER.size + len(body), kind, flags, 0, 0) + body
+
+
+_FOUND = _answer(
+    20, 2, destroy_request(InetSocket(2, 1, bytes(16), 1, bytes(16), 2, 0, (1, 2)))[20:92].ljust(72, b"\0")
+)
+SEEDS: list[bytes] = [
+    b"",
+    _FOUND,
+    _FOUND + _FOUND + _answer(3, 2, bytes(4)),
+    _answer(2, 0, struct.pack("=i", -1) + bytes(16)),
+    _answer(2, 0, bytes(20)),
+    _answer(20, 0x12, bytes(72)),
+    _answer(1, 0, b"") + _answer(3, 2, b""),
+]
+
+
+def fuzz(data: bytes) -> None:
+    """Whole sockets, a number of an error, or a documented error that is safe to log."""
+    found: list[bytes] = []
+    try:
+        read_dump(data, found)
+    except MalformedAnswer as error:
+        if not str(error).isprintable():
+            raise AssertionError("an error's text is not safe to log") from error
+    except OSError as error:
+        if not error.errno:
+            raise AssertionError("an error without its number") from error
+    for body in found:
+        of = InetSocket.parse(body)
+        if len(body) != FOUND_SIZE or len(destroy_request(of)) != len(destroy_request(of, 1)):
+            raise AssertionError("a part of a socket was taken for the whole")
+        if of.family == socket.AF_INET6:
+            socket.inet_ntop(socket.AF_INET6, of.destination)
+    with contextlib.suppress(MalformedAnswer):
+        if read_status(data) < 0:
+            raise AssertionError("a negative number of an error")
