@@ -20,7 +20,6 @@ from lab.bed.agents import RMPA, Agent, last_link
 from lab.bed.processes import BedError, Deadline
 from lab.bed.ros import NODES, PYTHON, Ros, compiled, words
 from rmpa.core.errors import UnreachableError
-from rmpa.observe.io.control_client import ControlClient, choose_agent
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -373,10 +372,8 @@ class Rmpa(System):
 
     def _snapshot(self, host: str) -> Snapshot | None:
         """What its agent says of itself; ``None`` if it does not answer."""
-        agent = self._agents[host]
         try:
-            with ControlClient(choose_agent(agent.env, agent.name).path) as client:
-                return client.snapshot()
+            return self._agents[host].snapshot()
         except UnreachableError:
             return None
 

@@ -130,9 +130,7 @@ def _take(plan: schedule.Rounds, console: Console, *, realtime: bool) -> tuple[S
 
 
 def _targets(scores: Scores) -> list[Claim]:
-    ours, idle, mixed = (
-        scores[key] for key in (("agents", "loaded"), ("agents", "unloaded"), ("agents_mixed", "loaded"))
-    )
+    ours, idle, mixed = scores["agents", "loaded"], scores["agents", "unloaded"], scores[_MIXED.key, "loaded"]
     return [
         Claim("p99 beside images, ms", _ms(ours.summary.p99), 1.0),
         Claim("p99 beside images / unloaded", ratio(ours.summary.p99, idle.summary.p99), 3.0),

@@ -158,7 +158,7 @@ def _claims(scores: Scores) -> list[Claim]:
 
 
 def _agents_claim(one: RoundTripPath, scores: Sequence[TripScore]) -> Claim:
-    """What both agents used of a core while their nodes talked directly, beyond what they use while nothing happens."""
+    """What both agents used while their nodes talked directly, beyond what they use while nothing happens."""
     agents = {name: process.pid for name, process in one.processes.items() if name.startswith("agent")}
     meter = Meter(agents)
     time.sleep(_IDLE_SECONDS)
