@@ -122,10 +122,10 @@ def _measure(
                         console.print(f"left out from here on: {one.key}: {error}", style="red", markup=False)
                         taking_part.remove(one)
         titles = {one.key: one.title for one in taking_part}
-        claims = _claims(scores)
+        wanted = claims(scores)
         for one in taking_part:
             if one.key == _DIRECT:
-                claims.append(_agents_claim(one, [score for (key, _), score in scores.items() if key == _DIRECT]))
+                wanted.append(_agents_claim(one, [score for (key, _), score in scores.items() if key == _DIRECT]))
     for size in plan.trips:
         console.print(_table(size, scores, titles))
     small = min(plan.trips)
@@ -137,11 +137,11 @@ def _measure(
         for size in plan.trips
     }
     panels = shapes.shares(shown, "one way, µs")
-    return finish(console, name, asdict(plan), result, json, claims=claims, panels=panels)
+    return finish(console, name, asdict(plan), result, json, claims=wanted, panels=panels)
 
 
-def _claims(scores: Scores) -> list[Claim]:
-    """Of what was measured."""
+def claims(scores: Scores) -> list[Claim]:
+    """What is to be reached, of those that were measured."""
     made = []
     for size in sorted({size for _, size in scores}):
         for name, limit in _DIRECT_LIMITS.items():
@@ -150,10 +150,10 @@ def _claims(scores: Scores) -> list[Claim]:
                 text = f"{tables.size(size)}, {name}, RMPA direct / roscpp over the same cable"
                 made.append(Claim(text, tables.ratio(ours, base), limit))
     smallest = min((size for _, size in scores), default=0)
-    for key, limit in ((_BASE, _RELAYED_LIMIT), (_RELAYS, 1.0)):
+    for key, name, limit in ((_BASE, "roscpp direct", _RELAYED_LIMIT), (_RELAYS, "two relays", 1.0)):
         if {(_OURS, smallest), (key, smallest)} <= scores.keys():
             ours, base = (scores[of, smallest].one_way.p50 for of in (_OURS, key))
-            made.append(Claim(f"{tables.size(smallest)}, p50, two agents / {key}", tables.ratio(ours, base), limit))
+            made.append(Claim(f"{tables.size(smallest)}, p50, two agents / {name}", tables.ratio(ours, base), limit))
     return made
 
 
