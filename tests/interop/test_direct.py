@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from lab.bed.processes import eventually
-from tests.interop.modules import Module, flows, whole
+from tests.interop.modules import Module, flows
 
 if TYPE_CHECKING:
     from tests.interop.conftest import ModuleFactory

@@ -39,8 +39,8 @@ _GONE: Final = frozenset({errno.ENOENT, errno.ESTALE})
 _UNSUPPORTED: Final = frozenset({errno.EOPNOTSUPP, errno.EINVAL})
 """``EINVAL`` comes from kernels before 4.5, which do not know the message."""
 REMEDY: Final = (
-    "run the agent with CAP_NET_ADMIN: `AmbientCapabilities=CAP_NET_ADMIN` in its systemd unit, or "
-    "`setcap cap_net_admin+ep` on its Python interpreter"
+    "run the agent with CAP_NET_ADMIN: `AmbientCapabilities=CAP_NET_ADMIN` in its systemd unit, "
+    "`--cap-add NET_ADMIN` for Docker, or `setcap cap_net_admin+ep PYTHON`"
 )
 """What gives an agent the right to end connections."""
 

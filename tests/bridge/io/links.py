@@ -91,6 +91,7 @@ class LinkEnd:
     """
 
     remote_endpoint = ("10.0.0.9", 1)
+    local_address = "10.0.0.8"
 
     def __init__(self, side: Side, other: Side) -> None:
         self.side = side
@@ -98,6 +99,7 @@ class LinkEnd:
         self.guid = other.identity.guid
         self.name = other.name
         self.silent = False
+        self.crashed = False
         self.clock_offset: float | None = None
         self.clock_error: float | None = None
         self.gone = False

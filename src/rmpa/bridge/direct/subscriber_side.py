@@ -22,12 +22,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
-from rmpa.bridge.messages import Source
 from rmpa.core.contract import Transport
 from rmpa.core.timer_queue import TimerQueue
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+
+    from rmpa.bridge.messages import Source
 
 
 class DirectKey(NamedTuple):
@@ -210,7 +211,7 @@ class DirectSubscriptions:
         """The subscribers whose last answer was the publisher's address."""
         return [(key, route) for key, route in self._routes.items() if route.path is Path.DIRECT]
 
-    # --- the local graph -------------------------------------------------------------------------------------------
+    # --- the local graph --------------------------------------------------------------------------------------------
 
     def consider(self, key: DirectKey, wanted: Transport, unmet: Unmet | None, now: float) -> list[DirectAction]:
         """Judge a subscriber that is new, or for which something changed here.
@@ -256,7 +257,7 @@ class DirectSubscriptions:
             actions.append(HangUp(key, route.endpoint))
         return [Release(key), *actions] if held else actions
 
-    # --- its requests ------------------------------------------------------------------------------------------------
+    # --- its requests -----------------------------------------------------------------------------------------------
 
     def decision(self, key: DirectKey) -> Grant | Unmet | None:
         """The answer for a subscriber: a grant, or why it is relayed; ``None`` while it is not decided."""
@@ -296,7 +297,7 @@ class DirectSubscriptions:
         latched = route.unmet is not None and route.unmet.condition is Condition.LATCHED
         return self._ask(key, route, now) if latched else []
 
-    # --- the peer ------------------------------------------------------------------------------------------------
+    # --- the peer ---------------------------------------------------------------------------------------------------
 
     def replied(self, key: DirectKey, attempt: int, found: Grant | Unmet, now: float) -> list[DirectAction]:
         """Take the response to ``Ask``; one to an earlier attempt is ignored."""
@@ -390,7 +391,7 @@ class DirectSubscriptions:
         route.grant = None
         return [Release(key, broken=True), *self._ask(key, route, now)]
 
-    # --- links ---------------------------------------------------------------------------------------------------
+    # --- links ------------------------------------------------------------------------------------------------------
 
     def link_down(self, peer: int, now: float, *, crashed: bool) -> list[DirectAction]:
         """Handle the loss of a peer's link.
@@ -427,7 +428,7 @@ class DirectSubscriptions:
             for action in self._ask(key, route, now)
         ]
 
-    # --- timers --------------------------------------------------------------------------------------------------
+    # --- timers -----------------------------------------------------------------------------------------------------
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due, monotonic seconds; ``None`` if no timer runs."""
@@ -442,7 +443,7 @@ class DirectSubscriptions:
                 actions += self._ask(key, route, now)
         return actions
 
-    # --- inside --------------------------------------------------------------------------------------------------
+    # --- inside -----------------------------------------------------------------------------------------------------
 
     @staticmethod
     def _held(route: DirectRoute) -> bool:

@@ -21,6 +21,7 @@ from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.descriptors import DESCRIPTORS
 from rmpa.runtime.event_loop import yield_to_data
 from rmpa.runtime.realtime import refused
+from rmpa.runtime.tcp_connections import may_end_connections
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator
@@ -160,6 +161,7 @@ class SnapshotBuilder:
             proxy_sockets=bridge.proxy_nodes.sockets(proxies),
             proxy_listening=bridge.proxy_nodes.listening,
             core_memory=core.restored(),
+            end_connections=may_end_connections(),
         )
 
     def _cpu_share(self) -> float | None:

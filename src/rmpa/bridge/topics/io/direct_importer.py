@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct import requests
-from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, read_unmet
-from rmpa.bridge.direct.io.nodes import direct_links, end_to, publisher_update, standing
+from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, read_unmet, unmet_by_contract
+from rmpa.bridge.direct.io.nodes import direct_links, standing
 from rmpa.bridge.direct.requests import CloseDirect, OpenDirect
 from rmpa.bridge.direct.subscriber_side import (
     Ask,
     Decided,
     DirectKey,
-    DirectState,
     DirectSubscriptions,
     Fallback,
     HangUp,
@@ -27,8 +26,7 @@ from rmpa.bridge.direct.subscriber_side import (
 )
 from rmpa.bridge.policy import is_own
 from rmpa.bridge.topics.audience import is_watched
-from rmpa.bridge.topics.io.direct_exporter import unmet_by_contract
-from rmpa.bridge.topics.remote_topic import RouteState
+from rmpa.bridge.topics.io.direct_moves import SubscriberMoves
 from rmpa.core.contract import Transport
 from rmpa.core.errors import RmpaError
 from rmpa.ros.environment import host_of, is_loopback
@@ -56,7 +54,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 MEASURING: Final = "/rmpa_topic_"
-"""The names of the nodes of ``rmpa topic hz|bw|delay|echo`` begin so; they are relayed, so that the agents measure."""
+"""The names of the nodes of ``rmpa topic hz|bw|delay|echo`` begin so; relayed, so that the agents measure."""
 
 
 class DirectImporter:
@@ -93,17 +91,26 @@ class DirectImporter:
         self._contracts = contracts
         self._sessions = sessions
         self._rpc = rpc
-        self._on_demand = on_demand
         self._on_warning = on_warning
         self._counters = counters
         self.routes = DirectSubscriptions(self._is_latched, self._is_relayed)
         """The state of each subscriber."""
+        self._moves = SubscriberMoves(
+            core,
+            imports,
+            topics,
+            sessions,
+            self.routes,
+            on_demand=on_demand,
+            on_warning=on_warning,
+            counters=counters,
+        )
         self._timer = MachineTimer(self.routes.next_timer, lambda now: self._act(self.routes.handle_timer(now)))
         self._waiting: dict[DirectKey, list[asyncio.Future[None]]] = {}
-        self._moves: dict[DirectKey, asyncio.Task[None]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         self._adrift: list[RemoteTopic] = []
         """The sources that are kept because of direct subscribers while their agent is gone."""
+        self._asking = asyncio.Semaphore(limits.DIRECT_ASKS)
         self._checking: asyncio.TimerHandle | None = None
         self._closed = False
         rpc.on_notification(requests.CLOSED, self._closed_there)
@@ -113,7 +120,7 @@ class DirectImporter:
     def _now() -> float:
         return asyncio.get_running_loop().time()
 
-    # --- the local graph ---------------------------------------------------------------------------------------------
+    # --- the local graph --------------------------------------------------------------------------------------------
 
     def reload(self, contracts: Contracts) -> None:
         """Take new contracts, and judge every subscriber again."""
@@ -133,7 +140,8 @@ class DirectImporter:
             if change.added:
                 self._consider(peer, source, change.node, change.api)
             else:
-                self._act(self.routes.remove(DirectKey(peer, source, change.node)))
+                # It has closed its connection, or is dead; a new node of its name must not be made to hang up.
+                self._act(self.routes.remove(DirectKey(peer, source, change.node), hang_up=False))
 
     def shown(self, peer: int, source: Source) -> None:
         """Judge the subscribers of a source that appears in the local graph."""
@@ -193,7 +201,7 @@ class DirectImporter:
         publication = self._publication(key.peer, key.source)
         return publication is not None and key.subscriber in publication.listeners
 
-    # --- what subscribers ask ------------------------------------------------------------------------------------------
+    # --- what subscribers ask ---------------------------------------------------------------------------------------
 
     def request(self, peer: int, source: Source, subscriber: str) -> Awaitable[RosReply | None] | None:
         """Answer a subscriber's ``requestTopic`` at the proxy of a source; see ``Publication.on_request``."""
@@ -213,10 +221,10 @@ class DirectImporter:
             self.routes.answered(key, None, self._now())
             return None
         endpoint = (session.address, decision.port)
-        uri = self._uri(key, entry)
+        uri = self._moves.uri(key.subscriber, entry.topic)
         adopted = bool(uri and standing(endpoint) and await direct_links(uri, entry.topic, endpoint))
         self.routes.answered(key, endpoint, self._now())
-        self._changed(key)
+        self._watch()
         if adopted:
             # It has been connected since an earlier run of this agent; a second connection would double messages.
             _log.info("= %s: %s is connected directly already", session.link.name, key.subscriber)
@@ -251,7 +259,7 @@ class DirectImporter:
             if route.path is Path.RELAY and name not in there and key not in self._moves:
                 self._act(self.routes.left(key, self._now()))
 
-    # --- links ---------------------------------------------------------------------------------------------------------
+    # --- links ------------------------------------------------------------------------------------------------------
 
     def link_up(self, session: PeerSession) -> None:
         """Ask again for the subscribers of a peer that was without a link."""
@@ -280,22 +288,25 @@ class DirectImporter:
             session: The peer.
             hang_up: End their connections, rather than leave them to the peer's next agent.
         """
-        left = set()
+        left: list[tuple[DirectKey, tuple[str, int]]] = []
         for key, route in self.routes:
             if key.peer == session.peer:
                 if not hang_up and route.path is Path.DIRECT and route.endpoint is not None:
-                    left.add(route.endpoint)
+                    left.append((key, route.endpoint))
                 self._act(self.routes.remove(key, hang_up=hang_up))
-        if left:
+        if left and not self._closed:
             asyncio.get_running_loop().call_later(limits.DIRECT_ADOPT, self._end_strays, left)
 
-    def _end_strays(self, endpoints: set[tuple[str, int]]) -> None:
+    def _end_strays(self, left: list[tuple[DirectKey, tuple[str, int]]]) -> None:
         """Ends direct connections from before a crash of the peer's agent that its next run has not taken over."""
-        known = {route.endpoint for _, route in self.routes.connected()}
-        for endpoint in endpoints - known:
-            end_to(endpoint)
+        if self._closed:
+            return
+        known = {(key.source, key.subscriber, route.endpoint) for key, route in self.routes.connected()}
+        for key, endpoint in left:
+            if (key.source, key.subscriber, endpoint) not in known:
+                self._moves.hang_up(key, endpoint)
 
-    # --- the peer --------------------------------------------------------------------------------------------------------
+    # --- the peer ---------------------------------------------------------------------------------------------------
 
     def _closed_there(self, session: PeerSession, args: dict[str, Any]) -> None:
         told = requests.read_closed(args)
@@ -306,6 +317,11 @@ class DirectImporter:
         self._act(self.routes.retry(session.peer, requests.read_retry(args).source, self._now()))
 
     async def _ask(self, key: DirectKey, attempt: int) -> None:
+        # A peer answers a bounded number of requests at a time, and others are waiting for it too.
+        async with self._asking:
+            await self._ask_now(key, attempt)
+
+    async def _ask_now(self, key: DirectKey, attempt: int) -> None:
         session, entry = self._sessions.get(key.peer), self._imports.get(key.peer, key.source)
         found: Grant | Unmet
         if session is None or not session.linked or entry is None:
@@ -332,7 +348,7 @@ class DirectImporter:
             problem = f"no connection to {address}:{grant.port}: {problem}"
         self._act(self.routes.probed(peer, grant.port, problem, self._now()))
 
-    # --- carrying out ------------------------------------------------------------------------------------------------------
+    # --- carrying out -----------------------------------------------------------------------------------------------
 
     def _act(self, actions: Iterable[DirectAction]) -> None:
         if self._closed:
@@ -344,25 +360,32 @@ class DirectImporter:
                 case Probe(peer, grant):
                     self._start(self._probe(peer, grant), f"probe {grant.node}")
                 case Decided(key):
-                    for future in self._waiting.pop(key, ()):
-                        if not future.done():
-                            future.set_result(None)
-                    self._changed(key)
+                    self._resume(key)
                 case Move(key):
-                    self._move_soon(key)
+                    self._moves.move(key)
                 case HangUp(key, endpoint):
                     self._counters.add("direct.hung_up")
-                    self._start(self._hang_up(key, endpoint), f"hang up {key.subscriber}")
+                    self._moves.hang_up(key, endpoint)
                 case Release(key, broken):
-                    session = self._sessions.get(key.peer)
-                    if session is not None and session.linked:
-                        closed = CloseDirect(key.source.topic, key.source.node, key.subscriber, broken)
-                        self._rpc.notify(session, requests.CLOSE, requests.write(closed))
+                    self._release(key, broken=broken)
                 case Fallback(key, unmet):
                     subject = f"{key.source} to {key.subscriber}"
                     text = f'{subject}: relayed although transport is "direct": {unmet.text}'
                     self._on_warning("direct.relayed", f"{key.peer} {subject} {unmet.condition}", text)
         self._timer.arm()
+
+    def _resume(self, key: DirectKey) -> None:
+        """Answers the requests of a subscriber that wait for its decision."""
+        for future in self._waiting.pop(key, ()):
+            if not future.done():
+                future.set_result(None)
+        self._watch()
+
+    def _release(self, key: DirectKey, *, broken: bool) -> None:
+        session = self._sessions.get(key.peer)
+        if session is not None and session.linked:
+            closed = CloseDirect(key.source.topic, key.source.node, key.subscriber, broken)
+            self._rpc.notify(session, requests.CLOSE, requests.write(closed))
 
     def _start(self, work: Coroutine[Any, Any, None], name: str) -> asyncio.Task[None]:
         task = asyncio.create_task(work, name=name)
@@ -370,8 +393,8 @@ class DirectImporter:
         task.add_done_callback(self._tasks.discard)
         return task
 
-    def _changed(self, key: DirectKey) -> None:
-        """Begins to watch direct connections."""
+    def _watch(self) -> None:
+        """Begins to watch direct connections, if there are any."""
         if self._checking is None and self.routes.connected():
             self._checking = asyncio.get_running_loop().call_later(limits.DIRECT_CHECK, self._check)
 
@@ -379,116 +402,7 @@ class DirectImporter:
         topics = self._topics.get(peer)
         return topics.publication(source) if topics is not None else None
 
-    def _uri(self, key: DirectKey, entry: RemoteTopic) -> str:
-        """The slave API of a subscriber; empty if it is not registered."""
-        return self._core.state().subscribers.get(entry.topic, {}).get(key.subscriber, "")
-
-    # --- moving a subscriber ---------------------------------------------------------------------------------------------
-
-    def _move_soon(self, key: DirectKey) -> None:
-        task = self._moves.get(key)
-        if task is not None:
-            return  # it looks at the decision when it calls the subscriber back
-        task = self._moves[key] = self._start(self._move(key), f"move {key.subscriber}")
-        task.add_done_callback(lambda _: self._moves.pop(key, None))
-
-    async def _hang_up(self, key: DirectKey, endpoint: tuple[str, int]) -> None:
-        """Makes a subscriber leave its direct connection: roscpp by the list of publishers, rospy by the kernel."""
-        state = self._core.state()
-        uri = state.nodes.get(key.subscriber, "")
-        proxy = self._proxy_uri(key)
-        topic = key.source.topic
-        if uri:
-            links = await direct_links(uri, topic, endpoint)
-            others = [one for one in self._core.publishers(topic).values() if one != proxy]
-            await publisher_update(uri, topic, others)
-            ports = {link.local_port for link in links or () if link.local_port is not None}
-            if ports & standing(endpoint) and (problem := end_to(endpoint, ports)):
-                self._cannot_end(key, endpoint, problem)
-
-    def _cannot_end(self, key: DirectKey, endpoint: tuple[str, int], problem: str) -> None:
-        text = (
-            f"{key.source}: {key.subscriber} stays connected to {endpoint[0]}:{endpoint[1]}: a rospy subscriber leaves "
-            f"only when its connection is ended, and this agent may not do that ({problem}); see rmpa doctor"
-        )
-        self._on_warning("direct.stuck", f"{key.peer} {key.source} {key.subscriber}", text)
-
-    def _proxy_uri(self, key: DirectKey) -> str:
-        session = self._sessions.get(key.peer)
-        proxy = session.proxies.get(key.source.node) if session is not None else None
-        return proxy.uri if proxy is not None else ""
-
-    async def _move(self, key: DirectKey) -> None:
-        """Makes a subscriber leave its present connection, and calls it back to get the other answer."""
-        entry, route = self._imports.get(key.peer, key.source), self.routes.get(key)
-        publication = self._publication(key.peer, key.source)
-        if entry is None or route is None or publication is None:
-            return
-        uri, proxy = self._uri(key, entry), self._proxy_uri(key)
-        if not uri or not proxy:
-            return
-        to_relay = route.state is DirectState.RELAYED
-        held = to_relay and route.path is Path.DIRECT
-        if held:
-            # Make before break: the relayed route flows, and its latched message is known, before the other ends.
-            self._on_demand(key.peer, key.source, True)
-            await self._opened(entry)
-        try:
-            had, begin = publication.latched if held else (), publication.messages
-            if not await self._leave(key, route, publication, uri, proxy):
-                return
-            publication.spare(key.subscriber, had)
-            self._counters.add("direct.moved")
-            await publisher_update(uri, entry.topic, list(self._core.publishers(entry.topic).values()))
-            if await self._arrived(key, publication):
-                route.missed += publication.messages - begin
-            elif self.routes.get(key) is route and route.path is Path.NONE:
-                # A list of publishers that the master sent at the same time may have overtaken this one.
-                await publisher_update(uri, entry.topic, list(self._core.publishers(entry.topic).values()))
-        finally:
-            if held and not publication.subscribers:
-                self._on_demand(key.peer, key.source, False)
-
-    async def _leave(self, key: DirectKey, route: Any, publication: Publication, uri: str, proxy: str) -> bool:
-        """Ends a subscriber's present connection to a source; return whether it has none any more."""
-        topic = publication.topic
-        endpoint = route.endpoint if route.path is Path.DIRECT else None
-        links = await direct_links(uri, topic, endpoint) if endpoint is not None else None
-        ports = {link.local_port for link in links or () if link.local_port is not None}
-        await publisher_update(uri, topic, [one for one in self._core.publishers(topic).values() if one != proxy])
-        publication.hang_up(key.subscriber)
-        if endpoint is not None and ports & standing(endpoint):
-            problem = end_to(endpoint, ports)
-            if not await self._until(lambda: not ports & standing(endpoint), limits.DIRECT_MOVE_WAIT):
-                route.stuck = problem or "the kernel does not end it"
-                self._cannot_end(key, endpoint, route.stuck)
-                return False
-        self.routes.hung_up(key)
-        return True
-
-    async def _opened(self, entry: RemoteTopic) -> None:
-        await self._until(lambda: entry.state is RouteState.OPEN, limits.DIRECT_MOVE_ROUTE)
-
-    async def _arrived(self, key: DirectKey, publication: Publication) -> bool:
-        """Waits until a subscriber that was called back is connected, by either transport."""
-
-        def there() -> bool:
-            route = self.routes.get(key)
-            if route is None or key.subscriber in publication.listeners:
-                return True
-            return route.path is Path.DIRECT and route.endpoint is not None and bool(standing(route.endpoint))
-
-        return await self._until(there, limits.DIRECT_SETTLE)
-
-    async def _until(self, condition: Callable[[], bool], seconds: float) -> bool:
-        deadline = self._now() + seconds
-        while not condition():
-            if self._now() >= deadline:
-                return False
-            await asyncio.sleep(limits.DIRECT_LOOK)
-        return True
-
-    # --- watching direct connections ---------------------------------------------------------------------------------------
+    # --- watching direct connections --------------------------------------------------------------------------------
 
     def _check(self) -> None:
         """Compares the direct connections with the kernel's table; asks the nodes only where some are missing."""
@@ -513,7 +427,7 @@ class DirectImporter:
 
     async def _check_one(self, key: DirectKey, endpoint: tuple[str, int]) -> None:
         entry = self._imports.get(key.peer, key.source)
-        uri = self._uri(key, entry) if entry is not None else ""
+        uri = self._moves.uri(key.subscriber, entry.topic) if entry is not None else ""
         if entry is None or not uri:
             return
         links = await direct_links(uri, entry.topic, endpoint)
@@ -535,4 +449,4 @@ class DirectImporter:
         tasks = list(self._tasks)
         for task in tasks:
             task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await asyncio.gather(*tasks, self._moves.close(), return_exceptions=True)

@@ -1,0 +1,202 @@
+"""Moves single subscribers of a remote source between the direct and the relayed transport.
+
+TCPROS has no way to redirect a connection. A subscriber is made to leave: roscpp by a list of publishers without the
+proxy, rospy by ending its connection. Then it is called back by a list with the proxy, and gets the other answer.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+from rmpa.bridge import limits
+from rmpa.bridge.direct.io.nodes import direct_links, end_to, publisher_update, standing
+from rmpa.bridge.direct.subscriber_side import DirectState, Path
+from rmpa.bridge.topics.remote_topic import RouteState
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from rmpa.bridge.direct.subscriber_side import DirectKey, DirectRoute, DirectSubscriptions
+    from rmpa.bridge.messages import Source
+    from rmpa.bridge.session.peer_sessions import PeerSessions
+    from rmpa.bridge.topics.imports import Imports
+    from rmpa.bridge.topics.io.peer_topics import PeerTopics
+    from rmpa.bridge.topics.remote_topic import RemoteTopic
+    from rmpa.core.counters import Counters
+    from rmpa.ros.core.api import Core
+    from rmpa.ros.node.publication import Publication
+
+
+class SubscriberMoves:
+    """Moves subscribers; one move of each at a time.
+
+    Args:
+        core: The local core.
+        imports: The remote sources.
+        topics: The peers' topics in the local graph, by the numbers of their sessions.
+        sessions: The peers.
+        routes: The state of each subscriber.
+        on_demand: ``(peer, source, wanted)``: opens the relayed route of a source, or lets it close.
+        on_warning: ``(kind, subject, text)``: logs and counts a warning.
+        counters: Counts ``direct.moved``.
+    """
+
+    def __init__(
+        self,
+        core: Core,
+        imports: Imports,
+        topics: Mapping[int, PeerTopics],
+        sessions: PeerSessions,
+        routes: DirectSubscriptions,
+        *,
+        on_demand: Callable[[int, Source, bool], None],
+        on_warning: Callable[[str, str, str], None],
+        counters: Counters,
+    ) -> None:
+        self._core = core
+        self._imports = imports
+        self._topics = topics
+        self._sessions = sessions
+        self._routes = routes
+        self._on_demand = on_demand
+        self._on_warning = on_warning
+        self._counters = counters
+        self._tasks: dict[DirectKey, asyncio.Task[None]] = {}
+        self._ending: dict[DirectKey, asyncio.Task[None]] = {}
+        """Subscribers that are made to hang up; a move of one waits for it."""
+
+    def __contains__(self, key: DirectKey) -> bool:
+        """Whether a subscriber is being moved."""
+        return key in self._tasks
+
+    def uri(self, subscriber: str, topic: str) -> str:
+        """The slave API of a local subscriber; empty if it is not registered."""
+        return self._core.state().subscribers.get(topic, {}).get(subscriber, "")
+
+    async def close(self) -> None:
+        """Stop all moves."""
+        tasks = [*self._tasks.values(), *self._ending.values()]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    def move(self, key: DirectKey) -> None:
+        """Make a subscriber leave its present connection, and call it back to get the answer that was decided."""
+        if key in self._tasks:
+            return  # the subscriber gets the latest decision when it is called back
+        task = self._tasks[key] = asyncio.create_task(self._move(key), name=f"move {key.subscriber}")
+        task.add_done_callback(lambda _: self._tasks.pop(key, None))
+
+    def hang_up(self, key: DirectKey, endpoint: tuple[str, int]) -> None:
+        """Make a subscriber leave its direct connection; it is not called back."""
+        before = self._ending.get(key)
+        task = asyncio.create_task(self._hang_up(key, endpoint, before), name=f"hang up {key.subscriber}")
+        self._ending[key] = task
+        task.add_done_callback(lambda done: self._ending.pop(key) if self._ending.get(key) is done else None)
+
+    async def _hang_up(self, key: DirectKey, endpoint: tuple[str, int], before: asyncio.Task[None] | None) -> None:
+        if before is not None:
+            await asyncio.wait([before])
+        topic, uri = key.source.topic, self._core.state().nodes.get(key.subscriber, "")
+        if not uri:
+            return
+        links = await direct_links(uri, topic, endpoint)
+        proxy = self._proxy_uri(key)
+        others = [one for one in self._core.publishers(topic).values() if one != proxy]
+        await publisher_update(uri, topic, others)
+        ports = {link.local_port for link in links or () if link.local_port is not None}
+        if ports & standing(endpoint) and (problem := end_to(endpoint, ports)):
+            self._cannot_end(key, endpoint, problem)
+        now = list(self._core.publishers(topic).values())
+        if [one for one in now if one != proxy] != others:
+            await publisher_update(uri, topic, now)  # the master's own list may have been overtaken
+
+    def _cannot_end(self, key: DirectKey, endpoint: tuple[str, int], problem: str) -> None:
+        text = (
+            f"{key.source}: {key.subscriber} stays connected to {endpoint[0]}:{endpoint[1]}: a rospy subscriber "
+            f"leaves only when its connection is ended, and this agent may not do that ({problem}); see rmpa doctor"
+        )
+        self._on_warning("direct.stuck", f"{key.peer} {key.source} {key.subscriber}", text)
+
+    def _publication(self, key: DirectKey) -> Publication | None:
+        topics = self._topics.get(key.peer)
+        return topics.publication(key.source) if topics is not None else None
+
+    def _proxy_uri(self, key: DirectKey) -> str:
+        session = self._sessions.get(key.peer)
+        proxy = session.proxies.get(key.source.node) if session is not None else None
+        return proxy.uri if proxy is not None else ""
+
+    async def _move(self, key: DirectKey) -> None:
+        if (ending := self._ending.get(key)) is not None:
+            await asyncio.wait([ending])
+        entry, route = self._imports.get(key.peer, key.source), self._routes.get(key)
+        publication = self._publication(key)
+        if entry is None or route is None or publication is None:
+            return
+        uri, proxy = self.uri(key.subscriber, entry.topic), self._proxy_uri(key)
+        if not uri or not proxy:
+            return
+        to_relay = route.state is DirectState.RELAYED
+        held = to_relay and route.path is Path.DIRECT
+        if held:
+            # Make before break: the relayed route flows, and its latched message is known, before the other ends.
+            self._on_demand(key.peer, key.source, True)
+            await self._opened(entry)
+        try:
+            had, begin = publication.latched if held else (), publication.messages
+            if not await self._leave(key, route, publication, uri, proxy):
+                return
+            publication.spare(key.subscriber, had)
+            self._counters.add("direct.moved")
+            await publisher_update(uri, entry.topic, list(self._core.publishers(entry.topic).values()))
+            if await self._arrived(key, publication):
+                route.missed += publication.messages - begin
+            elif self._routes.get(key) is route and route.path is Path.NONE:
+                # A list of publishers that the master sent at the same time may have overtaken this one.
+                await publisher_update(uri, entry.topic, list(self._core.publishers(entry.topic).values()))
+        finally:
+            if held and not publication.subscribers:
+                self._on_demand(key.peer, key.source, False)
+
+    async def _leave(
+        self, key: DirectKey, route: DirectRoute, publication: Publication, uri: str, proxy: str
+    ) -> bool:
+        """Ends a subscriber's present connection to a source; return whether it has none any more."""
+        topic = publication.topic
+        endpoint = route.endpoint if route.path is Path.DIRECT else None
+        links = await direct_links(uri, topic, endpoint) if endpoint is not None else None
+        ports = {link.local_port for link in links or () if link.local_port is not None}
+        await publisher_update(uri, topic, [one for one in self._core.publishers(topic).values() if one != proxy])
+        publication.hang_up(key.subscriber)
+        if endpoint is not None and ports & standing(endpoint):
+            problem = end_to(endpoint, ports)
+            if not await self._until(lambda: not ports & standing(endpoint), limits.DIRECT_MOVE_WAIT):
+                route.stuck = problem or "the kernel does not end it"
+                self._cannot_end(key, endpoint, route.stuck)
+                return False
+        self._routes.hung_up(key)
+        return True
+
+    async def _opened(self, entry: RemoteTopic) -> None:
+        await self._until(lambda: entry.state is RouteState.OPEN, limits.DIRECT_MOVE_ROUTE)
+
+    async def _arrived(self, key: DirectKey, publication: Publication) -> bool:
+        """Waits until a subscriber that was called back is connected, by either transport."""
+
+        def there() -> bool:
+            route = self._routes.get(key)
+            if route is None or key.subscriber in publication.listeners:
+                return True
+            return route.path is Path.DIRECT and route.endpoint is not None and bool(standing(route.endpoint))
+
+        return await self._until(there, limits.DIRECT_SETTLE)
+
+    async def _until(self, condition: Callable[[], bool], seconds: float) -> bool:
+        deadline = asyncio.get_running_loop().time() + seconds
+        while not condition():
+            if asyncio.get_running_loop().time() >= deadline:
+                return False
+            await asyncio.sleep(limits.DIRECT_LOOK)
+        return True
