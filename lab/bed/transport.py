@@ -29,7 +29,7 @@ _LISTENING: Final = "0A"
 
 def settings(transport: Transport) -> str:
     """The part of ``rmpa.toml`` that asks for it, for topics and services."""
-    return f'[bridge]\ntransport = "{transport}"\n'
+    return f'[bridge]\ntransport = "{transport}"\n\n[services]\ntransport = "{transport}"\n'
 
 
 def require(transport: Transport, pairs: Iterable[Pair], timeout: float = DEADLINE) -> None:
