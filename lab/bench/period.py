@@ -124,13 +124,13 @@ def measure(quick: bool, console: Console, json: Path | None = None, *, realtime
     rows = [(titles[key], one.usage, one.messages) for (key, rate), one in scores.items() if rate == _FASTEST]
     console.print(usage_table(f"processes on the path, {_FASTEST} Hz", rows))
     targets = [
-        Claim(f"period sd at {rate} Hz, {what} / direct", ratio(scores[key, rate].sd, base.sd), _LIMIT)
-        for key, what in (("agents", "through agents"), ("agents_direct", "RMPA direct"))
+        Claim(f"period sd at {rate} Hz, {what}", ratio(scores[key, rate].sd, base.sd), _LIMIT)
+        for key, what in (("agents", "through agents / direct"), ("agents_direct", "RMPA direct / roscpp direct"))
         for rate in plan.seconds
         for base in [scores["direct", rate]]
     ]
     ours, theirs = scores["agents_direct", _FASTEST], scores["direct", _FASTEST]
-    text = f"p99 less p50 of the period at {_FASTEST} Hz, RMPA direct / direct"
+    text = f"p99 less p50 of the period at {_FASTEST} Hz, RMPA direct / roscpp direct"
     targets.append(Claim(text, ratio(ours.spread, theirs.spread), _LIMIT))
     result: dict[str, object] = {
         "rows": [_row(key, rate, one, scores["direct", rate]) for (key, rate), one in scores.items()],
