@@ -17,13 +17,12 @@ from tests.interop.transports import (
     on_the_network,
     unbroken,
     wait_direct,
-    wait_relayed,
 )
 
 if TYPE_CHECKING:
     from lab.bed.namespaces import Lab
     from lab.bed.processes import Process
-    from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
+    from tests.interop.conftest import ModuleFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
