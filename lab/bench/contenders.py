@@ -17,9 +17,8 @@ from lab.bed.transport import require
 from lab.usage import Meter, Usage
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
-    from lab.bed.agents import Agent
     from lab.bed.bench import Bed
     from lab.bed.plan import Transport
     from lab.bed.processes import Process
@@ -161,45 +160,25 @@ def relays(bed: Bed) -> RoundTripPath:
     return _nodes("relays", "roscpp, two C++ relays", shell, shell, "roscpp", between, ask="/ping2", answer="/pong2")
 
 
-def agents_hosts(bed: Bed) -> RoundTripPath:
-    """Roscpp through two agents in two network namespaces."""
-    a, b = bed.lab.hosts("a", "b")
-    pair = bed.agent(a, name="a"), bed.agent(b, name="b")
-    return _through("agents_hosts", "roscpp, two agents, two hosts", bed, pair)
+def through(
+    key: str, title: str, transport: Transport, *, network: int | None = None, flags: Sequence[str] = ()
+) -> Callable[[Bed], RoundTripPath]:
+    """Roscpp by two agents: in two network namespaces, or without a network both on the real machine."""
 
+    def start(bed: Bed) -> RoundTripPath:
+        names = f"{key}_a", f"{key}_b"
+        hosts = bed.lab.hosts(*names, network=network) if network is not None else (MACHINE, MACHINE)
+        pair = [
+            bed.agent(host, name=name, flags=flags, way=transport) for host, name in zip(hosts, names, strict=True)
+        ]
+        here, there = (bed.shell(agent.host, agent.core_port) for agent in pair)
+        between = {f"agent {number}": agent.process for number, agent in enumerate(pair, 1)}
+        made = _nodes(key, title, here, there, "roscpp", between)
+        made.still, made.transport = [], transport
+        made.require_transport()
+        return made
 
-def agents_one_host(bed: Bed) -> RoundTripPath:
-    """Roscpp through two agents on the real machine."""
-    pair = bed.agent(MACHINE, name="one"), bed.agent(MACHINE, name="two")
-    return _through("agents_one_host", "roscpp, two agents, one host", bed, pair)
-
-
-def rmpa_direct_hosts(bed: Bed) -> RoundTripPath:
-    """Roscpp from node to node, as two agents in two network namespaces have told them to."""
-    a, b = bed.lab.hosts("direct_a", "direct_b", network=1)
-    pair = bed.agent(a, name="direct_a", way="direct"), bed.agent(b, name="direct_b", way="direct")
-    return _through("direct_hosts", "roscpp, RMPA direct, two hosts", bed, pair, "direct")
-
-
-def rmpa_direct_one_host(bed: Bed) -> RoundTripPath:
-    """Likewise on the real machine, in a domain of their own."""
-    domain = ("--domain", "1")
-    pair = (
-        bed.agent(MACHINE, name="direct_one", flags=domain, way="direct"),
-        bed.agent(MACHINE, name="direct_two", flags=domain, way="direct"),
-    )
-    return _through("direct_one_host", "roscpp, RMPA direct, one host", bed, pair, "direct")
-
-
-def _through(
-    key: str, title: str, bed: Bed, pair: tuple[Agent, Agent], transport: Transport = "relay"
-) -> RoundTripPath:
-    between = {f"agent {number}": agent.process for number, agent in enumerate(pair, 1)}
-    here, there = (bed.shell(agent.host, agent.core_port) for agent in pair)
-    made = _nodes(key, title, here, there, "roscpp", between)
-    made.still, made.transport = [], transport
-    made.require_transport()
-    return made
+    return start
 
 
 def _nodes(
@@ -273,10 +252,14 @@ ENTRIES: Final[dict[str, Entry]] = {
         "cyclonedds",
     ),
     "pyzmq": Entry(script("pyzmq", "pyzmq, PAIR over TCP", "ping_zmq.py", freeze=True), "zmq"),
-    "agents_hosts": Entry(agents_hosts, needs=_HOSTS),
-    "agents_one_host": Entry(agents_one_host, needs=_ROS),
-    "direct_hosts": Entry(rmpa_direct_hosts, needs=_HOSTS),
-    "direct_one_host": Entry(rmpa_direct_one_host, needs=_ROS),
+    "agents_hosts": Entry(through("agents_hosts", "roscpp, two agents, two hosts", "relay", network=0), needs=_HOSTS),
+    "agents_one_host": Entry(through("agents_one_host", "roscpp, two agents, one host", "relay"), needs=_ROS),
+    "direct_hosts": Entry(
+        through("direct_hosts", "roscpp, RMPA direct, two hosts", "direct", network=1), needs=_HOSTS
+    ),
+    "direct_one_host": Entry(
+        through("direct_one_host", "roscpp, RMPA direct, one host", "direct", flags=("--domain", "1")), needs=_ROS
+    ),
 }
 """All ways to carry bytes from process to process, each at its best (Zenoh peer to peer, DDS over loopback alone)."""
 _LIBRARIES: Final = {"zenoh", "zenoh_shm", "cyclonedds", "pyzmq"}

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from lab.bed.bench import Bed
 from lab.bench import schedule
-from lab.experiments.images import MIXED_CONTRACTS
+from lab.experiments.images import DEADLINE, IMAGE, IMAGE_QUEUE, IMAGE_RATE, MIXED_CONTRACTS, RATE, SIZE
 from lab.figures import shapes
 from lab.findings import Claim
 from lab.results import finish
@@ -27,15 +27,8 @@ if TYPE_CHECKING:
 
 _LINK: Final = 100e6
 """Bits a second, as tbf counts them: with Ethernet's headers."""
-_SIZE, _RATE = 64, 100.0
-_IMAGE: Final = 1024 * 1024
-_IMAGE_RATE: Final = 15.1
-"""Hz; 127 Mbit/s, and no divisor of the command's rate, so that the two drift past each other."""
-_IMAGE_QUEUE: Final = 2
 _AHEAD: Final = 2.0
 """Seconds of images before the first command that counts: queues are full then."""
-_DEADLINE: Final = 1000.0
-"""µs."""
 _MIXED: Final = schedule.AgentPair("agents_mixed", "images direct, command relayed", "relay", MIXED_CONTRACTS)
 _NO_WORSE: Final = 1.1
 """Of a p99 of 10,000 commands: two runs of one way differ by that."""
@@ -57,7 +50,7 @@ class LoadedScore(schedule.LatencyScore):
         """Take the images of one round; only those count that came while commands were due."""
         self.images.add(images)
         if commands.due:
-            self.throughput.append(images.bytes_per_second(_IMAGE, commands.due[0], commands.due[-1]))
+            self.throughput.append(images.bytes_per_second(IMAGE, commands.due[0], commands.due[-1]))
 
     @property
     def share(self) -> float | None:
@@ -88,10 +81,10 @@ def measure(quick: bool, console: Console, json: Path | None = None, *, realtime
     }
     settings = {
         **asdict(plan),
-        "bytes": _SIZE,
-        "hz": _RATE,
-        "image_bytes": _IMAGE,
-        "image_hz": _IMAGE_RATE,
+        "bytes": SIZE,
+        "hz": RATE,
+        "image_bytes": IMAGE,
+        "image_hz": IMAGE_RATE,
         "link_bits_per_s": _LINK,
     }
     return finish(
@@ -101,7 +94,7 @@ def measure(quick: bool, console: Console, json: Path | None = None, *, realtime
         result,
         json,
         claims=_targets(scores),
-        panels=shapes.tails(_panels(scores, titles), "from due to there, µs", _DEADLINE),
+        panels=shapes.tails(_panels(scores, titles), "from due to there, µs", DEADLINE),
     )
 
 
@@ -119,7 +112,7 @@ def _take(plan: schedule.Rounds, console: Console, *, realtime: bool) -> tuple[S
                 shell.host.shape(f"{_LINK / 1e6:.0f}mbit", bands=True)  # as on a real card
             # The images' nodes are the less urgent ones of the user's, too.
             transport: Transport | None = "direct" if way.key == _MIXED.key else None
-            images = way.stream(bed, "/image", queue=_IMAGE_QUEUE, fifo=fifo and fifo - 1, transport=transport)
+            images = way.stream(bed, "/image", queue=IMAGE_QUEUE, fifo=fifo and fifo - 1, transport=transport)
             streams[way.key] = way.stream(bed, "/command", fifo=fifo), images
         for order in schedule.turns(ways, plan.rounds, console):
             for way in order:
@@ -153,9 +146,9 @@ def _round(
     loaded: bool,
 ) -> None:
     if loaded:
-        image.begin(_IMAGE, _IMAGE_RATE, _AHEAD + seconds + 1.0)
+        image.begin(IMAGE, IMAGE_RATE, _AHEAD + seconds + 1.0)
         image.wait_lead_in(_AHEAD)
-    commands = command.run(_SIZE, _RATE, seconds)
+    commands = command.run(SIZE, RATE, seconds)
     score.add(commands)
     if loaded:
         score.add_images(image.end(), commands)
@@ -170,7 +163,7 @@ def _row(key: str, condition: str, one: LoadedScore, scores: Scores) -> dict[str
     row = {
         "way": key,
         "condition": condition,
-        **one.row(_DEADLINE),
+        **one.row(DEADLINE),
         "p99_to_unloaded": ratio(one.summary.p99, idle.p99),
         "p99_to_direct": ratio(one.summary.p99, classic.p99),
     }
@@ -187,7 +180,7 @@ def _row(key: str, condition: str, one: LoadedScore, scores: Scores) -> dict[str
 def _table(scores: Scores, titles: dict[str, str]) -> Table:
     heads = ("p50", "p95", "p99", "p99.9", "max", "count", "lost", ">1 ms", "to unloaded", "to classic")
     table = table_of(
-        f"a command of {_SIZE} B at {_RATE:.0f} Hz on {_LINK / 1e6:.0f} Mbit/s, from due to there, µs",
+        f"a command of {SIZE} B at {RATE:.0f} Hz on {_LINK / 1e6:.0f} Mbit/s, from due to there, µs",
         ("way", "beside"),
         heads,
     )
@@ -196,7 +189,7 @@ def _table(scores: Scores, titles: dict[str, str]) -> Table:
             one = scores[key, condition]
             row = one.summary
             cells = percentiles(row)
-            counts = [str(row.count), str(row.lost), f"{100 * one.later_than(_DEADLINE):.2f} %"]
+            counts = [str(row.count), str(row.lost), f"{100 * one.later_than(DEADLINE):.2f} %"]
             bases = (scores[key, "unloaded"].summary.p99, scores["direct", condition].summary.p99)
             table.add_row(title, beside, *cells, *counts, *[dash(ratio(row.p99, base)) for base in bases])
     return table
@@ -204,7 +197,7 @@ def _table(scores: Scores, titles: dict[str, str]) -> Table:
 
 def _image_table(scores: Scores, titles: dict[str, str]) -> Table:
     table = table_of(
-        f"images of 1 MB, {_IMAGE_RATE} Hz offered ({8 * _IMAGE * _IMAGE_RATE / _LINK:.2f} of the link)",
+        f"images of 1 MB, {IMAGE_RATE} Hz offered ({8 * IMAGE * IMAGE_RATE / _LINK:.2f} of the link)",
         ("way",),
         ("MB/s", "share of the link", "to classic", "p50 late, ms", "max, ms", "came", "dropped"),
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import re
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -14,6 +13,7 @@ from lab import frames
 from lab.experiments import flow
 from lab.experiments.contenders import CLASSIC, COMPARED, MIXED, RMPA, contender_of, system_of, transport_of, turn
 from lab.experiments.model import Cell, Measured, Results
+from lab.experiments.payload import bits_per_second
 from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
 from lab.frames import counting_from
 from lab.samples import summary
@@ -33,15 +33,15 @@ if TYPE_CHECKING:
 HOSTS: Final = ("joystick", "pc")
 _LINK: Final = "100mbit"
 """Where the plan has none: the experiment is about a cable that is full."""
-_SIZE, _RATE = 64, 100.0
-_IMAGE: Final = 1024 * 1024
-_IMAGE_RATE: Final = 15.1
+SIZE, RATE = 64, 100.0
+IMAGE: Final = 1024 * 1024
+IMAGE_RATE: Final = 15.1
 """Hz; 127 Mbit/s, and no divisor of the commands' rate, so that the two drift past each other."""
-_IMAGE_QUEUE: Final = 2
+IMAGE_QUEUE: Final = 2
 _LEAD_IN: Final = 0.2
 """Seconds of each round of commands that are thrown away: caches and the processor's clock come up."""
 _FLOWING_WITHIN: Final = 30.0
-_DEADLINE: Final = 1000.0
+DEADLINE: Final = 1000.0
 """µs."""
 _CLASSIC_LIMIT: Final = 10.0
 """ms: "tens"."""
@@ -63,7 +63,6 @@ transport = "direct"
 
 """
 """Part of every agent's ``rmpa.toml`` where images are direct and commands relayed."""
-_UNITS: Final = {"": 1.0, "k": 1e3, "m": 1e6, "g": 1e9}
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +122,7 @@ class _Stream:
 
 
 _ABOUT: Final = f"""\
-*joystick* sends commands of {_SIZE} B at {_RATE:g} Hz and images of 1 MB at {_IMAGE_RATE:g} Hz to *pc*, each by a
+*joystick* sends commands of {SIZE} B at {RATE:g} Hz and images of 1 MB at {IMAGE_RATE:g} Hz to *pc*, each by a
 node of its own. The cable carries 100 Mbit/s, less than the images alone would need, so that there is always one
 waiting. Packets leave by the kernel's usual three bands (`pfifo_fast` inside `tbf`). Classic ROS has a connection for
 each topic, with tcp_nodelay. RMPA stands there three times: both relayed, both direct from node to node, and images
@@ -159,13 +158,13 @@ class Images:
         config = MIXED_CONTRACTS if mixed else ""
         with stage.system(system_of(cell), HOSTS, link=link, way=transport_of(cell), config=config) as system:
             commands = _Stream(system, client, "/cmd", 100, stage, None)
-            images = _Stream(system, client, "/image", _IMAGE_QUEUE, stage, mixed)
-            alone, alone_sent = commands.end(commands.begin(_SIZE, _RATE, _LEAD_IN + times.alone))
-            taken = images.begin(_IMAGE, _IMAGE_RATE, times.ahead + _LEAD_IN + times.beside + 1.0)
+            images = _Stream(system, client, "/image", IMAGE_QUEUE, stage, mixed)
+            alone, alone_sent = commands.end(commands.begin(SIZE, RATE, _LEAD_IN + times.alone))
+            taken = images.begin(IMAGE, IMAGE_RATE, times.ahead + _LEAD_IN + times.beside + 1.0)
             time.sleep(times.ahead)
-            among, among_sent = commands.end(commands.begin(_SIZE, _RATE, _LEAD_IN + times.beside))
+            among, among_sent = commands.end(commands.begin(SIZE, RATE, _LEAD_IN + times.beside))
             pictures, pictures_sent = images.end(taken)
-        lead = round(_RATE * _LEAD_IN)
+        lead = round(RATE * _LEAD_IN)
         counted_in = {"alone": counting_from(alone, lead), "images": counting_from(among, lead)}
         tables = {
             "commands": pd.concat(counted_in, names=["beside"]).reset_index("beside").reset_index(drop=True),
@@ -202,19 +201,6 @@ class Images:
 
 def _times(plan: Plan) -> ImageTimes:
     return _SHORT if plan.short else _FULL
-
-
-def bits(link: str) -> float | None:
-    """Bits a second of a rate as ``tc`` writes it (``100mbit``); ``None`` without one.
-
-    Raises:
-        ValueError: It is none.
-    """
-    if not link:
-        return None
-    if not (found := re.fullmatch(r"(\d+(?:\.\d+)?)([kmg]?)bit", link)):
-        raise ValueError(f"{link!r} is no rate such as 100mbit")
-    return float(found[1]) * _UNITS[found[2]]
 
 
 # --- what follows ---------------------------------------------------------------------------------------------------
@@ -257,15 +243,15 @@ def _score(rounds: Sequence[Measured]) -> ImageScore:
         dues = frames.where(commands, beside="images")["due_ns"].tolist()
         if dues and (speed := bytes_per_second(pictures["came_ns"].tolist(), min(dues), max(dues))):
             speeds.append(speed / 1e6)
-            if carried := bits(str(one.facts["link"])):
-                shares.append(8 * speed / carried)
+            if link := str(one.facts["link"]):
+                shares.append(8 * speed / bits_per_second(link))
     return ImageScore(latencies, lost, shares, speeds, late, dropped)
 
 
 def bytes_per_second(came: Sequence[int], begin: int, end: int) -> float:
     """Bytes a second of the images that came between two moments of the clock (ns); 0 if fewer than two came."""
     inside = sorted(at for at in came if begin <= at <= end)
-    return _IMAGE * (len(inside) - 1) / (inside[-1] - inside[0]) * 1e9 if len(inside) > 1 else 0.0
+    return IMAGE * (len(inside) - 1) / (inside[-1] - inside[0]) * 1e9 if len(inside) > 1 else 0.0
 
 
 def _int(value: object) -> int:
@@ -295,7 +281,7 @@ def _figure(client: str, scores: Scores) -> Figure:
         )
     return Figure(
         f"images-{client}",
-        f"Commands of {_SIZE} B at {_RATE:g} Hz on a full cable ({client})",
+        f"Commands of {SIZE} B at {RATE:g} Hz on a full cable ({client})",
         "The share of commands that came later than so many ms; the lower left is good.",
         tuple(panels),
     )
@@ -316,7 +302,7 @@ def _commands(scores: Scores) -> Grid:
 
 
 def _later(score: ImageScore, beside: str) -> str:
-    late = sum(value > _DEADLINE for value in score.latencies[beside]) + score.lost[beside]
+    late = sum(value > DEADLINE for value in score.latencies[beside]) + score.lost[beside]
     sent = len(score.latencies[beside]) + score.lost[beside]
     return f"{100 * late / sent:.2f} %" if sent else "-"
 
@@ -329,7 +315,7 @@ def _images(scores: Scores) -> Grid:
         counts = (str(len(score.images)), str(score.dropped))
         rows.append((client, one.label, *(counted(value) for value in figures), *counts))
     note = (
-        f"1 MB at {_IMAGE_RATE:g} Hz are offered, 1.27 of the cable; what does not fit is dropped by the"
+        f"1 MB at {IMAGE_RATE:g} Hz are offered, 1.27 of the cable; what does not fit is dropped by the"
         " publisher, which keeps two. The share is of payload only: Ethernet, IP and TCP take 4.3 % themselves."
     )
     return Grid("Images", heads, rows, note)
@@ -347,7 +333,7 @@ def _claims(scores: Scores) -> Iterable[Claim]:
             text = f"commands beside images, p99, classic, {client}"
             yield Claim(text, value, _CLASSIC_LIMIT, at_least=True, unit="ms")
         elif one == RMPA:
-            yield Claim(f"commands beside images, p99, RMPA, {client}", value, _DEADLINE / 1000, unit="ms")
+            yield Claim(f"commands beside images, p99, RMPA, {client}", value, DEADLINE / 1000, unit="ms")
         elif one == MIXED and (client, RMPA) in scores:
             base = _p99(scores[client, RMPA])
             text = f"commands beside images, p99, {client}: images direct, commands relayed / both relayed"

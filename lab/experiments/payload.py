@@ -6,6 +6,7 @@ is almost linear".
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -50,7 +51,7 @@ _SIZES_NEEDED: Final = 3
 _DIRECT_LIMIT: Final = 1.05
 """Of the direct transport's p50 by classic ROS's, on a cable that is not shaped: the wire hides nothing there."""
 _DIRECT_SIZES: Final = (64 * _KB, _KB * _KB)
-_UNITS: Final = {"kbit": 1e3, "mbit": 1e6, "gbit": 1e9}
+_UNITS: Final = {"": 1.0, "k": 1e3, "m": 1e6, "g": 1e9}
 
 _ABOUT: Final = """\
 One stream from *joystick* to *pc*, one way, from the moment at which a message was due at its source to when the
@@ -134,10 +135,9 @@ def bits_per_second(link: str) -> float:
     Raises:
         ValueError: It is not written so.
     """
-    for unit, factor in _UNITS.items():
-        if link.lower().endswith(unit):
-            return float(link[: -len(unit)]) * factor
-    raise ValueError(f"{link!r} is no rate such as 100mbit")
+    if not (found := re.fullmatch(r"(\d+(?:\.\d+)?)([kmg]?)bit", link.lower())):
+        raise ValueError(f"{link!r} is no rate such as 100mbit")
+    return float(found[1]) * _UNITS[found[2]]
 
 
 def name(size: int) -> str:
