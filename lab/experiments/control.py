@@ -404,7 +404,7 @@ def _figure(ways: Ways, client: str, mode: str) -> Figure:
     ]
     caption = "Message by message as in the paper, which has a figure for each system; one round after the other."
     if mode == "polled":
-        caption += " The steps of the delay are the phases that both systems were given."
+        caption += " The steps of the delay are the phases that all systems were given."
     return Figure(
         f"fig-8-9-{client}-{mode}",
         f"Figs. 8 and 9. Periods and control computation delay: {client}, {_NODES[mode]}",
