@@ -444,7 +444,14 @@ class ServiceInfo(msgspec.Struct, kw_only=True, frozen=True):
         type: ``package/Name``; empty before a client has asked for it.
         md5: Of that type, likewise.
         callers: ``out``: the peers that have it open.
-        calls: Calls across the mesh so far.
+        transport: ``in``: ``direct`` (clients call the server itself) or ``relay``; empty for ``out``.
+        wanted: The transport that the rules of this module ask for: ``relay``, ``direct`` or ``auto``.
+        condition: ``in``: the condition of direct transport that does not hold, in one word; empty if none is known.
+        relayed_because: That condition's fact, ready to read.
+        address: ``in``: where clients call the server directly, ``rosrpc://address:port``; else empty.
+        lookups: ``in``: lookups that were answered with that address.
+        direct_callers: ``out``: the peers whose nodes may call the server directly.
+        calls: Calls across the mesh so far; direct ones pass no agent, and are not counted.
         failed: Of these, those that ended with an error.
         active: Calls under way.
         latency: Of the last successful calls; ``in``: from a client's request to its reply, ``out``: the server's
@@ -464,6 +471,13 @@ class ServiceInfo(msgspec.Struct, kw_only=True, frozen=True):
     type: str = ""
     md5: str = ""
     callers: tuple[str, ...] = ()
+    transport: str = ""
+    wanted: str = "relay"
+    condition: str = ""
+    relayed_because: str = ""
+    address: str = ""
+    lookups: int = 0
+    direct_callers: tuple[str, ...] = ()
     calls: int = 0
     failed: int = 0
     active: int = 0
