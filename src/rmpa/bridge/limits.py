@@ -136,9 +136,9 @@ QUALITY_CLOCK_STEP: Final = 0.9
 """Seconds in which at most two of these estimates are remembered. An estimate comes once a second, and at each
 request for it."""
 DIRECT_HOLD: Final = 0.25
-"""Seconds that a subscriber's `requestTopic` waits at most for the decision about direct transport; then it is answered
-with the proxy's address, and moved when the decision is there. The decision takes one round trip between the agents, one
-call of the publisher and one connection to it: a few milliseconds."""
+"""Seconds that a subscriber's `requestTopic` waits at most for the decision about direct transport; then it is
+answered with the proxy's address, and moved when the decision is there. The decision takes one round trip between the
+agents, one call of the publisher and one connection to it: a few milliseconds."""
 DIRECT_ASK_TIMEOUT: Final = 5.0
 """Seconds that a peer has to answer a request for a direct connection; its publisher may be slow."""
 DIRECT_NODE_TIMEOUT: Final = 2.0
@@ -148,8 +148,13 @@ DIRECT_PORT_KNOWN: Final = 10.0
 DIRECT_PROBE_TIMEOUT: Final = 1.0
 """Seconds that a peer's node has to answer a probe. A firewall that drops packets costs this once for each node."""
 DIRECT_RETRY: Final = 30.0
-"""Seconds after which a subscriber that was refused for a passing reason (the node does not answer, the port cannot be
-reached) is considered again."""
+"""Seconds after which a subscriber that was refused for a passing reason (the node does not answer, the port cannot
+be reached) is considered again."""
+DIRECT_RETRY_PAUSE: Final = 1.0
+"""Seconds between two requests for one subscriber that a peer's notifications cause."""
+DIRECT_ASKS: Final = 16
+"""Requests for direct connections to one peer that wait for a response; further ones wait here. Less than
+ASKS_AT_ONCE, which they share with the other requests."""
 DIRECT_CHECK: Final = 1.0
 """Seconds between two looks at the kernel's table, whether direct connections still stand."""
 DIRECT_SETTLE: Final = 2.0
@@ -157,8 +162,9 @@ DIRECT_SETTLE: Final = 2.0
 DIRECT_MAX: Final = 1024
 """Direct connections that one peer may have to publishers of this module, and as many to its services."""
 DIRECT_ADOPT: Final = 10.0
-"""Seconds that a new run of a peer's agent has to offer again what its earlier run left connected directly; after that the
-connections are ended."""
+"""Seconds that a new run of a peer's agent has to offer again what its earlier run left connected directly; after
+that the connections are ended. Likewise the seconds that a peer has, after a new link, to ask again for what it
+uses."""
 DIRECT_BREAKS: Final = 3
 """A direct connection that broke so many times within `DIRECT_BREAKS_SPAN` seconds is relayed for `DIRECT_RETRY`."""
 DIRECT_BREAKS_SPAN: Final = 10.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
@@ -13,9 +14,10 @@ from rmpa.ros.wire.xmlrpc import RosFault
 from rmpa.runtime.tcp_connections import connections, end_connections
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from rmpa.ros.wire.bus import BusLink
+    from rmpa.runtime.tcp_connections import TcpConnection
 
 MASTER: Final = "/master"
 """The caller id of ``publisherUpdate``, as rosmaster has it."""
@@ -50,6 +52,17 @@ async def bus_links(uri: str) -> list[BusLink] | None:
     return read_bus_info(value)
 
 
+async def until(condition: Callable[[], bool], seconds: float) -> bool:
+    """Wait until a condition holds; return whether it did within these seconds."""
+    loop = asyncio.get_running_loop()
+    deadline = loop.time() + seconds
+    while not condition():
+        if loop.time() >= deadline:
+            return False
+        await asyncio.sleep(limits.DIRECT_LOOK)
+    return True
+
+
 async def direct_links(uri: str, topic: str, endpoint: tuple[str, int]) -> list[BusLink] | None:
     """The connections of a subscriber, for one topic, to a publisher's address; ``None`` if it does not answer."""
     links = await bus_links(uri)
@@ -64,22 +77,37 @@ def standing(endpoint: tuple[str, int]) -> set[int]:
     return {one.local[1] for one in found if one.state in _STANDING}
 
 
-def end_to(endpoint: tuple[str, int], ports: set[int] | None = None) -> str:
+def end_to(endpoint: tuple[str, int], ports: set[int]) -> str:
     """End connections from this machine to a publisher's address.
 
     Args:
         endpoint: The address and port.
-        ports: The local ports of those to end; ``None``: all.
+        ports: The local ports of those to end: other programs may be connected there too.
 
     Returns:
         Empty if none is left, else why they could not be ended.
     """
-    found = [
-        one
-        for one in connections(remote=endpoint) or []
-        if (ports is None or one.local[1] in ports) and one.local != endpoint
-    ]
+    found = [one for one in connections(remote=endpoint) or [] if one.local[1] in ports and one.local != endpoint]
     return _end(found)
+
+
+async def end_links(endpoint: tuple[str, int], links: Iterable[BusLink]) -> str:
+    """End connections of a subscriber to a publisher's address, if they still stand; wait until they are gone.
+
+    Args:
+        endpoint: The address and port.
+        links: As ``direct_links`` returned them.
+
+    Returns:
+        Empty if none is left, else why they could not be ended.
+    """
+    ports = {link.local_port for link in links if link.local_port is not None}
+    if not ports & standing(endpoint):
+        return ""
+    problem = end_to(endpoint, ports)
+    if await until(lambda: not ports & standing(endpoint), limits.DIRECT_MOVE_WAIT):
+        return ""
+    return problem or "the kernel does not end it"
 
 
 def end_from(port: int, address: str) -> str:
@@ -87,7 +115,7 @@ def end_from(port: int, address: str) -> str:
     return _end(connections(local_port=port, remote=(address, None)) or [])
 
 
-def _end(found: list) -> str:  # type: ignore[type-arg]
+def _end(found: list[TcpConnection]) -> str:
     if not found:
         return ""
     try:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.bridge import limits
 from rmpa.bridge.direct import requests
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, read_unmet
-from rmpa.bridge.direct.io.nodes import direct_links, end_to, publisher_update, standing
+from rmpa.bridge.direct.io.nodes import direct_links, end_links, publisher_update, standing, until
 from rmpa.bridge.direct.requests import CloseDirect, OpenDirect
 from rmpa.bridge.direct.subscriber_side import (
     Ask,
@@ -30,7 +30,7 @@ from rmpa.bridge.topics.audience import is_watched
 from rmpa.bridge.topics.io.direct_exporter import unmet_by_contract
 from rmpa.bridge.topics.remote_topic import RouteState
 from rmpa.core.contract import Transport
-from rmpa.core.errors import RmpaError
+from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.ros.environment import host_of, is_loopback
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
 from rmpa.ros.node.probe import probe
@@ -55,8 +55,10 @@ if TYPE_CHECKING:
     from rmpa.ros.node.publication import Publication
 
 _log = logging.getLogger(__name__)
+_UNKNOWN: Final = "does not know the question"
+"""In the response of an agent of an earlier release (``PeerRpc``)."""
 MEASURING: Final = "/rmpa_topic_"
-"""The names of the nodes of ``rmpa topic hz|bw|delay|echo`` begin so; they are relayed, so that the agents measure."""
+"""Names of nodes of ``rmpa topic hz|bw|delay|echo`` begin so; they are relayed, so that the agents measure."""
 
 
 class DirectImporter:
@@ -102,8 +104,13 @@ class DirectImporter:
         self._waiting: dict[DirectKey, list[asyncio.Future[None]]] = {}
         self._moves: dict[DirectKey, asyncio.Task[None]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
-        self._adrift: list[RemoteTopic] = []
-        """The sources that are kept because of direct subscribers while their agent is gone."""
+        self._again: set[DirectKey] = set()
+        """Subscribers to be judged again when their move is over."""
+        self._adrift: dict[int, list[RemoteTopic]] = {}
+        """The sources of each peer that are kept because of direct subscribers while its agent is gone."""
+        self._strays: dict[tuple[str, str], tuple[str, int]] = {}
+        """Direct connections that a crashed agent left: topic and subscriber, and the publisher's endpoint."""
+        self._asking: dict[int, asyncio.Semaphore] = {}
         self._checking: asyncio.TimerHandle | None = None
         self._closed = False
         rpc.on_notification(requests.CLOSED, self._closed_there)
@@ -113,7 +120,7 @@ class DirectImporter:
     def _now() -> float:
         return asyncio.get_running_loop().time()
 
-    # --- the local graph ---------------------------------------------------------------------------------------------
+    # --- the local graph --------------------------------------------------------------------------------------------
 
     def reload(self, contracts: Contracts) -> None:
         """Take new contracts, and judge every subscriber again."""
@@ -133,7 +140,8 @@ class DirectImporter:
             if change.added:
                 self._consider(peer, source, change.node, change.api)
             else:
-                self._act(self.routes.remove(DirectKey(peer, source, change.node)))
+                # It ends its connections itself; it may subscribe again while a call from here is on its way.
+                self._act(self.routes.remove(DirectKey(peer, source, change.node), hang_up=False))
 
     def shown(self, peer: int, source: Source) -> None:
         """Judge the subscribers of a source that appears in the local graph."""
@@ -191,9 +199,9 @@ class DirectImporter:
 
     def _is_relayed(self, key: DirectKey) -> bool:
         publication = self._publication(key.peer, key.source)
-        return publication is not None and key.subscriber in publication.listeners
+        return publication is not None and key.subscriber in publication.callers
 
-    # --- what subscribers ask ------------------------------------------------------------------------------------------
+    # --- what subscribers ask ---------------------------------------------------------------------------------------
 
     def request(self, peer: int, source: Source, subscriber: str) -> Awaitable[RosReply | None] | None:
         """Answer a subscriber's ``requestTopic`` at the proxy of a source; see ``Publication.on_request``."""
@@ -203,27 +211,43 @@ class DirectImporter:
         return self._answer(key)
 
     async def _answer(self, key: DirectKey) -> RosReply | None:
+        if self.routes.decision(key) is None:
+            await self._decision(key)
+        topic = key.source.topic
+        uri = self._core.state().subscribers.get(topic, {}).get(key.subscriber, "")
+        stray = self._strays.get((topic, key.subscriber))
+        session = self._sessions.get(key.peer)
         decision = self.routes.decision(key)
-        if decision is None:
-            decision = await self._decision(key)
-        entry, session = self._imports.get(key.peer, key.source), self._sessions.get(key.peer)
-        if entry is None or session is None:
-            return None
-        if not isinstance(decision, Grant):
-            self.routes.answered(key, None, self._now())
-            return None
-        endpoint = (session.address, decision.port)
-        uri = self._uri(key, entry)
-        adopted = bool(uri and standing(endpoint) and await direct_links(uri, entry.topic, endpoint))
-        self.routes.answered(key, endpoint, self._now())
-        self._changed(key)
-        if adopted:
-            # It has been connected since an earlier run of this agent; a second connection would double messages.
-            _log.info("= %s: %s is connected directly already", session.link.name, key.subscriber)
-            return RosReply(0, "connected to the publisher already", [])
-        return RosReply(1, f"ready on {endpoint[0]}:{endpoint[1]}", [TCPROS, endpoint[0], endpoint[1]])
+        direct = (session.address, decision.port) if session is not None and isinstance(decision, Grant) else None
+        for endpoint in dict.fromkeys(one for one in (stray, self._endpoint(key), direct) if one is not None):
+            # A connection from an earlier answer, or an earlier run of an agent: a second one would double messages.
+            if not uri or not standing(endpoint) or not (links := await direct_links(uri, topic, endpoint)):
+                continue
+            if endpoint == direct and self.routes.decision(key) == decision:
+                _log.info("= %s: %s is connected directly already", key.source, key.subscriber)
+                return self._answered(key, direct, RosReply(0, "connected to the publisher already", []))
+            if problem := await end_links(endpoint, links):
+                self._act(self.routes.answered(key, endpoint, self._now()))
+                self._stuck(key, endpoint, problem)
+                return RosReply(0, "connected to the publisher directly still", [])
+        if self.routes.decision(key) != decision or direct is None:
+            return self._answered(key, None, None)  # it is moved if it is direct by now
+        reply = RosReply(1, f"ready on {direct[0]}:{direct[1]}", [TCPROS, direct[0], direct[1]])
+        return self._answered(key, direct, reply)
 
-    async def _decision(self, key: DirectKey) -> Grant | Unmet | None:
+    def _endpoint(self, key: DirectKey) -> tuple[str, int] | None:
+        """Where a subscriber was connected directly by its last answer."""
+        route = self.routes.get(key)
+        return route.endpoint if route is not None and route.path is Path.DIRECT else None
+
+    def _answered(self, key: DirectKey, endpoint: tuple[str, int] | None, reply: RosReply | None) -> RosReply | None:
+        self._strays.pop((key.source.topic, key.subscriber), None)
+        self._act(self.routes.answered(key, endpoint, self._now()))
+        self._watch()
+        return reply
+
+    async def _decision(self, key: DirectKey) -> None:
+        """Waits for the decision about a subscriber, at most ``limits.DIRECT_HOLD``."""
         future: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._waiting.setdefault(key, []).append(future)
         try:
@@ -237,7 +261,6 @@ class DirectImporter:
                 waiting.remove(future)
             if not waiting:
                 self._waiting.pop(key, None)
-        return self.routes.decision(key)
 
     def listeners_changed(self, peer: int, source: Source) -> None:
         """Note which subscribers have left the proxy of a source."""
@@ -245,22 +268,21 @@ class DirectImporter:
         if not routes:
             return
         publication = self._publication(peer, source)
-        there = set(publication.listeners) if publication is not None else set()
+        there = publication.callers if publication is not None else frozenset()
         for name, route in routes:
             key = DirectKey(peer, source, name)
             if route.path is Path.RELAY and name not in there and key not in self._moves:
                 self._act(self.routes.left(key, self._now()))
 
-    # --- links ---------------------------------------------------------------------------------------------------------
+    # --- links ------------------------------------------------------------------------------------------------------
 
     def link_up(self, session: PeerSession) -> None:
         """Ask again for the subscribers of a peer that was without a link."""
         for key, route in self.routes.connected():
             if key.peer == session.peer and route.endpoint is not None and route.endpoint[0] != session.address:
                 self._act([Move(key)])  # the peer has another address now
-        for entry in self._adrift:
+        for entry in self._adrift.pop(session.peer, ()):
             entry.direct = False
-        self._adrift.clear()
         self._act(self.routes.link_up(session.peer, self._now()))
 
     def link_down(self, session: PeerSession, *, crashed: bool) -> None:
@@ -271,7 +293,7 @@ class DirectImporter:
             direct = any(route.path is Path.DIRECT for _, route in self.routes.of(session.peer, source))
             if entry is not None and direct:
                 entry.direct = True  # they were made to hang up above unless only the agent has died
-                self._adrift.append(entry)
+                self._adrift.setdefault(session.peer, []).append(entry)
 
     def gone(self, session: PeerSession, *, hang_up: bool) -> None:
         """Forget every subscriber of a peer.
@@ -280,22 +302,31 @@ class DirectImporter:
             session: The peer.
             hang_up: End their connections, rather than leave them to the peer's next agent.
         """
-        left = set()
+        left: dict[tuple[str, str], tuple[str, int]] = {}
         for key, route in self.routes:
             if key.peer == session.peer:
                 if not hang_up and route.path is Path.DIRECT and route.endpoint is not None:
-                    left.add(route.endpoint)
+                    left[key.source.topic, key.subscriber] = route.endpoint
                 self._act(self.routes.remove(key, hang_up=hang_up))
-        if left:
+        self._adrift.pop(session.peer, None)
+        self._asking.pop(session.peer, None)
+        if left and not self._closed:
+            self._strays |= left
             asyncio.get_running_loop().call_later(limits.DIRECT_ADOPT, self._end_strays, left)
 
-    def _end_strays(self, endpoints: set[tuple[str, int]]) -> None:
+    def _end_strays(self, left: Mapping[tuple[str, str], tuple[str, int]]) -> None:
         """Ends direct connections from before a crash of the peer's agent that its next run has not taken over."""
-        known = {route.endpoint for _, route in self.routes.connected()}
-        for endpoint in endpoints - known:
-            end_to(endpoint)
+        for (topic, subscriber), endpoint in left.items():
+            if not self._closed and self._strays.get((topic, subscriber)) == endpoint:
+                del self._strays[topic, subscriber]
+                self._start(self._end_stray(topic, subscriber, endpoint), f"end {subscriber}'s connection")
 
-    # --- the peer --------------------------------------------------------------------------------------------------------
+    async def _end_stray(self, topic: str, subscriber: str, endpoint: tuple[str, int]) -> None:
+        uri = self._core.state().subscribers.get(topic, {}).get(subscriber, "")
+        links = await direct_links(uri, topic, endpoint) if uri and standing(endpoint) else None
+        await end_links(endpoint, links or ())
+
+    # --- the peer ---------------------------------------------------------------------------------------------------
 
     def _closed_there(self, session: PeerSession, args: dict[str, Any]) -> None:
         told = requests.read_closed(args)
@@ -311,16 +342,27 @@ class DirectImporter:
         if session is None or not session.linked or entry is None:
             found = Unmet(Condition.OFFERED, "its module has no link")
         else:
-            contract = self._contracts.of(entry.topic, entry.type)
-            asked = OpenDirect(key.source.topic, key.source.node, key.subscriber, contract)
-            try:
-                value = await self._rpc.request(
-                    session, requests.OPEN, requests.write(asked), limits.DIRECT_ASK_TIMEOUT
-                )
-                found = read_reply(value, key.source.node)
-            except RmpaError as error:
-                found = Unmet(Condition.RELEASE, f"{session.link.name} does not grant it: {error}")
+            limit = self._asking.setdefault(key.peer, asyncio.Semaphore(limits.DIRECT_ASKS))
+            async with limit:
+                route = self.routes.get(key)
+                if route is None or route.attempt != attempt:
+                    return  # no request has been sent for this attempt
+                found = await self._request(session, key, entry)
         self._act(self.routes.replied(key, attempt, found, self._now()))
+
+    async def _request(self, session: PeerSession, key: DirectKey, entry: RemoteTopic) -> Grant | Unmet:
+        contract = self._contracts.of(entry.topic, entry.type)
+        asked = OpenDirect(key.source.topic, key.source.node, key.subscriber, contract)
+        try:
+            value = await self._rpc.request(session, requests.OPEN, requests.write(asked), limits.DIRECT_ASK_TIMEOUT)
+            return read_reply(value, key.source.node)
+        except PeerRefused as error:
+            older = _UNKNOWN in error.reason
+            return Unmet(Condition.RELEASE if older else Condition.AGENT, str(error))
+        except RemoteProtocolError as error:
+            return Unmet(Condition.RELEASE, f"{session.link.name}: {error}")
+        except RmpaError as error:
+            return Unmet(Condition.AGENT, str(error))
 
     async def _probe(self, peer: int, grant: Grant) -> None:
         session = self._sessions.get(peer)
@@ -332,7 +374,7 @@ class DirectImporter:
             problem = f"no connection to {address}:{grant.port}: {problem}"
         self._act(self.routes.probed(peer, grant.port, problem, self._now()))
 
-    # --- carrying out ------------------------------------------------------------------------------------------------------
+    # --- carrying out -----------------------------------------------------------------------------------------------
 
     def _act(self, actions: Iterable[DirectAction]) -> None:
         if self._closed:
@@ -344,33 +386,45 @@ class DirectImporter:
                 case Probe(peer, grant):
                     self._start(self._probe(peer, grant), f"probe {grant.node}")
                 case Decided(key):
-                    for future in self._waiting.pop(key, ()):
-                        if not future.done():
-                            future.set_result(None)
-                    self._changed(key)
+                    self._decided(key)
                 case Move(key):
                     self._move_soon(key)
                 case HangUp(key, endpoint):
                     self._counters.add("direct.hung_up")
                     self._start(self._hang_up(key, endpoint), f"hang up {key.subscriber}")
                 case Release(key, broken):
-                    session = self._sessions.get(key.peer)
-                    if session is not None and session.linked:
-                        closed = CloseDirect(key.source.topic, key.source.node, key.subscriber, broken)
-                        self._rpc.notify(session, requests.CLOSE, requests.write(closed))
+                    self._release(key, broken=broken)
                 case Fallback(key, unmet):
                     subject = f"{key.source} to {key.subscriber}"
                     text = f'{subject}: relayed although transport is "direct": {unmet.text}'
                     self._on_warning("direct.relayed", f"{key.peer} {subject} {unmet.condition}", text)
         self._timer.arm()
 
+    def _decided(self, key: DirectKey) -> None:
+        for future in self._waiting.pop(key, ()):
+            if not future.done():
+                future.set_result(None)
+        self._watch()
+
+    def _release(self, key: DirectKey, *, broken: bool) -> None:
+        session = self._sessions.get(key.peer)
+        if session is not None and session.linked:
+            closed = CloseDirect(key.source.topic, key.source.node, key.subscriber, broken)
+            self._rpc.notify(session, requests.CLOSE, requests.write(closed))
+
     def _start(self, work: Coroutine[Any, Any, None], name: str) -> asyncio.Task[None]:
         task = asyncio.create_task(work, name=name)
         self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        task.add_done_callback(self._ended)
         return task
 
-    def _changed(self, key: DirectKey) -> None:
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            self._counters.add("direct.failed")
+            _log.error("! %s failed", task.get_name(), exc_info=error)
+
+    def _watch(self) -> None:
         """Begins to watch direct connections."""
         if self._checking is None and self.routes.connected():
             self._checking = asyncio.get_running_loop().call_later(limits.DIRECT_CHECK, self._check)
@@ -383,33 +437,42 @@ class DirectImporter:
         """The slave API of a subscriber; empty if it is not registered."""
         return self._core.state().subscribers.get(entry.topic, {}).get(key.subscriber, "")
 
-    # --- moving a subscriber ---------------------------------------------------------------------------------------------
+    # --- moving a subscriber ----------------------------------------------------------------------------------------
 
     def _move_soon(self, key: DirectKey) -> None:
         task = self._moves.get(key)
         if task is not None:
-            return  # it looks at the decision when it calls the subscriber back
+            self._again.add(key)
+            return
         task = self._moves[key] = self._start(self._move(key), f"move {key.subscriber}")
-        task.add_done_callback(lambda _: self._moves.pop(key, None))
+        task.add_done_callback(lambda _: self._moved(key))
+
+    def _moved(self, key: DirectKey) -> None:
+        """Moves a subscriber again if the decision has changed since it was called back."""
+        self._moves.pop(key, None)
+        again = key in self._again
+        self._again.discard(key)
+        if again and not self._closed and self.routes.misplaced(key):
+            self._move_soon(key)
 
     async def _hang_up(self, key: DirectKey, endpoint: tuple[str, int]) -> None:
         """Makes a subscriber leave its direct connection: roscpp by the list of publishers, rospy by the kernel."""
-        state = self._core.state()
-        uri = state.nodes.get(key.subscriber, "")
-        proxy = self._proxy_uri(key)
-        topic = key.source.topic
-        if uri:
-            links = await direct_links(uri, topic, endpoint)
-            others = [one for one in self._core.publishers(topic).values() if one != proxy]
-            await publisher_update(uri, topic, others)
-            ports = {link.local_port for link in links or () if link.local_port is not None}
-            if ports & standing(endpoint) and (problem := end_to(endpoint, ports)):
-                self._cannot_end(key, endpoint, problem)
+        topic, proxy = key.source.topic, self._proxy_uri(key)
+        uri = self._core.state().subscribers.get(topic, {}).get(key.subscriber, "")
+        if not uri:
+            return
+        links = await direct_links(uri, topic, endpoint)
+        await publisher_update(uri, topic, [one for one in self._core.publishers(topic).values() if one != proxy])
+        if problem := await end_links(endpoint, links or ()):
+            self._stuck(key, endpoint, problem)
 
-    def _cannot_end(self, key: DirectKey, endpoint: tuple[str, int], problem: str) -> None:
+    def _stuck(self, key: DirectKey, endpoint: tuple[str, int], problem: str) -> None:
+        route = self.routes.get(key)
+        if route is not None:
+            route.stuck = problem
         text = (
-            f"{key.source}: {key.subscriber} stays connected to {endpoint[0]}:{endpoint[1]}: a rospy subscriber leaves "
-            f"only when its connection is ended, and this agent may not do that ({problem}); see rmpa doctor"
+            f"{key.source}: {key.subscriber} stays connected to {endpoint[0]}:{endpoint[1]}: a rospy subscriber "
+            f"leaves only when its connection is ended, and this agent may not do that ({problem}); see rmpa doctor"
         )
         self._on_warning("direct.stuck", f"{key.peer} {key.source} {key.subscriber}", text)
 
@@ -432,7 +495,7 @@ class DirectImporter:
         if held:
             # Make before break: the relayed route flows, and its latched message is known, before the other ends.
             self._on_demand(key.peer, key.source, True)
-            await self._opened(entry)
+            await until(lambda: entry.state is RouteState.OPEN, limits.DIRECT_MOVE_ROUTE)
         try:
             had, begin = publication.latched if held else (), publication.messages
             if not await self._leave(key, route, publication, uri, proxy):
@@ -453,42 +516,29 @@ class DirectImporter:
         """Ends a subscriber's present connection to a source; return whether it has none any more."""
         topic = publication.topic
         endpoint = route.endpoint if route.path is Path.DIRECT else None
-        links = await direct_links(uri, topic, endpoint) if endpoint is not None else None
-        ports = {link.local_port for link in links or () if link.local_port is not None}
+        links = await direct_links(uri, topic, endpoint) if endpoint is not None else []
+        if links is None and endpoint is not None and standing(endpoint):
+            return False  # the node is stopped: `_check` tries again
         await publisher_update(uri, topic, [one for one in self._core.publishers(topic).values() if one != proxy])
         publication.hang_up(key.subscriber)
-        if endpoint is not None and ports & standing(endpoint):
-            problem = end_to(endpoint, ports)
-            if not await self._until(lambda: not ports & standing(endpoint), limits.DIRECT_MOVE_WAIT):
-                route.stuck = problem or "the kernel does not end it"
-                self._cannot_end(key, endpoint, route.stuck)
-                return False
+        if endpoint is not None and (problem := await end_links(endpoint, links or ())):
+            self._stuck(key, endpoint, problem)
+            return False
         self.routes.hung_up(key)
         return True
-
-    async def _opened(self, entry: RemoteTopic) -> None:
-        await self._until(lambda: entry.state is RouteState.OPEN, limits.DIRECT_MOVE_ROUTE)
 
     async def _arrived(self, key: DirectKey, publication: Publication) -> bool:
         """Waits until a subscriber that was called back is connected, by either transport."""
 
         def there() -> bool:
             route = self.routes.get(key)
-            if route is None or key.subscriber in publication.listeners:
+            if route is None or key.subscriber in publication.callers:
                 return True
             return route.path is Path.DIRECT and route.endpoint is not None and bool(standing(route.endpoint))
 
-        return await self._until(there, limits.DIRECT_SETTLE)
+        return await until(there, limits.DIRECT_SETTLE)
 
-    async def _until(self, condition: Callable[[], bool], seconds: float) -> bool:
-        deadline = self._now() + seconds
-        while not condition():
-            if self._now() >= deadline:
-                return False
-            await asyncio.sleep(limits.DIRECT_LOOK)
-        return True
-
-    # --- watching direct connections ---------------------------------------------------------------------------------------
+    # --- watching direct connections --------------------------------------------------------------------------------
 
     def _check(self) -> None:
         """Compares the direct connections with the kernel's table; asks the nodes only where some are missing."""
@@ -508,7 +558,10 @@ class DirectImporter:
         wanted = Counter(endpoint for _, endpoint in settled)
         short = {endpoint for endpoint, count in wanted.items() if len(standing(endpoint)) < count}
         for key, endpoint in settled:
-            if endpoint in short:
+            route = self.routes.get(key)
+            if route is not None and not route.stuck and self.routes.misplaced(key):
+                self._move_soon(key)
+            elif endpoint in short:
                 self._start(self._check_one(key, endpoint), f"check {key.subscriber}")
 
     async def _check_one(self, key: DirectKey, endpoint: tuple[str, int]) -> None:
