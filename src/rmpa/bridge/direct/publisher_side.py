@@ -219,8 +219,7 @@ class DirectGrants:
         if any(granted.uri != uri for _, _, granted in self.of(source)):
             return self.withdraw(source, unmet)
         away = self._away.pop(source, {})
-        retries = [one for one in self.changed(source) if one.peer not in away]
-        return [*(Withdraw(peer, source, "", unmet) for peer in away), *retries]
+        return [*(Withdraw(peer, source, "", unmet) for peer in away), *self.changed(source)]
 
     def judge_again(self, unmet: Callable[[Source, int, Granted], Unmet | None]) -> list[GrantAction]:
         """Withdraw the grants that the rules do not allow any more.

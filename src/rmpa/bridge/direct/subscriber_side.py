@@ -179,6 +179,9 @@ _UNSTABLE: Final = Unmet(
     Condition.STABLE,
     f"its direct connection broke {limits.DIRECT_BREAKS} times in {limits.DIRECT_BREAKS_SPAN:g} s",
 )
+_TWICE: Final = Unmet(
+    Condition.LATCHED, "it latches, and a move would deliver its last message twice: subscribe again"
+)
 _NO_LINK: Final = Unmet(Condition.OFFERED, "its module has no link")
 DirectAction = Ask | Probe | Decided | Move | HangUp | Release | Fallback
 
@@ -241,7 +244,7 @@ class DirectSubscriptions:
             route.path = Path.RELAY if self._is_relayed(key) else Path.NONE
         warn = wanted is Transport.DIRECT and route.wanted is not wanted
         route.wanted = wanted
-        if unmet is not None and route.unmet != unmet:
+        if unmet is not None and (route.unmet != unmet or not route.local):
             return self._relay(key, route, unmet, now, local=True)
         if unmet is None and route.local:
             return self._ask(key, route, now)
@@ -507,6 +510,9 @@ class DirectSubscriptions:
             route.unmet, route.local = None, False
 
     def _ask(self, key: DirectKey, route: DirectRoute, now: float) -> list[DirectAction]:
+        if route.path is Path.RELAY and self._is_latched(key):
+            # Known before it is asked for: two modules with a subscriber of one name would free it for each other.
+            return self._relay(key, route, _TWICE, now)
         self._timers.set(key, None)
         self._enter(route, DirectState.ASKING, now)
         self._attempts += 1
@@ -524,8 +530,7 @@ class DirectSubscriptions:
 
     def _direct(self, key: DirectKey, route: DirectRoute, now: float) -> list[DirectAction]:
         if route.path is Path.RELAY and self._is_latched(key):
-            text = "it latches, and a move would deliver its last message twice: subscribe again"
-            return self._relay(key, route, Unmet(Condition.LATCHED, text), now)
+            return self._relay(key, route, _TWICE, now)
         self._enter(route, DirectState.DIRECT, now)
         if route.path is Path.DIRECT and route.grant is not None and route.endpoint is not None:
             same = route.endpoint[1] == route.grant.port

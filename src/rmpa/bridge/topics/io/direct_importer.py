@@ -104,6 +104,8 @@ class DirectImporter:
         self._waiting: dict[DirectKey, list[asyncio.Future[None]]] = {}
         self._moves: dict[DirectKey, asyncio.Task[None]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
+        self._hang_ups: dict[DirectKey, asyncio.Task[None]] = {}
+        """The calls that make subscribers hang up, for which their moves wait."""
         self._again: set[DirectKey] = set()
         """Subscribers to be judged again when their move is over."""
         self._adrift: dict[int, list[RemoteTopic]] = {}
@@ -391,7 +393,7 @@ class DirectImporter:
                     self._move_soon(key)
                 case HangUp(key, endpoint):
                     self._counters.add("direct.hung_up")
-                    self._start(self._hang_up(key, endpoint), f"hang up {key.subscriber}")
+                    self._hang_ups[key] = self._start(self._hang_up(key, endpoint), f"hang up {key.subscriber}")
                 case Release(key, broken):
                     self._release(key, broken=broken)
                 case Fallback(key, unmet):
@@ -420,6 +422,8 @@ class DirectImporter:
 
     def _ended(self, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
+        for key in [one for one, hanging in self._hang_ups.items() if hanging is task]:
+            del self._hang_ups[key]
         if not task.cancelled() and (error := task.exception()) is not None:
             self._counters.add("direct.failed")
             _log.error("! %s failed", task.get_name(), exc_info=error)
@@ -483,13 +487,18 @@ class DirectImporter:
 
     async def _move(self, key: DirectKey) -> None:
         """Makes a subscriber leave its present connection, and calls it back to get the other answer."""
+        if (hanging := self._hang_ups.pop(key, None)) is not None:
+            await asyncio.wait([hanging])
         entry, route = self._imports.get(key.peer, key.source), self.routes.get(key)
         publication = self._publication(key.peer, key.source)
         if entry is None or route is None or publication is None:
             return
-        uri, proxy = self._uri(key, entry), self._proxy_uri(key)
-        if not uri or not proxy:
+        uri, proxy, session = self._uri(key, entry), self._proxy_uri(key), self._sessions.get(key.peer)
+        if not uri or not proxy or session is None:
             return
+        elsewhere = route.endpoint is not None and route.endpoint[0] != session.address
+        if not elsewhere and not self.routes.misplaced(key):
+            return  # decided otherwise meanwhile
         to_relay = route.state is DirectState.RELAYED
         held = to_relay and route.path is Path.DIRECT
         if held:
