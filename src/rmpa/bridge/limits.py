@@ -141,6 +141,8 @@ answered with the proxy's address, and moved when the decision is there. The dec
 agents, one call of the publisher and one connection to it: a few milliseconds."""
 DIRECT_ASK_TIMEOUT: Final = 5.0
 """Seconds that a peer has to answer a request for a direct connection; its publisher may be slow."""
+DIRECT_ASKS: Final = 16
+"""Requests for direct connections that this agent sends at a time; less than `ASKS_AT_ONCE`, so that others pass."""
 DIRECT_NODE_TIMEOUT: Final = 2.0
 """Seconds that a local node has to answer a question about direct transport."""
 DIRECT_PORT_KNOWN: Final = 10.0

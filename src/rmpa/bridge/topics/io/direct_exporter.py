@@ -96,8 +96,11 @@ class DirectExporter:
         self._act(self.grants.judge_again(self._unmet_by_rules))
 
     def link_down(self, session: PeerSession, *, crashed: bool) -> None:
-        """End the publishers' connections to a peer that cannot be reached; unless only its agent has died."""
-        if not crashed:
+        """End the publishers' connections to a peer that cannot be reached; unless only its agent has died.
+
+        On this machine no host can vanish, and other modules use the same addresses.
+        """
+        if not crashed and not session.same_machine:
             self._act(self.grants.unreachable(session.peer))
 
     def gone(self, session: PeerSession) -> None:

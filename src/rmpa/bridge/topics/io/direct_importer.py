@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.bridge import limits
 from rmpa.bridge.direct import requests
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, read_unmet, unmet_by_contract
-from rmpa.bridge.direct.io.nodes import direct_links, end_to, standing
+from rmpa.bridge.direct.io.nodes import direct_links, standing
 from rmpa.bridge.direct.requests import CloseDirect, OpenDirect
 from rmpa.bridge.direct.subscriber_side import (
     Ask,
@@ -110,6 +110,7 @@ class DirectImporter:
         self._tasks: set[asyncio.Task[None]] = set()
         self._adrift: list[RemoteTopic] = []
         """The sources that are kept because of direct subscribers while their agent is gone."""
+        self._asking = asyncio.Semaphore(limits.DIRECT_ASKS)
         self._checking: asyncio.TimerHandle | None = None
         self._closed = False
         rpc.on_notification(requests.CLOSED, self._closed_there)
@@ -139,7 +140,8 @@ class DirectImporter:
             if change.added:
                 self._consider(peer, source, change.node, change.api)
             else:
-                self._act(self.routes.remove(DirectKey(peer, source, change.node)))
+                # It has closed its connection, or is dead; a new node of its name must not be made to hang up.
+                self._act(self.routes.remove(DirectKey(peer, source, change.node), hang_up=False))
 
     def shown(self, peer: int, source: Source) -> None:
         """Judge the subscribers of a source that appears in the local graph."""
@@ -286,20 +288,23 @@ class DirectImporter:
             session: The peer.
             hang_up: End their connections, rather than leave them to the peer's next agent.
         """
-        left = set()
+        left: list[tuple[DirectKey, tuple[str, int]]] = []
         for key, route in self.routes:
             if key.peer == session.peer:
                 if not hang_up and route.path is Path.DIRECT and route.endpoint is not None:
-                    left.add(route.endpoint)
+                    left.append((key, route.endpoint))
                 self._act(self.routes.remove(key, hang_up=hang_up))
-        if left:
+        if left and not self._closed:
             asyncio.get_running_loop().call_later(limits.DIRECT_ADOPT, self._end_strays, left)
 
-    def _end_strays(self, endpoints: set[tuple[str, int]]) -> None:
+    def _end_strays(self, left: list[tuple[DirectKey, tuple[str, int]]]) -> None:
         """Ends direct connections from before a crash of the peer's agent that its next run has not taken over."""
-        known = {route.endpoint for _, route in self.routes.connected()}
-        for endpoint in endpoints - known:
-            end_to(endpoint)
+        if self._closed:
+            return
+        known = {(key.source, key.subscriber, route.endpoint) for key, route in self.routes.connected()}
+        for key, endpoint in left:
+            if (key.source, key.subscriber, endpoint) not in known:
+                self._moves.hang_up(key, endpoint)
 
     # --- the peer ---------------------------------------------------------------------------------------------------
 
@@ -312,6 +317,11 @@ class DirectImporter:
         self._act(self.routes.retry(session.peer, requests.read_retry(args).source, self._now()))
 
     async def _ask(self, key: DirectKey, attempt: int) -> None:
+        # A peer answers a bounded number of requests at a time, and others are waiting for it too.
+        async with self._asking:
+            await self._ask_now(key, attempt)
+
+    async def _ask_now(self, key: DirectKey, attempt: int) -> None:
         session, entry = self._sessions.get(key.peer), self._imports.get(key.peer, key.source)
         found: Grant | Unmet
         if session is None or not session.linked or entry is None:
@@ -355,7 +365,7 @@ class DirectImporter:
                     self._moves.move(key)
                 case HangUp(key, endpoint):
                     self._counters.add("direct.hung_up")
-                    self._start(self._moves.hang_up(key, endpoint), f"hang up {key.subscriber}")
+                    self._moves.hang_up(key, endpoint)
                 case Release(key, broken):
                     self._release(key, broken=broken)
                 case Fallback(key, unmet):

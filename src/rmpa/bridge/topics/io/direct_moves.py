@@ -63,6 +63,8 @@ class SubscriberMoves:
         self._on_warning = on_warning
         self._counters = counters
         self._tasks: dict[DirectKey, asyncio.Task[None]] = {}
+        self._ending: dict[DirectKey, asyncio.Task[None]] = {}
+        """Subscribers that are made to hang up; a move of one waits for it."""
 
     def __contains__(self, key: DirectKey) -> bool:
         """Whether a subscriber is being moved."""
@@ -74,7 +76,7 @@ class SubscriberMoves:
 
     async def close(self) -> None:
         """Stop all moves."""
-        tasks = list(self._tasks.values())
+        tasks = [*self._tasks.values(), *self._ending.values()]
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -86,19 +88,29 @@ class SubscriberMoves:
         task = self._tasks[key] = asyncio.create_task(self._move(key), name=f"move {key.subscriber}")
         task.add_done_callback(lambda _: self._tasks.pop(key, None))
 
-    async def hang_up(self, key: DirectKey, endpoint: tuple[str, int]) -> None:
+    def hang_up(self, key: DirectKey, endpoint: tuple[str, int]) -> None:
         """Make a subscriber leave its direct connection; it is not called back."""
-        state = self._core.state()
-        uri = state.nodes.get(key.subscriber, "")
+        before = self._ending.get(key)
+        task = asyncio.create_task(self._hang_up(key, endpoint, before), name=f"hang up {key.subscriber}")
+        self._ending[key] = task
+        task.add_done_callback(lambda done: self._ending.pop(key) if self._ending.get(key) is done else None)
+
+    async def _hang_up(self, key: DirectKey, endpoint: tuple[str, int], before: asyncio.Task[None] | None) -> None:
+        if before is not None:
+            await asyncio.wait([before])
+        topic, uri = key.source.topic, self._core.state().nodes.get(key.subscriber, "")
+        if not uri:
+            return
+        links = await direct_links(uri, topic, endpoint)
         proxy = self._proxy_uri(key)
-        topic = key.source.topic
-        if uri:
-            links = await direct_links(uri, topic, endpoint)
-            others = [one for one in self._core.publishers(topic).values() if one != proxy]
-            await publisher_update(uri, topic, others)
-            ports = {link.local_port for link in links or () if link.local_port is not None}
-            if ports & standing(endpoint) and (problem := end_to(endpoint, ports)):
-                self._cannot_end(key, endpoint, problem)
+        others = [one for one in self._core.publishers(topic).values() if one != proxy]
+        await publisher_update(uri, topic, others)
+        ports = {link.local_port for link in links or () if link.local_port is not None}
+        if ports & standing(endpoint) and (problem := end_to(endpoint, ports)):
+            self._cannot_end(key, endpoint, problem)
+        now = list(self._core.publishers(topic).values())
+        if [one for one in now if one != proxy] != others:
+            await publisher_update(uri, topic, now)  # the master's own list may have been overtaken
 
     def _cannot_end(self, key: DirectKey, endpoint: tuple[str, int], problem: str) -> None:
         text = (
@@ -117,6 +129,8 @@ class SubscriberMoves:
         return proxy.uri if proxy is not None else ""
 
     async def _move(self, key: DirectKey) -> None:
+        if (ending := self._ending.get(key)) is not None:
+            await asyncio.wait([ending])
         entry, route = self._imports.get(key.peer, key.source), self._routes.get(key)
         publication = self._publication(key)
         if entry is None or route is None or publication is None:
