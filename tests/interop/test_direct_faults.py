@@ -19,7 +19,6 @@ from tests.interop.transports import (
     reload,
     unbroken,
     wait_direct,
-    wait_relayed,
 )
 
 if TYPE_CHECKING:

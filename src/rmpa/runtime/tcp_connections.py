@@ -81,7 +81,7 @@ def ask_listening_ports() -> set[int] | None:
 
 
 def listening_addresses(port: int) -> frozenset[str] | None:
-    """The local addresses of the sockets in state LISTEN at a port, in some 0.05 ms.
+    """The local addresses of the sockets in state LISTEN at a port, in some 0.1 ms.
 
     Returns:
         ``"0.0.0.0"`` and ``"::"`` for any address (``"::"`` may be for IPv6 alone), ``"127.0.0.1"``…; empty where
@@ -225,8 +225,8 @@ def _socket(connection: TcpConnection) -> InetSocket:
 def may_end_connections() -> str:
     """Whether this process may end connections: an empty text, or why not, with the remedy after the first ``"; "``.
 
-    It tries once, on a connection of its own over loopback, in some 0.3 ms; later calls return the same. An attempt
-    that fails for another reason, as a lack of file descriptors, is made again by the next call.
+    It tries once, on a connection of its own over loopback, in about a millisecond; later calls return the same. An
+    attempt that fails for another reason, as a lack of file descriptors, is made again by the next call.
     """
     try:
         return try_to_end()

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rmpa.ros.wire.bus import BusLink
+    from rmpa.runtime.tcp_connections import TcpConnection
 
 MASTER: Final = "/master"
 """The caller id of ``publisherUpdate``, as rosmaster has it."""
@@ -74,20 +75,20 @@ def end_to(endpoint: tuple[str, int], ports: set[int] | None = None) -> str:
     Returns:
         Empty if none is left, else why they could not be ended.
     """
-    found = [
-        one
-        for one in connections(remote=endpoint) or []
-        if (ports is None or one.local[1] in ports) and one.local != endpoint
-    ]
-    return _end(found)
+    found = connections(remote=endpoint)
+    if found is None or ports is None:
+        return _end(found)
+    return _end([one for one in found if one.local[1] in ports])
 
 
 def end_from(port: int, address: str) -> str:
     """End the connections of a local publisher, by its port, to a peer's address; return why it failed, or empty."""
-    return _end(connections(local_port=port, remote=(address, None)) or [])
+    return _end(connections(local_port=port, remote=(address, None)))
 
 
-def _end(found: list) -> str:  # type: ignore[type-arg]
+def _end(found: list[TcpConnection] | None) -> str:
+    if found is None:
+        return "the kernel does not say which connections there are"
     if not found:
         return ""
     try:
