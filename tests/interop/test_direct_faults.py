@@ -19,6 +19,7 @@ from tests.interop.transports import (
     reload,
     unbroken,
     wait_direct,
+    wait_relayed,
 )
 
 if TYPE_CHECKING:
@@ -188,6 +189,7 @@ def test_a_node_that_was_direct_under_a_killed_agent_obeys_the_new_one(
     listeners = [b.ros.node(client, "listener", topic="/chatter") for client in ("roscpp", "rospy")]
     for listener in listeners:
         wait_direct(listener, talker)
+    flows(listeners[0], 200)  # the new run knows the nodes that were registered for more than a second
     b.agent.kill()
     b.agent.config = AUTO + RELAY
     b.agent.restart()

@@ -113,6 +113,8 @@ class DirectImporter:
         self._asking = asyncio.Semaphore(limits.DIRECT_ASKS)
         self._checking: asyncio.TimerHandle | None = None
         self._closed = False
+        self._started = self._now()
+        """Subscribers may have direct connections from before this moment, of an earlier run of this agent."""
         rpc.on_notification(requests.CLOSED, self._closed_there)
         rpc.on_notification(requests.RETRY, self._retry)
 
@@ -206,7 +208,7 @@ class DirectImporter:
     def request(self, peer: int, source: Source, subscriber: str) -> Awaitable[RosReply | None] | None:
         """Answer a subscriber's ``requestTopic`` at the proxy of a source; see ``Publication.on_request``."""
         key = DirectKey(peer, source, subscriber)
-        if self.routes.get(key) is None:
+        if self.routes.get(key) is None and self._now() > self._started + limits.DIRECT_ADOPT:
             return None
         return self._answer(key)
 
@@ -218,8 +220,7 @@ class DirectImporter:
         if entry is None or session is None:
             return None
         if not isinstance(decision, Grant):
-            self.routes.answered(key, None, self._now())
-            return None
+            return await self._answer_relayed(key, entry, session)
         endpoint = (session.address, decision.port)
         uri = self._moves.uri(key.subscriber, entry.topic)
         adopted = bool(uri and standing(endpoint) and await direct_links(uri, entry.topic, endpoint))
@@ -230,6 +231,19 @@ class DirectImporter:
             _log.info("= %s: %s is connected directly already", session.link.name, key.subscriber)
             return RosReply(0, "connected to the publisher already", [])
         return RosReply(1, f"ready on {endpoint[0]}:{endpoint[1]}", [TCPROS, endpoint[0], endpoint[1]])
+
+    async def _answer_relayed(self, key: DirectKey, entry: RemoteTopic, session: PeerSession) -> RosReply | None:
+        """Answers the proxy's own address, unless the subscriber keeps a direct connection that cannot be ended."""
+        if self._now() < self._started + limits.DIRECT_ADOPT or self._moves.is_stuck(key):
+            endpoint, problem = await self._moves.end_strays(key, entry.topic, session.address)
+            if endpoint is not None:
+                self.routes.answered(key, endpoint, self._now())
+                if (route := self.routes.get(key)) is not None:
+                    route.stuck = problem
+                self._watch()
+                return RosReply(0, f"connected to {endpoint[0]}:{endpoint[1]} still", [])
+        self.routes.answered(key, None, self._now())
+        return None
 
     async def _decision(self, key: DirectKey) -> Grant | Unmet | None:
         future: asyncio.Future[None] = asyncio.get_running_loop().create_future()

@@ -10,8 +10,9 @@ import asyncio
 from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.io.nodes import direct_links, end_to, publisher_update, standing
+from rmpa.bridge.direct.io.nodes import bus_links, direct_links, end_to, publisher_update, standing
 from rmpa.bridge.direct.subscriber_side import DirectState, Path
+from rmpa.bridge.policy import is_own
 from rmpa.bridge.topics.remote_topic import RouteState
 
 if TYPE_CHECKING:
@@ -65,6 +66,8 @@ class SubscriberMoves:
         self._tasks: dict[DirectKey, asyncio.Task[None]] = {}
         self._ending: dict[DirectKey, asyncio.Task[None]] = {}
         """Subscribers that are made to hang up; a move of one waits for it."""
+        self._stuck: dict[tuple[Source, str], None] = {}
+        """Sources and subscribers whose direct connection could not be ended, the latest last."""
 
     def __contains__(self, key: DirectKey) -> bool:
         """Whether a subscriber is being moved."""
@@ -80,6 +83,44 @@ class SubscriberMoves:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+
+    def is_stuck(self, key: DirectKey) -> bool:
+        """Whether a direct connection of a subscriber to a source could not be ended."""
+        return (key.source, key.subscriber) in self._stuck
+
+    async def end_strays(self, key: DirectKey, topic: str, address: str) -> tuple[tuple[str, int] | None, str]:
+        """End a subscriber's direct connections to a peer that were not granted, or could not be ended before.
+
+        Args:
+            key: The subscriber.
+            topic: The topic's local name.
+            address: The address of the peer's nodes.
+
+        Returns:
+            The other end of one that stays, and why; ``None`` if none is left.
+        """
+        uri = self.uri(key.subscriber, topic)
+        known = {route.endpoint for one, route in self._routes.connected() if one.subscriber == key.subscriber}
+        if (route := self._routes.get(key)) is not None:
+            known.discard(route.endpoint)
+        local = {one for name, one in self._core.publishers(topic).items() if not is_own(name)}
+        left: tuple[tuple[str, int] | None, str] = (None, "")
+        for link in await bus_links(uri) or () if uri else ():
+            end, port = link.remote, link.local_port
+            direct = link.inbound and link.topic == topic and link.connected and link.other not in local
+            if direct and end is not None and end[0] == address and end not in known and port in standing(end):
+                problem = end_to(end, {port})
+                left = (end, problem) if problem else left
+        self._mark_stuck(key, stuck=bool(left[1]))
+        return left
+
+    def _mark_stuck(self, key: DirectKey, *, stuck: bool) -> None:
+        if not stuck:
+            self._stuck.pop((key.source, key.subscriber), None)
+            return
+        self._stuck[key.source, key.subscriber] = None
+        if len(self._stuck) > limits.DIRECT_MAX:
+            del self._stuck[next(iter(self._stuck))]
 
     def move(self, key: DirectKey) -> None:
         """Make a subscriber leave its present connection, and call it back to get the answer that was decided."""
@@ -113,6 +154,7 @@ class SubscriberMoves:
             await publisher_update(uri, topic, now)  # the master's own list may have been overtaken
 
     def _cannot_end(self, key: DirectKey, endpoint: tuple[str, int], problem: str) -> None:
+        self._mark_stuck(key, stuck=True)
         text = (
             f"{key.source}: {key.subscriber} stays connected to {endpoint[0]}:{endpoint[1]}: a rospy subscriber "
             f"leaves only when its connection is ended, and this agent may not do that ({problem}); see rmpa doctor"
