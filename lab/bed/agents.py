@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Final, Self
 
 from lab.bed.processes import DEADLINE, BedError, CommandFailed, Deadline, Process, eventually
 from lab.bed.ros import free_port
+from rmpa.observe.io.control_client import ControlClient, choose_agent
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -183,6 +184,15 @@ class Agent:
         env = {**self.env, "RMPA_AGENT": self.name}  # several may share the runtime directory
         with Process(self.host.command([RMPA, *words]), env=env) as process:
             return process.wait(timeout), process.output
+
+    def snapshot(self) -> Snapshot:
+        """What it says of itself.
+
+        Raises:
+            UnreachableError: It does not answer.
+        """
+        with ControlClient(choose_agent(self.env, self.name).path) as client:
+            return client.snapshot()
 
     def peers(self) -> dict[str, dict[str, object]]:
         """What ``rmpa peer list --json`` says, by peer name."""

@@ -142,7 +142,8 @@ agents, one call of the publisher and one connection to it: a few milliseconds."
 DIRECT_ASK_TIMEOUT: Final = 5.0
 """Seconds that a peer has to answer a request for a direct connection; its publisher may be slow."""
 DIRECT_ASKS: Final = 16
-"""Requests for direct connections that this agent sends at a time; less than `ASKS_AT_ONCE`, so that others pass."""
+"""Requests for direct connections that this agent sends at a time; less than `ASKS_AT_ONCE`, so that others
+pass. Services of one peer have as many places for themselves, which they hold until they are probed."""
 DIRECT_NODE_TIMEOUT: Final = 2.0
 """Seconds that a local node has to answer a question about direct transport."""
 DIRECT_PORT_KNOWN: Final = 10.0
@@ -161,6 +162,9 @@ DIRECT_MAX: Final = 1024
 DIRECT_ADOPT: Final = 10.0
 """Seconds that a new run of a peer's agent has to offer again what its earlier run left connected directly; after
 that the connections are ended."""
+DIRECT_KEEP: Final = 30.0
+"""Seconds that services which are called directly stay in the graph after their agent has crashed, as topics do
+(``core.limits.RESUME_WINDOW``). Their servers are probed each `DIRECT_CHECK` meanwhile."""
 DIRECT_BREAKS: Final = 3
 """A direct connection that broke so many times within `DIRECT_BREAKS_SPAN` seconds is relayed for `DIRECT_RETRY`."""
 DIRECT_BREAKS_SPAN: Final = 10.0
