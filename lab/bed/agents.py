@@ -75,6 +75,7 @@ class Agent:
         config: Text of its ``rmpa.toml``; empty for none.
         runtime_dir: Directory of control sockets; default: one for each ``home``, as of one user.
         log_level: As of ``--log-level``.
+        prefix: Words before the command of ``rmpa up``, such as ``setpriv`` with its options.
     """
 
     host: Host
@@ -86,6 +87,7 @@ class Agent:
     config: str = ""
     runtime_dir: Path | None = None
     log_level: str = "debug"
+    prefix: Sequence[str] = ()
     process: Process = field(init=False)
     ready_after: float = field(init=False, default=0.0)
     """Seconds from exec to READY=1."""
@@ -129,7 +131,7 @@ class Agent:
             path = self.home / f"{self.name}.toml"
             path.write_text(self.config, encoding="utf-8")
             words += ["--config", str(path)]
-        return self.host.command([*words, *self.flags])
+        return self.host.command([*self.prefix, *words, *self.flags])
 
     @property
     def pid(self) -> int:
