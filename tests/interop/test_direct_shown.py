@@ -139,7 +139,7 @@ def test_a_relayed_topic_names_the_condition(modules: ModuleFactory, config: str
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_tools_that_measure_are_relayed_and_leave_the_user_direct(modules: ModuleFactory, client: str) -> None:
-    a, b = modules("a", "b", config=AUTO)
+    a, b = modules("a", "b", config='[bridge]\ntransport = "direct"\n')
     on_the_network(a, b)
     talker = a.ros.node(client, "talker", topic=TOPIC, rate=RATE, name="talker")
     viewer = b.ros.node(client, "listener", topic=TOPIC, name="viewer")
@@ -157,6 +157,7 @@ def test_tools_that_measure_are_relayed_and_leave_the_user_direct(modules: Modul
     assert (after["transport"], after["missed"]) == ("direct", 0)
     assert after["since_ago"] > since, "it was not moved meanwhile"
     unbroken(flows(viewer))
+    assert "direct.relayed" not in b.agent.snapshot().counters, "a tool is relayed on purpose: no warning"
 
 
 def test_a_latched_topic_is_told_to_a_tool_as_well(modules: ModuleFactory) -> None:

@@ -129,6 +129,14 @@ async def test_without_a_look_no_node_is_asked(calls: Calls, monkeypatch: pytest
         assert len(calls.methods) > asked
 
 
+async def test_looks_at_topics_without_direct_connections_leave_nothing_behind() -> None:
+    async with sampling() as sampler:
+        for number in range(100):
+            sampler.look([f"/none{number}"])
+        assert sampler.idle
+        assert sampler.watched == 0
+
+
 async def test_a_connection_that_is_gone_is_told(calls: Calls) -> None:
     async with pair() as (viewer, talker):
         gone = viewer._replace(endpoint=("127.0.0.1", 1))

@@ -101,13 +101,22 @@ class DirectSampler:
         """Whether no node is asked."""
         return self._task is None
 
+    @property
+    def watched(self) -> int:
+        """The number of topics (all of them are one) that are looked at."""
+        return len(self._until)
+
     def look(self, topics: Collection[str] | None) -> None:
         """Sample the direct connections of topics, or of all with ``None``, for ``limits.DIRECT_LOOK`` seconds."""
+        flows = list(self._flows(topics))
+        if not flows:
+            return
         until = asyncio.get_running_loop().time() + limits.DIRECT_LOOK
-        self._until |= dict.fromkeys([None] if topics is None else topics, until)
-        if self._unsettled(topics):
+        # Only topics that have direct connections: a peer may ask for any name.
+        self._until |= dict.fromkeys([None] if topics is None else {flow.topic for flow in flows}, until)
+        if not all(self[flow].settled for flow in flows):
             self._wake.set()
-        if self._task is None and any(True for _ in self._flows(topics)):
+        if self._task is None:
             self._task = asyncio.create_task(self._run(), name="figures of direct connections")
 
     async def settle(self, topics: Collection[str] | None) -> None:

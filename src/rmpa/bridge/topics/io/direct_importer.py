@@ -422,7 +422,7 @@ class DirectImporter:
                     self._moves.hang_up(key, endpoint)
                 case Release(key, broken):
                     self._release(key, broken=broken)
-                case Fallback(key, unmet):
+                case Fallback(key, unmet) if unmet.condition is not Condition.MEASURES:
                     subject = f"{key.source} to {key.subscriber}"
                     text = f'{subject}: relayed although transport is "direct": {unmet.text}'
                     self._on_warning("direct.relayed", f"{key.peer} {subject} {unmet.condition}", text)
