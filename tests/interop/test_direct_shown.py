@@ -9,9 +9,13 @@ import pytest
 
 from lab.bed.processes import eventually
 from tests.interop.modules import Module, flows
+from tests.interop.test_direct_faults import UNPRIVILEGED
+from tests.interop.test_direct_moves import reload
 from tests.interop.transports import AUTO, on_the_network, unbroken, wait_direct
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from tests.interop.conftest import ModuleFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(150)]
@@ -158,6 +162,23 @@ def test_tools_that_measure_are_relayed_and_leave_the_user_direct(modules: Modul
     assert after["since_ago"] > since, "it was not moved meanwhile"
     unbroken(flows(viewer))
     assert "direct.relayed" not in b.agent.snapshot().counters, "a tool is relayed on purpose: no warning"
+
+
+def test_a_subscriber_that_cannot_be_moved_is_shown_as_stuck(modules: ModuleFactory, tmp_path: Path) -> None:
+    a, b = modules("a", "b", config=AUTO, prefix=UNPRIVILEGED)
+    on_the_network(a, b)
+    talker = a.ros.roscpp("talker", topic=TOPIC, rate=RATE, name="talker")
+    viewer = b.ros.rospy("listener", topic=TOPIC, name="viewer")
+    wait_direct(viewer, talker)
+    reload(tmp_path, b, f'{AUTO}[[contract]]\ntopics = ["{TOPIC}"]\ntransport = "relay"\n')
+    eventually(lambda: subscriber(b, "/viewer")["stuck"], what="/viewer is stuck")
+    found = subscriber(b, "/viewer")
+    assert (found["transport"], found["state"], found["condition"]) == ("direct", "relayed", "transport")
+    assert near(found["figures"]["rate"], RATE), found
+    level, text = stages(b)["transport"]
+    assert level == "warn"
+    assert f"has to be relayed, but its connection cannot be ended ({found['stuck']})" in text
+    assert text in [one["text"].removeprefix("of a: ") for one in json.loads(b.agent.rmpa("doctor", "--json")[1])]
 
 
 def test_a_latched_topic_is_told_to_a_tool_as_well(modules: ModuleFactory) -> None:
