@@ -84,7 +84,7 @@ def test_both_ends_say_which_subscriber_is_direct_and_why_another_is_not(modules
     assert "messages, as /viewer counts" in text or "dropped by its queue, as /viewer counts" in text
     code, text = a.agent.rmpa("topic", "info", TOPIC)
     assert f"transport  direct for /viewer, to port {port} of this machine" in text
-    assert "Direct:       1 connections of subscribers here to its nodes" in b.agent.rmpa("peer", "info", "a")[1]
+    assert "Direct:       1 of the subscribers here to its nodes" in b.agent.rmpa("peer", "info", "a")[1]
     assert ", 1 of its subscribers to nodes here" in a.agent.rmpa("peer", "info", "b")[1]
     for module in (a, b):
         said = stages(module)
@@ -162,6 +162,23 @@ def test_tools_that_measure_are_relayed_and_leave_the_user_direct(modules: Modul
     assert after["since_ago"] > since, "it was not moved meanwhile"
     unbroken(flows(viewer))
     assert "direct.relayed" not in b.agent.snapshot().counters, "a tool is relayed on purpose: no warning"
+
+
+def test_of_two_publishers_of_a_roscpp_subscriber_one_is_counted_by_the_kernel(modules: ModuleFactory) -> None:
+    """roscpp's statistics have only the publisher of a subscription that connected last."""
+    a, b = modules("a", "b", config=AUTO)
+    on_the_network(a, b)
+    talkers = [a.ros.roscpp("talker", topic=TOPIC, rate=RATE, size=1000, name=name) for name in ("one", "two")]
+    viewer = b.ros.roscpp("listener", topic=TOPIC, name="viewer")
+    for talker in talkers:
+        wait_direct(viewer, talker)
+    ends = [one["subscribers"][0] for one in mesh(b)["routes"]]
+    assert sorted(one["figures"]["counted_by"] for one in ends) == ["kernel", "node"]
+    for one in ends:
+        assert near(one["figures"]["bandwidth"], RATE * 1000), one
+        assert bool(one["unmeasured"]) is (one["figures"]["counted_by"] == "kernel")
+    text = b.agent.rmpa("topic", "info", TOPIC)[1]
+    assert "as the kernel counts\n                /viewer does not tell the figures of this connection" in text
 
 
 def test_a_subscriber_that_cannot_be_moved_is_shown_as_stuck(modules: ModuleFactory, tmp_path: Path) -> None:

@@ -129,4 +129,6 @@ def _arrived_at(one: SubscriberTransport, there: SubscriberTransport | None) -> 
         text = f"{one.node} has dropped {figures.dropped} of {count} by its own queue"
         return Check("arrived", WARN, text, "its callbacks are too slow, or its queue is too short")
     rate = f", {figures.rate:.1f} Hz" if figures.rate is not None else ""
-    return Check("arrived", OK, f"{count}{rate}, as {one.node} counts")
+    return Check(
+        "arrived", OK, f"{count}{rate}, as {'the kernel' if figures.counted_by == 'kernel' else one.node} counts"
+    )
