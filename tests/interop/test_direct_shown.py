@@ -10,8 +10,7 @@ import pytest
 from lab.bed.processes import eventually
 from tests.interop.modules import Module, flows
 from tests.interop.test_direct_faults import UNPRIVILEGED
-from tests.interop.test_direct_moves import reload
-from tests.interop.transports import AUTO, on_the_network, unbroken, wait_direct
+from tests.interop.transports import AUTO, on_the_network, reload, unbroken, wait_direct
 
 if TYPE_CHECKING:
     from pathlib import Path
