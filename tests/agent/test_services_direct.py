@@ -14,9 +14,11 @@ from rmpa.config.settings import ServiceRule, ServiceSettings
 from rmpa.core.contract import Transport
 from rmpa.core.errors import PeerRefused
 from rmpa.ros.node.service_client import ServiceConnection
+from rmpa.ros.node.service_server import ServiceEndpoint
 from rmpa.ros.node.slave_node import SlaveNode
+from rmpa.ros.wire.services import ServiceDescription
 from tests.agent.test_agent import running, settings, until
-from tests.agent.test_services import Server, come_back, fall_silent, provider, serving
+from tests.agent.test_services import MD5, Server, come_back, fall_silent, provider, serving
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -144,6 +146,9 @@ HOSTILE: dict[str, Callable[[int], object]] = {
 @pytest.mark.parametrize("lie", HOSTILE)
 async def test_false_answers_lead_nowhere(pair: tuple[Settings, Settings], lie: str) -> None:
     async with running(*pair) as (a, b), serving(b, "/trap", "/trap") as trap:
+        # It serves a service of that name too, and would take the calls.
+        description = ServiceDescription("a/Add", MD5)
+        trap.node.add_service(ServiceEndpoint("/add", "/trap", trap.calls.append, description=description))
         answer = HOSTILE[lie](int(trap.node.service_uri.rpartition(":")[2]))
         a.bridge.rpc.on_request(SERVICE, lambda _session, _args: answer)
         async with serving(a):

@@ -170,6 +170,14 @@ def test_a_new_run_of_the_agent_is_asked_anew(services: DirectServices) -> None:
     ]
 
 
+def test_a_server_that_clients_cannot_reach_is_relayed_and_tried_again(services: DirectServices) -> None:
+    assert services.unreachable(KEY, "no answer", 0.0) == []
+    direct(services)
+    assert services.unreachable(KEY, "no answer", 0.0) == [AnswerRelay(KEY)]
+    assert state(services) == (DirectState.RELAYED, Unmet(Condition.REACHABLE, "no answer"))
+    assert asked(services.handle_timer(limits.DIRECT_RETRY)) == ["/add"]
+
+
 def test_many_services_are_asked_for_a_few_at_a_time_and_every_one_in_turn() -> None:
     services = DirectServices()
     keys = [ServiceKey(1, f"/s{number}") for number in range(5 * limits.DIRECT_ASKS)]

@@ -239,6 +239,13 @@ class DirectServices:
             return []
         return self._ask(key, service)
 
+    def unreachable(self, key: ServiceKey, problem: str, now: float) -> list[ServiceAction]:
+        """Relay a service whose server cannot be reached any more, although the peer has a link."""
+        service = self._services.get(key)
+        if service is None or service.state is not DirectState.DIRECT or service.adrift:
+            return []
+        return self._relay(key, service, Unmet(Condition.REACHABLE, problem), now)
+
     # --- links ---------------------------------------------------------------------------------------------------
 
     def link_down(self, peer: int, now: float, *, crashed: bool) -> list[ServiceAction]:

@@ -20,7 +20,7 @@ from rmpa.bridge.direct.client_side import (
     ServiceKey,
 )
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, read_unmet
-from rmpa.bridge.direct.io.nodes import end_to
+from rmpa.bridge.direct.io.nodes import connecting, end_these, end_to
 from rmpa.bridge.direct.service_requests import AskService
 from rmpa.bridge.policy import OWN_NODE, is_own
 from rmpa.core.contract import Transport
@@ -54,14 +54,20 @@ class DirectAnswer:
     Args:
         peer: The number of the peer's session.
         uri: The server's address, ``rosrpc://address:port``.
+        endpoint: The same as address and port.
         nearby: Whether the server runs on this machine, so that clients that are bound to loopback reach it too.
         lookups: How many lookups were answered so.
+        looked_at: How many of these the last ``_look`` has seen.
+        waiting: The sockets that were connecting then, by their cookies.
     """
 
     peer: int
     uri: str
+    endpoint: tuple[str, int]
     nearby: bool
     lookups: int = 0
+    looked_at: int = 0
+    waiting: frozenset[tuple[int, int]] = frozenset()
 
 
 class DirectServiceImporter:
@@ -76,7 +82,7 @@ class DirectServiceImporter:
         proxy_uri: ``(peer, service)``: the proxy's address for a service; empty if there is none.
         on_lost: ``(peer, service, problem)``: removes a service whose agent has crashed and whose server is gone.
         on_warning: ``(kind, subject, text)``: logs and counts a warning.
-        counters: Count ``direct.service_stopped`` and ``direct.lookup_relayed``.
+        counters: Count ``direct.service_stopped``, ``direct.service_unreachable`` and ``direct.lookup_relayed``.
     """
 
     def __init__(
@@ -109,6 +115,7 @@ class DirectServiceImporter:
         self._timer = MachineTimer(self.services.next_timer, lambda now: self._act(self.services.handle_timer(now)))
         self._tasks: dict[ServiceKey, asyncio.Task[None]] = {}
         """The question or the probe for each service: the latest one, so that floods of notifications add none."""
+        self._looking: asyncio.TimerHandle | None = None
         self._closed = False
         self._able = core.on_lookup(self._lookup)
         rpc.on_notification(requests.SERVICE_CLOSED, self._closed_there)
@@ -130,7 +137,32 @@ class DirectServiceImporter:
             self._counters.add("direct.lookup_relayed")
             return ""
         found.lookups += 1
+        if self._looking is None and not found.nearby:
+            self._looking = asyncio.get_running_loop().call_later(limits.DIRECT_CHECK, self._look)
         return found.uri
+
+    def _look(self) -> None:
+        """Find servers that clients cannot reach any more, as behind a new firewall: relay them.
+
+        It is called while services are looked up. A connection that waits for its first answer from one look to the
+        next is ended, so that its client gets an error instead of waiting for minutes.
+        """
+        self._looking = None
+        again = False
+        for service, found in list(self.answers.items()):
+            if found.nearby or (found.lookups == found.looked_at and not found.waiting):
+                continue
+            again, found.looked_at = True, found.lookups
+            waiting = connecting(found.endpoint)
+            stuck = [one for one in waiting if one.cookie in found.waiting]
+            found.waiting = frozenset(one.cookie for one in waiting)
+            if stuck:
+                end_these(stuck)
+                self._counters.add("direct.service_unreachable")
+                problem = f"clients get no answer from {found.uri}"
+                self._act(self.services.unreachable(ServiceKey(found.peer, service), problem, self._now()))
+        if again and not self._closed:
+            self._looking = asyncio.get_running_loop().call_later(limits.DIRECT_CHECK, self._look)
 
     def answer(self, peer: int, service: str) -> DirectAnswer | None:
         """What lookups of a peer's service are answered; ``None``: the proxy's address."""
@@ -302,10 +334,11 @@ class DirectServiceImporter:
         if session is None:
             return
         uri = f"rosrpc://{session.address}:{grant.port}"
-        self.answers[key.service] = DirectAnswer(key.peer, uri, session.same_machine)
+        endpoint = (session.address, grant.port)
+        self.answers[key.service] = DirectAnswer(key.peer, uri, endpoint, session.same_machine)
         used = self._used.setdefault(session.link.name, set())
         if len(used) < limits.DIRECT_MAX:
-            used.add((session.address, grant.port))
+            used.add(endpoint)
         _log.info("= %s of %s is called directly at %s", key.service, session.link.name, uri)
 
     def _relay(self, key: ServiceKey) -> None:
@@ -328,6 +361,8 @@ class DirectServiceImporter:
         """Stop everything; direct connections go on."""
         self._closed = True
         self._timer.close()
+        if self._looking is not None:
+            self._looking.cancel()
         self.answers.clear()
         tasks = list(self._tasks.values())
         for task in tasks:
