@@ -9,9 +9,19 @@ from lab.bed.processes import DEADLINE, eventually
 from tests.interop.modules import Module, flows
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from lab.bed.processes import Event, Process
 
 AUTO: Final = '[bridge]\ntransport = "auto"\n'
+RELAY: Final = '[[contract]]\ntopics = ["/chatter"]\ntransport = "relay"\n'
+
+
+def reload(tmp_path: Path, module: Module, text: str) -> None:
+    """Give an agent other settings."""
+    (tmp_path / f"{module.name}.toml").write_text(text, encoding="utf-8")
+    code, said = module.agent.rmpa("reload")
+    assert code == 0, said
 
 
 def on_the_network(*modules: Module) -> None:
