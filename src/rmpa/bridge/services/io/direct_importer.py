@@ -23,8 +23,9 @@ from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, r
 from rmpa.bridge.direct.io.nodes import connecting, end_these, end_to
 from rmpa.bridge.direct.service_requests import AskService
 from rmpa.bridge.policy import OWN_NODE, is_own
+from rmpa.bridge.session.peer_rpc import UNKNOWN_QUESTION
 from rmpa.core.contract import Transport
-from rmpa.core.errors import RmpaError
+from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.ros.environment import host_of, is_loopback
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.wire.tcpros import printable
@@ -278,15 +279,23 @@ class DirectServiceImporter:
         if session is None or not session.linked or known is None:
             found = Unmet(Condition.OFFERED, "its module has no link")
         else:
-            asked = requests.write(AskService(key.service, known.node, known.wanted))
-            try:
-                value = await self._rpc.request(session, requests.SERVICE, asked, limits.DIRECT_ASK_TIMEOUT)
-                found = read_reply(value, known.node)
-            except RmpaError as error:
-                found = Unmet(Condition.RELEASE, f"{session.link.name} does not grant it: {error}")
-            if isinstance(found, Unmet):
-                found = Unmet(found.condition, printable(found.text))
+            found = await self._request(session, AskService(key.service, known.node, known.wanted))
+        if isinstance(found, Unmet):
+            found = Unmet(found.condition, printable(found.text))
         self._act(self.services.replied(key, attempt, found, self._now()))
+
+    async def _request(self, session: PeerSession, asked: AskService) -> Grant | Unmet:
+        args = requests.write(asked)
+        try:
+            value = await self._rpc.request(session, requests.SERVICE, args, limits.DIRECT_ASK_TIMEOUT)
+            return read_reply(value, asked.node)
+        except PeerRefused as error:
+            older = UNKNOWN_QUESTION in error.reason
+            return Unmet(Condition.RELEASE if older else Condition.AGENT, str(error))
+        except RemoteProtocolError as error:
+            return Unmet(Condition.RELEASE, f"{session.link.name}: {error}")
+        except RmpaError as error:
+            return Unmet(Condition.AGENT, str(error))
 
     async def _probe(self, key: ServiceKey, attempt: int, grant: Grant) -> None:
         session = self._sessions.get(key.peer)
