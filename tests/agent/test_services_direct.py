@@ -114,8 +114,10 @@ async def test_both_modules_must_want_it(pair: tuple[Settings, Settings], side: 
         await until(lambda: transport(agents[1]) == ("relay", "transport"))
         agents[side].bridge.reload(pair[side])
         await until(lambda: transport(agents[1]) == ("direct", ""))
+        await until(lambda: agents[0].services.direct_exports.grants.peers("/add"))
         agents[side].bridge.reload(relayed)
         await until(lambda: transport(agents[1]) == ("relay", "transport"))
+        await until(lambda: not agents[0].services.direct_exports.grants.peers("/add"))
 
 
 async def test_direct_warns_once_where_it_cannot_be_had(

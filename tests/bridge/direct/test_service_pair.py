@@ -16,6 +16,7 @@ from rmpa.bridge.direct.client_side import (
     DirectServices,
     Lost,
     ProbeServer,
+    ReleaseGrant,
     ServiceAction,
     ServiceKey,
 )
@@ -45,7 +46,7 @@ class World:
         self.uris = dict.fromkeys(NAMES, "")
         self.allowed = dict.fromkeys(NAMES, True)
         self.wanted = dict.fromkeys(NAMES, True)
-        self.to_server: deque[AskPeer] = deque()
+        self.to_server: deque[AskPeer | ReleaseGrant] = deque()
         self.to_client: deque[tuple[AskPeer, Grant | Unmet] | ServerAction] = deque()
         self.probes: deque[ProbeServer] = deque()
         self.answers: dict[str, int] = {}
@@ -56,7 +57,7 @@ class World:
     def act(self, actions: Sequence[ServiceAction]) -> None:
         for action in actions:
             match action:
-                case AskPeer():
+                case AskPeer() | ReleaseGrant():
                     if self.linked:
                         self.to_server.append(action)
                 case ProbeServer():
@@ -117,6 +118,9 @@ class World:
     def ask(self, _name: str = "") -> None:
         if self.to_server:
             asked = self.to_server.popleft()
+            if isinstance(asked, ReleaseGrant):
+                self.grants.released(1, asked.key.service, asked.node)
+                return
             name = asked.key.service
             found: Grant | Unmet = Grant(self.ports[name], "/n") if self.ports[name] else CLOSED
             if not self.allowed[name]:
@@ -176,3 +180,4 @@ def test_in_the_end_lookups_are_answered_with_where_the_server_listens(events: l
     for name in NAMES:
         expected = world.ports[name] if world.allowed[name] and world.wanted[name] else 0
         assert world.answers.get(name, 0) == expected, name
+        assert world.grants.peers(name) == ((1,) if expected else ()), "no grant is left that is not used"

@@ -16,12 +16,13 @@ from rmpa.bridge.direct.client_side import (
     DirectServices,
     Lost,
     ProbeServer,
+    ReleaseGrant,
     ServiceFallback,
     ServiceKey,
 )
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, read_unmet
 from rmpa.bridge.direct.io.nodes import connecting, end_these, end_to
-from rmpa.bridge.direct.service_requests import AskService
+from rmpa.bridge.direct.service_requests import AskService, CloseService
 from rmpa.bridge.policy import OWN_NODE, is_own
 from rmpa.bridge.session.peer_rpc import UNKNOWN_QUESTION
 from rmpa.core.contract import Transport
@@ -195,7 +196,8 @@ class DirectServiceImporter:
             return
         unmet = self._unmet_here(service, remote)
         if unmet is None and not session.linked:
-            return  # the next link asks for it
+            self.services.wait(key, remote.node, wanted)
+            return
         self._act(self.services.consider(key, remote.node, wanted, unmet, self._now()))
 
     def hidden(self, peer: int, service: str) -> None:
@@ -226,9 +228,6 @@ class DirectServiceImporter:
     def link_up(self, session: PeerSession) -> None:
         """Ask for the services of a peer that was without a link."""
         self._act(self.services.link_up(session.peer))
-        for peer, remote in list(self._imports):
-            if peer == session.peer and remote.shown:
-                self.shown(peer, remote.name)
 
     def link_down(self, session: PeerSession, *, crashed: bool) -> None:
         """Stop direct calls to a peer that cannot be reached, those under way too; unless only its agent has died."""
@@ -330,6 +329,11 @@ class DirectServiceImporter:
                     self._answer(key, grant)
                 case AnswerRelay(key):
                     self._relay(key)
+                case ReleaseGrant(key, node):
+                    session = self._sessions.get(key.peer)
+                    if session is not None and session.linked:
+                        closed = requests.write(CloseService(key.service, node))
+                        self._rpc.notify(session, requests.SERVICE_CLOSE, closed)
                 case Lost(key, problem):
                     self._on_lost(key.peer, key.service, problem)
                 case ServiceFallback(key, unmet):
