@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 from typing import TYPE_CHECKING, Final
 
-from lab.bed.processes import DEADLINE, eventually
+from lab.bed.processes import DEADLINE, Deadline, eventually
 from tests.interop.modules import Module, flows
+from tests.interop.ros import PYTHON
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
     from pathlib import Path
 
     from lab.bed.processes import Event, Process
 
 AUTO: Final = '[bridge]\ntransport = "auto"\n'
+_BUS_INFO: Final = """
+import json, sys, xmlrpc.client
+master, node = sys.argv[1:]
+uri = xmlrpc.client.ServerProxy(master).lookupNode("/test", node)[2]
+print(json.dumps(xmlrpc.client.ServerProxy(uri).getBusInfo("/test")[2]))
+"""
 RELAY: Final = '[[contract]]\ntopics = ["/chatter"]\ntransport = "relay"\n'
 
 
@@ -48,6 +57,30 @@ def links(subscriber: Process, publisher: Process) -> int:
     """The number of connections between two nodes; 0 if every message between them goes through the agents."""
     there = connections(publisher)
     return sum((other, own) in there for own, other in connections(subscriber))
+
+
+def direct_topics(module: Module, node: str, other: Module) -> set[str]:
+    """The topics that a node gets from nodes on another module's host, as the node itself says."""
+    rows = json.loads(module.ros.tool(PYTHON, "-c", _BUS_INFO, module.ros.uri, node))
+    inbound = [row for row in rows if row[2] == "i" and f"[{other.host.address}:" in str(row[6:])]
+    assert len(inbound) == len({row[4] for row in inbound}), inbound
+    return {row[4] for row in inbound}
+
+
+def wait_direct_topics(module: Module, node: str, other: Module, topics: Collection[str]) -> None:
+    """Wait until a node gets exactly these topics from nodes on another module's host."""
+    found: set[str] = set()
+
+    def as_wanted() -> bool:
+        found.clear()
+        found.update(direct_topics(module, node, other))
+        return found == set(topics)
+
+    try:
+        eventually(as_wanted)
+    except Deadline as error:
+        text = f"{node} of {module.name}: direct are {sorted(found)}, not {sorted(topics)}"
+        raise AssertionError(text) from error
 
 
 def wait_direct(subscriber: Process, publisher: Process, timeout: float = DEADLINE) -> Event:

@@ -25,7 +25,7 @@ from rmpa.bridge.direct.subscriber_side import (
     Release,
 )
 from rmpa.bridge.policy import is_own
-from rmpa.bridge.topics.audience import is_watched
+from rmpa.bridge.topics.audience import compares_names
 from rmpa.bridge.topics.io.direct_moves import SubscriberMoves
 from rmpa.core.contract import Transport
 from rmpa.core.errors import RmpaError
@@ -186,8 +186,8 @@ class DirectImporter:
             return Unmet(Condition.OWN_SOURCE, f"it is {entry.origin.name}'s, and comes by a relay")
         if entry.topic != source.topic:
             return Unmet(Condition.NAME, f"it is {source.topic} in the publisher's module")
-        if is_watched(entry.type):
-            return Unmet(Condition.ACTION, f"publishers of {entry.type} compare the names of their subscribers")
+        if compares_names(entry.type):
+            return Unmet(Condition.ACTION, f"actions compare the names of the nodes at {entry.type}")
         if node.startswith(MEASURING):
             return Unmet(Condition.MEASURES, "rmpa's own tools measure by the agents")
         if is_loopback(host_of(uri)) and not session.same_machine:
