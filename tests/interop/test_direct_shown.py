@@ -133,8 +133,8 @@ def test_a_relayed_topic_names_the_condition(modules: ModuleFactory, config: str
     # Only where the contract says "direct" does relaying it deserve a warning.
     assert level == ("warn" if condition == "listening" else "ok")
     checks = json.loads(b.agent.rmpa("doctor", "--json")[1])
-    found = [one for one in checks if one["check"] == "transport" and one["subject"] == TOPIC]
-    assert bool(found) is (condition == "listening"), found
+    told = [one for one in checks if one["check"] == "transport" and one["subject"] == TOPIC]
+    assert bool(told) is (condition == "listening"), told
 
 
 @pytest.mark.parametrize("client", CLIENTS)

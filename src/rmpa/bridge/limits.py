@@ -153,6 +153,8 @@ DIRECT_PROBE_TIMEOUT: Final = 1.0
 DIRECT_RETRY: Final = 30.0
 """Seconds after which a subscriber that was refused for a passing reason (the node does not answer, the port cannot
 be reached) is considered again."""
+DIRECT_RETRY_PAUSE: Final = 1.0
+"""Seconds between two requests for one subscriber that a peer's notifications cause."""
 DIRECT_CHECK: Final = 1.0
 """Seconds between two looks at the kernel's table, whether direct connections still stand."""
 DIRECT_SETTLE: Final = 2.0
@@ -161,7 +163,8 @@ DIRECT_MAX: Final = 1024
 """Direct connections that one peer may have to publishers of this module, and as many to its services."""
 DIRECT_ADOPT: Final = 10.0
 """Seconds that a new run of a peer's agent has to offer again what its earlier run left connected directly; after
-that the connections are ended."""
+that the connections are ended. Likewise the seconds that a peer has, after a new link, to ask again for what it
+uses."""
 DIRECT_KEEP: Final = 30.0
 """Seconds that services which are called directly stay in the graph after their agent has crashed, as topics do
 (``core.limits.RESUME_WINDOW``). Their servers are probed each `DIRECT_CHECK` meanwhile."""

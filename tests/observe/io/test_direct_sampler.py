@@ -101,7 +101,7 @@ async def test_the_first_look_waits_for_the_figures_of_both_ends(calls: Calls) -
         await sampler.settle(["/cmd"])
         assert asyncio.get_running_loop().time() - begin < limits.DIRECT_FIRST_LOOK + 0.5
         for flow in flows:
-            await until(lambda flow=flow: sampler[flow].figures is not None and sampler[flow].settled)
+            await until(lambda flow=flow: sampler[flow].figures is not None and sampler[flow].settled)  # type: ignore[misc]
             sample = sampler[flow]
             assert sample.connected is True
             assert sample.figures is not None

@@ -268,7 +268,7 @@ class Mesh:
         link = self._links.pop(connection.id, None)
         if link is not None:
             link.silent = link.silent or connection.silent
-            link.crashed = connection.crashed
+            link.crashed = link.crashed or connection.crashed
             if discarded := link.discard():
                 self.counters.add("link.discarded", discarded)
             self._peering.link_down(link.id, reason, now, silent=link.silent)

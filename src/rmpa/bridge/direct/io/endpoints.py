@@ -84,18 +84,16 @@ class LocalEndpoints:
     def _judge(self, session: PeerSession, node: str, port: int, probe: str) -> Grant | Unmet:
         """Checks by the kernel's table that the port's listening socket can be reached from the peer."""
         addresses = listening_addresses(port)
-        local = session.link.local_address
         if addresses is None:
             return Unmet(Condition.LISTENING, "the kernel does not say where its node listens")
         if not addresses:
             return Unmet(Condition.LISTENING, f"{node} does not listen on this module's machine (port {port})")
-        if addresses & _EVERY_ADDRESS or local in addresses:
-            return Grant(port, node, probe)
-        if session.same_machine and any(is_loopback(address) for address in addresses):
+        if addresses & _EVERY_ADDRESS or session.own_address in addresses:
             return Grant(port, node, probe)
         if all(is_loopback(address) for address in addresses):
             return Unmet(Condition.LISTENING, f"{node} listens on loopback only: {_REMEDY}")
-        return Unmet(Condition.LISTENING, f"{node} listens at {', '.join(sorted(addresses))}, not at {local}")
+        text = f"{node} listens at {', '.join(sorted(addresses))}, not at {session.own_address}"
+        return Unmet(Condition.LISTENING, text)
 
     def _probe_service(self, node: str) -> str:
         """A service of a node: rospy and roscpp nodes have their logger services."""
