@@ -291,16 +291,20 @@ class DirectImporter:
                 self._waiting.pop(key, None)
 
     def listeners_changed(self, peer: int, source: Source) -> None:
-        """Note which subscribers have left the proxy of a source."""
+        """Note which subscribers have left the proxy of a source, or have come back to it by themselves."""
         routes = self.routes.of(peer, source)
         if not routes:
             return
         publication = self._publication(peer, source)
         there = publication.callers if publication is not None else frozenset()
-        for name, route in routes:
+        for name, _ in routes:
             key = DirectKey(peer, source, name)
-            if route.path is Path.RELAY and name not in there and key not in self._moves:
+            if key in self._moves:
+                continue
+            if name not in there:
                 self._act(self.routes.left(key, self._now()))
+            else:
+                self._act(self.routes.arrived(key, self._now()))
 
     # --- links ------------------------------------------------------------------------------------------------------
 
