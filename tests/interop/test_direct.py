@@ -11,10 +11,12 @@ from tests.interop.ros import lacks
 from tests.interop.transports import (
     AUTO,
     direct_topics,
+    heard,
     in_order,
     links,
     on_the_network,
     reload,
+    steady,
     unbroken,
     wait_direct,
     wait_direct_topics,
@@ -22,11 +24,10 @@ from tests.interop.transports import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
     from pathlib import Path
 
     from lab.bed.namespaces import Lab
-    from lab.bed.processes import Event, Process
+    from lab.bed.processes import Process
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
@@ -79,39 +80,6 @@ BY_TERMS: Final = (
     "/fresh",
 )
 FREE: Final = ("/free", "/free_too")
-
-
-def heard(listener: Process, topics: Iterable[str], more: int = 10) -> dict[str, Event]:
-    """Wait until a listener of many topics has received so many further messages of each; return their reports."""
-    wanted = dict.fromkeys(topics, more)
-    for topic, report in _last(listener).items():
-        if topic in wanted:
-            wanted[topic] += int(str(report["count"]))
-
-    def enough(event: Event) -> bool:
-        rows = event["topics"]
-        assert isinstance(rows, dict)
-        return all(topic in rows and rows[topic]["count"] >= count for topic, count in wanted.items())
-
-    rows = listener.wait_event("report", where=enough, since=listener.mark_events())["topics"]
-    assert isinstance(rows, dict)
-    return rows
-
-
-def steady(listener: Process, topics: Iterable[str]) -> dict[str, Event]:
-    """Fail unless messages of all topics come one by one from now on, and each came in order before."""
-    begin, end = heard(listener, topics), heard(listener, topics, 25)
-    for topic in topics:
-        in_order(end[topic])
-        assert end[topic]["gaps"] == begin[topic]["gaps"], topic
-    return end
-
-
-def _last(listener: Process) -> dict[str, Event]:
-    reports = listener.events("report")
-    rows = reports[-1]["topics"] if reports else {}
-    assert isinstance(rows, dict)
-    return rows
 
 
 @pytest.mark.parametrize(("subscriber", "publisher"), CLIENTS)

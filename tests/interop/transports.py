@@ -11,7 +11,7 @@ from tests.interop.modules import Module, flows
 from tests.interop.ros import PYTHON
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Iterable
     from pathlib import Path
 
     from lab.bed.processes import Event, Process
@@ -105,3 +105,36 @@ def in_order(report: Event) -> None:
 def unbroken(report: Event) -> None:
     """Fail unless a report says: each byte right, none doubled, moved or missing after the first."""
     assert (report["bad"], report["doubled"], report["gaps"]) == (0, 0, 0), report
+
+
+def heard(listener: Process, topics: Iterable[str], more: int = 10) -> dict[str, Event]:
+    """Wait until a listener of many topics has received so many further messages of each; return their reports."""
+    wanted = dict.fromkeys(topics, more)
+    for topic, report in _last(listener).items():
+        if topic in wanted:
+            wanted[topic] += int(str(report["count"]))
+
+    def enough(event: Event) -> bool:
+        rows = event["topics"]
+        assert isinstance(rows, dict)
+        return all(topic in rows and rows[topic]["count"] >= count for topic, count in wanted.items())
+
+    rows = listener.wait_event("report", where=enough, since=listener.mark_events())["topics"]
+    assert isinstance(rows, dict)
+    return rows
+
+
+def steady(listener: Process, topics: Iterable[str]) -> dict[str, Event]:
+    """Fail unless messages of all topics come one by one from now on, and each came in order before."""
+    begin, end = heard(listener, topics), heard(listener, topics, 25)
+    for topic in topics:
+        in_order(end[topic])
+        assert end[topic]["gaps"] == begin[topic]["gaps"], topic
+    return end
+
+
+def _last(listener: Process) -> dict[str, Event]:
+    reports = listener.events("report")
+    rows = reports[-1]["topics"] if reports else {}
+    assert isinstance(rows, dict)
+    return rows
