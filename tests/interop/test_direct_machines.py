@@ -1,4 +1,4 @@
-"""Direct transport with other numbers of machines, modules and topics: two modules on one, three, a real roscore, many."""
+"""Direct transport elsewhere: two modules on one machine, three modules, a real roscore, hundreds of topics."""
 
 from __future__ import annotations
 
@@ -102,10 +102,11 @@ def test_nodes_of_a_real_roscore_are_direct_if_they_are_on_its_machine(
     """A roscore may have nodes on other machines: the agent cannot see their sockets, so they are relayed."""
     first, second, far = lab.hosts("a", "b", "far")
     ros = shell(first)
+    ros.env["ROS_IP"] = first.address  # roscore listens for other machines too
     ros.roscore()
     a = Module(first, agent(first, name="a", flags=EXTERNAL, config=AUTO), ros)
     b = Module(second, agent(second, name="b", config=AUTO), shell(second))
-    on_the_network(a, b)
+    on_the_network(b)
     a.agent.wait_peer("b")
     elsewhere = shell(far)
     elsewhere.env.update(ROS_IP=far.address, ROS_MASTER_URI=f"http://{first.address}:11311/")
@@ -121,15 +122,15 @@ def test_nodes_of_a_real_roscore_are_direct_if_they_are_on_its_machine(
     in_order(wait_direct(here, talker))
 
 
-def test_a_hundred_topics_of_many_nodes_go_direct_at_once(modules: ModuleFactory) -> None:
-    """Four publishers with 50 topics each, and three subscribers of all: 600 connections, and agents that answer."""
+def test_two_hundred_topics_of_many_nodes_go_direct_at_once(modules: ModuleFactory) -> None:
+    """Four publishers with 50 topics each, and two subscribers of all: 400 connections, and agents that answer."""
     a, b = modules("a", "b", config=AUTO, log_level="info")
     on_the_network(a, b)
     topics = [[f"/flood/n{node}/t{number}" for number in range(50)] for node in range(4)]
     every = [topic for some in topics for topic in some]
     talkers = [a.ros.roscpp("many_talker", topics=",".join(some), rate=2) for some in topics]
     b.wait_topic(every[-1], 60.0)
-    listeners = [b.ros.roscpp("many_listener", topics=",".join(every)) for _ in range(3)]
+    listeners = [b.ros.roscpp("many_listener", topics=",".join(every)) for _ in range(2)]
     slowest = 0.0
 
     def all_direct() -> bool:
@@ -140,7 +141,7 @@ def test_a_hundred_topics_of_many_nodes_go_direct_at_once(modules: ModuleFactory
         assert code == 0
         return all(links(listener, talker) == 50 for listener in listeners for talker in talkers)
 
-    eventually(all_direct, 60.0, what="600 connections", every=0.2)
+    eventually(all_direct, 60.0, what="400 connections", every=0.2)
     assert slowest < 10.0
     for listener in listeners:
         for report in heard(listener, every, 4).values():
