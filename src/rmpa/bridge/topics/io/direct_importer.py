@@ -25,7 +25,7 @@ from rmpa.bridge.direct.subscriber_side import (
     Release,
 )
 from rmpa.bridge.policy import is_own
-from rmpa.bridge.topics.audience import is_watched
+from rmpa.bridge.topics.audience import compares_names
 from rmpa.bridge.topics.io.direct_moves import SubscriberMoves
 from rmpa.core.contract import Transport
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
@@ -190,8 +190,8 @@ class DirectImporter:
             return Unmet(Condition.OWN_SOURCE, f"it is {entry.origin.name}'s, and comes by a relay")
         if entry.topic != source.topic:
             return Unmet(Condition.NAME, f"it is {source.topic} in the publisher's module")
-        if is_watched(entry.type):
-            return Unmet(Condition.ACTION, f"publishers of {entry.type} compare the names of their subscribers")
+        if compares_names(entry.type):
+            return Unmet(Condition.ACTION, f"actions compare the names of the nodes at {entry.type}")
         if node.startswith(MEASURING):
             return Unmet(Condition.MEASURES, "rmpa's own tools measure by the agents")
         if is_loopback(host_of(uri)) and not session.same_machine:
@@ -291,16 +291,20 @@ class DirectImporter:
                 self._waiting.pop(key, None)
 
     def listeners_changed(self, peer: int, source: Source) -> None:
-        """Note which subscribers have left the proxy of a source."""
+        """Note which subscribers have left the proxy of a source, or have come back to it by themselves."""
         routes = self.routes.of(peer, source)
         if not routes:
             return
         publication = self._publication(peer, source)
         there = publication.callers if publication is not None else frozenset()
-        for name, route in routes:
+        for name, _ in routes:
             key = DirectKey(peer, source, name)
-            if route.path is Path.RELAY and name not in there and key not in self._moves:
+            if key in self._moves:
+                continue
+            if name not in there:
                 self._act(self.routes.left(key, self._now()))
+            else:
+                self._act(self.routes.arrived(key, self._now()))
 
     # --- links ------------------------------------------------------------------------------------------------------
 
