@@ -254,6 +254,7 @@ def test_an_answer_that_a_new_decision_overtook_moves_its_subscriber() -> None:
 def test_a_broken_connection_is_reported_and_asked_for_again_but_not_for_ever() -> None:
     sut = Sut()
     sut.connected_directly()
+    rest: list[DirectAction] = []
     for number in range(limits.DIRECT_BREAKS):
         released, *rest = sut.broken(KEY, 1.0 + number)
         assert released == Release(KEY, broken=True)
