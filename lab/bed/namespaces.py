@@ -124,6 +124,17 @@ class Host:
         time.sleep(seconds)
         self.restore(cable)
 
+    def dropout(self, seconds: float, cable: int = 0) -> None:
+        """Let the switch drop every frame of this host for a while; the carrier stays, as with a radio.
+
+        An outage of a carrier takes up to a second longer than asked for, because the kernel gathers its changes.
+        """
+        wire = self.cables[cable]
+        port = ["-n", wire.switch, "link", "set", wire.port, "type", "bridge_slave", "state"]
+        _ip(*port, "0")
+        time.sleep(seconds)
+        _ip(*port, "3")
+
     def switch_off(self, cable: int = 0) -> None:
         """Take the interface down inside the host (its routes go with it)."""
         self.ip("link", "set", self.cables[cable].interface, "down")

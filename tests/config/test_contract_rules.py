@@ -100,6 +100,13 @@ def test_the_default_transport_is_that_of_the_bridge(load: Load) -> None:
     assert load(RULE + "transport = 'auto'").settings.make_contracts().of("/b", "a/B") == Contract()
 
 
+def test_one_word_is_enough_for_topics_to_go_direct(load: Load) -> None:
+    assert not load(RULE + "transport = 'relay'").settings.allows_direct
+    assert not load("[bridge]\ntransport = 'relay'\n" + RULE + "depth = 1").settings.allows_direct
+    assert load("[bridge]\ntransport = 'auto'\n" + RULE + "transport = 'relay'").settings.allows_direct
+    assert load(RULE + "transport = 'direct'").settings.allows_direct
+
+
 def test_inline_tables_are_rules_too(load: Load) -> None:
     text = 'contract = [\n  {topics = ["/a"], depth = 1},\n  {types = ["a/B"], depth = 2},\n]\n'
     assert [rule.values for rule in load(text).settings.contracts] == [{"depth": 1}, {"depth": 2}]

@@ -94,7 +94,7 @@ def test_schema_accepts_the_files_of_the_documentation(validate: Any) -> None:
         "[[peer]]\nprefix = '/a'",
         "[[peer]]\nname = 'a'\n[[peer.remap]]\nfrom = '/a'\nto = '/b'",
         "[[peer]]\nname = 'a'\nremap_in = {'/a' = 1}",
-        "[[service]]\nnames = ['/a']",
+        "[[service]]\ntimeout = 1",
         "[[param]]\nkey = '/a'",
         "[param]\nkey = '/a'",
     ],

@@ -8,6 +8,7 @@ import pytest
 
 from rmpa.config.settings import ServiceRule, ServiceSettings
 from rmpa.config.sources import load_settings
+from rmpa.core.contract import Transport
 from rmpa.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ def _load(tmp_path: Path, text: str, **environ: str) -> ServiceSettings:
 
 
 def test_defaults_let_all_but_loggers_cross_for_a_minute(tmp_path: Path) -> None:
-    assert _load(tmp_path, "") == ServiceSettings(("/**",), (), False, 60.0, ())
+    assert _load(tmp_path, "") == ServiceSettings(("/**",), (), False, 60.0, Transport.RELAY, ())
 
 
 def test_a_file_says_it_all(tmp_path: Path) -> None:
@@ -31,20 +32,31 @@ def test_a_file_says_it_all(tmp_path: Path) -> None:
         deny = ["/**/restart"]
         loggers = true
         timeout = "500 ms"
+        transport = "auto"
         [[service]]
         names = ["/plan/**", "/map"]
         timeout = "5 min"
         [[service]]
+        names = ["/ik"]
+        transport = "direct"
+        [[service]]
         names = ["/**"]
         timeout = 2
+        transport = "relay"
     """
-    rules = (ServiceRule(("/plan/**", "/map"), 300.0), ServiceRule(("/**",), 2.0))
-    assert _load(tmp_path, text) == ServiceSettings(("/arm/**",), ("/**/restart",), True, 0.5, rules)
+    rules = (
+        ServiceRule(("/plan/**", "/map"), 300.0),
+        ServiceRule(("/ik",), None, Transport.DIRECT),
+        ServiceRule(("/**",), 2.0, Transport.RELAY),
+    )
+    assert _load(tmp_path, text) == ServiceSettings(("/arm/**",), ("/**/restart",), True, 0.5, Transport.AUTO, rules)
 
 
 def test_variables_outweigh_the_file(tmp_path: Path) -> None:
     found = _load(tmp_path, "[services]\ntimeout = 3\n", RMPA_SERVICE_TIMEOUT="4 s", RMPA_SERVICE_DENY="/a;/b")
     assert (found.timeout, found.deny) == (4.0, ("/a", "/b"))
+    found = _load(tmp_path, "[services]\ntransport = 'relay'\n", RMPA_SERVICE_TRANSPORT="direct")
+    assert found.transport is Transport.DIRECT
 
 
 @pytest.mark.parametrize(
@@ -57,8 +69,11 @@ def test_variables_outweigh_the_file(tmp_path: Path) -> None:
         ("[services]\ntimeout = '10 Hz'", 2, "is a rate"),
         ("[services]\ntimeouts = 1", 2, "did you mean services.timeout?"),
         ("[services]\nloggers = 1", 2, "is not true or false"),
-        ("[[service]]\nnames = ['/a']", 1, "a rule without timeout"),
+        ("[[service]]\nnames = ['/a']", 1, "a rule without timeout and transport; one has names"),
         ("[[service]]\ntimeout = 1", 1, "a rule without names"),
+        ("[[service]]\ntransport = 'auto'", 1, "a rule without names"),
+        ("[[service]]\nnames = ['/a']\ntransport = 'diret'", 3, 'one of relay, direct, auto; did you mean "direct"?'),
+        ("[services]\ntransport = 1", 2, "services.transport: 1 is not a text in quotes"),
         ("\n[[service]]\nnames = []\ntimeout = 1", 3, "an empty list fits nothing"),
         ("[[service]]\nnames = ['/a', 'b c']\ntimeout = 1", 2, "'b c' is not a glob over services"),
         ("[[service]]\nnames = ['/a']\ntimeout = 0", 3, "service.timeout: 0 is out of range"),

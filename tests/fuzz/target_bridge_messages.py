@@ -20,7 +20,7 @@ SEEDS: list[bytes] = [
         b'"lifespan":null,"liveliness":"manual_by_topic","liveliness_lease":2.0,"priority":"high","max_rate":50.0}}'
     ),
     (
-        b'{"op":"opened","route":7,"epoch":1,"first":1,"contract":{"priority":"low"},"description":'
+        b'{"op":"opened","route":7,"epoch":1,"first":1,"contract":{"priority":"low","transport":"auto"},"description":'
         b'{"type":"a/B","md5":"5a9ea5f83505693b71e785041e67a8bb","definition":"","latching":false}}'
     ),
     b'{"op":"closed","route":7,"reason":"the node has gone"}',

@@ -39,6 +39,7 @@ SEEDS: list[bytes] = [
     b'[[contract]]\ntopics = ["/a/**"]\ntypes = ["a/B", "std_msgs/*"]\ndepth = 5\nhistory = "keep_all"\n',
     b'[[contract]]\ntopics = ["/**"]\nliveliness = "manual_by_topic"\nliveliness_lease_duration = "1.5 s"\n',
     b'contract = [{topics = "/a;/b", max_rate = "10 Hz", deadline = 1e-3, lifespan = inf, priority = "LOW"}]\n',
+    b"[[contract]]\ntopics = ['/a']\ntransport = 'auto'\n",
     b"[[contract]]\ntypes = ['*/*']\nreliability = 'reliable'\ndurability = 'transient_local'\ndepth = 100_000\n",
     b"[[contract]]\ntopics = ['/**']\ndeadline = 1e-9\nlifespan = 1e9\nmax_rate = 1e-9\ndepth = 0\n",
     b"[[contract]]\ntopics = ['/**']\nlifespan = '86401 s'\n",

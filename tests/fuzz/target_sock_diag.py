@@ -24,6 +24,7 @@ SEEDS: list[bytes] = [
     _FOUND + _FOUND + _answer(3, 2, bytes(4)),
     _answer(2, 0, struct.pack("=i", -1) + bytes(16)),
     _answer(2, 0, bytes(20)),
+    _answer(2, 0, struct.pack("=i", -(1 << 31)) + bytes(16)),
     _answer(20, 0x12, bytes(72)),
     _answer(1, 0, b"") + _answer(3, 2, b""),
 ]

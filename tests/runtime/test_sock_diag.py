@@ -118,6 +118,8 @@ def test_an_error_ends_a_dump() -> None:
         TAKEN,
         b"\x12\0\0\0" + TAKEN[4:20],
         REFUSED[:16] + b"\1\0\0\0" + REFUSED[20:],
+        REFUSED[:16] + b"\0\0\0\x80" + REFUSED[20:],
+        DONE[:-4] + b"\0\0\0\x80",
     ],
     ids=[
         "half a header",
@@ -129,6 +131,8 @@ def test_an_error_ends_a_dump() -> None:
         "a mere acknowledgement",
         "an error without its number",
         "a positive number",
+        "no number of an error",
+        "no number of an error at the end",
     ],
 )
 def test_malformed_answers_are_refused(data: bytes) -> None:

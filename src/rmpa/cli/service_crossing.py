@@ -41,8 +41,19 @@ def _headline(info: ServiceInfo) -> str:
     return f"from {info.peer}: {info.node}{over_there}, {state}"
 
 
+def _transport(info: ServiceInfo) -> list[tuple[str, str]]:
+    if info.direct_callers:
+        return [("transport", f"direct for {', '.join(info.direct_callers)}")]
+    if info.transport == "direct":
+        return [("transport", f"direct, at {info.address}, {info.lookups} lookups answered so")]
+    if info.transport and info.wanted != "relay":
+        why = f" ({info.condition}): {info.relayed_because}" if info.condition else "; its module is being asked"
+        return [("transport", f"relayed{why}")]
+    return []
+
+
 def _facts(info: ServiceInfo) -> list[tuple[str, str]]:
-    facts = []
+    facts = _transport(info)
     if info.calls or info.active:
         under_way = f", {info.active} under way" if info.active else ""
         facts.append(("calls", f"{info.calls}, {info.failed} failed{under_way}"))

@@ -63,13 +63,13 @@ def _table(name: str) -> JsonSchema:
 
 
 def json_value(value: object) -> object:
-    """A setting's value as JSON has it: addresses as text, rules as objects."""
+    """A setting's value as JSON has it: addresses as text, rules as objects of the keys that they have."""
     if isinstance(value, tuple):
         return [json_value(element) for element in value]
     if isinstance(value, Multicast | HostPort):
         return str(value) if value != Multicast(enabled=False) else False
     if is_dataclass(value) and not isinstance(value, type):
-        return asdict(value)
+        return {key: json_value(part) for key, part in asdict(value).items() if part is not None}
     return value.value if isinstance(value, StrEnum) else value
 
 

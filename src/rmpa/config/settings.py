@@ -75,7 +75,10 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class ServiceSettings:
-    """Which services cross, and how long a call may take. The first of ``rules`` that fits a service holds for it."""
+    """Which services cross, how long a call may take, and its path.
+
+    Of ``rules`` the first that fits a service and says a time-out gives its time-out; its transport likewise.
+    """
 
     allow: tuple[str, ...] = setting(
         ("/**",), list_of(SERVICE_GLOB), "Services that may cross, by their names here.", env="RMPA_SERVICE_ALLOW"
@@ -90,8 +93,17 @@ class ServiceSettings:
         "How long a call may take, in seconds or as a text such as 500 ms; then the caller gets an error.",
         env="RMPA_SERVICE_TIMEOUT",
     )
+    transport: Transport = setting(
+        DEFAULT_TRANSPORT,
+        TRANSPORT,
+        "The path of calls, unless a [[service]] says another; the words are those of bridge.transport.",
+        env="RMPA_SERVICE_TRANSPORT",
+    )
     rules: tuple[ServiceRule, ...] = setting(
-        (), SERVICE_RULES, "Time-outs of single services; the first that fits holds.", key="service"
+        (),
+        SERVICE_RULES,
+        "Time-outs and transports of single services; of each, the first that fits holds.",
+        key="service",
     )
 
 
@@ -363,6 +375,12 @@ class Settings:
     def make_contracts(self) -> Contracts:
         """The contracts of this module's topics, by ``[[contract]]`` and ``[bridge] transport``."""
         return Contracts(self.contracts, self.transport)
+
+    @property
+    def allows_direct(self) -> bool:
+        """Whether any topic may go from node to node, past the agents."""
+        words = (self.transport, *(rule.values.get("transport") for rule in self.contracts))
+        return any(word in (Transport.DIRECT, Transport.AUTO) for word in words)
 
 
 SETTINGS: Final = tuple(settings_of(Settings))

@@ -31,6 +31,8 @@ _INTERRUPTED: Final = 0x10
 """Flag ``NLM_F_DUMP_INTR``: the table changed during the dump, which may lack sockets."""
 _HEADER: Final = struct.Struct("=IHHII")
 _ERRNO: Final = struct.Struct("=i")
+_ERRNO_MAX: Final = 4095
+"""``MAX_ERRNO`` of the kernel."""
 _QUERY: Final = struct.Struct("=BBBBI")
 _FOUND: Final = struct.Struct("=BBBB")
 _PORTS: Final = struct.Struct("!HH")
@@ -154,7 +156,7 @@ def read_dump(data: bytes, found: list[bytes], sequence: int = 0) -> bool:
             raise InterruptedDump(errno.EINTR, "the kernel's table of sockets changed while it was read")
         if kind == _DONE:
             # The status of the whole dump; some kernels leave it out.
-            _raise(_ERRNO.unpack_from(data, start)[0] if end - start >= _ERRNO.size else 0)
+            _raise(_status(data, start, end) if end > start else 0)
             return False
         if kind == _ERROR:
             _raise(_status(data, start, end))
@@ -198,8 +200,8 @@ def _status(data: bytes, start: int, end: int) -> int:
     if end - start < _ERRNO.size:
         raise MalformedAnswer(f"an error of {end - start} bytes")
     number: int = _ERRNO.unpack_from(data, start)[0]
-    if number > 0:
-        raise MalformedAnswer(f"an error with the positive number {number}")
+    if not -_ERRNO_MAX <= number <= 0:
+        raise MalformedAnswer(f"an error with the number {number}")
     return number
 
 

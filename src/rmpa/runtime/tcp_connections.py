@@ -39,8 +39,8 @@ _GONE: Final = frozenset({errno.ENOENT, errno.ESTALE})
 _UNSUPPORTED: Final = frozenset({errno.EOPNOTSUPP, errno.EINVAL})
 """``EINVAL`` comes from kernels before 4.5, which do not know the message."""
 REMEDY: Final = (
-    "run the agent with CAP_NET_ADMIN: `AmbientCapabilities=CAP_NET_ADMIN` in its systemd unit, or "
-    "`setcap cap_net_admin+ep` on its Python interpreter"
+    "run the agent with CAP_NET_ADMIN: `AmbientCapabilities=CAP_NET_ADMIN` in its systemd unit, "
+    "`--cap-add NET_ADMIN` for Docker, or `setcap cap_net_admin+ep PYTHON`"
 )
 """What gives an agent the right to end connections."""
 
@@ -81,7 +81,7 @@ def ask_listening_ports() -> set[int] | None:
 
 
 def listening_addresses(port: int) -> frozenset[str] | None:
-    """The local addresses of the sockets in state LISTEN at a port, in some 0.05 ms.
+    """The local addresses of the sockets in state LISTEN at a port, in some 0.1 ms.
 
     Returns:
         ``"0.0.0.0"`` and ``"::"`` for any address (``"::"`` may be for IPv6 alone), ``"127.0.0.1"``…; empty where
@@ -225,8 +225,8 @@ def _socket(connection: TcpConnection) -> InetSocket:
 def may_end_connections() -> str:
     """Whether this process may end connections: an empty text, or why not, with the remedy after the first ``"; "``.
 
-    It tries once, on a connection of its own over loopback, in some 0.3 ms; later calls return the same. An attempt
-    that fails for another reason, as a lack of file descriptors, is made again by the next call.
+    It tries once, on a connection of its own over loopback, in about a millisecond; later calls return the same. An
+    attempt that fails for another reason, as a lack of file descriptors, is made again by the next call.
     """
     try:
         return try_to_end()

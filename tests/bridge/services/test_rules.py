@@ -10,6 +10,7 @@ from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.services.rules import ServiceRules
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceRule, ServiceSettings
+from rmpa.core.contract import Transport
 
 if TYPE_CHECKING:
     from rmpa.bridge.services.exports import ServiceExports
@@ -63,3 +64,20 @@ def test_the_first_rule_that_fits_says_how_long_a_call_may_take() -> None:
         ServiceSettings(timeout=5.0, rules=(ServiceRule(("/plan/**",), 300.0), ServiceRule(("/plan/quick",), 1.0)))
     )
     assert [made.timeout(service) for service in ("/add", "/plan/path", "/plan/quick")] == [5.0, 300.0, 300.0]
+
+
+def test_the_first_rule_that_says_a_transport_gives_it() -> None:
+    said = (
+        ServiceRule(("/plan/**",), 300.0),
+        ServiceRule(("/plan/ik",), transport=Transport.DIRECT),
+        ServiceRule(("/**/ik", "/map"), 1.0, Transport.RELAY),
+    )
+    made = rules(ServiceSettings(transport=Transport.AUTO, rules=said))
+    services = ("/add", "/plan/path", "/plan/ik", "/arm/ik")
+    assert [made.transport(service) for service in services] == [
+        *(Transport.AUTO, Transport.AUTO, Transport.DIRECT, Transport.RELAY)
+    ]
+    assert [made.timeout(service) for service in services] == [60.0, 300.0, 300.0, 1.0]
+    assert [made.has_timeout(service) for service in services] == [False, True, True, True]
+    assert rules().transport("/add") is Transport.RELAY
+    assert rules(ServiceSettings(timeout=5.0)).has_timeout("/add")

@@ -19,14 +19,15 @@ def main() -> None:
     options.add_argument("--source", type=int, default=1, help="this sender's number")
     options.add_argument("--latch", action="store_true")
     options.add_argument("--wait", type=int, default=0, help="subscribers to wait for before the first message")
-    options.add_argument("--queue", type=int, default=10000)
+    options.add_argument("--queue", type=int, default=10000, help="below 0: none, so that publish() writes itself")
     options.add_argument("--type", choices=["UInt8MultiArray", "String"], default="UInt8MultiArray")
     options.add_argument("--another-md5", action="store_true", help="the same name, not the same fields")
     args = options.parse_args(rospy.myargv(sys.argv)[1:])
     rospy.init_node(args.name or "talker", anonymous=not args.name, disable_signals=False)
     kind = String if args.type == "String" else UInt8MultiArray
     kind = of_another_release(kind) if args.another_md5 else kind
-    publisher = rospy.Publisher(args.topic, kind, queue_size=args.queue, latch=args.latch, tcp_nodelay=args.nodelay)
+    queue = args.queue if args.queue >= 0 else None
+    publisher = rospy.Publisher(args.topic, kind, queue_size=queue, latch=args.latch, tcp_nodelay=args.nodelay)
     say("up", node=rospy.get_name())
     while publisher.get_num_connections() < args.wait and not rospy.is_shutdown():
         time.sleep(0.01)

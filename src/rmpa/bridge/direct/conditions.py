@@ -7,10 +7,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.messages import is_crossing_name
+from rmpa.core.contract import Transport, needs_agents
 from rmpa.core.errors import RemoteProtocolError
+
+if TYPE_CHECKING:
+    from rmpa.core.contract import Contract
 
 _TEXT_MAX: Final = 300
 """Characters of a peer's text that are kept."""
@@ -122,3 +126,16 @@ def reply_of(found: Grant | Unmet) -> dict[str, object]:
     if isinstance(found, Grant):
         return {"port": found.port, "probe": found.probe}
     return {"why": found.condition.value, "text": found.text}
+
+
+def unmet_by_contract(contract: Contract, where: str) -> Unmet | None:
+    """The condition that a contract does not meet, if any.
+
+    Args:
+        contract: The contract.
+        where: Whose it is, as text.
+    """
+    if contract.transport is Transport.RELAY:
+        return Unmet(Condition.TRANSPORT, f'transport is "relay" in {where}')
+    terms = needs_agents(contract)
+    return Unmet(Condition.CONTRACT, f"the contract asks for what only agents do: {terms}") if terms else None

@@ -225,7 +225,7 @@ class DirectSubscriptions:
         """The subscribers whose last answer was the publisher's address."""
         return [(key, route) for key, route in self._routes.items() if route.path is Path.DIRECT]
 
-    # --- the local graph -------------------------------------------------------------------------------------------
+    # --- the local graph --------------------------------------------------------------------------------------------
 
     def consider(self, key: DirectKey, wanted: Transport, unmet: Unmet | None, now: float) -> list[DirectAction]:
         """Judge a subscriber that is new, or for which something changed here.
@@ -327,7 +327,7 @@ class DirectSubscriptions:
         latched = route.unmet is not None and route.unmet.condition is Condition.LATCHED
         return self._ask(key, route, now) if latched else []
 
-    # --- the peer ------------------------------------------------------------------------------------------------
+    # --- the peer ---------------------------------------------------------------------------------------------------
 
     def replied(self, key: DirectKey, attempt: int, found: Grant | Unmet, now: float) -> list[DirectAction]:
         """Take the response to ``Ask``; a grant that is not needed any more is released.
@@ -443,7 +443,7 @@ class DirectSubscriptions:
             return [*released, *self._relay(key, route, _UNSTABLE, now)]
         return [*released, *self._ask(key, route, now)]
 
-    # --- links ---------------------------------------------------------------------------------------------------
+    # --- links ------------------------------------------------------------------------------------------------------
 
     def link_down(self, peer: int, now: float, *, crashed: bool) -> list[DirectAction]:
         """Handle the loss of a peer's link.
@@ -481,7 +481,7 @@ class DirectSubscriptions:
             for action in self._ask(key, route, now)
         ]
 
-    # --- timers --------------------------------------------------------------------------------------------------
+    # --- timers -----------------------------------------------------------------------------------------------------
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due, monotonic seconds; ``None`` if no timer runs."""
@@ -496,7 +496,7 @@ class DirectSubscriptions:
                 actions += self._ask(key, route, now)
         return actions
 
-    # --- inside --------------------------------------------------------------------------------------------------
+    # --- inside -----------------------------------------------------------------------------------------------------
 
     @staticmethod
     def _unstable(route: DirectRoute, now: float) -> bool:

@@ -1,4 +1,4 @@
-"""Which services may cross, their names at a peer and here, and the time-out of a call. Without I/O."""
+"""Which services may cross, their names at a peer and here, the time-out of a call and its path. Without I/O."""
 
 from __future__ import annotations
 
@@ -6,11 +6,15 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import PolicyDecision, is_own
+from rmpa.config import limits as config_limits
 from rmpa.core.names import matches
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from rmpa.bridge.policy import Policy
-    from rmpa.config.settings import ServiceSettings
+    from rmpa.config.settings import ServiceRule, ServiceSettings
+    from rmpa.core.contract import Transport
 
 OWN_SERVICES: Final = "/rmpa/**"
 LOGGERS: Final = ("**/get_loggers", "**/set_logger_level")
@@ -78,9 +82,28 @@ class ServiceRules:
     def timeout(self, service: str) -> float:
         """The time-out of a call of a service, in seconds.
 
-        It is that of the first ``[[service]]`` that fits the service's name, else that of ``[services]``.
+        It is that of the first ``[[service]]`` that fits the service's name and says one, else that of
+        ``[services]``.
         """
-        for rule in self._settings.rules:
-            if any(matches(pattern, service) for pattern in rule.names):
-                return rule.timeout
-        return self._settings.timeout
+        said = (rule.timeout for rule in self._fitting(service) if rule.timeout is not None)
+        return next(said, self._settings.timeout)
+
+    def has_timeout(self, service: str) -> bool:
+        """Whether a service has another time-out than the built-in one.
+
+        Only agents keep time-outs: a call from node to node has none.
+        """
+        return self.timeout(service) != config_limits.SERVICE_TIMEOUT
+
+    def transport(self, service: str) -> Transport:
+        """The path of a service's calls that this module wants.
+
+        It is that of the first ``[[service]]`` that fits the service's name and says one, else that of
+        ``[services]``.
+        """
+        said = (rule.transport for rule in self._fitting(service) if rule.transport is not None)
+        return next(said, self._settings.transport)
+
+    def _fitting(self, service: str) -> Iterator[ServiceRule]:
+        """The rules ``[[service]]`` that fit a service, in order."""
+        return (rule for rule in self._settings.rules if any(matches(pattern, service) for pattern in rule.names))

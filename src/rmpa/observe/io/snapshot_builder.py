@@ -13,6 +13,7 @@ import psutil
 
 import rmpa
 from rmpa.observe import limits
+from rmpa.observe.io.direct_section import DirectSection
 from rmpa.observe.io.peers_section import PeersSection, own_text
 from rmpa.observe.io.services_section import ServicesSection
 from rmpa.observe.io.topics_section import TopicsSection, unreachable_infos
@@ -21,6 +22,7 @@ from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.descriptors import DESCRIPTORS
 from rmpa.runtime.event_loop import yield_to_data
 from rmpa.runtime.realtime import refused
+from rmpa.runtime.tcp_connections import may_end_connections
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator
@@ -81,7 +83,11 @@ class SnapshotBuilder:
         self._cpu: float | None = None
         self._cpu_known = time.monotonic()
         self._peers = PeersSection(sources.bridge, sources.limit_reports)
-        self._topics = TopicsSection(settings, sources.core, sources.bridge, sources.clocks)
+        self.direct = DirectSection(sources.core, sources.bridge)
+        """What is known of direct transport."""
+        self.sampler = self.direct.sampler
+        """The figures of direct connections, which are read only while somebody looks."""
+        self._topics = TopicsSection(settings, sources.core, sources.bridge, sources.clocks, self.direct)
         self._services = ServicesSection(sources.services)
 
     @property
@@ -160,6 +166,7 @@ class SnapshotBuilder:
             proxy_sockets=bridge.proxy_nodes.sockets(proxies),
             proxy_listening=bridge.proxy_nodes.listening,
             core_memory=core.restored(),
+            end_connections=may_end_connections(),
         )
 
     def _cpu_share(self) -> float | None:

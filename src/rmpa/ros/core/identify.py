@@ -7,10 +7,10 @@ import logging
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.sizes import KIB
 from rmpa.ros import limits
 from rmpa.ros.http.client import call_api, connect
-from rmpa.ros.wire.tcpros import encode_header, parse_header, subscriber_header
+from rmpa.ros.node.probe import exchange_headers
+from rmpa.ros.wire.tcpros import subscriber_header
 from rmpa.ros.wire.xmlrpc import RosFault
 from rmpa.runtime.descriptors import Use
 
@@ -21,7 +21,6 @@ _log = logging.getLogger(__name__)
 
 _CALLER_ID: Final = "/rmpa_identify"
 _TOPICS_ASKED: Final = 2
-_CHUNK: Final = 64 * KIB
 
 
 async def name_at(api: str, topics: Sequence[str] = ()) -> str | None:
@@ -68,18 +67,9 @@ async def _publisher_of(api: str, topic: str) -> str | None:
 
 
 async def _callerid(host: str, port: int, topic: str) -> str | None:
-    loop = asyncio.get_running_loop()
     sock = await connect(host, port, Use.CORE)
     try:
-        await loop.sock_sendall(sock, encode_header(subscriber_header(topic, _CALLER_ID)))
-        data = b""
-        while True:
-            fields, _, _ = parse_header(data)
-            if fields is not None:
-                return fields.get("callerid")
-            chunk = await loop.sock_recv(sock, _CHUNK)
-            if not chunk:
-                return None
-            data += chunk
+        fields = await exchange_headers(sock, subscriber_header(topic, _CALLER_ID))
     finally:
         sock.close()
+    return None if fields is None else fields.get("callerid")

@@ -1,4 +1,19 @@
-"""Answers of other nodes to ``getBusInfo``. Pure; replaced soon by a complete reader."""
+"""What other nodes answer to ``getBusInfo`` and ``getBusStats``: their topic connections, and the traffic of each.
+
+Pure. The wiki (wiki.ros.org/ROS/Slave_API) leaves much open, and the libraries differ:
+
+* roscpp's ``getBusStats`` answers ``[publications, subscriptions]`` alone, without code, status and services. Of a
+  subscription it lists only the publisher that connected last.
+* A connection of a publication is ``[number, bytes, messages, connected]`` in rospy (as on the wiki), and
+  ``[number, bytes, bytes of messages, messages, 0]`` in roscpp.
+* rospy counts the bytes of the connection headers too; roscpp counts only messages, and at the receiver without the
+  4-byte length in front of each.
+* XML-RPC's integers are signed and have 32 bits. roscpp's numbers wrap: after 2 GiB they are negative. rospy's cannot
+  be written then: once a publication has sent 2 GiB or a connection has carried as much, ``getBusStats`` of that node
+  is a fault ("int exceeds XML-RPC limits") until the publication or the connection ends.
+
+A row that cannot be read is left out, and so is what is unknown in one that can: a node may be of any library.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +21,38 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from rmpa.core.sizes import INT32_MIN, UINT32_MAX
+from rmpa.ros.wire.slave_api import INBOUND, OUTBOUND, TCPROS
+
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
-_INFO: Final = re.compile(r"port (\d+) to \[([^\]\s]+):(\d+)")
+_INFO: Final = re.compile(r"on port ([0-9]{1,5}) to \[([^\s\[\]]+):([0-9]{1,5})(?: on socket \w+)?\]")
+"""``TCPROS connection on port 46087 to [10.0.0.1:45225 on socket 12]``; the socket is not always named."""
+_CLOSED: Final = "Closed "
+"""How rospy's text begins for a connection that has ended; the row says that it is connected all the same."""
+_PORT_MAX: Final = 65535
+_SUCCESS: Final = 1
+_REPLY_LENGTH: Final = 3
+_ROSCPP_SENT_LENGTH: Final = 5
 
 
 @dataclass(frozen=True, slots=True)
 class BusLink:
-    """One topic connection of a node."""
+    """One connection of a node, as ``getBusInfo`` has it.
+
+    Args:
+        number: Its number within the node; ``BusTraffic`` has the same one.
+        other: The other side: a subscriber's caller id, or a publisher's slave API URI.
+        inbound: Whether it is from a publisher; else it is to a subscriber.
+        topic: The topic.
+        connected: Whether messages can flow, as far as the node knows.
+        local_port: The port of the node's end of a TCP connection; ``None`` if the node does not say it.
+        remote: Host and port of the other end of a TCP connection, likewise. The host is an address, or the name that
+            the publisher goes by.
+    """
 
     number: int
     other: str
@@ -25,23 +63,116 @@ class BusLink:
     remote: tuple[str, int] | None
 
 
-def read_bus_info(value: XmlRpcValue) -> list[BusLink]:
-    """Read the answer ``[code, status, links]``."""
-    links = value[2] if isinstance(value, list) and len(value) == 3 else []
-    found = []
-    for link in links if isinstance(links, list) else []:
-        if not isinstance(link, list) or len(link) < 6:
-            continue
-        match = _INFO.search(str(link[6])) if len(link) > 6 else None
-        found.append(
-            BusLink(
-                link[0] if isinstance(link[0], int) else 0,
-                str(link[1]),
-                link[2] == "i",
-                str(link[4]),
-                bool(link[5]),
-                int(match[1]) if match else None,
-                (match[2], int(match[3])) if match else None,
-            )
-        )
-    return found
+@dataclass(frozen=True, slots=True)
+class BusTraffic:
+    """The traffic of one connection of a node since it began, as ``getBusStats`` has it.
+
+    Args:
+        number: The connection's number within the node.
+        topic: The topic.
+        inbound: Whether it is from a publisher; else it is to a subscriber.
+        bytes: Bytes carried, modulo 2**32: of two readings take the difference modulo 2**32.
+        messages: Messages carried, likewise; ``None`` if the node does not say it.
+        dropped: Messages dropped because the node's own queue was full; ``None``: unknown, as always outbound.
+    """
+
+    number: int
+    topic: str
+    inbound: bool
+    bytes: int
+    messages: int | None
+    dropped: int | None
+
+
+def read_bus_info(answer: XmlRpcValue) -> list[BusLink]:
+    """The connections of a node.
+
+    Args:
+        answer: The node's answer to ``getBusInfo``: code, status and value, or the value alone.
+    """
+    return [link for row in _list(_value_of(answer)) if (link := _link(_list(row))) is not None]
+
+
+def read_bus_stats(answer: XmlRpcValue) -> list[BusTraffic]:
+    """The traffic of a node's connections.
+
+    Args:
+        answer: The node's answer to ``getBusStats``: code, status and value, or the value alone.
+    """
+    value = _list(_value_of(answer))
+    return [*_traffic(_at(value, 0), inbound=False), *_traffic(_at(value, 1), inbound=True)]
+
+
+def _value_of(answer: XmlRpcValue) -> XmlRpcValue:
+    """The value in an answer with code and status; nothing if the code is that of an error."""
+    parts = _list(answer)
+    if len(parts) == _REPLY_LENGTH and (code := _int(parts[0])) is not None:
+        return parts[2] if code == _SUCCESS else None
+    return answer
+
+
+def _link(row: Sequence[XmlRpcValue]) -> BusLink | None:
+    number, other, direction, topic, info = _int(_at(row, 0)), _at(row, 1), _at(row, 2), _at(row, 4), _at(row, 6)
+    if number is None or not isinstance(other, str) or not isinstance(topic, str):
+        return None
+    if direction not in (INBOUND, OUTBOUND):
+        return None
+    text = info if isinstance(info, str) else ""
+    local, remote = _addresses(text) if _at(row, 3) == TCPROS else (None, None)
+    standing = _at(row, 5) in (True, 1) and not text.startswith(_CLOSED)
+    return BusLink(number, other, direction == INBOUND, topic, standing, local, remote)
+
+
+def _addresses(info: str) -> tuple[int | None, tuple[str, int] | None]:
+    """The local port, and the remote host and port, in the text about a connection."""
+    found = _INFO.search(info)
+    if found is None:
+        return None, None
+    local, host, port = int(found[1]), found[2], int(found[3])
+    return (local if 0 < local <= _PORT_MAX else None, (host, port) if 0 < port <= _PORT_MAX else None)
+
+
+def _traffic(topics: XmlRpcValue, *, inbound: bool) -> Iterator[BusTraffic]:
+    """The traffic of all connections of the publications, or of the subscriptions."""
+    for entry in map(_list, _list(topics)):
+        # Between topic and connections rospy's publications have the bytes of all.
+        if len(entry) > 1 and isinstance(topic := entry[0], str):
+            for row in map(_list, _list(entry[-1])):
+                read = _received(topic, row) if inbound else _sent(topic, row)
+                if read is not None:
+                    yield read
+
+
+def _sent(topic: str, row: Sequence[XmlRpcValue]) -> BusTraffic | None:
+    messages = 3 if len(row) >= _ROSCPP_SENT_LENGTH else 2
+    number, size = _int(_at(row, 0)), _count(_at(row, 1))
+    if number is None or size is None:
+        return None
+    return BusTraffic(number, topic, False, size, _count(_at(row, messages)), None)
+
+
+def _received(topic: str, row: Sequence[XmlRpcValue]) -> BusTraffic | None:
+    number, size, dropped = _int(_at(row, 0)), _count(_at(row, 1)), _int(_at(row, 3))
+    if number is None or size is None:
+        return None
+    # rospy has -1: it does not count what it drops.
+    known = dropped if dropped is not None and dropped >= 0 else None
+    return BusTraffic(number, topic, True, size, _count(_at(row, 2)), known)
+
+
+def _list(value: XmlRpcValue) -> Sequence[XmlRpcValue]:
+    return value if isinstance(value, list | tuple) else ()
+
+
+def _at(row: Sequence[XmlRpcValue], index: int) -> XmlRpcValue:
+    return row[index] if index < len(row) else None
+
+
+def _int(value: XmlRpcValue) -> int | None:
+    return value if isinstance(value, int) and not isinstance(value, bool) else None
+
+
+def _count(value: XmlRpcValue) -> int | None:
+    """A number that only grows, modulo 2**32: roscpp's are negative from 2**31 on."""
+    number = _int(value)
+    return number % (UINT32_MAX + 1) if number is not None and INT32_MIN <= number <= UINT32_MAX else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
@@ -16,9 +17,11 @@ from rmpa.runtime.tcp_connections import connections, end_connections
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
+    from rmpa.core.counters import Counters
     from rmpa.ros.wire.bus import BusLink
     from rmpa.runtime.tcp_connections import TcpConnection
 
+_log = logging.getLogger(__name__)
 MASTER: Final = "/master"
 """The caller id of ``publisherUpdate``, as rosmaster has it."""
 _STANDING: Final = frozenset({"ESTABLISHED", "SYN_SENT", "CLOSE_WAIT"})
@@ -77,18 +80,18 @@ def standing(endpoint: tuple[str, int]) -> set[int]:
     return {one.local[1] for one in found if one.state in _STANDING}
 
 
-def end_to(endpoint: tuple[str, int], ports: set[int]) -> str:
+def end_to(endpoint: tuple[str, int], ports: set[int] | None = None) -> str:
     """End connections from this machine to a publisher's address.
 
     Args:
         endpoint: The address and port.
-        ports: The local ports of those to end: other programs may be connected there too.
+        ports: The local ports of those to end: other programs may be connected there too. ``None``: all of them.
 
     Returns:
         Empty if none is left, else why they could not be ended.
     """
-    found = [one for one in connections(remote=endpoint) or [] if one.local[1] in ports and one.local != endpoint]
-    return _end(found)
+    found = connections(remote=endpoint)
+    return _end(None if found is None else [one for one in found if ports is None or one.local[1] in ports])
 
 
 async def end_links(endpoint: tuple[str, int], links: Iterable[BusLink]) -> str:
@@ -112,10 +115,12 @@ async def end_links(endpoint: tuple[str, int], links: Iterable[BusLink]) -> str:
 
 def end_from(port: int, address: str) -> str:
     """End the connections of a local publisher, by its port, to a peer's address; return why it failed, or empty."""
-    return _end(connections(local_port=port, remote=(address, None)) or [])
+    return _end(connections(local_port=port, remote=(address, None)))
 
 
-def _end(found: list[TcpConnection]) -> str:
+def _end(found: list[TcpConnection] | None) -> str:
+    if found is None:
+        return "the kernel does not say which connections there are"
     if not found:
         return ""
     try:
@@ -123,3 +128,10 @@ def _end(found: list[TcpConnection]) -> str:
     except OSError as error:
         return error.strerror or str(error)
     return ""
+
+
+def report_failure(task: asyncio.Task[None], counters: Counters) -> None:
+    """Log and count the exception of a task that has ended, if there is one."""
+    if not task.cancelled() and (error := task.exception()) is not None:
+        counters.add("direct.failed")
+        _log.error("! %s failed", task.get_name(), exc_info=error)

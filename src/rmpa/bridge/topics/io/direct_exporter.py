@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct import requests
-from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, reply_of
+from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, reply_of, unmet_by_contract
 from rmpa.bridge.direct.io.nodes import end_from
 from rmpa.bridge.direct.publisher_side import DirectGrants, EndConnections, Granted, Retry, Withdraw
 from rmpa.bridge.direct.requests import DirectClosed, RetryDirect
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import is_own
 from rmpa.bridge.topics.audience import is_watched
-from rmpa.core.contract import Contract, Transport, combine, needs_agents
+from rmpa.core.contract import combine
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
 
 if TYPE_CHECKING:
@@ -223,16 +223,3 @@ class DirectExporter:
                     self._rpc.notify(session, requests.RETRY, requests.write(again))
                 case _:
                     pass
-
-
-def unmet_by_contract(contract: Contract, where: str) -> Unmet | None:
-    """The condition that a contract does not meet, if any.
-
-    Args:
-        contract: The contract.
-        where: Whose it is, as text.
-    """
-    if contract.transport is Transport.RELAY:
-        return Unmet(Condition.TRANSPORT, f'transport is "relay" in {where}')
-    terms = needs_agents(contract)
-    return Unmet(Condition.CONTRACT, f"the contract asks for what only agents do: {terms}") if terms else None

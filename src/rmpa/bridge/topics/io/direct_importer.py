@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct import requests
-from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, read_unmet
-from rmpa.bridge.direct.io.nodes import direct_links, end_links, publisher_update, standing, until
+from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, read_unmet, unmet_by_contract
+from rmpa.bridge.direct.io.nodes import direct_links, end_links, report_failure, standing
 from rmpa.bridge.direct.requests import CloseDirect, OpenDirect
 from rmpa.bridge.direct.subscriber_side import (
     Ask,
     Decided,
     DirectKey,
-    DirectState,
     DirectSubscriptions,
     Fallback,
     HangUp,
@@ -27,8 +26,7 @@ from rmpa.bridge.direct.subscriber_side import (
 )
 from rmpa.bridge.policy import is_own
 from rmpa.bridge.topics.audience import is_watched
-from rmpa.bridge.topics.io.direct_exporter import unmet_by_contract
-from rmpa.bridge.topics.remote_topic import RouteState
+from rmpa.bridge.topics.io.direct_moves import SubscriberMoves
 from rmpa.core.contract import Transport
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.ros.environment import host_of, is_loopback
@@ -95,19 +93,23 @@ class DirectImporter:
         self._contracts = contracts
         self._sessions = sessions
         self._rpc = rpc
-        self._on_demand = on_demand
         self._on_warning = on_warning
         self._counters = counters
         self.routes = DirectSubscriptions(self._is_latched, self._is_relayed)
         """The state of each subscriber."""
         self._timer = MachineTimer(self.routes.next_timer, lambda now: self._act(self.routes.handle_timer(now)))
         self._waiting: dict[DirectKey, list[asyncio.Future[None]]] = {}
-        self._moves: dict[DirectKey, asyncio.Task[None]] = {}
+        self._moves = SubscriberMoves(
+            core,
+            imports,
+            topics,
+            sessions,
+            self.routes,
+            on_demand=on_demand,
+            on_warning=on_warning,
+            counters=counters,
+        )
         self._tasks: set[asyncio.Task[None]] = set()
-        self._hang_ups: dict[DirectKey, asyncio.Task[None]] = {}
-        """The calls that make subscribers hang up, for which their moves wait."""
-        self._again: set[DirectKey] = set()
-        """Subscribers to be judged again when their move is over."""
         self._adrift: dict[int, list[RemoteTopic]] = {}
         """The sources of each peer that are kept because of direct subscribers while its agent is gone."""
         self._strays: dict[tuple[str, str], tuple[str, int]] = {}
@@ -115,6 +117,8 @@ class DirectImporter:
         self._asking: dict[int, asyncio.Semaphore] = {}
         self._checking: asyncio.TimerHandle | None = None
         self._closed = False
+        self._started = self._now()
+        """Subscribers may have direct connections from before this moment, of an earlier run of this agent."""
         rpc.on_notification(requests.CLOSED, self._closed_there)
         rpc.on_notification(requests.RETRY, self._retry)
 
@@ -208,15 +212,20 @@ class DirectImporter:
     def request(self, peer: int, source: Source, subscriber: str) -> Awaitable[RosReply | None] | None:
         """Answer a subscriber's ``requestTopic`` at the proxy of a source; see ``Publication.on_request``."""
         key = DirectKey(peer, source, subscriber)
-        if self.routes.get(key) is None:
+        if self.routes.get(key) is None and not self._is_new and not self._moves.is_stuck(key):
             return None
         return self._answer(key)
+
+    @property
+    def _is_new(self) -> bool:
+        """Whether subscribers may still have direct connections of an earlier run of this agent."""
+        return self._now() < self._started + limits.DIRECT_ADOPT
 
     async def _answer(self, key: DirectKey) -> RosReply | None:
         if self.routes.decision(key) is None:
             await self._decision(key)
-        topic = key.source.topic
-        uri = self._core.state().subscribers.get(topic, {}).get(key.subscriber, "")
+        entry, topic = self._imports.get(key.peer, key.source), key.source.topic
+        uri = self._moves.uri(key.subscriber, topic)
         stray = self._strays.get((topic, key.subscriber))
         session = self._sessions.get(key.peer)
         decision = self.routes.decision(key)
@@ -230,12 +239,29 @@ class DirectImporter:
                 return self._answered(key, direct, RosReply(0, "connected to the publisher already", []))
             if problem := await end_links(endpoint, links):
                 self._act(self.routes.answered(key, endpoint, self._now()))
-                self._stuck(key, endpoint, problem)
+                self._moves.stuck(key, endpoint, problem)
                 return RosReply(0, "connected to the publisher directly still", [])
+        if direct is None and entry is not None and session is not None:
+            left = await self._left_by_others(key, entry.topic, session.address)
+            if left is not None:
+                return left
         if self.routes.decision(key) != decision or direct is None:
             return self._answered(key, None, None)  # it is moved if it is direct by now
         reply = RosReply(1, f"ready on {direct[0]}:{direct[1]}", [TCPROS, direct[0], direct[1]])
         return self._answered(key, direct, reply)
+
+    async def _left_by_others(self, key: DirectKey, topic: str, address: str) -> RosReply | None:
+        """Ends direct connections that no present decision knows of; the answer to give if one cannot be ended."""
+        if not self._is_new and not self._moves.is_stuck(key):
+            return None
+        endpoint, problem = await self._moves.end_unknown(key, topic, address)
+        if endpoint is None:
+            return None
+        self._act(self.routes.answered(key, endpoint, self._now()))
+        if (route := self.routes.get(key)) is not None:
+            route.stuck = problem
+        self._watch()
+        return RosReply(0, f"connected to {endpoint[0]}:{endpoint[1]} still", [])
 
     def _endpoint(self, key: DirectKey) -> tuple[str, int] | None:
         """Where a subscriber was connected directly by its last answer."""
@@ -324,7 +350,7 @@ class DirectImporter:
                 self._start(self._end_stray(topic, subscriber, endpoint), f"end {subscriber}'s connection")
 
     async def _end_stray(self, topic: str, subscriber: str, endpoint: tuple[str, int]) -> None:
-        uri = self._core.state().subscribers.get(topic, {}).get(subscriber, "")
+        uri = self._moves.uri(subscriber, topic)
         links = await direct_links(uri, topic, endpoint) if uri and standing(endpoint) else None
         await end_links(endpoint, links or ())
 
@@ -390,10 +416,10 @@ class DirectImporter:
                 case Decided(key):
                     self._decided(key)
                 case Move(key):
-                    self._move_soon(key)
+                    self._moves.move(key)
                 case HangUp(key, endpoint):
                     self._counters.add("direct.hung_up")
-                    self._hang_ups[key] = self._start(self._hang_up(key, endpoint), f"hang up {key.subscriber}")
+                    self._moves.hang_up(key, endpoint)
                 case Release(key, broken):
                     self._release(key, broken=broken)
                 case Fallback(key, unmet):
@@ -422,11 +448,7 @@ class DirectImporter:
 
     def _ended(self, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
-        for key in [one for one, hanging in self._hang_ups.items() if hanging is task]:
-            del self._hang_ups[key]
-        if not task.cancelled() and (error := task.exception()) is not None:
-            self._counters.add("direct.failed")
-            _log.error("! %s failed", task.get_name(), exc_info=error)
+        report_failure(task, self._counters)
 
     def _watch(self) -> None:
         """Begins to watch direct connections."""
@@ -436,116 +458,6 @@ class DirectImporter:
     def _publication(self, peer: int, source: Source) -> Publication | None:
         topics = self._topics.get(peer)
         return topics.publication(source) if topics is not None else None
-
-    def _uri(self, key: DirectKey, entry: RemoteTopic) -> str:
-        """The slave API of a subscriber; empty if it is not registered."""
-        return self._core.state().subscribers.get(entry.topic, {}).get(key.subscriber, "")
-
-    # --- moving a subscriber ----------------------------------------------------------------------------------------
-
-    def _move_soon(self, key: DirectKey) -> None:
-        task = self._moves.get(key)
-        if task is not None:
-            self._again.add(key)
-            return
-        task = self._moves[key] = self._start(self._move(key), f"move {key.subscriber}")
-        task.add_done_callback(lambda _: self._moved(key))
-
-    def _moved(self, key: DirectKey) -> None:
-        """Moves a subscriber again if the decision has changed since it was called back."""
-        self._moves.pop(key, None)
-        again = key in self._again
-        self._again.discard(key)
-        if again and not self._closed and self.routes.misplaced(key):
-            self._move_soon(key)
-
-    async def _hang_up(self, key: DirectKey, endpoint: tuple[str, int]) -> None:
-        """Makes a subscriber leave its direct connection: roscpp by the list of publishers, rospy by the kernel."""
-        topic, proxy = key.source.topic, self._proxy_uri(key)
-        uri = self._core.state().subscribers.get(topic, {}).get(key.subscriber, "")
-        if not uri:
-            return
-        links = await direct_links(uri, topic, endpoint)
-        await publisher_update(uri, topic, [one for one in self._core.publishers(topic).values() if one != proxy])
-        if problem := await end_links(endpoint, links or ()):
-            self._stuck(key, endpoint, problem)
-
-    def _stuck(self, key: DirectKey, endpoint: tuple[str, int], problem: str) -> None:
-        route = self.routes.get(key)
-        if route is not None:
-            route.stuck = problem
-        text = (
-            f"{key.source}: {key.subscriber} stays connected to {endpoint[0]}:{endpoint[1]}: a rospy subscriber "
-            f"leaves only when its connection is ended, and this agent may not do that ({problem}); see rmpa doctor"
-        )
-        self._on_warning("direct.stuck", f"{key.peer} {key.source} {key.subscriber}", text)
-
-    def _proxy_uri(self, key: DirectKey) -> str:
-        session = self._sessions.get(key.peer)
-        proxy = session.proxies.get(key.source.node) if session is not None else None
-        return proxy.uri if proxy is not None else ""
-
-    async def _move(self, key: DirectKey) -> None:
-        """Makes a subscriber leave its present connection, and calls it back to get the other answer."""
-        if (hanging := self._hang_ups.pop(key, None)) is not None:
-            await asyncio.wait([hanging])
-        entry, route = self._imports.get(key.peer, key.source), self.routes.get(key)
-        publication = self._publication(key.peer, key.source)
-        if entry is None or route is None or publication is None:
-            return
-        uri, proxy, session = self._uri(key, entry), self._proxy_uri(key), self._sessions.get(key.peer)
-        if not uri or not proxy or session is None:
-            return
-        elsewhere = route.endpoint is not None and route.endpoint[0] != session.address
-        if not elsewhere and not self.routes.misplaced(key):
-            return  # decided otherwise meanwhile
-        to_relay = route.state is DirectState.RELAYED
-        held = to_relay and route.path is Path.DIRECT
-        if held:
-            # Make before break: the relayed route flows, and its latched message is known, before the other ends.
-            self._on_demand(key.peer, key.source, True)
-            await until(lambda: entry.state is RouteState.OPEN, limits.DIRECT_MOVE_ROUTE)
-        try:
-            had, begin = publication.latched if held else (), publication.messages
-            if not await self._leave(key, route, publication, uri, proxy):
-                return
-            publication.spare(key.subscriber, had)
-            self._counters.add("direct.moved")
-            await publisher_update(uri, entry.topic, list(self._core.publishers(entry.topic).values()))
-            if await self._arrived(key, publication):
-                route.missed += publication.messages - begin
-            elif self.routes.get(key) is route and route.path is Path.NONE:
-                # A list of publishers that the master sent at the same time may have overtaken this one.
-                await publisher_update(uri, entry.topic, list(self._core.publishers(entry.topic).values()))
-        finally:
-            if held and not publication.subscribers:
-                self._on_demand(key.peer, key.source, False)
-
-    async def _leave(self, key: DirectKey, route: Any, publication: Publication, uri: str, proxy: str) -> bool:
-        """Ends a subscriber's present connection to a source; return whether it has none any more."""
-        topic = publication.topic
-        endpoint = route.endpoint if route.path is Path.DIRECT else None
-        links = await direct_links(uri, topic, endpoint) if endpoint is not None else []
-        if links is None and endpoint is not None and standing(endpoint):
-            return False  # the node is stopped: `_check` tries again
-        await publisher_update(uri, topic, [one for one in self._core.publishers(topic).values() if one != proxy])
-        publication.hang_up(key.subscriber)
-        if endpoint is not None and (problem := await end_links(endpoint, links or ())):
-            self._stuck(key, endpoint, problem)
-            return False
-        self.routes.hung_up(key)
-        return True
-
-    async def _arrived(self, key: DirectKey, publication: Publication) -> bool:
-        """Waits until a subscriber that was called back is connected, by either transport."""
-
-        def there() -> bool:
-            route = self.routes.get(key)
-            if route is None or key.subscriber in publication.callers:
-                return True
-            return route.path is Path.DIRECT and route.endpoint is not None and bool(standing(route.endpoint))
-
-        return await until(there, limits.DIRECT_SETTLE)
 
     # --- watching direct connections --------------------------------------------------------------------------------
 
@@ -569,13 +481,13 @@ class DirectImporter:
         for key, endpoint in settled:
             route = self.routes.get(key)
             if route is not None and not route.stuck and self.routes.misplaced(key):
-                self._move_soon(key)
+                self._moves.move(key)
             elif endpoint in short:
                 self._start(self._check_one(key, endpoint), f"check {key.subscriber}")
 
     async def _check_one(self, key: DirectKey, endpoint: tuple[str, int]) -> None:
         entry = self._imports.get(key.peer, key.source)
-        uri = self._uri(key, entry) if entry is not None else ""
+        uri = self._moves.uri(key.subscriber, entry.topic) if entry is not None else ""
         if entry is None or not uri:
             return
         links = await direct_links(uri, entry.topic, endpoint)
@@ -597,4 +509,4 @@ class DirectImporter:
         tasks = list(self._tasks)
         for task in tasks:
             task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await asyncio.gather(*tasks, self._moves.close(), return_exceptions=True)

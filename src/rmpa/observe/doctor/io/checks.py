@@ -32,9 +32,11 @@ from rmpa.observe.doctor.network import (
     judge_rp_filter,
 )
 from rmpa.observe.doctor.ros_environment import RosShell, judge_shell, names_of
+from rmpa.observe.doctor.stale_connections import judge_stale_connections
 from rmpa.observe.io.control_client import ControlClient, find_agents
 from rmpa.observe.snapshot import Snapshot
 from rmpa.ros.environment import DEFAULT_MASTER_URI, host_of
+from rmpa.runtime.tcp_connections import may_end_connections
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -194,6 +196,11 @@ def _rights(given: DoctorInput) -> Iterable[Check]:
     return judge_rights(rights)
 
 
+def _stale_connections(given: DoctorInput) -> Iterable[Check]:
+    told = {name: shown.agent.end_connections for name, shown in given.snapshots.items()}
+    return judge_stale_connections(told, may_end_connections(), direct=given.settings.allows_direct)
+
+
 CHECKS: Final = (
     DoctorCheck("settings", lambda given: given.settings_checks),
     DoctorCheck("agent", lambda given: judge_agents(given.agents, rmpa.__version__)),
@@ -207,5 +214,6 @@ CHECKS: Final = (
     DoctorCheck("ROS", _shell),
     DoctorCheck("clock", lambda _: judge_clock(machine.read_clock())),
     DoctorCheck("realtime", _rights),
+    DoctorCheck("stale connections", _stale_connections),
 )
 """All checks, in the order of the output."""

@@ -14,6 +14,7 @@ from rmpa.core.names import is_global_name
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, Check
 from rmpa.observe.why.diagnosis import BothEnds, Diagnosis, TopicAtPublisher
+from rmpa.observe.why.direct_stages import connected_directly
 from rmpa.observe.why.io.service_evidence import ServiceEvidence
 from rmpa.observe.why.io.topic_evidence import TopicEvidence, name_in
 from rmpa.observe.why.services import ServiceAtServer, diagnose_service
@@ -159,7 +160,8 @@ class WhyService:
         topic, wire = self._topics.there(peer.name, topic)
         ends = await self._both_ends(peer, topic)
         later = None
-        if any(r.state in _MOVING for t in ends.here.snapshot.topics for r in t.routes if r.direction == "in"):
+        routes = [r for t in ends.here.snapshot.topics for r in t.routes if r.direction == "in"]
+        if any(route.state in _MOVING or connected_directly(route) for route in routes):
             # Only a second count shows whether messages flow.
             await asyncio.sleep(observe_limits.WHY_WINDOW)
             later = await self._both_ends(peer, topic)
@@ -171,6 +173,7 @@ class WhyService:
         if session is None:
             return BothEnds(self._topics.here(None, peer, topic), refusal="it is not linked")
         _, wire = self._topics.there(peer.name, topic)
+        await self._snapshots.sampler.settle((topic,))
         question = {"topic": wire, "instance": peer.instance if peer.state == "relayed" else ""}
         try:
             there, refusal = await self._ask(session, TOPIC, question, TopicAtPublisher), ""
