@@ -578,6 +578,7 @@ async def test_a_held_subscriber_counts_as_connected_while_others_are_served(hel
         link.close()
 
 
+@pytest.mark.trap(42)
 async def test_one_subscriber_is_hung_up_on_and_the_others_stay(known: Owner) -> None:
     links = {name: await known.subscriber(callerid=name) for name in ("/one", "/two")}
     for link in links.values():
@@ -594,6 +595,7 @@ async def test_one_subscriber_is_hung_up_on_and_the_others_stay(known: Owner) ->
         link.close()
 
 
+@pytest.mark.trap(42)
 async def test_a_latched_message_that_was_had_by_another_path_is_not_sent_again() -> None:
     owner = Owner(LATCHED)
     owner.publication.publish_framed(frame_message(b"old"))

@@ -131,6 +131,7 @@ async def test_a_port_in_use_is_a_clear_error_and_leaves_nothing_open(node: Slav
 
 
 @pytest.mark.parametrize("other", [RosReply(1, "there", ["TCPROS", "10.0.0.1", 45225]), RosReply(0, "no", []), None])
+@pytest.mark.trap(42)
 async def test_the_answer_to_request_topic_may_take_its_time(node: SlaveNode, other: RosReply | None) -> None:
     asked: list[str] = []
     known = asyncio.Event()
