@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 ParamValue: TypeAlias = Union[  # noqa: UP007 - | does not take the forward references of a recursive type
-    None, bool, int, float, str, bytes, list["ParamValue"], dict[str, "ParamValue"]
+    bool, int, float, str, bytes, list["ParamValue"], dict[str, "ParamValue"], None
 ]
 Payload: TypeAlias = bytes | bytearray | memoryview
 
@@ -66,13 +66,21 @@ class Publish:
 
 @dataclass(frozen=True, slots=True)
 class CallService:
-    """One call; `type` is None where the session does not know it. `timeout` is in seconds, None for the hub's own."""
+    """One call; `type` is None where the session does not know it. `timeout` in seconds; None for the hub's own."""
 
     handle: int
     service: str
     type: str | None
     request: Payload
     timeout: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class FindService:
+    """Asks for the type of a service whose type the graph does not say; answered by `ServiceFound` or `Failed`."""
+
+    handle: int
+    service: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +178,7 @@ Request: TypeAlias = (
     | Unadvertise
     | Publish
     | CallService
+    | FindService
     | CancelCall
     | ServeService
     | EndService
@@ -210,6 +219,15 @@ class ServiceResult:
     ok: bool
     payload: Payload = b""
     error: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceFound:
+    """The answer to `FindService`."""
+
+    handle: int
+    type: str
+    uri: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,4 +288,4 @@ class Failed:
     remedy: str = ""
 
 
-Answer: TypeAlias = Received | ServiceResult | ServiceRequest | ParamsChanged | GraphChanged | Failed
+Answer: TypeAlias = Received | ServiceResult | ServiceFound | ServiceRequest | ParamsChanged | GraphChanged | Failed
