@@ -171,6 +171,30 @@ class UnfollowGraph:
     handle: int
 
 
+@dataclass(frozen=True, slots=True)
+class Describe:
+    """Asks for the definition of a message type, or of a service type where `service`.
+
+    Answered by `Described`, or by `Failed` where it is not known; then by `Described` if it becomes known later.
+    """
+
+    handle: int
+    type: str
+    service: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class FetchAsset:
+    """Asks for a file of a ROS package, `package://NAME/PATH`, of at most `most` bytes.
+
+    The answer is `AssetFetched`, or `Failed`. The hub reads only files inside that package's folder.
+    """
+
+    handle: int
+    uri: str
+    most: int
+
+
 Request: TypeAlias = (
     Subscribe
     | Unsubscribe
@@ -190,6 +214,8 @@ Request: TypeAlias = (
     | UnfollowParams
     | FollowGraph
     | UnfollowGraph
+    | Describe
+    | FetchAsset
 )
 
 
@@ -280,6 +306,27 @@ class GraphChanged:
 
 
 @dataclass(frozen=True, slots=True)
+class Described:
+    """The definition of a type with all that it embeds, as in a TCPROS header; of a service, of both its halves.
+
+    `text` is the message type's, or that of a service's request; `response` that of a service's response.
+    """
+
+    handle: int
+    type: str
+    text: str
+    response: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class AssetFetched:
+    """The contents of a file that `FetchAsset` asked for."""
+
+    handle: int
+    data: Payload
+
+
+@dataclass(frozen=True, slots=True)
 class Failed:
     """The request of `handle` failed, or what it opened has ended; `remedy` says what to do."""
 
@@ -288,4 +335,14 @@ class Failed:
     remedy: str = ""
 
 
-Answer: TypeAlias = Received | ServiceResult | ServiceFound | ServiceRequest | ParamsChanged | GraphChanged | Failed
+Answer: TypeAlias = (
+    Received
+    | ServiceResult
+    | ServiceFound
+    | ServiceRequest
+    | ParamsChanged
+    | GraphChanged
+    | Described
+    | AssetFetched
+    | Failed
+)
