@@ -38,9 +38,11 @@ JSON = {
             metadata={"fg-library": "foxglove-sdk-python/0.30.3"},
             session_id="s1",
         ),
-        b'{"op":"serverInfo","name":"base","capabilities":["clientPublish","parameters","parametersSubscribe",'
-        b'"services","time","connectionGraph","assets"],"supportedEncodings":["ros1"],'
-        b'"metadata":{"fg-library":"foxglove-sdk-python/0.30.3"},"sessionId":"s1"}',
+        (
+            b'{"op":"serverInfo","name":"base","capabilities":["clientPublish","parameters","parametersSubscribe",'
+            b'"services","time","connectionGraph","assets"],"supportedEncodings":["ros1"],'
+            b'"metadata":{"fg-library":"foxglove-sdk-python/0.30.3"},"sessionId":"s1"}'
+        ),
     ),
     "advertise": (
         protocol.Advertise(
@@ -55,8 +57,10 @@ JSON = {
                 ),
             )
         ),
-        b'{"op":"advertise","channels":[{"id":1,"topic":"/chatter","encoding":"ros1",'
-        b'"schemaName":"std_msgs/String","schemaEncoding":"ros1msg","schema":"string data"}]}',
+        (
+            b'{"op":"advertise","channels":[{"id":1,"topic":"/chatter","encoding":"ros1",'
+            b'"schemaName":"std_msgs/String","schemaEncoding":"ros1msg","schema":"string data"}]}'
+        ),
     ),
     "unadvertise": (protocol.Unadvertise(channel_ids=(1,)), b'{"op":"unadvertise","channelIds":[1]}'),
     "advertise services": (
@@ -71,10 +75,12 @@ JSON = {
                 ),
             )
         ),
-        b'{"op":"advertiseServices","services":[{"id":1,"name":"/set_bool","type":"std_srvs/SetBool",'
-        b'"request":{"encoding":"ros1","schemaName":"std_srvs/SetBoolRequest","schemaEncoding":"ros1msg",'
-        b'"schema":"bool data"},"response":{"encoding":"ros1","schemaName":"std_srvs/SetBoolResponse",'
-        b'"schemaEncoding":"ros1msg","schema":"bool success\\nstring message"}}]}',
+        (
+            b'{"op":"advertiseServices","services":[{"id":1,"name":"/set_bool","type":"std_srvs/SetBool",'
+            b'"request":{"encoding":"ros1","schemaName":"std_srvs/SetBoolRequest","schemaEncoding":"ros1msg",'
+            b'"schema":"bool data"},"response":{"encoding":"ros1","schemaName":"std_srvs/SetBoolResponse",'
+            b'"schemaEncoding":"ros1msg","schema":"bool success\\nstring message"}}]}'
+        ),
     ),
     "unadvertise services": (
         protocol.UnadvertiseServices(service_ids=(1,)),
@@ -96,9 +102,11 @@ JSON = {
             ),
             id="r1",
         ),
-        b'{"op":"parameterValues","parameters":[{"name":"/a","value":1},'
-        b'{"name":"/c","type":"byte_array","value":"QUJDRA=="},'
-        b'{"name":"/d","type":"float64_array","value":[1.5,2.0]},{"name":"/e","value":{"x":true}}],"id":"r1"}',
+        (
+            b'{"op":"parameterValues","parameters":[{"name":"/a","value":1},'
+            b'{"name":"/c","type":"byte_array","value":"QUJDRA=="},'
+            b'{"name":"/d","type":"float64_array","value":[1.5,2.0]},{"name":"/e","value":{"x":true}}],"id":"r1"}'
+        ),
     ),
     "parameter update": (
         protocol.ParameterValues(parameters=(to_parameter("/a", 6),)),
@@ -116,9 +124,11 @@ JSON = {
             removed_topics=(),
             removed_services=(),
         ),
-        b'{"op":"connectionGraphUpdate","publishedTopics":[{"name":"/t","publisherIds":["/n1"]}],'
-        b'"subscribedTopics":[{"name":"/t","subscriberIds":["/n2"]}],'
-        b'"advertisedServices":[{"name":"/s","providerIds":["/n1"]}],"removedTopics":[],"removedServices":[]}',
+        (
+            b'{"op":"connectionGraphUpdate","publishedTopics":[{"name":"/t","publisherIds":["/n1"]}],'
+            b'"subscribedTopics":[{"name":"/t","subscriberIds":["/n2"]}],'
+            b'"advertisedServices":[{"name":"/s","providerIds":["/n1"]}],"removedTopics":[],"removedServices":[]}'
+        ),
     ),
 }
 BINARY = {
