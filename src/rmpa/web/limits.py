@@ -39,3 +39,15 @@ FOXGLOVE_STATUS_RATE: Final = 5.0
 FOXGLOVE_STATUS_BURST: Final = 100.0
 """Errors of one client at once. Beyond that and the rate, what it may not do is refused without a status, and a
 malformed message disconnects it: it does not speak the protocol."""
+
+# --- /metrics -----------------------------------------------------------------------------------------------------
+METRIC_PEERS: Final = 512
+"""Peers in /metrics, each with some fifteen time series: as many as an agent may know."""
+METRIC_ROUTES: Final = 2000
+"""Routes in /metrics, each with some twenty time series; a module of 300 topics and three peers has some 1,000."""
+METRIC_SERVICES: Final = 1000
+"""Services in /metrics, each with some six time series."""
+METRIC_REASONS: Final = 256
+"""Counters of what was refused or dropped in /metrics; there are some hundred."""
+METRIC_LABEL_CHARACTERS: Final = 256
+"""Characters of a label's value in /metrics, which Prometheus keeps with each time series."""
