@@ -7,7 +7,7 @@ from typing import Final
 from rmpa.core.sizes import KIB, MIB
 
 FRAME_MAX: Final = 16 * MIB
-"""One frame of a client, and so a message that it publishes, in JSON or CBOR; parsed, it may take eight times this."""
+"""One frame of a client, and so a message that it publishes, in JSON or CBOR; parsed, up to eight times this."""
 ID_MAX: Final = 1 * KIB
 """Characters of an ``id``, which is sent back and kept."""
 NAME_MAX: Final = 1 * KIB
