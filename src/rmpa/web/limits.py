@@ -51,3 +51,9 @@ METRIC_REASONS: Final = 256
 """Counters of what was refused or dropped in /metrics; there are some hundred."""
 METRIC_LABEL_CHARACTERS: Final = 256
 """Characters of a label's value in /metrics, which Prometheus keeps with each time series."""
+
+# --- REST ---------------------------------------------------------------------------------------------------------
+REST_PATH_MAX: Final = 2048
+"""Characters of a path: a name of 512 characters, percent-encoded."""
+REST_NAMES_COMPARED: Final = 1000
+"""Names that a wrong one is compared with for a hint, which takes some microseconds each."""
