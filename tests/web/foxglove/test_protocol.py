@@ -215,7 +215,7 @@ def test_binary_messages_of_a_client_are_read_without_a_copy() -> None:
     message = protocol.parse_binary(data)
     assert isinstance(message, protocol.ClientMessageData)
     assert message.channel_id == 4
-    assert message.payload == b"\x02\x00\x00\x00hi"
+    assert bytes(message.payload) == b"\x02\x00\x00\x00hi"
     assert message.payload.obj is data
     call = protocol.parse_binary(struct.pack("<BIII", 2, 1, 12, 4) + b"ros1" + b"\x01")
     assert call == protocol.ServiceCallRequest(1, 12, "ros1", memoryview(b"\x01"))
