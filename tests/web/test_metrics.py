@@ -14,12 +14,15 @@ import pytest
 from prometheus_client.openmetrics.parser import text_string_to_metric_families as parse_openmetrics
 from prometheus_client.parser import text_string_to_metric_families
 
+from rmpa.bridge.data.qos_events import QosEventKind
 from rmpa.observe.snapshot import Snapshot, TopicInfo
 from rmpa.web import limits
-from rmpa.web.metrics import exposition
+from rmpa.web.metrics import EVENT_KINDS, exposition, metrics
 from tests.web.snapshots import AGENT, FULL, SERVICE, peer, route
 
-DASHBOARD = Path(__file__).parents[2] / "docs" / "grafana" / "rmpa.json"
+DOCS = Path(__file__).parents[2] / "docs"
+DASHBOARD = DOCS / "grafana" / "rmpa.json"
+PAGE = DOCS / "metrics.md"
 PROMTOOL = shutil.which("promtool")
 with_promtool = pytest.mark.skipif(PROMTOOL is None, reason="promtool is not installed (apt install prometheus)")
 ROUTE = {"topic": "/image", "peer": "arm", "node": "/camera", "direction": "in"}
@@ -77,6 +80,17 @@ def value(name: str, labels: dict[str, str], snapshot: Snapshot | None = FULL) -
 )
 def test_each_figure_of_the_snapshot_has_its_unit(name: str, labels: dict[str, str], expected: float) -> None:
     assert value(name, labels) == pytest.approx(expected)
+
+
+def test_events_of_a_contract_begin_at_0_so_that_an_alarm_sees_the_first() -> None:
+    assert set(EVENT_KINDS) == set(QosEventKind)
+    strict = msgspec.structs.replace(route(), contract={"deadline": 0.1}, events={"messages_lost": 3})
+    free = msgspec.structs.replace(route(), events={})
+    for each, expected in ((strict, dict.fromkeys(EVENT_KINDS, 0.0) | {"messages_lost": 3.0}), (free, {})):
+        snapshot = Snapshot(agent=AGENT, taken=1.0, topics=(TopicInfo(name="/t", routes=(each,)),))
+        name = "rmpa_route_contract_events_total"
+        shown = {dict(labels)["event"]: count for (n, labels), count in samples(snapshot).items() if n == name}
+        assert shown == expected
 
 
 def test_without_an_agent_there_is_one_metric_that_says_so() -> None:
@@ -196,6 +210,29 @@ def test_each_query_of_the_dashboard_is_valid_promql(tmp_path: Path) -> None:
     file.write_text(json.dumps({"groups": [{"name": "dashboard", "rules": rules}]}), encoding="utf-8")
     checked = subprocess.run([PROMTOOL, "check", "rules", str(file)], check=False, capture_output=True, timeout=30)
     assert checked.returncode == 0, checked.stdout.decode() + checked.stderr.decode()
+
+
+@with_promtool
+def test_the_alarms_of_the_page_are_valid_rules_about_metrics_that_there_are(tmp_path: Path) -> None:
+    assert PROMTOOL is not None
+    rules = next(
+        block for block in re.findall(r"```yaml\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL) if "expr:" in block
+    )
+    file = tmp_path / "rules.yaml"
+    file.write_text(rules, encoding="utf-8")
+    checked = subprocess.run([PROMTOOL, "check", "rules", str(file)], check=False, capture_output=True, timeout=30)
+    assert checked.returncode == 0, checked.stdout.decode() + checked.stderr.decode()
+    assert set(re.findall(r"rmpa_\w+", rules)) <= {name for name, _ in samples(FULL)}
+
+
+def test_the_page_has_a_row_for_each_metric() -> None:
+    rows = re.findall(r"^\| `(rmpa_\w+)` \| (\w+) \| ([^|]+) \| ([^|]+) \|$", PAGE.read_text("utf-8"), re.MULTILINE)
+    written = {name: (kind, set(re.findall(r"\w+", labels)), meaning) for name, kind, labels, meaning in rows}
+    known = {
+        family.samples[0].name: (family.type, set(family.samples[0].labels), family.documentation)
+        for family in metrics(FULL)
+    }
+    assert written == known
 
 
 def test_a_service_has_one_series_for_each_peer() -> None:

@@ -24,6 +24,15 @@ if TYPE_CHECKING:
 
 PEER_STATES: Final = ("linked", "linking", "refused", "conflict", "relayed")
 """The values of ``PeerInfo.state``."""
+EVENT_KINDS: Final = (
+    "deadline_missed",
+    "lifespan_expired",
+    "liveliness_lost",
+    "liveliness_restored",
+    "messages_lost",
+    "loss_unknown",
+)
+"""The values of ``EventInfo.kind``; a route with a contract shows all of them from 0 on, so that the first counts."""
 _LOGGER_SERVICES: Final = ("/get_loggers", "/set_logger_level")
 """Each node has these; they are shown only where they were called across the mesh."""
 _T = TypeVar("_T")
@@ -255,7 +264,8 @@ def _route_details(routes: Sequence[tuple[str, RouteInfo]]) -> Iterator[Metric]:
         discarded.add(route.late, *key, "late")
         discarded.add(route.expired, *key, "expired")
         discarded.add(route.oversized, *key, "oversized")
-        for kind, count in route.events.items():
+        known = dict.fromkeys(EVENT_KINDS, 0) if route.contract else {}
+        for kind, count in {**known, **route.events}.items():
             events.add(count, *key, kind)
         latency.add_quantiles(route.latency, *key)
         period.add_quantiles(route.period, *key)
