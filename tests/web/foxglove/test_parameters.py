@@ -57,6 +57,13 @@ def test_numbers_that_json_lacks_become_texts() -> None:
     assert to_parameter("/p", [1.0, float("-inf")]).type is UNSET
 
 
+def test_floating_point_numbers_say_so_as_javascript_writes_whole_ones_without_a_point() -> None:
+    assert to_parameter("/p", 1.0).type == "float64"
+    assert to_parameter("/p", [1.0, 2.0]).type == "float64_array"
+    assert to_parameter("/p", [1.0, 2]).type is UNSET
+    assert to_parameter("/p", 1).type is UNSET
+
+
 def test_a_whole_number_of_type_float64_is_a_double() -> None:
     value = from_parameter(protocol.Parameter(name="/p", type="float64", value=3))
     assert isinstance(value, float)
