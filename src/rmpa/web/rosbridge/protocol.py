@@ -76,7 +76,7 @@ class Advertise(Op, frozen=True, kw_only=True):
 
     topic: str
     type: str
-    latch: bool = False
+    latch: bool | None = False
     queue_size: int | None = None
 
 
@@ -91,7 +91,7 @@ class Publish(Op, frozen=True, kw_only=True):
 
     topic: str
     msg: Any = None
-    latch: bool = False
+    latch: bool | None = False
 
 
 class Subscribe(Op, frozen=True, kw_only=True):
@@ -268,6 +268,8 @@ def parse_op(values: Mapping[str, Any]) -> tuple[str, Op]:
         raise OpError(f"{name}: {str(error)[: limits.TEXT_MAX]}") from None
     if isinstance(op.id, str) and len(op.id) > limits.ID_MAX:
         raise LimitExceeded("id", len(op.id), limits.ID_MAX)
+    if isinstance(op.id, int) and abs(op.id) >= 1 << 63:
+        raise OpError("an id that is a number has 64 bits")
     return name, op
 
 
@@ -335,11 +337,13 @@ def _json(text: str) -> object:
         first = error
     # Python's clients write NaN and Infinity, which are no JSON and which rosbridge_suite accepts.
     try:
-        return json.loads(text)
+        values: object = json.loads(text)
+        msgspec.json.encode(values)  # Python also takes half of a surrogate pair, which cannot be sent back
     except RecursionError:
         raise OpError("the message is nested too deep") from None
-    except ValueError:
+    except (ValueError, OverflowError):
         raise OpError(f"the message is not JSON: {first}"[: limits.TEXT_MAX]) from None
+    return values
 
 
 def _cbor(data: Part) -> object:

@@ -54,13 +54,13 @@ class Publications:
                 raise OpError(f"{name} is advertised as {publisher.type}, not {kind}", "unadvertise it first")
             self._end(publisher)
             publisher = None
-        if publisher is not None and publisher.latch != op.latch:
+        if publisher is not None and publisher.latch != bool(op.latch):
             ids = publisher.ids
             self._end(publisher)
-            publisher = self._begin(name, kind, latch=op.latch)
+            publisher = self._begin(name, kind, latch=bool(op.latch))
             publisher.ids |= ids
         if publisher is None:
-            publisher = self._begin(name, kind, latch=op.latch)
+            publisher = self._begin(name, kind, latch=bool(op.latch))
         if op.id not in publisher.ids:
             check_count(len(publisher.ids), limits.SUBSCRIBERS_MAX, f"advertisements of {name}")
         publisher.ids.add(op.id)
@@ -90,7 +90,7 @@ class Publications:
             MessageError: The message does not fit the type.
         """
         name = graph_name(op.topic)
-        publisher = self._publishers.get(name) or self._begin(name, self._type_of(name), latch=op.latch)
+        publisher = self._publishers.get(name) or self._begin(name, self._type_of(name), latch=bool(op.latch))
         written = publisher.codec.write({} if op.msg is None else op.msg, self._context.ros_time_ns())
         if written.missing:
             fields = ", ".join(written.missing)

@@ -37,8 +37,8 @@ Verify: TypeAlias = Callable[[protocol.Auth], bool]
 class RosbridgeSession:
     """The state of one client.
 
-    After each call of `receive_frame`, `receive_answer` and `handle_timer`, its user sends `frames_to_send`, and gives
-    `requests_to_send` to the hub.
+    After each call of `receive_frame`, `receive_answer`, `handle_timer` and `close`, its user sends `frames_to_send`,
+    and gives `requests_to_send` to the hub.
 
     Args:
         types: Finds definitions.
