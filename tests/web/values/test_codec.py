@@ -109,7 +109,8 @@ _SCALARS: dict[str, st.SearchStrategy[Any]] = {
 @st.composite
 def _messages(draw: st.DrawFn) -> tuple[str, dict[str, Any]]:
     """The text of a type with two levels, and values of it."""
-    texts, strategies = [], []
+    texts: list[str] = []
+    strategies: list[st.SearchStrategy[dict[str, Any]]] = []
     for inner in (True, False):
         lines, fields = [], {}
         kinds = draw(st.lists(st.sampled_from([*_SCALARS] + ([] if inner else ["t/I"] * 4)), min_size=1, max_size=6))
@@ -260,8 +261,9 @@ def test_arguments_are_an_object_or_the_fields_in_order() -> None:
     codec = _codec("int8 a\nint8 b")
     for arguments in ([1, 2], {"b": 2, "a": 1}):
         assert codec.write_arguments(arguments, 0).payload == b"\x01\x02"
-    for arguments in ([], None, {}):
-        assert codec.write_arguments(arguments, 0).payload == b"\0\0"
+    nothing: Any
+    for nothing in ([], None, {}):
+        assert codec.write_arguments(nothing, 0).payload == b"\0\0"
     for wrong in ([1, 2, 3], "1", 5):
         with pytest.raises(MessageError):
             codec.write_arguments(wrong, 0)
