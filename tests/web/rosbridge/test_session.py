@@ -365,7 +365,9 @@ def test_all_that_a_client_had_ends_with_it() -> None:
         (b"\x5b\x00\x00\x00\xff\xff\xff\xff\xff", "CBOR"),
         (b"\x81" * 100_000, "CBOR"),
         (b"\xa1\x01\x02", "no 'op'"),
-        ("[" * 1_000_000, "too deep"),
+        ("[" * 100_000, "too deep"),
+        ("[" + "{}," * limits.CONTAINERS_MAX + "{}]", "objects and lists"),
+        (bytes(limits.BINARY_FRAME_MAX + 1), "exceeds the limit"),
         ('{"op": "publish", "topic": "/t", "msg": ' + '{"a":' * 100_000, "too deep"),
         ("x" * (limits.FRAME_MAX + 1), "exceeds the limit"),
     ],
@@ -429,9 +431,9 @@ def test_a_goal_goes_to_actionlib_and_its_result_comes_back(status: int, code: i
     assert handles.keys() == {"/f/result", "/f/feedback", "/f/goal", "/f/cancel"}
     assert publish.handle == handles["/f/goal"]
     kind = MessageType(f"{TEST}ActionGoal")
-    goal = kind.to_plain(kind.deserialize(publish.payload))
+    goal: Any = kind.to_plain(kind.deserialize(publish.payload))
     assert goal["goal"] == {"goal": 5}
-    goal_id = goal["goal_id"]["id"]  # type: ignore[index,call-overload]
+    goal_id = goal["goal_id"]["id"]
     _result(client, "feedback", handles["/f/feedback"], goal_id, 1, 1)
     _result(client, "feedback", handles["/f/feedback"], "of another client", 1, 7)
     (cancel,) = client.send("cancel_action_goal", id="g", action="/f")
