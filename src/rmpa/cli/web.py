@@ -98,9 +98,16 @@ def web(
 
 
 def _check_libraries() -> None:
-    missing = [name for name in _LIBRARIES if importlib.util.find_spec(name) is None]
+    missing = [name for name in _LIBRARIES if not _is_there(name)]
     if missing:
         raise ConfigError("rmpa web", f"{' and '.join(missing)} not installed", "run pip install 'rmpa[web]'")
+
+
+def _is_there(name: str) -> bool:
+    try:
+        return importlib.util.find_spec(name) is not None
+    except ValueError:  # it was taken out of sys.modules
+        return False
 
 
 def _host(option: str, text: str) -> str:

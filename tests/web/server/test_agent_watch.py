@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import threading
+from typing import TYPE_CHECKING
 
 from rmpa.core.errors import UnreachableError
-from rmpa.observe.snapshot import Snapshot
 from rmpa.web import limits
 from rmpa.web.server.agent_watch import AgentWatch
 from tests.web.snapshots import FULL
+
+if TYPE_CHECKING:
+    from rmpa.observe.snapshot import Snapshot
 
 
 class Agent:

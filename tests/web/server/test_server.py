@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from rmpa.core.errors import StartError, UnreachableError
-from rmpa.observe.snapshot import Snapshot
 from rmpa.web import limits
 from rmpa.web.server.agent_watch import AgentWatch
 from rmpa.web.server.app import HEADERS
 from rmpa.web.server.auth import AccessPolicy, own_names
 from rmpa.web.server.server import WebServer
 from tests.web.snapshots import FULL
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from rmpa.observe.snapshot import Snapshot
 
 DEADLINE = 30.0
 TOKEN = "secret-" * 6
@@ -191,19 +195,20 @@ async def test_it_only_shows() -> None:
             status, headers, body = await site.get("/api/v1/peers", method)
             assert (status, headers["Allow"]) == (405, "GET, HEAD"), method
             assert "only shows" in detail(body)
-        status, headers, _ = await site.get("/metrics", Content_Length="5")
+        status, headers, _ = await site.send(
+            b"GET /metrics HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5\r\n\r\nhello"
+        )
         assert (status, headers["Connection"]) == (413, "close")
         assert (await site.refused("method"), await site.refused("body")) == (5, 1)
 
 
 BROKEN = {
     "no HTTP": b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n",
-    "no version": b"GET /\r\n\r\n",
     "a space in a header's name": b"GET / HTTP/1.1\r\nHost : localhost\r\n\r\n",
     "two lengths": b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1\r\nContent-Length: 2\r\n\r\n",
     "a length and chunks": b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1\r\nTransfer-Encoding: chunked\r\n\r\n",
     "a long line": b"GET /" + b"a" * limits.WEB_LINE_MAX + b" HTTP/1.1\r\nHost: localhost\r\n\r\n",
-    "a long header": b"GET / HTTP/1.1\r\nHost: localhost\r\nA: " + b"a" * limits.WEB_FIELD_MAX + b"\r\n\r\n",
+    "a long header": b"GET / HTTP/1.1\r\nHost: localhost\r\nA: " + b"a" * 2 * limits.WEB_FIELD_MAX + b"\r\n\r\n",
     "many headers": b"GET / HTTP/1.1\r\nHost: localhost\r\n" + b"A: b\r\n" * limits.WEB_HEADERS_MAX + b"\r\n",
 }
 
@@ -219,6 +224,7 @@ async def test_broken_requests_are_refused_and_counted(what: str) -> None:
 async def test_a_request_without_a_host_or_with_two_is_refused() -> None:
     async with running() as site:
         assert (await site.send(b"GET / HTTP/1.0\r\n\r\n"))[0] == 400
+        assert (await site.send(b"GET /\r\n\r\n"))[0] == 400
         assert (await site.send(b"GET / HTTP/1.1\r\nHost: localhost\r\nHost: evil.example\r\n\r\n"))[0] == 400
 
 

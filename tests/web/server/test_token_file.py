@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import stat
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -11,6 +11,9 @@ from rmpa.config.settings import WebSettings
 from rmpa.core.errors import StartError
 from rmpa.web.server.process import access_of, address_of
 from rmpa.web.server.token_file import token_from
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 def test_a_token_is_made_once_for_its_owner_alone(tmp_path: Path) -> None:

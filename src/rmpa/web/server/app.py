@@ -33,7 +33,8 @@ _log = logging.getLogger(__name__)
 _OPEN: Final = ("/healthz",)
 """Paths without a token: they tell only whether the agent answers."""
 _METHODS: Final = ("GET", "HEAD")
-_JUDGED: Final = "rmpa.judged"
+_JUDGED: Final = web.RequestKey("rmpa.judged", bool)
+"""Marks requests that reached the middleware; aiohttp answers malformed ones before."""
 HEADERS: Final = {
     "Content-Security-Policy": "default-src 'self'; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'; object-src 'none'",
