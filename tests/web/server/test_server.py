@@ -206,7 +206,8 @@ BROKEN = {
     "no HTTP": b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n",
     "a space in a header's name": b"GET / HTTP/1.1\r\nHost : localhost\r\n\r\n",
     "two lengths": b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1\r\nContent-Length: 2\r\n\r\n",
-    "a length and chunks": b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1\r\nTransfer-Encoding: chunked\r\n\r\n",
+    "a length and chunks": b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1\r\n"
+    b"Transfer-Encoding: chunked\r\n\r\n",
     "a long line": b"GET /" + b"a" * limits.WEB_LINE_MAX + b" HTTP/1.1\r\nHost: localhost\r\n\r\n",
     "a long header": b"GET / HTTP/1.1\r\nHost: localhost\r\nA: " + b"a" * 2 * limits.WEB_FIELD_MAX + b"\r\n\r\n",
     "many headers": b"GET / HTTP/1.1\r\nHost: localhost\r\n" + b"A: b\r\n" * limits.WEB_HEADERS_MAX + b"\r\n",
