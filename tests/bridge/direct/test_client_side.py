@@ -12,6 +12,7 @@ from rmpa.bridge.direct.client_side import (
     DirectServices,
     Lost,
     ProbeServer,
+    ReleaseGrant,
     ServiceAction,
     ServiceFallback,
     ServiceKey,
@@ -24,6 +25,7 @@ KEY = ServiceKey(1, "/add")
 GRANT = Grant(45000, "/adder")
 REFUSED = Unmet(Condition.LISTENING, "/adder listens on loopback only")
 PASSING = Unmet(Condition.NODE, "/adder does not answer")
+RELEASE = ReleaseGrant(KEY, "/adder")
 RENAMED = Unmet(Condition.NAME, "it is /sum there")
 
 
@@ -69,7 +71,7 @@ def test_a_port_that_does_not_answer_is_never_told_to_clients_and_is_tried_again
     services: DirectServices,
 ) -> None:
     services.replied(KEY, 1, GRANT, 0.0)
-    assert services.probed(KEY, 1, "connection refused", 0.0) == []
+    assert services.probed(KEY, 1, "connection refused", 0.0) == [RELEASE]
     assert state(services) == (DirectState.RELAYED, Unmet(Condition.REACHABLE, "connection refused"))
     assert services.next_timer() == limits.DIRECT_RETRY
     assert asked(services.handle_timer(limits.DIRECT_RETRY)) == ["/add"]
@@ -94,7 +96,7 @@ def test_late_outcomes_of_earlier_attempts_change_nothing(services: DirectServic
 
 def test_a_condition_that_fails_here_ends_direct_calls_and_asks_nothing(services: DirectServices) -> None:
     direct(services)
-    assert services.consider(KEY, "/adder", Transport.AUTO, RENAMED, 0.0) == [AnswerRelay(KEY)]
+    assert services.consider(KEY, "/adder", Transport.AUTO, RENAMED, 0.0) == [AnswerRelay(KEY), RELEASE]
     assert services.retry(KEY, "/adder") == []
     assert services.renewed(KEY) == []
     assert services.link_up(1) == []
@@ -123,7 +125,7 @@ def test_a_restarted_server_is_relayed_at_once_and_asked_for_again(services: Dir
 def test_a_service_that_moves_to_another_node_begins_anew(services: DirectServices) -> None:
     direct(services)
     actions = services.consider(KEY, "/other", Transport.AUTO, None, 0.0)
-    assert actions == [AnswerRelay(KEY), AskPeer(KEY, 1)]
+    assert actions == [AnswerRelay(KEY), RELEASE, AskPeer(KEY, 1)]
 
 
 def test_a_lost_link_ends_direct_calls_and_the_next_one_asks_again(services: DirectServices) -> None:
@@ -153,6 +155,15 @@ def test_after_a_crash_direct_calls_go_on_while_the_server_answers(services: Dir
     assert services.adrift(1) == set()
 
 
+def test_a_service_that_appears_without_a_link_is_asked_for_over_the_next_one() -> None:
+    services = DirectServices()
+    services.wait(KEY, "/adder", Transport.AUTO)
+    assert state(services)[1] == Unmet(Condition.OFFERED, "its module has no link")
+    assert services.consider(KEY, "/adder", Transport.AUTO, RENAMED, 0.0) == []
+    services.wait(KEY, "/adder", Transport.AUTO)
+    assert asked(services.link_up(1)) == ["/add"]
+
+
 def test_a_crash_ends_what_was_not_direct_yet(services: DirectServices) -> None:
     services.replied(KEY, 1, GRANT, 0.0)
     assert services.link_down(1, 0.0, crashed=True) == []
@@ -168,6 +179,14 @@ def test_a_new_run_of_the_agent_is_asked_anew(services: DirectServices) -> None:
     assert services.consider(ServiceKey(2, "/add"), "/adder", Transport.AUTO, None, 1.0) == [
         AskPeer(ServiceKey(2, "/add"), 1)
     ]
+
+
+def test_a_server_that_clients_cannot_reach_is_relayed_and_tried_again(services: DirectServices) -> None:
+    assert services.unreachable(KEY, "no answer", 0.0) == []
+    direct(services)
+    assert services.unreachable(KEY, "no answer", 0.0) == [AnswerRelay(KEY), RELEASE]
+    assert state(services) == (DirectState.RELAYED, Unmet(Condition.REACHABLE, "no answer"))
+    assert asked(services.handle_timer(limits.DIRECT_RETRY)) == ["/add"]
 
 
 def test_many_services_are_asked_for_a_few_at_a_time_and_every_one_in_turn() -> None:

@@ -65,3 +65,7 @@ def test_the_grants_of_one_peer_are_bounded(grants: ServiceGrants) -> None:
     assert beyond.condition is Condition.LIMIT
     assert grants.full(1, "/s0") is None
     assert grants.full(2, "/one_more") is None
+    grants.released(1, "/s0", "/another")
+    assert grants.full(1, "/one_more") is not None
+    grants.released(1, "/s0", "/n")
+    assert grants.full(1, "/one_more") is None

@@ -97,6 +97,19 @@ class AnswerRelay:
 
 
 @dataclass(frozen=True, slots=True)
+class ReleaseGrant:
+    """Tell the peer that the service is not called directly any more.
+
+    Args:
+        key: The service.
+        node: The node that provides it.
+    """
+
+    key: ServiceKey
+    node: str
+
+
+@dataclass(frozen=True, slots=True)
 class Lost:
     """The server of a service that was adrift does not answer any more: remove the service from the graph."""
 
@@ -112,7 +125,7 @@ class ServiceFallback:
     unmet: Unmet
 
 
-ServiceAction = AskPeer | ProbeServer | AnswerDirect | AnswerRelay | Lost | ServiceFallback
+ServiceAction = AskPeer | ProbeServer | AnswerDirect | AnswerRelay | ReleaseGrant | Lost | ServiceFallback
 
 
 class DirectServices:
@@ -165,14 +178,20 @@ class DirectServices:
             return self._relay(key, service, unmet, now, local=True)
         return self._ask(key, service) if service.local else []
 
+    def wait(self, key: ServiceKey, node: str, wanted: Transport) -> None:
+        """Note a service that nothing stands against here, and whose peer has no link; ``link_up`` asks for it."""
+        service = self._services.get(key)
+        if service is None or service.node != node or service.local:
+            unmet = Unmet(Condition.OFFERED, "its module has no link")
+            self._services[key] = DirectService(node, wanted, unmet=unmet, local=False)
+
     def remove(self, key: ServiceKey) -> list[ServiceAction]:
         """Forget a service: it has left the local graph, or is relayed by rule."""
         service = self._services.pop(key, None)
         if service is None:
             return []
         self._timers.set(key, None)
-        actions: list[ServiceAction] = [AnswerRelay(key)] if service.state is DirectState.DIRECT else []
-        return actions + self._done(key)
+        return [*self._leave(key, service), *self._done(key)]
 
     def renewed(self, key: ServiceKey) -> list[ServiceAction]:
         """Ask again for a service that the peer has offered again: its server may be another one."""
@@ -205,7 +224,6 @@ class DirectServices:
             return []
         if service.adrift:
             if problem:
-                service.adrift = False
                 return [*self._relay(key, service, Unmet(Condition.REACHABLE, problem), now), Lost(key, problem)]
             self._timers.set(key, now + limits.DIRECT_CHECK)
             return []
@@ -238,6 +256,13 @@ class DirectServices:
         if service is None or service.node != node or service.local or service.state is not DirectState.RELAYED:
             return []
         return self._ask(key, service)
+
+    def unreachable(self, key: ServiceKey, problem: str, now: float) -> list[ServiceAction]:
+        """Relay a service whose server cannot be reached any more, although the peer has a link."""
+        service = self._services.get(key)
+        if service is None or service.state is not DirectState.DIRECT or service.adrift:
+            return []
+        return self._relay(key, service, Unmet(Condition.REACHABLE, problem), now)
 
     # --- links ---------------------------------------------------------------------------------------------------
 
@@ -327,10 +352,19 @@ class DirectServices:
         busy.add(name)
         return [AskPeer(following, self._services[following].attempt)]
 
+    @staticmethod
+    def _leave(key: ServiceKey, service: DirectService, *, release: bool = True) -> list[ServiceAction]:
+        """Stops direct answers, and gives a grant back that the peer may count on."""
+        actions: list[ServiceAction] = [AnswerRelay(key)] if service.state is DirectState.DIRECT else []
+        if release and service.state is not DirectState.RELAYED and not service.adrift:
+            actions.append(ReleaseGrant(key, service.node))
+        return actions
+
     def _relay(
         self, key: ServiceKey, service: DirectService, unmet: Unmet, now: float, *, local: bool = False
     ) -> list[ServiceAction]:
-        actions: list[ServiceAction] = [AnswerRelay(key)] if service.state is DirectState.DIRECT else []
+        ours = local or unmet.condition is Condition.REACHABLE
+        actions = self._leave(key, service, release=ours)
         service.state, service.unmet, service.local = DirectState.RELAYED, unmet, local
         service.grant, service.adrift = None, False
         service.attempt += 1

@@ -54,6 +54,8 @@ class ServiceGrants:
 
     def __init__(self) -> None:
         self._told: dict[str, dict[int, Told]] = {}
+        self._granted: dict[int, int] = {}
+        """By peer: how many of its answers are grants."""
 
     def __iter__(self) -> Iterator[tuple[str, int, Told]]:
         """Each service, peer and answer; changes during the iteration are allowed."""
@@ -69,15 +71,20 @@ class ServiceGrants:
 
     def full(self, peer: int, service: str) -> Unmet | None:
         """Why a peer can have no further grant for a service, if so."""
-        granted = [name for name, number, told in self if number == peer and told.port is not None]
-        if service in granted or len(granted) < limits.DIRECT_MAX:
+        told = self._told.get(service, {}).get(peer)
+        if (told is not None and told.port is not None) or self._granted.get(peer, 0) < limits.DIRECT_MAX:
             return None
         return Unmet(Condition.LIMIT, f"more than {limits.DIRECT_MAX} services are called directly from there")
 
     def answered(self, peer: int, service: str, node: str, uri: str, found: Grant | Unmet) -> None:
         """Note what a peer is answered."""
-        port = found.port if isinstance(found, Grant) else None
-        self._told.setdefault(service, {})[peer] = Told(node, uri, port)
+        self._put(service, peer, Told(node, uri, found.port if isinstance(found, Grant) else None))
+
+    def released(self, peer: int, service: str, node: str) -> None:
+        """Forget the grant of a peer whose clients do not call a service directly any more."""
+        told = self._told.get(service, {}).get(peer)
+        if told is not None and told.node == node and told.port is not None:
+            self._drop(service, peer)
 
     def server(self, service: str, node: str, uri: str) -> list[ServerAction]:
         """Let the peers ask again for a service that has another server now.
@@ -108,7 +115,7 @@ class ServiceGrants:
         for service, peer, told in self:
             why = unmet(service, peer)
             if why is not None and told.port is not None:
-                self._told[service][peer] = Told(told.node, told.uri, None)
+                self._put(service, peer, Told(told.node, told.uri, None))
                 actions.append(CloseDirect(peer, service, told.node, why))
             elif why is None and told.port is None:
                 self._drop(service, peer)
@@ -121,8 +128,22 @@ class ServiceGrants:
             if number == peer:
                 self._drop(service, number)
 
+    def _put(self, service: str, peer: int, told: Told) -> None:
+        peers = self._told.setdefault(service, {})
+        before, peers[peer] = peers.get(peer), told
+        was_granted = before is not None and before.port is not None
+        self._count(peer, (told.port is not None) - was_granted)
+
+    def _count(self, peer: int, more: int) -> None:
+        number = self._granted.get(peer, 0) + more
+        if number:
+            self._granted[peer] = number
+        else:
+            self._granted.pop(peer, None)
+
     def _drop(self, service: str, peer: int) -> None:
         peers = self._told[service]
-        del peers[peer]
+        if peers.pop(peer).port is not None:
+            self._count(peer, -1)
         if not peers:
             del self._told[service]

@@ -17,11 +17,13 @@ from rmpa.core.errors import RemoteProtocolError
 SERVICE: Final = "direct.service"
 """Request: may the nodes of this module call the server of this service directly? The response is as to
 ``direct.open``."""
+SERVICE_CLOSE: Final = "direct.service_close"
+"""Notification: the clients' agent does not use what was permitted any more."""
 SERVICE_CLOSED: Final = "direct.service_closed"
 """Notification: the server's agent withdraws what it has permitted."""
 SERVICE_RETRY: Final = "direct.service_retry"
 """Notification: what was refused may be permitted now."""
-_Kind = TypeVar("_Kind", "AskService", "ServiceDirectClosed", "RetryService")
+_Kind = TypeVar("_Kind", "AskService", "CloseService", "ServiceDirectClosed", "RetryService")
 
 
 class AskService(msgspec.Struct, frozen=True):
@@ -30,6 +32,13 @@ class AskService(msgspec.Struct, frozen=True):
     service: str
     node: str
     transport: Transport
+
+
+class CloseService(msgspec.Struct, frozen=True):
+    """``direct.service_close``."""
+
+    service: str
+    node: str
 
 
 class ServiceDirectClosed(msgspec.Struct, frozen=True):
@@ -48,7 +57,7 @@ class RetryService(msgspec.Struct, frozen=True):
     node: str
 
 
-def write(arguments: AskService | ServiceDirectClosed | RetryService) -> dict[str, Any]:
+def write(arguments: AskService | CloseService | ServiceDirectClosed | RetryService) -> dict[str, Any]:
     """The arguments as values that JSON can represent."""
     values: dict[str, Any] = msgspec.to_builtins(arguments)
     return values
@@ -61,6 +70,11 @@ def read_ask(args: dict[str, Any]) -> AskService:
         RemoteProtocolError: A name or a value is invalid.
     """
     return _read(args, AskService)
+
+
+def read_close(args: dict[str, Any]) -> CloseService:
+    """Read and validate ``direct.service_close``; errors as ``read_ask``."""
+    return _read(args, CloseService)
 
 
 def read_closed(args: dict[str, Any]) -> ServiceDirectClosed:

@@ -80,6 +80,16 @@ def standing(endpoint: tuple[str, int]) -> set[int]:
     return {one.local[1] for one in found if one.state in _STANDING}
 
 
+def connecting(endpoint: tuple[str, int]) -> list[TcpConnection]:
+    """The connections from this machine to an address that wait for its first answer."""
+    return [one for one in connections(remote=endpoint) or [] if one.state == "SYN_SENT"]
+
+
+def end_these(found: list[TcpConnection]) -> str:
+    """End connections; return why it failed, or empty."""
+    return _end(found)
+
+
 def end_to(endpoint: tuple[str, int], ports: set[int] | None = None) -> str:
     """End connections from this machine to a publisher's address.
 

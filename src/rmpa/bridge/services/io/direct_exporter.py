@@ -62,6 +62,7 @@ class DirectServiceExporter:
         self.grants = ServiceGrants()
         """What the peers were answered."""
         rpc.on_request(requests.SERVICE, self._answer)
+        rpc.on_notification(requests.SERVICE_CLOSE, self._released)
 
     def reload(self, rules: ServiceRules) -> None:
         """Take new rules, and withdraw the grants that they do not allow."""
@@ -100,6 +101,10 @@ class DirectServiceExporter:
             text = f'{asked.service}: calls from {name} are relayed although transport is "direct": {found.text}'
             self._on_warning("direct.service_relayed", f"{name} {asked.service} {found.condition}", text)
         return reply_of(found)
+
+    def _released(self, session: PeerSession, args: dict[str, Any]) -> None:
+        closed = requests.read_close(args)
+        self.grants.released(session.peer, closed.service, closed.node)
 
     def _find(self, session: PeerSession, service: str, node: str) -> Grant | Unmet:
         unmet = self._unmet(service, session.peer) or self.grants.full(session.peer, service)

@@ -16,15 +16,17 @@ from rmpa.bridge.direct.client_side import (
     DirectServices,
     Lost,
     ProbeServer,
+    ReleaseGrant,
     ServiceFallback,
     ServiceKey,
 )
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, read_unmet
-from rmpa.bridge.direct.io.nodes import end_to
-from rmpa.bridge.direct.service_requests import AskService
+from rmpa.bridge.direct.io.nodes import connecting, end_these, end_to
+from rmpa.bridge.direct.service_requests import AskService, CloseService
 from rmpa.bridge.policy import OWN_NODE, is_own
+from rmpa.bridge.session.peer_rpc import UNKNOWN_QUESTION
 from rmpa.core.contract import Transport
-from rmpa.core.errors import RmpaError
+from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.ros.environment import host_of, is_loopback
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.wire.tcpros import printable
@@ -54,14 +56,20 @@ class DirectAnswer:
     Args:
         peer: The number of the peer's session.
         uri: The server's address, ``rosrpc://address:port``.
+        endpoint: The same as address and port.
         nearby: Whether the server runs on this machine, so that clients that are bound to loopback reach it too.
         lookups: How many lookups were answered so.
+        looked_at: How many of these the last ``_look`` has seen.
+        waiting: The sockets that were connecting then, by their cookies.
     """
 
     peer: int
     uri: str
+    endpoint: tuple[str, int]
     nearby: bool
     lookups: int = 0
+    looked_at: int = 0
+    waiting: frozenset[tuple[int, int]] = frozenset()
 
 
 class DirectServiceImporter:
@@ -76,7 +84,7 @@ class DirectServiceImporter:
         proxy_uri: ``(peer, service)``: the proxy's address for a service; empty if there is none.
         on_lost: ``(peer, service, problem)``: removes a service whose agent has crashed and whose server is gone.
         on_warning: ``(kind, subject, text)``: logs and counts a warning.
-        counters: Count ``direct.service_stopped`` and ``direct.lookup_relayed``.
+        counters: Count ``direct.service_stopped``, ``direct.service_unreachable`` and ``direct.lookup_relayed``.
     """
 
     def __init__(
@@ -109,6 +117,7 @@ class DirectServiceImporter:
         self._timer = MachineTimer(self.services.next_timer, lambda now: self._act(self.services.handle_timer(now)))
         self._tasks: dict[ServiceKey, asyncio.Task[None]] = {}
         """The question or the probe for each service: the latest one, so that floods of notifications add none."""
+        self._looking: asyncio.TimerHandle | None = None
         self._closed = False
         self._able = core.on_lookup(self._lookup)
         rpc.on_notification(requests.SERVICE_CLOSED, self._closed_there)
@@ -130,7 +139,32 @@ class DirectServiceImporter:
             self._counters.add("direct.lookup_relayed")
             return ""
         found.lookups += 1
+        if self._looking is None and not found.nearby:
+            self._looking = asyncio.get_running_loop().call_later(limits.DIRECT_CHECK, self._look)
         return found.uri
+
+    def _look(self) -> None:
+        """Find servers that clients cannot reach any more, as behind a new firewall: relay them.
+
+        It is called while services are looked up. A connection that waits for its first answer from one look to the
+        next is ended, so that its client gets an error instead of waiting for minutes.
+        """
+        self._looking = None
+        again = False
+        for service, found in list(self.answers.items()):
+            if found.nearby or (found.lookups == found.looked_at and not found.waiting):
+                continue
+            again, found.looked_at = True, found.lookups
+            waiting = connecting(found.endpoint)
+            stuck = [one for one in waiting if one.cookie in found.waiting]
+            found.waiting = frozenset(one.cookie for one in waiting)
+            if stuck:
+                end_these(stuck)
+                self._counters.add("direct.service_unreachable")
+                problem = f"clients get no answer from {found.uri}"
+                self._act(self.services.unreachable(ServiceKey(found.peer, service), problem, self._now()))
+        if again and not self._closed:
+            self._looking = asyncio.get_running_loop().call_later(limits.DIRECT_CHECK, self._look)
 
     def answer(self, peer: int, service: str) -> DirectAnswer | None:
         """What lookups of a peer's service are answered; ``None``: the proxy's address."""
@@ -162,7 +196,8 @@ class DirectServiceImporter:
             return
         unmet = self._unmet_here(service, remote)
         if unmet is None and not session.linked:
-            return  # the next link asks for it
+            self.services.wait(key, remote.node, wanted)
+            return
         self._act(self.services.consider(key, remote.node, wanted, unmet, self._now()))
 
     def hidden(self, peer: int, service: str) -> None:
@@ -193,9 +228,6 @@ class DirectServiceImporter:
     def link_up(self, session: PeerSession) -> None:
         """Ask for the services of a peer that was without a link."""
         self._act(self.services.link_up(session.peer))
-        for peer, remote in list(self._imports):
-            if peer == session.peer and remote.shown:
-                self.shown(peer, remote.name)
 
     def link_down(self, session: PeerSession, *, crashed: bool) -> None:
         """Stop direct calls to a peer that cannot be reached, those under way too; unless only its agent has died."""
@@ -246,15 +278,23 @@ class DirectServiceImporter:
         if session is None or not session.linked or known is None:
             found = Unmet(Condition.OFFERED, "its module has no link")
         else:
-            asked = requests.write(AskService(key.service, known.node, known.wanted))
-            try:
-                value = await self._rpc.request(session, requests.SERVICE, asked, limits.DIRECT_ASK_TIMEOUT)
-                found = read_reply(value, known.node)
-            except RmpaError as error:
-                found = Unmet(Condition.RELEASE, f"{session.link.name} does not grant it: {error}")
-            if isinstance(found, Unmet):
-                found = Unmet(found.condition, printable(found.text))
+            found = await self._request(session, AskService(key.service, known.node, known.wanted))
+        if isinstance(found, Unmet):
+            found = Unmet(found.condition, printable(found.text))
         self._act(self.services.replied(key, attempt, found, self._now()))
+
+    async def _request(self, session: PeerSession, asked: AskService) -> Grant | Unmet:
+        args = requests.write(asked)
+        try:
+            value = await self._rpc.request(session, requests.SERVICE, args, limits.DIRECT_ASK_TIMEOUT)
+            return read_reply(value, asked.node)
+        except PeerRefused as error:
+            older = UNKNOWN_QUESTION in error.reason
+            return Unmet(Condition.RELEASE if older else Condition.AGENT, str(error))
+        except RemoteProtocolError as error:
+            return Unmet(Condition.RELEASE, f"{session.link.name}: {error}")
+        except RmpaError as error:
+            return Unmet(Condition.AGENT, str(error))
 
     async def _probe(self, key: ServiceKey, attempt: int, grant: Grant) -> None:
         session = self._sessions.get(key.peer)
@@ -289,6 +329,11 @@ class DirectServiceImporter:
                     self._answer(key, grant)
                 case AnswerRelay(key):
                     self._relay(key)
+                case ReleaseGrant(key, node):
+                    session = self._sessions.get(key.peer)
+                    if session is not None and session.linked:
+                        closed = requests.write(CloseService(key.service, node))
+                        self._rpc.notify(session, requests.SERVICE_CLOSE, closed)
                 case Lost(key, problem):
                     self._on_lost(key.peer, key.service, problem)
                 case ServiceFallback(key, unmet):
@@ -302,10 +347,11 @@ class DirectServiceImporter:
         if session is None:
             return
         uri = f"rosrpc://{session.address}:{grant.port}"
-        self.answers[key.service] = DirectAnswer(key.peer, uri, session.same_machine)
+        endpoint = (session.address, grant.port)
+        self.answers[key.service] = DirectAnswer(key.peer, uri, endpoint, session.same_machine)
         used = self._used.setdefault(session.link.name, set())
         if len(used) < limits.DIRECT_MAX:
-            used.add((session.address, grant.port))
+            used.add(endpoint)
         _log.info("= %s of %s is called directly at %s", key.service, session.link.name, uri)
 
     def _relay(self, key: ServiceKey) -> None:
@@ -328,6 +374,8 @@ class DirectServiceImporter:
         """Stop everything; direct connections go on."""
         self._closed = True
         self._timer.close()
+        if self._looking is not None:
+            self._looking.cancel()
         self.answers.clear()
         tasks = list(self._tasks.values())
         for task in tasks:
