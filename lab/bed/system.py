@@ -397,7 +397,10 @@ class Rmpa(System):
         return made
 
     def _boot(self, host: str) -> None:
-        self._agents[host].restart()
+        agent = self._agents[host]
+        agent.process.end()
+        agent.start()
+        agent.wait_ready(_LINKED)  # beside as many others as there are
 
     def _own(self, host: str) -> list[Process]:
         return [self._agents[host].process]

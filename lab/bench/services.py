@@ -79,8 +79,11 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
                         failed += bad
     result = _show(console, took)
     targets = [
-        Claim(f"a call of {size} bytes ({how}), {key} / direct, p50", tables.ratio(*medians), limit)
-        for key, hows, limit in (("agents", _HOWS, _TARGET), ("agents_direct", ("persistent",), _DIRECT_TARGET))
+        Claim(f"a call of {size} bytes ({how}), {text}, p50", tables.ratio(*medians), limit)
+        for key, text, hows, limit in (
+            ("agents", "agents / direct", _HOWS, _TARGET),
+            ("agents_direct", "RMPA direct / roscpp direct", ("persistent",), _DIRECT_TARGET),
+        )
         for how in hows
         for size in plan.calls
         for medians in [[_p50(took[of, how, size]) for of in (key, "direct")]]

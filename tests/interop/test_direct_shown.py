@@ -9,9 +9,12 @@ import pytest
 
 from lab.bed.processes import eventually
 from tests.interop.modules import Module, flows
-from tests.interop.transports import AUTO, on_the_network, unbroken, wait_direct
+from tests.interop.test_direct_faults import UNPRIVILEGED
+from tests.interop.transports import AUTO, on_the_network, reload, unbroken, wait_direct
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from tests.interop.conftest import ModuleFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(150)]
@@ -80,7 +83,7 @@ def test_both_ends_say_which_subscriber_is_direct_and_why_another_is_not(modules
     assert "messages, as /viewer counts" in text or "dropped by its queue, as /viewer counts" in text
     code, text = a.agent.rmpa("topic", "info", TOPIC)
     assert f"transport  direct for /viewer, to port {port} of this machine" in text
-    assert "Direct:       1 connections of subscribers here to its nodes" in b.agent.rmpa("peer", "info", "a")[1]
+    assert "Direct:       1 of the subscribers here to its nodes" in b.agent.rmpa("peer", "info", "a")[1]
     assert ", 1 of its subscribers to nodes here" in a.agent.rmpa("peer", "info", "b")[1]
     for module in (a, b):
         said = stages(module)
@@ -133,13 +136,13 @@ def test_a_relayed_topic_names_the_condition(modules: ModuleFactory, config: str
     # Only where the contract says "direct" does relaying it deserve a warning.
     assert level == ("warn" if condition == "listening" else "ok")
     checks = json.loads(b.agent.rmpa("doctor", "--json")[1])
-    told = [one for one in checks if one["check"] == "transport" and one["subject"] == TOPIC]
-    assert bool(told) is (condition == "listening"), told
+    warned = [one for one in checks if one["check"] == "transport" and one["subject"] == TOPIC]
+    assert bool(warned) is (condition == "listening"), warned
 
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_tools_that_measure_are_relayed_and_leave_the_user_direct(modules: ModuleFactory, client: str) -> None:
-    a, b = modules("a", "b", config=AUTO)
+    a, b = modules("a", "b", config='[bridge]\ntransport = "direct"\n')
     on_the_network(a, b)
     talker = a.ros.node(client, "talker", topic=TOPIC, rate=RATE, name="talker")
     viewer = b.ros.node(client, "listener", topic=TOPIC, name="viewer")
@@ -157,6 +160,41 @@ def test_tools_that_measure_are_relayed_and_leave_the_user_direct(modules: Modul
     assert (after["transport"], after["missed"]) == ("direct", 0)
     assert after["since_ago"] > since, "it was not moved meanwhile"
     unbroken(flows(viewer))
+    assert "direct.relayed" not in b.agent.snapshot().counters, "a tool is relayed on purpose: no warning"
+
+
+def test_of_two_publishers_of_a_roscpp_subscriber_one_is_counted_by_the_kernel(modules: ModuleFactory) -> None:
+    """roscpp's statistics have only the publisher of a subscription that connected last."""
+    a, b = modules("a", "b", config=AUTO)
+    on_the_network(a, b)
+    talkers = [a.ros.roscpp("talker", topic=TOPIC, rate=RATE, size=1000, name=name) for name in ("one", "two")]
+    viewer = b.ros.roscpp("listener", topic=TOPIC, name="viewer")
+    for talker in talkers:
+        wait_direct(viewer, talker)
+    ends = [one["subscribers"][0] for one in mesh(b)["routes"]]
+    assert sorted(one["figures"]["counted_by"] for one in ends) == ["kernel", "node"]
+    for one in ends:
+        assert near(one["figures"]["bandwidth"], RATE * 1000), one
+        assert bool(one["unmeasured"]) is (one["figures"]["counted_by"] == "kernel")
+    text = b.agent.rmpa("topic", "info", TOPIC)[1]
+    assert "as the kernel counts\n                /viewer does not tell the figures of this connection" in text
+
+
+def test_a_subscriber_that_cannot_be_moved_is_shown_as_stuck(modules: ModuleFactory, tmp_path: Path) -> None:
+    a, b = modules("a", "b", config=AUTO, prefix=UNPRIVILEGED)
+    on_the_network(a, b)
+    talker = a.ros.roscpp("talker", topic=TOPIC, rate=RATE, name="talker")
+    viewer = b.ros.rospy("listener", topic=TOPIC, name="viewer")
+    wait_direct(viewer, talker)
+    reload(tmp_path, b, f'{AUTO}[[contract]]\ntopics = ["{TOPIC}"]\ntransport = "relay"\n')
+    eventually(lambda: subscriber(b, "/viewer")["stuck"], what="/viewer is stuck")
+    found = subscriber(b, "/viewer")
+    assert (found["transport"], found["state"], found["condition"]) == ("direct", "relayed", "transport")
+    assert near(found["figures"]["rate"], RATE), found
+    level, text = stages(b)["transport"]
+    assert level == "warn"
+    assert f"has to be relayed, but its connection cannot be ended ({found['stuck']})" in text
+    assert text in [one["text"].removeprefix("of a: ") for one in json.loads(b.agent.rmpa("doctor", "--json")[1])]
 
 
 def test_a_latched_topic_is_told_to_a_tool_as_well(modules: ModuleFactory) -> None:
@@ -173,6 +211,22 @@ def test_a_latched_topic_is_told_to_a_tool_as_well(modules: ModuleFactory) -> No
     assert [one["count"] for one in viewer.events("report")][-1] == 1
 
 
+def test_why_sees_that_messages_go_on_without_the_peers_agent(modules: ModuleFactory) -> None:
+    a, b = modules("a", "b", config=AUTO)
+    on_the_network(a, b)
+    talker = a.ros.roscpp("talker", topic=TOPIC, rate=RATE, name="talker")
+    viewer = b.ros.roscpp("listener", topic=TOPIC, name="viewer")
+    wait_direct(viewer, talker)
+    a.agent.kill()
+    b.agent.wait_no_peer("a")
+    flows(viewer)
+    said = stages(b)
+    assert said["link"][0] == "warn"
+    assert "without its agent only what is connected directly goes on" in said["link"][1]
+    assert said["connection"][0] == "ok"
+    assert said["arrived"][1].endswith(" Hz, as /viewer counts")
+
+
 def test_a_stopped_subscriber_is_noticed_by_its_own_agent(modules: ModuleFactory) -> None:
     a, b = modules("a", "b", config=AUTO)
     on_the_network(a, b)
@@ -180,9 +234,10 @@ def test_a_stopped_subscriber_is_noticed_by_its_own_agent(modules: ModuleFactory
     viewer = b.ros.roscpp("listener", topic=TOPIC, name="viewer")
     wait_direct(viewer, talker)
     viewer.freeze()
-    (level, text), (connection, _) = (stages(b)[name] for name in ("arrived", "connection"))
-    assert (level, connection) != ("ok", "ok")
-    assert "/viewer" in text
+    said = stages(b)
+    (level, text), (connection, _) = said["arrived"], said["connection"]
+    assert (level, connection) == ("warn", "ok"), "the kernel has the connection, the node does not answer"
+    assert text.startswith("/viewer does not tell its figures")
     viewer.thaw()
     eventually(lambda: stages(b)["arrived"][0] == "ok", what="/viewer is heard of again")
 

@@ -137,7 +137,7 @@ SNAPSHOT = Snapshot(
                     ),
                     transport="relay",
                     condition="contract",
-                    condition_text="the contract asks for what only agents do: reliable, deadline 0.2 s",
+                    condition_text="the contract asks for a deadline",
                     subscribers=(
                         SubscriberTransport(
                             node="/velocity",
@@ -146,7 +146,7 @@ SNAPSHOT = Snapshot(
                             since_ago=5.0,
                             wanted="auto",
                             condition="contract",
-                            text="the contract asks for what only agents do: reliable, deadline 0.2 s",
+                            text="the contract asks for a deadline",
                         ),
                     ),
                 ),

@@ -330,7 +330,7 @@ def test_direct_and_relayed_subscribers_share_a_status() -> None:
         (
             {"wanted": "auto", "transport": "direct", "endpoint": "10.0.0.2:41234", "stuck": "not permitted"},
             DiagnosticLevel.WARN,
-            "direct to 10.0.0.2:41234 for /viewer, although it has to be relayed (no way): its connection cannot be",
+            "direct to 10.0.0.2:41234 for /viewer, has to be relayed, but its connection cannot be ended",
         ),
     ],
 )

@@ -10,9 +10,10 @@ import pytest
 from rmpa.observe.transport_text import fallbacks, route_texts, stuck, subscriber_text
 from tests.observe.samples import DIRECT, VIEWER
 
-WHY = "a node /viewer of another module is connected already"
+SAID = "a node /viewer of another module is connected already"
 STUCK = "its connection cannot be ended (Operation not permitted)"
-RELAYED: dict[str, Any] = {"transport": "relay", "state": "relayed", "condition": "caller_id", "text": WHY}
+RELAYED: dict[str, Any] = {"transport": "relay", "state": "relayed", "condition": "caller_id", "text": SAID}
+WHY = f"{SAID} (condition caller_id)"
 
 
 @pytest.mark.parametrize(
@@ -27,7 +28,7 @@ RELAYED: dict[str, Any] = {"transport": "relay", "state": "relayed", "condition"
         ),
         (
             RELAYED | {"transport": "direct", "stuck": "Operation not permitted"},
-            f"direct to 10.0.0.2:41234 for /viewer, although it has to be relayed ({WHY}): {STUCK}",
+            f"direct to 10.0.0.2:41234 for /viewer, has to be relayed, but {STUCK}: {WHY}",
         ),
         (
             {"transport": "relay", "state": "asking"},
@@ -53,7 +54,7 @@ def test_a_topic_that_is_relayed_by_rule_says_so() -> None:
     route = msgspec.structs.replace(
         DIRECT, transport="relay", condition="transport", condition_text=text, subscribers=()
     )
-    assert route_texts(route) == [f"relayed: {text}"]
+    assert route_texts(route) == [f"relayed: {text} (condition transport)"]
     assert route_texts(msgspec.structs.replace(route, transport="", condition="", condition_text="")) == []
 
 

@@ -176,7 +176,7 @@ def _facts(info: PeerInfo) -> list[tuple[str, str]]:
             ("Drops", f"{link.dropped} messages"),
         ]
         if info.direct_in or info.direct_out:
-            ours = f"{info.direct_in} connections of subscribers here to its nodes"
+            ours = f"{info.direct_in} of the subscribers here to its nodes"
             facts.append(("Direct", f"{ours}, {info.direct_out} of its subscribers to nodes here"))
         if link.packet is not None:
             facts.append(("Packets", f"of at most {link.packet} bytes to it"))

@@ -102,7 +102,7 @@ def transport_lines(route: RouteInfo) -> Iterator[tuple[str, str]]:
         yield "transport", subscriber_text(one, since) + missed
         if one.figures is not None:
             yield "", figures_text(one.figures, route.node if one.state == "granted" else one.node)
-        elif one.unmeasured:
+        if one.unmeasured:
             yield "", one.unmeasured
 
 
@@ -115,6 +115,8 @@ def figures_text(figures: DirectFigures, node: str) -> str:
         flow.append(f"{figures.messages} messages")
     if figures.dropped is not None:
         flow.append(f"{figures.dropped} dropped by its queue")
+    if figures.counted_by == "kernel":
+        return f"{', '.join(flow)}, as the kernel counts"
     return f"{', '.join(flow)}, as {node} counts"
 
 

@@ -256,7 +256,7 @@ class EventInfo(msgspec.Struct, kw_only=True, frozen=True):
 
 
 class DirectFigures(msgspec.Struct, kw_only=True, frozen=True):
-    """The figures of a direct connection, by the statistics of one of its two nodes (``getBusStats``).
+    """The figures of a direct connection, by the statistics of a node at its end (``getBusStats``).
 
     Attributes:
         messages: Since the connection was made, by the node's counter of 32 bits; ``None`` if the node does not say.
@@ -265,6 +265,7 @@ class DirectFigures(msgspec.Struct, kw_only=True, frozen=True):
         rate: Messages a second.
         bandwidth: Bytes a second.
         window: The time that both are measured over, seconds.
+        counted_by: ``node``, or ``kernel`` where the node does not tell: bytes alone.
     """
 
     messages: int | None = None
@@ -273,6 +274,7 @@ class DirectFigures(msgspec.Struct, kw_only=True, frozen=True):
     rate: float | None = None
     bandwidth: float | None = None
     window: float = 0.0
+    counted_by: str = "node"
 
 
 class SubscriberTransport(msgspec.Struct, kw_only=True, frozen=True):
@@ -292,7 +294,7 @@ class SubscriberTransport(msgspec.Struct, kw_only=True, frozen=True):
         stuck: Why its direct connection cannot be ended although it has to be relayed; empty: nothing is wrong.
         connected: Whether its direct connection stands, by the node and the kernel; ``None``: nobody looked.
         figures: Of its direct connection, while somebody looks; see ``unmeasured``.
-        unmeasured: Why there are no figures although somebody looks, ready to read.
+        unmeasured: Why the node tells no figures although somebody looks, ready to read.
         silent: Whether the node that was asked for them did not answer.
     """
 

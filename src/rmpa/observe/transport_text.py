@@ -13,9 +13,9 @@ BY_RULE: Final = "transport"
 """``Condition.TRANSPORT``: the contract of one end says ``relay``."""
 _REMEDIES: Final = {
     "contract": 'take these terms out of [[contract]], or set its transport to "relay"',
-    "name": "let it have one name in both modules ([[peer]] names of both)",
-    "listening": "start the publisher's node with ROS_IP of an address of its network, not of loopback",
-    "subscriber": "start the subscriber with ROS_IP of an address of its network, not of loopback",
+    "name": "leave it out of prefix and remap of the [[peer]]",
+    "listening": "start the publisher without ROS_IP and ROS_HOSTNAME, or with an address of that network",
+    "subscriber": "start the subscriber without ROS_IP and ROS_HOSTNAME, or with an address of that network",
     "caller_id": "give one of both nodes another name",
     "reachable": "see that TCP gets through from this machine to the ports of nodes over there (a firewall?)",
     "latched": "start the subscriber again",
@@ -43,19 +43,20 @@ def subscriber_text(one: SubscriberTransport, since: str = "") -> str:
         since: For how long, as text.
     """
     node = f"{one.node} ({since})" if since else one.node
+    reason = f"{one.text} (condition {one.condition})" if one.condition else one.text
     if one.state == "granted":
         return f"direct for {node}, to port {one.endpoint} of this machine"
     if one.transport == "direct":
         text = f"direct to {one.endpoint} for {node}"
         if one.stuck:
-            return f"{text}, although it has to be relayed ({one.text}): its connection cannot be ended ({one.stuck})"
+            return f"{text}, has to be relayed, but its connection cannot be ended ({one.stuck}): {reason}"
         if one.state == "relayed":
-            return f"{text}, is moved to the relayed transport: {one.text}"
+            return f"{text}, is moved to the relayed transport: {reason}"
         return text
     if one.transport == "relay":
-        return f"relayed for {node}: {one.text or _MOVES.get(one.state, one.state)}"
+        return f"relayed for {node}: {reason or _MOVES.get(one.state, one.state)}"
     if one.state == "relayed":
-        return f"relayed for {node}, once it connects: {one.text}"
+        return f"relayed for {node}, once it connects: {reason}"
     return f"none yet for {node}: {_WAITS.get(one.state, one.state)}"
 
 
@@ -64,7 +65,7 @@ def route_texts(route: RouteInfo) -> list[str]:
     if route.subscribers:
         return [subscriber_text(one) for one in route.subscribers]
     if route.transport == "relay" and route.condition:
-        return [f"relayed: {route.condition_text}"]
+        return [f"relayed: {route.condition_text} (condition {route.condition})"]
     return []
 
 

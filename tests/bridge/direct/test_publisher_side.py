@@ -29,6 +29,7 @@ def condition(unmet: Unmet | None) -> Condition | None:
     return unmet.condition if unmet is not None else None
 
 
+@pytest.mark.trap(12)
 def test_a_name_is_granted_once_for_a_source(sut: DirectGrants) -> None:
     assert condition(sut.judge(2, SOURCE, "/viewer", [])) is Condition.CALLER_ID
     assert sut.judge(1, SOURCE, "/viewer", []) is None, "the same subscriber may ask again"

@@ -306,3 +306,16 @@ def test_nothing_is_left_of_a_subscriber_that_is_removed(hang_up: bool) -> None:
     assert actions == [Release(KEY), Decided(KEY), *([HangUp(KEY, END)] if hang_up else [])]
     assert (list(sut), sut.of(1, SOURCE), sut.next_timer(), sut.connected()) == ([], [], None, [])
     assert sut.remove(KEY) == []
+
+
+def test_a_subscriber_that_comes_back_to_the_proxy_without_asking_is_moved() -> None:
+    sut = Sut()
+    sut.ask()
+    sut.answered(KEY, None, 1.0)
+    assert sut.left(KEY, 2.0) == []
+    assert sut.arrived(KEY, 2.2) == []
+    assert sut.state() == (DirectState.ASKING, Path.RELAY)
+    sut = Sut()
+    sut.direct()
+    assert sut.arrived(KEY, 3.0) == [Decided(KEY), Move(KEY)]
+    assert sut.arrived(KEY, 3.1) == []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import socket
 from contextlib import AsyncExitStack, asynccontextmanager
+from functools import partial
 from typing import TYPE_CHECKING
 
 import pytest
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 
 DEADLINE = 20.0
 RATE = 100.0
+MESSAGE = 4 + 4 + len("hello")
+"""Bytes of a message, with its length in front."""
 
 
 class Calls:
@@ -101,7 +104,7 @@ async def test_the_first_look_waits_for_the_figures_of_both_ends(calls: Calls) -
         await sampler.settle(["/cmd"])
         assert asyncio.get_running_loop().time() - begin < limits.DIRECT_FIRST_LOOK + 0.5
         for flow in flows:
-            await until(lambda flow=flow: sampler[flow].figures is not None and sampler[flow].settled)  # type: ignore[misc]
+            await until(partial(lambda of: sampler[of].figures is not None and sampler[of].settled, flow))
             sample = sampler[flow]
             assert sample.connected is True
             assert sample.figures is not None
@@ -126,6 +129,14 @@ async def test_without_a_look_no_node_is_asked(calls: Calls, monkeypatch: pytest
         assert sampler[flows[0]].figures is None, "old figures are not shown"
         await sampler.settle(["/cmd"])
         assert len(calls.methods) > asked
+
+
+async def test_looks_at_topics_without_direct_connections_leave_nothing_behind() -> None:
+    async with sampling() as sampler:
+        for number in range(100):
+            sampler.look([f"/none{number}"])
+        assert sampler.idle
+        assert sampler.watched == 0
 
 
 async def test_a_connection_that_is_gone_is_told(calls: Calls) -> None:
@@ -169,9 +180,26 @@ async def judge_frozen(port: int) -> None:
         ([1, "", [[], [], []]], "/viewer does not tell the figures of this connection"),
     ],
 )
-async def test_a_node_without_figures_says_why(calls: Calls, stats: XmlRpcValue | RosFault, problem: str) -> None:
+async def test_where_a_node_tells_no_figures_the_kernel_counts_bytes(
+    calls: Calls, stats: XmlRpcValue | RosFault, problem: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     calls.stats = stats
-    async with pair() as (viewer, _), sampling(viewer) as sampler:
-        await sampler.settle(None)
-        sample = sampler[viewer]
-        assert (sample.connected, sample.figures, sample.problem, sample.silent) == (True, None, problem, False)
+    async with pair() as flows:
+        async with sampling(*flows) as sampler:
+            await sampler.settle(None)
+            for flow in flows:
+                sample = sampler[flow]
+                assert (sample.connected, sample.silent) == (True, False)
+                assert sample.problem == problem.replace("/viewer", flow.node)
+                await until(partial(lambda of: of.settled, sample))
+                figures = sample.figures
+                assert figures is not None
+                assert (figures.counted_by, figures.messages, figures.rate) == ("kernel", None, None)
+                assert figures.bandwidth is not None
+                assert 0.3 * RATE * MESSAGE < figures.bandwidth < 1.5 * RATE * MESSAGE
+        monkeypatch.setattr(direct_sampler, "carried", lambda *_: None)
+        async with sampling(*flows) as sampler:
+            await sampler.settle(None)
+            assert [sampler[flow].figures for flow in flows] == [None, None]
+            assert sampler[flows[0]].problem == problem
+            assert sampler[flows[0]].settled, "a look does not wait for what does not come"

@@ -10,7 +10,7 @@ import pytest
 
 from rmpa.observe.check import CheckLevel
 from rmpa.observe.snapshot import DirectFigures, SubscriberTransport
-from tests.observe.why.test_topics import ROUTE, SOURCE, Case, connected
+from tests.observe.why.test_topics import PEER, ROUTE, SOURCE, Case, connected
 
 if TYPE_CHECKING:
     from rmpa.observe.why.diagnosis import Diagnosis
@@ -198,16 +198,20 @@ RELAYED = {"transport": "relay", "state": "relayed", "endpoint": "", "connected"
 @pytest.mark.parametrize(
     ("changes", "level", "text"),
     [
-        ({"condition": "caller_id", "text": "taken"}, CheckLevel.OK, "relayed for /base: taken"),
+        (
+            {"condition": "caller_id", "text": "taken"},
+            CheckLevel.OK,
+            "relayed for /base: taken (condition caller_id)",
+        ),
         (
             {"condition": "caller_id", "text": "taken", "wanted": "direct"},
             CheckLevel.WARN,
-            "relayed for /base: taken",
+            "relayed for /base: taken (condition caller_id)",
         ),
         (
             {"condition": "transport", "text": 'it is "relay"', "wanted": "direct"},
             CheckLevel.OK,
-            'relayed for /base: it is "relay"',
+            'relayed for /base: it is "relay" (condition transport)',
         ),
     ],
 )
@@ -222,6 +226,18 @@ def test_the_transport_never_fails_and_names_the_condition(
     case = Case(route=route, later=later)
     assert walk(case).flows
     assert stages(case)["transport"] == (level, text)
+
+
+def test_direct_messages_go_on_without_the_peers_agent() -> None:
+    unlinked = msgspec.structs.replace(PEER, state="linking", link=None, last_error="connection reset")
+    found = walk(replace(direct(), peer=unlinked))
+    assert found.flows, found
+    assert [stage.name for stage in found.stages] == ["peer", "link", "transport", "connection", "sent", "arrived"]
+    assert found.stages[1].level is CheckLevel.WARN
+    assert "connection reset; without its agent only what is connected directly goes on" in found.stages[1].text
+    broken = walk(replace(direct(changed(HERE, connected=False)), peer=unlinked))
+    assert broken.failed is not None
+    assert broken.failed.name == "connection"
 
 
 def test_a_subscriber_that_cannot_be_moved_is_a_warning() -> None:

@@ -327,6 +327,14 @@ class DirectSubscriptions:
         latched = route.unmet is not None and route.unmet.condition is Condition.LATCHED
         return self._ask(key, route, now) if latched else []
 
+    def arrived(self, key: DirectKey, now: float) -> list[DirectAction]:
+        """Note that a subscriber is connected to the proxy; roscpp connects again without asking again."""
+        route = self._routes.get(key)
+        if route is None or route.path is not Path.NONE:
+            return []
+        route.path, route.stranded = Path.RELAY, False
+        return self._direct(key, route, now) if route.state is DirectState.DIRECT else []
+
     # --- the peer ---------------------------------------------------------------------------------------------------
 
     def replied(self, key: DirectKey, attempt: int, found: Grant | Unmet, now: float) -> list[DirectAction]:

@@ -11,20 +11,22 @@ import logging
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+import msgspec
+
 from rmpa.bridge.policy import OWN_NODE
 from rmpa.core.errors import RmpaError
 from rmpa.observe import limits
 from rmpa.observe.direct_traffic import TrafficMeter
 from rmpa.ros.http.client import call
-from rmpa.ros.wire.bus import read_bus_info, read_bus_stats
+from rmpa.ros.wire.bus import BusTraffic, read_bus_info, read_bus_stats
 from rmpa.ros.wire.xmlrpc import RosFault
-from rmpa.runtime.tcp_connections import connections
+from rmpa.runtime.tcp_connections import carried, connections
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable
 
     from rmpa.observe.snapshot import DirectFigures
-    from rmpa.ros.wire.bus import BusLink, BusTraffic
+    from rmpa.ros.wire.bus import BusLink
 
 _log = logging.getLogger(__name__)
 _BEYOND: Final = "exceeds XML-RPC limits"
@@ -55,7 +57,8 @@ class DirectSample:
 
     Args:
         connected: Whether it has the connection, and the kernel too; ``None``: not known.
-        problem: Why there are no figures, ready to read; empty if there are, or will be.
+        problem: Why the node tells no figures, ready to read; empty if it does, or will.
+        by_kernel: Whether the readings are the kernel's for that reason.
         silent: Whether the node did not answer.
         meter: The readings.
     """
@@ -63,17 +66,21 @@ class DirectSample:
     connected: bool | None = None
     problem: str = ""
     silent: bool = False
+    by_kernel: bool = False
     meter: TrafficMeter = field(default_factory=TrafficMeter)
 
     @property
     def figures(self) -> DirectFigures | None:
         """The figures; ``None`` if they are not known."""
-        return None if self.problem else self.meter.figures()
+        figures = self.meter.figures() if self.by_kernel or not self.problem else None
+        if figures is None or not self.by_kernel:
+            return figures
+        return msgspec.structs.replace(figures, counted_by="kernel")
 
     @property
     def settled(self) -> bool:
-        """Whether the node has been asked as often as a rate needs, or cannot tell one."""
-        return bool(self.problem) or self.meter.measured
+        """Whether there are as many readings as a rate needs, or will be none."""
+        return self.meter.measured or (bool(self.problem) and not self.by_kernel)
 
 
 class DirectSampler:
@@ -101,13 +108,22 @@ class DirectSampler:
         """Whether no node is asked."""
         return self._task is None
 
+    @property
+    def watched(self) -> int:
+        """The number of topics (all of them are one) that are looked at."""
+        return len(self._until)
+
     def look(self, topics: Collection[str] | None) -> None:
         """Sample the direct connections of topics, or of all with ``None``, for ``limits.DIRECT_LOOK`` seconds."""
+        flows = list(self._flows(topics))
+        if not flows:
+            return
         until = asyncio.get_running_loop().time() + limits.DIRECT_LOOK
-        self._until |= dict.fromkeys([None] if topics is None else topics, until)
-        if self._unsettled(topics):
+        # Only topics that have direct connections: a peer may ask for any name.
+        self._until |= dict.fromkeys([None] if topics is None else {flow.topic for flow in flows}, until)
+        if not all(self[flow].settled for flow in flows):
             self._wake.set()
-        if self._task is None and any(True for _ in self._flows(topics)):
+        if self._task is None:
             self._task = asyncio.create_task(self._run(), name="figures of direct connections")
 
     async def settle(self, topics: Collection[str] | None) -> None:
@@ -211,7 +227,7 @@ def _take(
     now: float,
 ) -> None:
     """Judge what a node said of one of its flows."""
-    sample.problem, sample.silent = problem, links is None
+    sample.problem, sample.silent, sample.by_kernel = problem, links is None, False
     if links is None:
         # The node may be stopped, or too busy; the kernel still knows whether it has a connection.
         sample.connected = _stands(flow.endpoint)
@@ -220,12 +236,26 @@ def _take(
     sample.connected = found is not None and _stands(flow.endpoint, found.local_port) is not False
     if found is None:
         sample.problem = problem or f"{flow.node} has no such connection now"
-    elif not problem:
-        if found.number not in traffic:
-            # roscpp lists only the publisher of a subscription that connected last.
-            sample.problem = f"{flow.node} does not tell the figures of this connection"
-        else:
-            sample.meter.take(found, traffic[found.number], now)
+        return
+    counts = traffic.get(found.number)
+    if counts is None:
+        # roscpp lists only the publisher of a subscription that connected last.
+        sample.problem = problem or f"{flow.node} does not tell the figures of this connection"
+        counts = _by_kernel(found)
+    sample.by_kernel = bool(sample.problem) and counts is not None
+    if counts is not None:
+        sample.meter.take(found, counts, now)
+
+
+def _by_kernel(link: BusLink) -> BusTraffic | None:
+    """What the kernel has counted of a connection; ``None`` if it cannot be named, or the kernel does not tell."""
+    try:
+        found = carried(link.local_port, link.remote) if link.local_port and link.remote else None
+    except ValueError:
+        return None  # the node gives a host name
+    if found is None:
+        return None
+    return BusTraffic(link.number, link.topic, link.inbound, found[1] if link.inbound else found[0], None, None)
 
 
 def _is(link: BusLink, flow: DirectFlow) -> bool:

@@ -126,7 +126,9 @@ def _flow_out(source: Source, subscriber: str, granted: Granted) -> DirectFlow:
 
 def _with(one: SubscriberTransport, sample: DirectSample) -> SubscriberTransport:
     """A subscriber with what its node, or its publisher, said last."""
-    return msgspec.structs.replace(one, connected=sample.connected, figures=sample.figures, unmeasured=sample.problem)
+    return msgspec.structs.replace(
+        one, connected=sample.connected, figures=sample.figures, unmeasured=sample.problem, silent=sample.silent
+    )
 
 
 def _transport(*, direct: bool, relayed: bool) -> str:

@@ -54,6 +54,21 @@ def direct_stages(route: RouteInfo, report: PublisherReport | None, *, relayed: 
     yield _arrived(direct, told, bad)
 
 
+def adrift_stages(link: Check, route: RouteInfo) -> tuple[Check, ...]:
+    """Judge the direct subscribers of a peer whose agent has died: their messages go on without it.
+
+    Args:
+        link: The stage of the link, which fails.
+        route: The route.
+    """
+    text = f"{link.text}; without its agent only what is connected directly goes on"
+    return (
+        Check("link", WARN, text, f"start the agent of {route.peer} again: it takes the direct connections over"),
+        transport(route),
+        *direct_stages(route, None, relayed=False),
+    )
+
+
 def _connection(direct: list[SubscriberTransport], bad: CheckLevel) -> Check:
     missing = [one for one in direct if one.connected is False]
     if missing:
@@ -114,4 +129,6 @@ def _arrived_at(one: SubscriberTransport, there: SubscriberTransport | None) -> 
         text = f"{one.node} has dropped {figures.dropped} of {count} by its own queue"
         return Check("arrived", WARN, text, "its callbacks are too slow, or its queue is too short")
     rate = f", {figures.rate:.1f} Hz" if figures.rate is not None else ""
-    return Check("arrived", OK, f"{count}{rate}, as {one.node} counts")
+    return Check(
+        "arrived", OK, f"{count}{rate}, as {'the kernel' if figures.counted_by == 'kernel' else one.node} counts"
+    )

@@ -20,7 +20,7 @@ from rmpa.mesh import limits as mesh_limits
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check
 from rmpa.observe.why.diagnosis import Diagnosis, until_failure
-from rmpa.observe.why.direct_stages import connected_directly, direct_stages, transport
+from rmpa.observe.why.direct_stages import adrift_stages, connected_directly, direct_stages, transport
 from rmpa.ros import limits as ros_limits
 
 if TYPE_CHECKING:
@@ -118,6 +118,11 @@ def diagnose_topic(ends: BothEnds, peer: str, later: BothEnds | None = None, wir
     name = known.name if known is not None else peer
     wire = wire or topic
     begin = peer_stages(snapshot, peer)
+    if begin[-1].name == "link" and begin[-1].level is FAIL:
+        left = [route for route in _routes((later or ends).here, name) if connected_directly(route)]
+        if left:
+            stages = [(route.node, (*begin[:-1], *adrift_stages(begin[-1], route))) for route in left]
+            return tuple(Diagnosis.of(found, name=topic, peer=name, to=to, node=node) for node, found in stages)
     if begin[-1].level is not FAIL:
         begin += (_published(ends, name, wire),)
     if begin[-1].level is FAIL:

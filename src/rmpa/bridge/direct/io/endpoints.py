@@ -12,6 +12,7 @@ from rmpa.bridge.policy import OWN_NODE
 from rmpa.core.errors import RmpaError
 from rmpa.ros.environment import is_loopback
 from rmpa.ros.http.client import call_api
+from rmpa.ros.wire.services import parse_service_uri
 from rmpa.ros.wire.slave_api import TCPROS
 from rmpa.ros.wire.xmlrpc import RosFault
 from rmpa.runtime.tcp_connections import listening_addresses
@@ -65,10 +66,11 @@ class LocalEndpoints:
             uri: Its registered URI, ``rosrpc://host:port``.
             service: The service.
         """
-        text = uri.rpartition(":")[2].rstrip("/")
-        if not uri.startswith("rosrpc://") or not text.isdecimal() or not 0 < int(text) < 1 << 16:
+        try:
+            _, port = parse_service_uri(uri)
+        except RmpaError:
             return Unmet(Condition.NODE, f"{node} registered {uri[:100]!r} for {service}")
-        return self._judge(session, node, int(text), service)
+        return self._judge(session, node, port, service)
 
     def forget(self, uri: str) -> None:
         """Forget a node's port: the node has ended or broken a connection."""

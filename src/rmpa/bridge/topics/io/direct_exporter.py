@@ -14,7 +14,7 @@ from rmpa.bridge.direct.publisher_side import DirectGrants, EndConnections, Gran
 from rmpa.bridge.direct.requests import DirectClosed, RetryDirect
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import is_own
-from rmpa.bridge.topics.audience import is_watched
+from rmpa.bridge.topics.audience import compares_names
 from rmpa.core.contract import combine
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
 
@@ -182,8 +182,8 @@ class DirectExporter:
         offered = self._exports.offered[source]
         if offered.origin is not None:
             return Unmet(Condition.OWN_SOURCE, "it comes by a relay")
-        if is_watched(offered.type):
-            return Unmet(Condition.ACTION, f"publishers of {offered.type} compare the names of their subscribers")
+        if compares_names(offered.type):
+            return Unmet(Condition.ACTION, f"actions compare the names of the nodes at {offered.type}")
         return unmet_by_contract(
             combine(self._contracts.of(source.topic, offered.type), granted.asked), "the publisher's module"
         )

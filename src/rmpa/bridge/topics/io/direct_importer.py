@@ -25,7 +25,7 @@ from rmpa.bridge.direct.subscriber_side import (
     Release,
 )
 from rmpa.bridge.policy import is_own
-from rmpa.bridge.topics.audience import is_watched
+from rmpa.bridge.topics.audience import compares_names
 from rmpa.bridge.topics.io.direct_moves import SubscriberMoves
 from rmpa.core.contract import Transport
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
@@ -112,8 +112,8 @@ class DirectImporter:
         self._tasks: set[asyncio.Task[None]] = set()
         self._adrift: dict[int, list[RemoteTopic]] = {}
         """The sources of each peer that are kept because of direct subscribers while its agent is gone."""
-        self._strays: dict[tuple[str, str], tuple[str, int]] = {}
-        """Direct connections that a crashed agent left: topic and subscriber, and the publisher's endpoint."""
+        self._strays: dict[tuple[Source, str], tuple[str, int]] = {}
+        """Direct connections that a crashed agent left, by source and subscriber: the publisher's endpoint."""
         self._asking: dict[int, asyncio.Semaphore] = {}
         self._checking: asyncio.TimerHandle | None = None
         self._closed = False
@@ -190,8 +190,8 @@ class DirectImporter:
             return Unmet(Condition.OWN_SOURCE, f"it is {entry.origin.name}'s, and comes by a relay")
         if entry.topic != source.topic:
             return Unmet(Condition.NAME, f"it is {source.topic} in the publisher's module")
-        if is_watched(entry.type):
-            return Unmet(Condition.ACTION, f"publishers of {entry.type} compare the names of their subscribers")
+        if compares_names(entry.type):
+            return Unmet(Condition.ACTION, f"actions compare the names of the nodes at {entry.type}")
         if node.startswith(MEASURING):
             return Unmet(Condition.MEASURES, "rmpa's own tools measure by the agents")
         if is_loopback(host_of(uri)) and not session.same_machine:
@@ -226,7 +226,7 @@ class DirectImporter:
             await self._decision(key)
         entry, topic = self._imports.get(key.peer, key.source), key.source.topic
         uri = self._moves.uri(key.subscriber, topic)
-        stray = self._strays.get((topic, key.subscriber))
+        stray = self._strays.get((key.source, key.subscriber))
         session = self._sessions.get(key.peer)
         decision = self.routes.decision(key)
         direct = (session.address, decision.port) if session is not None and isinstance(decision, Grant) else None
@@ -269,7 +269,7 @@ class DirectImporter:
         return route.endpoint if route is not None and route.path is Path.DIRECT else None
 
     def _answered(self, key: DirectKey, endpoint: tuple[str, int] | None, reply: RosReply | None) -> RosReply | None:
-        self._strays.pop((key.source.topic, key.subscriber), None)
+        self._strays.pop((key.source, key.subscriber), None)
         self._act(self.routes.answered(key, endpoint, self._now()))
         self._watch()
         return reply
@@ -291,16 +291,20 @@ class DirectImporter:
                 self._waiting.pop(key, None)
 
     def listeners_changed(self, peer: int, source: Source) -> None:
-        """Note which subscribers have left the proxy of a source."""
+        """Note which subscribers have left the proxy of a source, or have come back to it by themselves."""
         routes = self.routes.of(peer, source)
         if not routes:
             return
         publication = self._publication(peer, source)
         there = publication.callers if publication is not None else frozenset()
-        for name, route in routes:
+        for name, _ in routes:
             key = DirectKey(peer, source, name)
-            if route.path is Path.RELAY and name not in there and key not in self._moves:
+            if key in self._moves:
+                continue
+            if name not in there:
                 self._act(self.routes.left(key, self._now()))
+            else:
+                self._act(self.routes.arrived(key, self._now()))
 
     # --- links ------------------------------------------------------------------------------------------------------
 
@@ -330,11 +334,11 @@ class DirectImporter:
             session: The peer.
             hang_up: End their connections, rather than leave them to the peer's next agent.
         """
-        left: dict[tuple[str, str], tuple[str, int]] = {}
+        left: dict[tuple[Source, str], tuple[str, int]] = {}
         for key, route in self.routes:
             if key.peer == session.peer:
                 if not hang_up and route.path is Path.DIRECT and route.endpoint is not None:
-                    left[key.source.topic, key.subscriber] = route.endpoint
+                    left[key.source, key.subscriber] = route.endpoint
                 self._act(self.routes.remove(key, hang_up=hang_up))
         self._adrift.pop(session.peer, None)
         self._asking.pop(session.peer, None)
@@ -342,12 +346,12 @@ class DirectImporter:
             self._strays |= left
             asyncio.get_running_loop().call_later(limits.DIRECT_ADOPT, self._end_strays, left)
 
-    def _end_strays(self, left: Mapping[tuple[str, str], tuple[str, int]]) -> None:
+    def _end_strays(self, left: Mapping[tuple[Source, str], tuple[str, int]]) -> None:
         """Ends direct connections from before a crash of the peer's agent that its next run has not taken over."""
-        for (topic, subscriber), endpoint in left.items():
-            if not self._closed and self._strays.get((topic, subscriber)) == endpoint:
-                del self._strays[topic, subscriber]
-                self._start(self._end_stray(topic, subscriber, endpoint), f"end {subscriber}'s connection")
+        for (source, subscriber), endpoint in left.items():
+            if not self._closed and self._strays.get((source, subscriber)) == endpoint:
+                del self._strays[source, subscriber]
+                self._start(self._end_stray(source.topic, subscriber, endpoint), f"end {subscriber}'s connection")
 
     async def _end_stray(self, topic: str, subscriber: str, endpoint: tuple[str, int]) -> None:
         uri = self._moves.uri(subscriber, topic)
@@ -422,7 +426,7 @@ class DirectImporter:
                     self._moves.hang_up(key, endpoint)
                 case Release(key, broken):
                     self._release(key, broken=broken)
-                case Fallback(key, unmet):
+                case Fallback(key, unmet) if unmet.condition is not Condition.MEASURES:
                     subject = f"{key.source} to {key.subscriber}"
                     text = f'{subject}: relayed although transport is "direct": {unmet.text}'
                     self._on_warning("direct.relayed", f"{key.peer} {subject} {unmet.condition}", text)

@@ -120,10 +120,11 @@ class WhyService:
         peers = self._reachable_peers()
         own = self._topics.own(topic)
         coming = [peer.guid for peer in peers if self._offers(peer, topic)]
-        if not coming and not own:
+        if not coming and not own and not self._adrift(topic):
             # No peer offers it; one may have it, and not let it cross.
             known = await asyncio.gather(*(self._both_ends(peer, topic) for peer in peers))
             coming = [p.guid for p, e in zip(peers, known, strict=True) if e.there is not None and e.there.sources]
+        coming += self._adrift(topic)
         ways = [self._arrives(guid, topic) for guid in coming]
         ways += [self._leaves(topic, peer.guid) for peer in peers if own and peer.state == "linked"]
         found = [diagnosis for diagnoses in await asyncio.gather(*ways) for diagnosis in diagnoses]
@@ -131,6 +132,12 @@ class WhyService:
 
     def _reachable_peers(self) -> list[PeerInfo]:
         return [peer for peer in self._snapshots.build(frozenset()).peers if peer.state in ("linked", "relayed")]
+
+    def _adrift(self, topic: str) -> list[str]:
+        """The peers whose agent has died while a node of theirs is connected directly to a subscriber here."""
+        snapshot = self._snapshots.build(frozenset({topic}))
+        left = {r.peer for t in snapshot.topics for r in t.routes if r.direction == "in" and connected_directly(r)}
+        return [p.guid for p in snapshot.peers if p.name in left and p.state not in ("linked", "relayed")]
 
     def _offers(self, peer: PeerInfo, topic: str) -> bool:
         session = self._carrier(peer)
@@ -170,10 +177,10 @@ class WhyService:
     async def _both_ends(self, peer: PeerInfo, topic: str) -> BothEnds:
         """What both ends know now."""
         session = self._carrier(peer)
+        await self._snapshots.sampler.settle((topic,))
         if session is None:
             return BothEnds(self._topics.here(None, peer, topic), refusal="it is not linked")
         _, wire = self._topics.there(peer.name, topic)
-        await self._snapshots.sampler.settle((topic,))
         question = {"topic": wire, "instance": peer.instance if peer.state == "relayed" else ""}
         try:
             there, refusal = await self._ask(session, TOPIC, question, TopicAtPublisher), ""
