@@ -319,3 +319,18 @@ def test_a_subscriber_that_comes_back_to_the_proxy_without_asking_is_moved() -> 
     sut.direct()
     assert sut.arrived(KEY, 3.0) == [Decided(KEY), Move(KEY)]
     assert sut.arrived(KEY, 3.1) == []
+
+
+def test_a_port_that_was_not_reached_delays_no_further_subscriber_until_it_is_tried_again() -> None:
+    sut = Sut()
+    sut.consider(KEY, Transport.AUTO, None, 0.0)
+    sut.replied(KEY, 1, GRANT, 0.0)
+    sut.probed(1, GRANT.port, "no answer within 1 s", 1.0)
+    other = DirectKey(KEY.peer, KEY.source, "/another")
+    attempt = asked(sut.consider(other, Transport.AUTO, None, 2.0)).attempt
+    actions = sut.replied(other, attempt, GRANT, 2.0)
+    assert not any(isinstance(one, Probe) for one in actions)
+    assert Decided(other) in actions
+    later = 1.0 + limits.DIRECT_RETRY
+    attempt = asked(sut.handle_timer(later)).attempt
+    assert Probe(1, GRANT) in sut.replied(KEY, attempt, GRANT, later)

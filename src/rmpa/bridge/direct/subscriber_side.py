@@ -205,6 +205,9 @@ class DirectSubscriptions:
         self._of: dict[tuple[int, Source], dict[str, DirectKey]] = {}
         self._reached: set[tuple[int, int]] = set()
         """Peers and ports that were probed with success over the present link."""
+        self._unreached: dict[tuple[int, int], tuple[float, Unmet]] = {}
+        """Peers and ports that a probe did not reach, until when no other is made, and why. A firewall that drops
+        packets delays only the first subscriber of a node."""
         self._probing: set[tuple[int, int]] = set()
         self._timers: TimerQueue[DirectKey] = TimerQueue()
         self._attempts = 0
@@ -357,6 +360,9 @@ class DirectSubscriptions:
         route.grant = found
         if (key.peer, found.port) in self._reached:
             return self._direct(key, route, now)
+        until, unmet = self._unreached.get((key.peer, found.port), (now, None))
+        if unmet is not None and now < until:
+            return self._relay(key, route, unmet, now)
         self._enter(route, DirectState.PROBING, now)
         if (key.peer, found.port) in self._probing:
             return []
@@ -375,15 +381,21 @@ class DirectSubscriptions:
         if (peer, port) not in self._probing:
             return []  # of an earlier link
         self._probing.remove((peer, port))
-        if not problem:
+        unmet = Unmet(Condition.REACHABLE, problem)
+        if problem:
+            self._unreached[peer, port] = (now + limits.DIRECT_RETRY, unmet)
+            if len(self._unreached) > limits.DIRECT_MAX:
+                del self._unreached[next(iter(self._unreached))]
+        else:
             self._reached.add((peer, port))
+            self._unreached.pop((peer, port), None)
         actions: list[DirectAction] = []
         for key, route in self:
             waits = route.state is DirectState.PROBING and key.peer == peer
             if not waits or route.grant is None or route.grant.port != port:
                 continue
             if problem:
-                actions += self._relay(key, route, Unmet(Condition.REACHABLE, problem), now)
+                actions += self._relay(key, route, unmet, now)
             else:
                 actions += self._direct(key, route, now)
         return actions
@@ -463,6 +475,7 @@ class DirectSubscriptions:
                 be reached, or has left, and they are ended.
         """
         self._reached = {one for one in self._reached if one[0] != peer}
+        self._unreached = {one: why for one, why in self._unreached.items() if one[0] != peer}
         self._probing = {one for one in self._probing if one[0] != peer}
         actions: list[DirectAction] = []
         for key, route in self:
