@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING, Final
 
 import pytest
 
 from tests.interop.modules import Module, flows
-from tests.interop.ros import lacks
+from tests.interop.ros import NODES, lacks
 from tests.interop.transports import (
     AUTO,
     direct_topics,
@@ -228,6 +229,23 @@ def test_actions_work_because_their_topics_are_relayed(modules: ModuleFactory, c
     assert asking.wait_event("server")["found"]
     assert asking.wait_event("done")["result"] == 20
     assert direct_topics(a, "/counter", b) | direct_topics(b, "/asking", a) == set()
+
+
+@pytest.mark.parametrize("older", ["a", "b"])
+def test_with_an_agent_of_an_earlier_release_all_is_relayed(
+    lab: Lab, agent: AgentFactory, shell: ShellFactory, older: str
+) -> None:
+    earlier = {older: (sys.executable, str(NODES / "earlier_release.py"))}
+    a, b = (
+        Module(host, agent(host, name=host.name, config=AUTO, prefix=earlier.get(host.name, ())), shell(host))
+        for host in lab.hosts("a", "b")
+    )
+    a.agent.wait_peer("b")
+    on_the_network(a, b)
+    talker = a.ros.roscpp("talker", topic="/chatter", rate=100)
+    listener = b.ros.rospy("listener", topic="/chatter")
+    unbroken(flows(listener, 200))
+    assert links(listener, talker) == 0
 
 
 def test_measuring_tools_are_relayed_and_disturb_nothing(modules: ModuleFactory) -> None:

@@ -66,7 +66,8 @@ def test_a_cable_that_is_out_for_long_ends_both_ends_connections(
     eventually(lambda: not _abroad(listener, a) and not _abroad(talker, b), 6.0, what="both ends have hung up")
     time.sleep(1.0)  # nothing may come back before the cable is in
     b.host.restore()
-    in_order(wait_direct(listener, talker))
+    b.agent.wait_peer("a")
+    in_order(wait_direct(listener, talker, 6.0))
 
 
 @pytest.mark.parametrize("client", ["roscpp", "rospy"])
