@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from lab.bed.processes import Event, Process
+    from rmpa.observe.snapshot import SubscriberInfo
 
 AUTO: Final = '[bridge]\ntransport = "auto"\n'
 _BUS_INFO: Final = """
@@ -78,6 +79,14 @@ def conditions(module: Module) -> dict[str, str]:
         for route in topic.routes
         if route.direction == "in" and (route.transport or route.condition)
     }
+
+
+def shown(module: Module, topic: str, node: str) -> SubscriberInfo | None:
+    """What a module says of one subscriber of a topic that comes from one peer; ``None`` if it does not name it."""
+    with ControlClient(module.agent.sockets()[0]) as client:
+        topics = client.snapshot().topics
+    rows = [one for info in topics if info.name == topic for route in info.routes for one in route.subscribers]
+    return next((one for one in rows if one.node == node), None)
 
 
 def wait_condition(module: Module, topic: str, condition: str) -> None:
