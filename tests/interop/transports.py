@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from lab.bed.processes import Event, Process
-    from rmpa.observe.snapshot import SubscriberInfo
+    from rmpa.observe.snapshot import SubscriberTransport
 
 AUTO: Final = '[bridge]\ntransport = "auto"\n'
 _BUS_INFO: Final = """
@@ -81,7 +81,7 @@ def conditions(module: Module) -> dict[str, str]:
     }
 
 
-def shown(module: Module, topic: str, node: str) -> SubscriberInfo | None:
+def shown(module: Module, topic: str, node: str) -> SubscriberTransport | None:
     """What a module says of one subscriber of a topic that comes from one peer; ``None`` if it does not name it."""
     with ControlClient(module.agent.sockets()[0]) as client:
         topics = client.snapshot().topics
