@@ -330,6 +330,25 @@ def test_a_port_that_a_firewall_closes_is_relayed_soon(modules: ModuleFactory, k
     assert known(b)["calls"] == 2
 
 
+def test_a_roscore_answers_all_nodes_alike_so_its_module_is_relayed(
+    lab: Lab, agent: AgentFactory, shell: ShellFactory
+) -> None:
+    first, second = lab.hosts("a", "b")
+    a = Module(first, agent(first, name="a", config=AUTO), shell(first))
+    ros = shell(second)
+    ros.roscore()
+    b = Module(second, agent(second, name="b", config=AUTO, flags=("--core", "external")), ros)
+    a.agent.wait_peer("b")
+    on_network(a, b)
+    worker(a)
+    worker(b, "roscpp", "/mine")
+    wait_transport(b, "relay", "core")
+    wait_transport(a, "direct", service="/mine")
+    assert calls(caller(a, "rospy", "/mine"), "echo 0 10 2 once")["same"] == 2
+    assert calls(caller(b), "echo 0 10 2 once")["same"] == 2
+    assert (known(a, "/mine")["calls"], known(b)["calls"]) == (0, 2)
+
+
 def test_modules_of_one_machine_call_over_loopback(lab: Lab, agent: AgentFactory, shell: ShellFactory) -> None:
     host = lab.host("both")
     a = Module(host, agent(host, name="a", config=AUTO, core_port=11311), shell(host, port=11311))

@@ -334,3 +334,14 @@ def test_a_port_that_was_not_reached_delays_no_further_subscriber_until_it_is_tr
     later = 1.0 + limits.DIRECT_RETRY
     attempt = asked(sut.handle_timer(later)).attempt
     assert Probe(1, GRANT) in sut.replied(KEY, attempt, GRANT, later)
+
+
+def test_a_stuck_subscriber_that_may_be_direct_again_is_stuck_no_more() -> None:
+    sut = Sut()
+    sut.connected_directly()
+    sut.consider(KEY, Transport.RELAY, RULE, 1.0)
+    route = sut.get(KEY)
+    assert route is not None
+    route.stuck = "it cannot be ended"
+    sut.direct(now=2.0)
+    assert (sut.state(), route.stuck) == ((DirectState.DIRECT, Path.DIRECT), "")

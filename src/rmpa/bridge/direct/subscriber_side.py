@@ -555,6 +555,7 @@ class DirectSubscriptions:
         self._enter(route, DirectState.DIRECT, now)
         if route.path is Path.DIRECT and route.grant is not None and route.endpoint is not None:
             same = route.endpoint[1] == route.grant.port
+            route.stuck = "" if same else route.stuck  # it may stay now
         else:
             same = route.path is Path.NONE and not route.stranded
         return [Decided(key)] if same else [Decided(key), Move(key)]
