@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.agent import limits
-from rmpa.agent.web_process import WebProcess, web_command
+from rmpa.agent.web_process import WebProcess, web_command, web_environment
 from rmpa.config.settings import Settings, WebSettings
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ async def test_a_program_that_is_not_there_costs_the_agent_nothing(caplog: pytes
 
 async def test_the_child_may_use_the_cpus_that_the_agent_keeps_for_itself_no_longer() -> None:
     cpu = min(os.sched_getaffinity(0))
-    web = WebProcess([sys.executable, "-c", "import sys; sys.stdin.read()"], lambda: 1.0, {cpu})
+    web = WebProcess([sys.executable, "-c", "import sys; sys.stdin.read()"], lambda: 1.0, cpus={cpu})
     web.start()
     await until(lambda: web.pid)
     pid = web.pid
@@ -98,7 +98,7 @@ async def test_the_child_may_use_the_cpus_that_the_agent_keeps_for_itself_no_lon
     await web.close()
 
 
-def test_its_command_has_what_the_agent_was_told(tmp_path: Path) -> None:
+def test_its_command_and_environment_have_what_the_agent_was_told(tmp_path: Path) -> None:
     settings = Settings(
         name="base",
         web=WebSettings(enabled=True, port=9000, listen="0.0.0.0", token_file="t"),
@@ -107,3 +107,6 @@ def test_its_command_has_what_the_agent_was_told(tmp_path: Path) -> None:
     command = " ".join(web_command(settings))
     for part in ("--agent base", "--port 9000", "--listen 0.0.0.0", "--token-file t", "--config", "--with-agent"):
         assert part in command
+    settings = Settings(log_level="debug", log_json=True)
+    environ = web_environment(settings, {"RMPA_RUNTIME_DIR": "x", "RMPA_LOG_LEVEL": "error"})
+    assert environ == {"RMPA_RUNTIME_DIR": "x", "RMPA_LOG_LEVEL": "debug", "RMPA_LOG_JSON": "true"}

@@ -113,17 +113,18 @@ def child_of(pid: int) -> int:
 def test_beyond_this_machine_a_token_is_made_and_told_once(place: Place) -> None:
     port = free_port()
     arguments = ("web", "--port", str(port), "--listen", "0.0.0.0", "--agent", "base", "--json")
+    file = place.path / ".local" / "state" / "rmpa" / "base" / "web-token"
     told = []
     for _ in range(2):
         with running(place, *arguments) as web:
             assert web.stdout is not None
             told.append(json.loads(web.stdout.readline()))
-            file = place.path / ".local" / "state" / "rmpa" / "base" / "web-token"
             token = file.read_text().strip()
             assert file.stat().st_mode & 0o777 == 0o600
             assert get(port, "/metrics")[0] == 401
             assert get(port, "/metrics", token)[0] == 200
             assert get(port, f"/metrics?token={token}")[0] == 200
+    token = file.read_text().strip()
     assert told[0]["url"].endswith(f":{port}/?token={token}")
     assert token not in told[1]["url"]
     assert told[0]["token_file"] == told[1]["token_file"] == str(file)

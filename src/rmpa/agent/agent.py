@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.agent.core_choice import make_core
 from rmpa.agent.network import Network
 from rmpa.agent.reload import Reloader, SighupHandler
-from rmpa.agent.web_process import WebProcess, web_command
+from rmpa.agent.web_process import WebProcess, web_command, web_environment
 from rmpa.bridge.io.bridge import Bridge
 from rmpa.bridge.io.limit_reports import LimitReports
 from rmpa.bridge.io.node_requests import NodeRequests
@@ -200,7 +200,7 @@ async def _serve(
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stop.set)
     sighup = SighupHandler(agent.reloader, stop.set)
-    web = WebProcess(web_command(settings), random.random, cpus)
+    web = WebProcess(web_command(settings), random.random, environ=web_environment(settings, os.environ), cpus=cpus)
     await agent.start()
     sighup.start()
     if settings.web.enabled:

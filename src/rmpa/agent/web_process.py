@@ -17,7 +17,7 @@ from rmpa.agent import limits
 from rmpa.core.backoff import Backoff
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Sequence
+    from collections.abc import Callable, Collection, Mapping, Sequence
 
     from rmpa.config.settings import Settings
 
@@ -38,17 +38,32 @@ def web_command(settings: Settings) -> list[str]:
     return command
 
 
+def web_environment(settings: Settings, environ: Mapping[str, str]) -> dict[str, str]:
+    """The environment of the child: the agent's, with its log's level and format."""
+    log = {"RMPA_LOG_LEVEL": settings.log_level, "RMPA_LOG_JSON": str(settings.log_json).lower()}
+    return {**environ, **log}
+
+
 class WebProcess:
     """The child, started again with a growing delay whenever it ends.
 
     Args:
         command: Its command line.
         rng: Uniform numbers in [0, 1), for the delays.
+        environ: Its environment; ``None``: the agent's.
         cpus: The CPUs that it may run on; empty: the agent's. An agent with CPUs of its own keeps them for itself.
     """
 
-    def __init__(self, command: Sequence[str], rng: Callable[[], float], cpus: Collection[int] = ()) -> None:
+    def __init__(
+        self,
+        command: Sequence[str],
+        rng: Callable[[], float],
+        *,
+        environ: Mapping[str, str] | None = None,
+        cpus: Collection[int] = (),
+    ) -> None:
         self._command = command
+        self._environ = environ
         self._cpus = cpus
         self._backoff = Backoff(limits.WEB_RESTART_FIRST, limits.WEB_RESTART_CAP, rng)
         self._task: asyncio.Task[None] | None = None
@@ -104,7 +119,9 @@ class WebProcess:
 
     def _spawn(self) -> subprocess.Popen[bytes]:
         # In a session of its own Ctrl-C does not reach it: it ends with the agent, and not before.
-        return subprocess.Popen(self._command, stdin=subprocess.PIPE, start_new_session=True)  # noqa: S603 - our own program
+        return subprocess.Popen(  # noqa: S603 - our own program
+            self._command, stdin=subprocess.PIPE, start_new_session=True, env=self._environ
+        )
 
     async def _end(self, process: subprocess.Popen[bytes]) -> None:
         if process.stdin is not None:
@@ -121,10 +138,10 @@ async def _ended(pid: int) -> None:
     """Wait until a child process has ended, without a thread; it remains to be waited for."""
     descriptor = os.pidfd_open(pid)
     loop = asyncio.get_running_loop()
-    ended = loop.create_future()
+    ended = asyncio.Event()
     try:
-        loop.add_reader(descriptor, lambda: ended.done() or ended.set_result(None))
-        await ended
+        loop.add_reader(descriptor, ended.set)
+        await ended.wait()
     finally:
         loop.remove_reader(descriptor)
         os.close(descriptor)

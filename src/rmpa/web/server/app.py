@@ -22,9 +22,9 @@ from rmpa.web.server.connections import GuardedConnection
 from rmpa.web.server.figures import Figures, web_metrics
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping
+    from collections.abc import Callable, Mapping
 
-    from aiohttp.typedefs import Handler
+    from aiohttp.typedefs import Handler, Middleware
 
     from rmpa.web.server.agent_watch import AgentWatch
     from rmpa.web.server.pages import Page
@@ -93,7 +93,7 @@ class Routes:
 
     # --- what holds for all paths ---
 
-    def _middleware(self) -> Callable[[web.Request, Handler], Awaitable[web.StreamResponse]]:
+    def _middleware(self) -> Middleware:
         @web.middleware
         async def middleware(request: web.Request, handler: Handler) -> web.StreamResponse:
             request[_JUDGED] = True
