@@ -146,8 +146,10 @@ def test_mistakes_are_told_with_their_option(place: Place) -> None:
         sock.bind(("127.0.0.1", 0))
         sock.listen()
         code, _, err = place.run("web", "--port", str(sock.getsockname()[1]))
-    assert code == 1
-    assert "choose another --port" in err
+        assert code == 1
+        assert "choose another --port" in err
+        code, out, _ = place.run("web", "--port", str(sock.getsockname()[1]), "--json")
+        assert "choose another --port" in json.loads(out)["error"]
 
 
 def test_the_agent_does_not_import_the_web(place: Place) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
@@ -296,20 +297,28 @@ async def test_silent_connections_keep_no_one_out(monkeypatch: pytest.MonkeyPatc
 
 
 async def test_a_client_that_does_not_read_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "WEB_RESPONSE_TIMEOUT", 0.3)
-    monkeypatch.setattr(limits, "WEB_IDLE_TIMEOUT", 0.3)
+    monkeypatch.setattr(limits, "WEB_RESPONSE_TIMEOUT", 0.5)
     async with running() as site:
-        reader, writer = await site.connect()
-        get = b"GET /openapi.json HTTP/1.1\r\nHost: localhost\r\n\r\n"
-        try:
+        with socket.socket() as client:
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            client.connect(("127.0.0.1", site.server.port))
+            client.sendall(b"GET /openapi.json HTTP/1.1\r\nHost: localhost\r\n\r\n" * 500)  # 15 MB of responses
             async with asyncio.timeout(DEADLINE):
-                while not reader.at_eof() and not writer.is_closing():  # it asks on and on
-                    writer.write(get * 10)
-                    await asyncio.sleep(0.01)
-        except ConnectionError:
-            pass
-        writer.close()
+                while await site.refused("slow_response") == 0:
+                    await asyncio.sleep(0.05)
         assert (await site.get("/healthz"))[0] == 200
+
+
+async def test_requests_without_end_in_a_row_are_cut_off() -> None:
+    async with running() as site:
+        loop = asyncio.get_running_loop()
+        with socket.socket() as client:
+            client.setblocking(False)
+            await loop.sock_connect(client, ("127.0.0.1", site.server.port))
+            endless = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n" * 1_000_000
+            with pytest.raises(ConnectionError):
+                await asyncio.wait_for(loop.sock_sendall(client, endless), DEADLINE)
+        assert await site.refused("oversized") == 1
 
 
 async def test_a_taken_port_is_told() -> None:

@@ -93,6 +93,7 @@ class GuardedConnection(asyncio.Protocol):
         self._timer: asyncio.TimerHandle | None = None
         self._received = 0
         self._arriving = False
+        self._unread = False
         self._upgraded = False
         self.is_answering = False
         """Whether a response is being made."""
@@ -132,7 +133,7 @@ class GuardedConnection(asyncio.Protocol):
             if self._received > limits.WEB_REQUEST_MAX:
                 self.refuse("oversized", f"it sent more than {limits.WEB_REQUEST_MAX} bytes at once")
                 return
-            if not self._arriving and not self.is_answering:
+            if not (self._arriving or self.is_answering or self._unread):
                 self._await_request()
         self._inner.data_received(data)
 
@@ -141,11 +142,17 @@ class GuardedConnection(asyncio.Protocol):
         return self._inner.eof_received()
 
     def pause_writing(self) -> None:
-        """Pass on that the client reads too slowly."""
+        """Pass on that the client reads too slowly; it has some time to go on."""
+        self._unread = True
+        if not self._upgraded:
+            self._limit(limits.WEB_RESPONSE_TIMEOUT, "slow_response", "it does not read the response")
         self._inner.pause_writing()
 
     def resume_writing(self) -> None:
         """Pass on that it reads again."""
+        self._unread = False
+        if not self._upgraded:
+            self._limit(limits.WEB_IDLE_TIMEOUT, None, "")
         self._inner.resume_writing()
 
     def connection_lost(self, exc: Exception | None) -> None:
