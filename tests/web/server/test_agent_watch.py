@@ -3,16 +3,69 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 import threading
 from typing import TYPE_CHECKING
 
+import pytest
+
 from rmpa.core.errors import UnreachableError
 from rmpa.web import limits
-from rmpa.web.server.agent_watch import AgentWatch
+from rmpa.web.server.agent_watch import AgentWatch, ControlReader
 from tests.web.snapshots import FULL
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from rmpa.observe.snapshot import Snapshot
+from rmpa.observe.control import ControlReply
+
+
+class ControlSocket:
+    """A control socket that answers the first ``answers`` requests and then hangs."""
+
+    def __init__(self, place: Path, answers: int) -> None:
+        self.connections = self.requests = 0
+        self._answers = answers
+        self._listener = socket.socket(socket.AF_UNIX)
+        self._listener.bind(str(place / "base.sock"))
+        self._listener.listen()
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        held = []
+        while True:
+            connection, _ = self._listener.accept()
+            held.append(connection)
+            file = connection.makefile("rb")
+            held.append(file)
+            while line := file.readline():
+                if b"quit" in line:
+                    for each in (*held, self._listener):
+                        each.close()
+                    return
+                self.requests += 1
+                if self.requests <= self._answers:
+                    connection.sendall(ControlReply(ok=True, value=FULL).serialize())
+
+    def close(self, place: Path) -> None:
+        with socket.socket(socket.AF_UNIX) as client:
+            client.connect(str(place / "base.sock"))
+            client.sendall(b"quit\n")
+            self._thread.join(30)
+
+
+def test_an_agent_that_hangs_is_waited_for_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "WEB_AGENT_TIMEOUT", 0.2)
+    agent = ControlSocket(tmp_path, answers=2)
+    reader = ControlReader({"RMPA_RUNTIME_DIR": str(tmp_path)}, "base")
+    assert reader() == reader() == FULL
+    with pytest.raises(UnreachableError, match="in time"):
+        reader()
+    assert agent.requests == 3
+    reader.close()
+    agent.close(tmp_path)
 
 
 class Agent:

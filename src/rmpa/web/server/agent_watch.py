@@ -120,11 +120,14 @@ class ControlReader:
         Raises:
             RmpaError: No agent answers, or several run and none is named.
         """
-        if self._client is not None and time.monotonic() - self._used < observe_limits.CONTROL_IDLE_TIMEOUT / 2:
+        began = time.monotonic()
+        if self._client is not None and began - self._used < observe_limits.CONTROL_IDLE_TIMEOUT / 2:
             try:
                 return self._ask(self._client)
             except UnreachableError:
-                pass  # the agent was started anew: look for its new socket
+                if time.monotonic() - began >= limits.WEB_AGENT_TIMEOUT:
+                    raise  # the agent hangs; another connection would wait as long
+                # It hung up, as it was started anew: look for its new socket.
         self.close()
         agent = choose_agent(self._environ, self._name)
         self._name = agent.name
