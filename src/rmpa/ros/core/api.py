@@ -66,6 +66,9 @@ class Core(Protocol):
     def publishers(self, topic: str) -> Mapping[str, str]:
         """The publishers of a topic with their slave APIs; never changed afterwards."""
 
+    def subscribers(self, topic: str) -> Mapping[str, str]:
+        """The subscribers of a topic with their slave APIs; never changed afterwards."""
+
     def type_of(self, topic: str) -> str:
         """The type last registered for a topic; ``*`` for none."""
 

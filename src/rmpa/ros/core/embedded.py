@@ -194,6 +194,9 @@ class RosCore(Core):
     def publishers(self, topic: str) -> Mapping[str, str]:
         return self._api.registrations.at(RegistrationKind.PUBLISHER, topic)
 
+    def subscribers(self, topic: str) -> Mapping[str, str]:
+        return self._api.registrations.at(RegistrationKind.SUBSCRIBER, topic)
+
     def type_of(self, topic: str) -> str:
         return self._api.registrations.types().get(topic, ANY_TYPE)
 

@@ -209,6 +209,9 @@ class ExternalCore(Core):
     def publishers(self, topic: str) -> Mapping[str, str]:
         return self._mirror.publishers(topic)
 
+    def subscribers(self, topic: str) -> Mapping[str, str]:
+        return self._mirror.subscribers(topic)
+
     def type_of(self, topic: str) -> str:
         return self._mirror.type_of(topic)
 

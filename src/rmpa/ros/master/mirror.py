@@ -89,6 +89,10 @@ class Mirror:
         """The nodes that publish a topic, and their slave APIs."""
         return self._known.at(RegistrationKind.PUBLISHER, topic)
 
+    def subscribers(self, topic: str) -> Mapping[str, str]:
+        """The nodes that subscribe to a topic, and their slave APIs."""
+        return self._known.at(RegistrationKind.SUBSCRIBER, topic)
+
     def type_of(self, topic: str) -> str:
         """The type of a topic; ``*`` for none."""
         return self._known.types().get(topic, ANY_TYPE)

@@ -46,7 +46,14 @@ class Module:
         state = SimpleNamespace(publishers=self.publishers, subscribers=self.subscribers)
         monkeypatch.setattr(direct_exporter, "end_from", self._end_from)
         self.sut = DirectExporter(
-            cast("Any", SimpleNamespace(state=lambda: state, suspect=self.suspected.append)),
+            cast(
+                "Any",
+                SimpleNamespace(
+                    subscribers=lambda topic: state.subscribers.get(topic, {}),
+                    publishers=lambda topic: state.publishers.get(topic, {}),
+                    suspect=self.suspected.append,
+                ),
+            ),
             cast("Any", SimpleNamespace(offered=self.offered, local=self._local)),
             Contracts((), AUTO.transport),
             cast("Any", SimpleNamespace(of_topic=self._of_topic, forget=self.forgotten.append)),

@@ -61,7 +61,11 @@ class Module:
             cast(
                 "Any",
                 SimpleNamespace(
-                    state=lambda: state, publishers=lambda _: {}, suspect=lambda _: None, node_host="127.0.0.1"
+                    state=lambda: state,
+                    subscribers=lambda topic: state.subscribers.get(topic, {}),
+                    publishers=lambda _: {},
+                    suspect=lambda _: None,
+                    node_host="127.0.0.1",
                 ),
             ),
             cast("Any", self.imports),

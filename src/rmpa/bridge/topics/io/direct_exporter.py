@@ -164,7 +164,7 @@ class DirectExporter:
 
     def _uri(self, source: Source) -> str:
         """The slave API of a publisher now; the exports learn a new one a little later."""
-        return self._core.state().publishers.get(source.topic, {}).get(source.node, "")
+        return self._core.publishers(source.topic).get(source.node, "")
 
     def _unmet(self, session: PeerSession, source: Source, asked: requests.OpenDirect) -> Unmet | None:
         unmet = self._unmet_by_rules(source, session.peer, Granted(asked.contract, 0, ""))
@@ -172,7 +172,7 @@ class DirectExporter:
             return unmet
         if not self._uri(source):
             return Unmet(Condition.OFFERED, f"{source.node} has just left")
-        subscribers = self._core.state().subscribers.get(source.topic, {})
+        subscribers = self._core.subscribers(source.topic)
         return self.grants.judge(session.peer, source, asked.subscriber, subscribers)
 
     def _unmet_by_rules(self, source: Source, peer: int, granted: Granted) -> Unmet | None:

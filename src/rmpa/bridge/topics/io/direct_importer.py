@@ -156,7 +156,8 @@ class DirectImporter:
         """Judge the subscribers of a source that appears in the local graph."""
         entry = self._imports.get(peer, source)
         if entry is not None:
-            self._judge(entry.topic)
+            for node, uri in self._core.subscribers(entry.topic).items():
+                self._consider(peer, source, node, uri)
 
     def hidden(self, peer: int, source: Source, *, hang_up: bool = True) -> None:
         """Forget the subscribers of a source that leaves the local graph.
@@ -170,7 +171,7 @@ class DirectImporter:
             self._act(self.routes.remove(DirectKey(peer, source, name), hang_up=hang_up))
 
     def _judge(self, topic: str) -> None:
-        subscribers = self._core.state().subscribers.get(topic, {})
+        subscribers = self._core.subscribers(topic)
         for peer, source in list(self._imports.at(topic)):
             for node, uri in subscribers.items():
                 self._consider(peer, source, node, uri)

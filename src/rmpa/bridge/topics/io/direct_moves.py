@@ -91,7 +91,7 @@ class SubscriberMoves:
 
     def uri(self, subscriber: str, topic: str) -> str:
         """The slave API of a local subscriber; empty if it is not registered."""
-        return self._core.state().subscribers.get(topic, {}).get(subscriber, "")
+        return self._core.subscribers(topic).get(subscriber, "")
 
     async def close(self) -> None:
         """Stop all moves."""
