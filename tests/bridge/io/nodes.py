@@ -96,6 +96,11 @@ class Core:
         """As RosCore's."""
         return dict(self._topics.get(topic, {}))
 
+    def subscribers(self, topic: str) -> Mapping[str, str]:
+        """As RosCore's."""
+        found: Mapping[str, str] = self.state().subscribers.get(topic, {})
+        return found
+
     def type_of(self, topic: str) -> str:
         """As RosCore's."""
         return self._types.get(topic, "*")
