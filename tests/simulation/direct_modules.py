@@ -10,25 +10,16 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
+from rmpa.bridge.direct.direct_route import Ask, Decided, DirectKey, HangUp, Move, Path, ProbeNode, Release
 from rmpa.bridge.direct.publisher_side import DirectGrants, EndConnections, Granted, Retry, Withdraw
-from rmpa.bridge.direct.subscriber_side import (
-    Ask,
-    Decided,
-    DirectKey,
-    DirectSubscriptions,
-    HangUp,
-    Move,
-    Path,
-    Probe,
-    Release,
-)
+from rmpa.bridge.direct.subscriber_side import DirectSubscriptions
 from rmpa.core.contract import Contract, Transport
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
+    from rmpa.bridge.direct.direct_route import DirectAction
     from rmpa.bridge.direct.publisher_side import GrantAction
-    from rmpa.bridge.direct.subscriber_side import DirectAction
     from rmpa.bridge.messages import Source
     from tests.simulation.network import World
 
@@ -305,7 +296,7 @@ class SubscriberModule:
             match action:
                 case Ask(key, attempt):
                     self._ask(key, attempt)
-                case Probe(peer, grant):
+                case ProbeNode(peer, grant):
                     self._soon(lambda p=peer, g=grant: self._probe(p, g), 0.01)  # type: ignore[misc]
                 case Decided(key):
                     for answer in self._waiting.pop(key, []):

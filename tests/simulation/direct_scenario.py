@@ -10,8 +10,8 @@ from typing import Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import Condition
+from rmpa.bridge.direct.direct_route import DirectKey, DirectState, Path
 from rmpa.bridge.direct.publisher_side import DirectGrants
-from rmpa.bridge.direct.subscriber_side import DirectKey, DirectState, Path
 from rmpa.bridge.messages import Source
 from tests.simulation.direct_modules import Channel, PublisherModule, SubscriberModule, Talker
 from tests.simulation.network import World

@@ -18,7 +18,7 @@ from rmpa.bridge.direct.client_side import (
     ServiceKey,
 )
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
-from rmpa.bridge.direct.subscriber_side import DirectState
+from rmpa.bridge.direct.direct_route import DirectState
 from rmpa.core.contract import Transport
 
 KEY = ServiceKey(1, "/add")

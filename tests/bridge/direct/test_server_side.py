@@ -6,7 +6,7 @@ import pytest
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
-from rmpa.bridge.direct.server_side import CloseDirect, RetryDirect, ServiceGrants
+from rmpa.bridge.direct.server_side import ReofferService, ServiceGrants, WithdrawService
 
 URI = "rosrpc://10.0.0.1:45000"
 GRANT = Grant(45000, "/adder")
@@ -26,8 +26,8 @@ def grants() -> ServiceGrants:
 def test_a_server_at_another_port_makes_every_peer_ask_again(grants: ServiceGrants) -> None:
     assert grants.server("/add", "/adder", URI) == []
     assert grants.server("/add", "/adder", "rosrpc://10.0.0.1:45001") == [
-        CloseDirect(1, "/add", "/adder", Unmet(Condition.NODE, "/adder has restarted")),
-        RetryDirect(2, "/add", "/adder"),
+        WithdrawService(1, "/add", "/adder", Unmet(Condition.NODE, "/adder has restarted")),
+        ReofferService(2, "/add", "/adder"),
     ]
     assert list(grants) == []
 
@@ -39,12 +39,12 @@ def test_what_the_advertisement_tells_needs_no_notification(grants: ServiceGrant
 
 
 def test_other_rules_withdraw_and_offer_again(grants: ServiceGrants) -> None:
-    assert grants.judge_again(lambda _service, _peer: FORBIDDEN) == [CloseDirect(1, "/add", "/adder", FORBIDDEN)]
+    assert grants.judge_again(lambda _service, _peer: FORBIDDEN) == [WithdrawService(1, "/add", "/adder", FORBIDDEN)]
     assert grants.peers("/add") == ()
     assert grants.judge_again(lambda _service, _peer: FORBIDDEN) == []
     assert grants.judge_again(lambda _service, _peer: None) == [
-        RetryDirect(1, "/add", "/adder"),
-        RetryDirect(2, "/add", "/adder"),
+        ReofferService(1, "/add", "/adder"),
+        ReofferService(2, "/add", "/adder"),
     ]
     assert grants.judge_again(lambda _service, _peer: None) == []
 
@@ -53,7 +53,7 @@ def test_a_peer_without_a_link_is_told_nothing(grants: ServiceGrants) -> None:
     assert (grants.ports(1), grants.ports(2)) == ({45000}, set())
     grants.peer_gone(1)
     assert grants.ports(1) == set()
-    assert grants.server("/add", "/adder", "rosrpc://10.0.0.1:1") == [RetryDirect(2, "/add", "/adder")]
+    assert grants.server("/add", "/adder", "rosrpc://10.0.0.1:1") == [ReofferService(2, "/add", "/adder")]
 
 
 def test_the_grants_of_one_peer_are_bounded(grants: ServiceGrants) -> None:

@@ -21,8 +21,8 @@ from rmpa.bridge.direct.client_side import (
     ServiceKey,
 )
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
-from rmpa.bridge.direct.server_side import CloseDirect, RetryDirect, ServiceGrants
-from rmpa.bridge.direct.subscriber_side import DirectState
+from rmpa.bridge.direct.direct_route import DirectState
+from rmpa.bridge.direct.server_side import ReofferService, ServiceGrants, WithdrawService
 from rmpa.core.contract import Transport
 
 if TYPE_CHECKING:
@@ -133,9 +133,9 @@ class World:
             match self.to_client.popleft():
                 case (AskPeer() as asked, found):
                     self.act(self.services.replied(asked.key, asked.attempt, found, self.now))
-                case CloseDirect(_, service, node, unmet):
+                case WithdrawService(_, service, node, unmet):
                     self.act(self.services.closed(ServiceKey(1, service), node, unmet, self.now))
-                case RetryDirect(_, service, node):
+                case ReofferService(_, service, node):
                     self.act(self.services.retry(ServiceKey(1, service), node))
 
     def probe(self, _name: str = "") -> None:

@@ -9,7 +9,7 @@ import pytest
 from rmpa.bridge import limits
 from rmpa.bridge.direct.service_requests import (
     AskService,
-    CloseService,
+    ReleaseService,
     RetryService,
     ServiceDirectClosed,
     read_ask,
@@ -32,8 +32,8 @@ def test_they_cross_as_the_protocol_says() -> None:
     retry = RetryService("/arm/grip", "/gripper")
     assert (write(ask), write(closed), write(retry)) == (ASK, CLOSED, RETRY)
     assert (read_ask(ASK), read_closed(CLOSED), read_retry(RETRY)) == (ask, closed, retry)
-    assert write(CloseService("/arm/grip", "/gripper")) == RETRY
-    assert read_close(RETRY) == CloseService("/arm/grip", "/gripper")
+    assert write(ReleaseService("/arm/grip", "/gripper")) == RETRY
+    assert read_close(RETRY) == ReleaseService("/arm/grip", "/gripper")
     assert read_retry(RETRY | {"of a later release": 1}) == retry
 
 

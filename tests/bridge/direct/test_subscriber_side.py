@@ -8,24 +8,24 @@ import pytest
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
-from rmpa.bridge.direct.subscriber_side import (
+from rmpa.bridge.direct.direct_route import (
     Ask,
     Decided,
     DirectKey,
     DirectState,
-    DirectSubscriptions,
     Fallback,
     HangUp,
     Move,
     Path,
-    Probe,
+    ProbeNode,
     Release,
 )
+from rmpa.bridge.direct.subscriber_side import DirectSubscriptions
 from rmpa.bridge.messages import Source
 from rmpa.core.contract import Transport
 
 if TYPE_CHECKING:
-    from rmpa.bridge.direct.subscriber_side import DirectAction
+    from rmpa.bridge.direct.direct_route import DirectAction
 
 SOURCE = Source("/chatter", "/talker")
 KEY = DirectKey(1, SOURCE, "/viewer")
@@ -52,7 +52,7 @@ class Sut(DirectSubscriptions):
 
     def direct(self, key: DirectKey = KEY, now: float = 0.0) -> None:
         actions = self.replied(key, self.ask(key, now), GRANT, now)
-        if actions == [Probe(1, GRANT)]:
+        if actions == [ProbeNode(1, GRANT)]:
             actions = self.probed(1, GRANT.port, "", now)
         assert actions == [Decided(key)]
 
@@ -75,7 +75,7 @@ def test_a_subscriber_is_asked_for_probed_and_answered_with_the_publishers_port(
     sut = Sut()
     attempt = sut.ask()
     assert sut.decision(KEY) is None, "its requestTopic waits"
-    assert sut.replied(KEY, attempt, GRANT, 0.1) == [Probe(1, GRANT)]
+    assert sut.replied(KEY, attempt, GRANT, 0.1) == [ProbeNode(1, GRANT)]
     assert sut.decision(KEY) is None
     assert sut.probed(1, GRANT.port, "", 0.2) == [Decided(KEY)]
     assert sut.decision(KEY) == GRANT
@@ -86,7 +86,7 @@ def test_a_subscriber_is_asked_for_probed_and_answered_with_the_publishers_port(
 def test_a_port_is_probed_once_for_all_subscribers() -> None:
     sut = Sut()
     first, second = sut.ask(), sut.ask(OTHER)
-    assert sut.replied(KEY, first, GRANT, 0.0) == [Probe(1, GRANT)]
+    assert sut.replied(KEY, first, GRANT, 0.0) == [ProbeNode(1, GRANT)]
     assert sut.replied(OTHER, second, GRANT, 0.0) == []
     assert sut.probed(1, GRANT.port, "", 0.0) == [Decided(KEY), Decided(OTHER)]
     third = DirectKey(1, SOURCE, "/third")
@@ -153,7 +153,7 @@ def test_a_notification_that_comes_while_the_peer_is_asked_makes_it_be_asked_onc
     again = sut.next_timer()
     assert again is not None
     attempt = asked(sut.handle_timer(again)).attempt
-    assert sut.replied(KEY, attempt, GRANT, again) == [Probe(1, GRANT)]
+    assert sut.replied(KEY, attempt, GRANT, again) == [ProbeNode(1, GRANT)]
 
 
 def test_a_retry_that_comes_while_the_peer_is_asked_is_not_lost() -> None:
@@ -188,7 +188,7 @@ def test_a_publisher_that_restarted_is_asked_for_at_once_and_its_subscriber_call
     assert hang_up == HangUp(KEY, END)
     assert isinstance(ask, Ask)
     other = Grant(45226, "/talker")
-    assert sut.replied(KEY, ask.attempt, other, 1.1) == [Probe(1, other)]
+    assert sut.replied(KEY, ask.attempt, other, 1.1) == [ProbeNode(1, other)]
     assert sut.probed(1, other.port, "", 1.2) == [Decided(KEY), Move(KEY)]
 
 
@@ -293,7 +293,7 @@ def test_direct_connections_outlive_an_agent_but_no_link(crashed: bool) -> None:
         assert sut.link_down(1, 6.1, crashed=True) == []
         assert sut.replied(KEY, ask.attempt, GRANT, 6.2) == [], "over a link that is gone"
         ask = asked(sut.link_up(1, 6.3))
-        assert sut.replied(KEY, ask.attempt, GRANT, 6.4) == [Probe(1, GRANT)], "probed again over the new link"
+        assert sut.replied(KEY, ask.attempt, GRANT, 6.4) == [ProbeNode(1, GRANT)], "probed again over the new link"
         assert sut.probed(1, GRANT.port, "", 6.5) == [Decided(KEY)]
         assert sut.state() == (DirectState.DIRECT, Path.DIRECT)
     else:
@@ -344,11 +344,11 @@ def test_a_port_that_was_not_reached_delays_no_further_subscriber_until_it_is_tr
     other = DirectKey(KEY.peer, KEY.source, "/another")
     attempt = asked(sut.consider(other, Transport.AUTO, None, 2.0)).attempt
     actions = sut.replied(other, attempt, GRANT, 2.0)
-    assert not any(isinstance(one, Probe) for one in actions)
+    assert not any(isinstance(one, ProbeNode) for one in actions)
     assert Decided(other) in actions
     later = 1.0 + limits.DIRECT_RETRY
     attempt = asked(sut.handle_timer(later)).attempt
-    assert Probe(1, GRANT) in sut.replied(KEY, attempt, GRANT, later)
+    assert ProbeNode(1, GRANT) in sut.replied(KEY, attempt, GRANT, later)
 
 
 def test_a_stuck_subscriber_that_may_be_direct_again_is_stuck_no_more() -> None:

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
-from rmpa.bridge.direct.subscriber_side import DirectState
+from rmpa.bridge.direct.conditions import NO_LINK, Condition, Grant, Unmet
+from rmpa.bridge.direct.direct_route import DirectState
 from rmpa.core.contract import Transport
 from rmpa.core.timer_queue import TimerQueue
 
@@ -182,7 +182,7 @@ class DirectServices:
         """Note a service that nothing stands against here, and whose peer has no link; ``link_up`` asks for it."""
         service = self._services.get(key)
         if service is None or service.node != node or service.local:
-            unmet = Unmet(Condition.OFFERED, "its module has no link")
+            unmet = NO_LINK
             self._services[key] = DirectService(node, wanted, unmet=unmet, local=False)
 
     def remove(self, key: ServiceKey) -> list[ServiceAction]:
@@ -290,7 +290,7 @@ class DirectServices:
                 if service.state is DirectState.DIRECT:
                     actions.append(AnswerRelay(key))
                 service.state, service.grant, service.adrift = DirectState.RELAYED, None, False
-                service.unmet = Unmet(Condition.OFFERED, "its module has no link")
+                service.unmet = NO_LINK
         return actions
 
     def link_up(self, peer: int) -> list[ServiceAction]:

@@ -77,6 +77,10 @@ class Unmet:
         return self.condition not in _PASSING
 
 
+NO_LINK: Final = Unmet(Condition.OFFERED, "its module has no link")
+"""What holds while there is no link."""
+
+
 @dataclass(frozen=True, slots=True)
 class Grant:
     """A peer's permission to connect to one of its nodes.

@@ -28,7 +28,7 @@ class Told:
 
 
 @dataclass(frozen=True, slots=True)
-class CloseDirect:
+class WithdrawService:
     """Tell a peer that calls of a service have to be relayed; ``Condition.NODE`` makes it ask again."""
 
     peer: int
@@ -38,7 +38,7 @@ class CloseDirect:
 
 
 @dataclass(frozen=True, slots=True)
-class RetryDirect:
+class ReofferService:
     """Tell a peer that a service that it was refused may be granted now."""
 
     peer: int
@@ -46,7 +46,7 @@ class RetryDirect:
     node: str
 
 
-ServerAction = CloseDirect | RetryDirect
+ServerAction = WithdrawService | ReofferService
 
 
 class ServiceGrants:
@@ -100,9 +100,9 @@ class ServiceGrants:
                 continue
             self._drop(service, peer)
             if told.node == node and told.port is not None:
-                actions.append(CloseDirect(peer, service, node, Unmet(Condition.NODE, f"{node} has restarted")))
+                actions.append(WithdrawService(peer, service, node, Unmet(Condition.NODE, f"{node} has restarted")))
             elif told.node == node:
-                actions.append(RetryDirect(peer, service, node))
+                actions.append(ReofferService(peer, service, node))
         return actions
 
     def judge_again(self, unmet: Callable[[str, int], Unmet | None]) -> list[ServerAction]:
@@ -116,10 +116,10 @@ class ServiceGrants:
             why = unmet(service, peer)
             if why is not None and told.port is not None:
                 self._put(service, peer, Told(told.node, told.uri, None))
-                actions.append(CloseDirect(peer, service, told.node, why))
+                actions.append(WithdrawService(peer, service, told.node, why))
             elif why is None and told.port is None:
                 self._drop(service, peer)
-                actions.append(RetryDirect(peer, service, told.node))
+                actions.append(ReofferService(peer, service, told.node))
         return actions
 
     def peer_gone(self, peer: int) -> None:

@@ -23,7 +23,7 @@ SERVICE_CLOSED: Final = "direct.service_closed"
 """Notification: the server's agent withdraws what it has permitted."""
 SERVICE_RETRY: Final = "direct.service_retry"
 """Notification: what was refused may be permitted now."""
-_Kind = TypeVar("_Kind", "AskService", "CloseService", "ServiceDirectClosed", "RetryService")
+_Kind = TypeVar("_Kind", "AskService", "ReleaseService", "ServiceDirectClosed", "RetryService")
 
 
 class AskService(msgspec.Struct, frozen=True):
@@ -34,7 +34,7 @@ class AskService(msgspec.Struct, frozen=True):
     transport: Transport
 
 
-class CloseService(msgspec.Struct, frozen=True):
+class ReleaseService(msgspec.Struct, frozen=True):
     """``direct.service_close``."""
 
     service: str
@@ -57,7 +57,7 @@ class RetryService(msgspec.Struct, frozen=True):
     node: str
 
 
-def write(arguments: AskService | CloseService | ServiceDirectClosed | RetryService) -> dict[str, Any]:
+def write(arguments: AskService | ReleaseService | ServiceDirectClosed | RetryService) -> dict[str, Any]:
     """The arguments as values that JSON can represent."""
     values: dict[str, Any] = msgspec.to_builtins(arguments)
     return values
@@ -72,9 +72,9 @@ def read_ask(args: dict[str, Any]) -> AskService:
     return _read(args, AskService)
 
 
-def read_close(args: dict[str, Any]) -> CloseService:
+def read_close(args: dict[str, Any]) -> ReleaseService:
     """Read and validate ``direct.service_close``; errors as ``read_ask``."""
-    return _read(args, CloseService)
+    return _read(args, ReleaseService)
 
 
 def read_closed(args: dict[str, Any]) -> ServiceDirectClosed:

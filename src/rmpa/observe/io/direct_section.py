@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from rmpa.bridge.direct.conditions import Condition, unmet_by_contract
-from rmpa.bridge.direct.subscriber_side import DirectState, Path
+from rmpa.bridge.direct.direct_route import DirectState, Path
 from rmpa.core.contract import Transport
 from rmpa.observe.io.direct_sampler import DirectFlow, DirectSampler
 from rmpa.observe.snapshot import RouteInfo, SubscriberTransport
@@ -15,8 +15,8 @@ from rmpa.observe.snapshot import RouteInfo, SubscriberTransport
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
+    from rmpa.bridge.direct.direct_route import DirectRoute
     from rmpa.bridge.direct.publisher_side import Granted
-    from rmpa.bridge.direct.subscriber_side import DirectRoute
     from rmpa.bridge.io.bridge import Bridge
     from rmpa.bridge.messages import Source
     from rmpa.core.contract import Contract

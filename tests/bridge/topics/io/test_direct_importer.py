@@ -11,8 +11,8 @@ import pytest
 from rmpa.bridge import limits
 from rmpa.bridge.direct import requests
 from rmpa.bridge.direct.conditions import Condition, Unmet
+from rmpa.bridge.direct.direct_route import DirectKey, DirectState, Path
 from rmpa.bridge.direct.requests import DirectClosed
-from rmpa.bridge.direct.subscriber_side import DirectKey, DirectState, Path
 from rmpa.bridge.messages import Source
 from rmpa.bridge.topics.io import direct_importer
 from rmpa.bridge.topics.io.direct_importer import DirectImporter

@@ -102,11 +102,6 @@ def connecting(endpoint: tuple[str, int]) -> list[TcpConnection]:
     return [one for one in connections(remote=endpoint) or [] if one.state == "SYN_SENT"]
 
 
-def end_these(found: list[TcpConnection]) -> str:
-    """End connections; return why it failed, or empty."""
-    return _end(found)
-
-
 def end_to(endpoint: tuple[str, int], ports: set[int] | None = None) -> str:
     """End connections from this machine to a publisher's address.
 
@@ -118,7 +113,7 @@ def end_to(endpoint: tuple[str, int], ports: set[int] | None = None) -> str:
         Empty if none is left, else why they could not be ended.
     """
     found = connections(remote=endpoint)
-    return _end(None if found is None else [one for one in found if ports is None or one.local[1] in ports])
+    return end_these(None if found is None else [one for one in found if ports is None or one.local[1] in ports])
 
 
 async def end_links(endpoint: tuple[str, int], links: Iterable[BusLink]) -> str:
@@ -142,10 +137,11 @@ async def end_links(endpoint: tuple[str, int], links: Iterable[BusLink]) -> str:
 
 def end_from(port: int, address: str) -> str:
     """End the connections of a local publisher, by its port, to a peer's address; return why it failed, or empty."""
-    return _end(connections(local_port=port, remote=(address, None)))
+    return end_these(connections(local_port=port, remote=(address, None)))
 
 
-def _end(found: list[TcpConnection] | None) -> str:
+def end_these(found: list[TcpConnection] | None) -> str:
+    """End connections; return why it failed, or empty."""
     if found is None:
         return "the kernel does not say which connections there are"
     if not found:

@@ -9,7 +9,7 @@ from rmpa.bridge.direct import service_requests as requests
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, reply_of
 from rmpa.bridge.direct.io.endpoints import LocalEndpoints
 from rmpa.bridge.direct.io.nodes import end_from
-from rmpa.bridge.direct.server_side import CloseDirect, RetryDirect, ServiceGrants
+from rmpa.bridge.direct.server_side import ReofferService, ServiceGrants, WithdrawService
 from rmpa.bridge.direct.service_requests import RetryService, ServiceDirectClosed
 from rmpa.core.contract import Transport
 
@@ -136,11 +136,11 @@ class DirectServiceExporter:
             if session is None or not session.linked:
                 continue
             match action:
-                case CloseDirect():
+                case WithdrawService():
                     self._counters.add("direct.service_withdrawn")
                     why, text = action.unmet.condition.value, action.unmet.text
                     closed = ServiceDirectClosed(action.service, action.node, why, text)
                     self._rpc.notify(session, requests.SERVICE_CLOSED, requests.write(closed))
-                case RetryDirect():
+                case ReofferService():
                     again = RetryService(action.service, action.node)
                     self._rpc.notify(session, requests.SERVICE_RETRY, requests.write(again))

@@ -20,9 +20,9 @@ from rmpa.bridge.direct.client_side import (
     ServiceFallback,
     ServiceKey,
 )
-from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, read_unmet
+from rmpa.bridge.direct.conditions import NO_LINK, Condition, Grant, Unmet, read_reply, read_unmet
 from rmpa.bridge.direct.io.nodes import connecting, end_these, end_to
-from rmpa.bridge.direct.service_requests import AskService, CloseService
+from rmpa.bridge.direct.service_requests import AskService, ReleaseService
 from rmpa.bridge.policy import OWN_NODE, is_own
 from rmpa.bridge.session.peer_rpc import UNKNOWN_QUESTION
 from rmpa.core.contract import Transport
@@ -276,7 +276,7 @@ class DirectServiceImporter:
         session, known = self._sessions.get(key.peer), self.services.get(key)
         found: Grant | Unmet
         if session is None or not session.linked or known is None:
-            found = Unmet(Condition.OFFERED, "its module has no link")
+            found = NO_LINK
         else:
             found = await self._request(session, AskService(key.service, known.node, known.wanted))
         if isinstance(found, Unmet):
@@ -332,7 +332,7 @@ class DirectServiceImporter:
                 case ReleaseGrant(key, node):
                     session = self._sessions.get(key.peer)
                     if session is not None and session.linked:
-                        closed = requests.write(CloseService(key.service, node))
+                        closed = requests.write(ReleaseService(key.service, node))
                         self._rpc.notify(session, requests.SERVICE_CLOSE, closed)
                 case Lost(key, problem):
                     self._on_lost(key.peer, key.service, problem)

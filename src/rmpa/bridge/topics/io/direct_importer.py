@@ -9,22 +9,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct import requests
-from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, read_unmet, unmet_by_contract
+from rmpa.bridge.direct.conditions import NO_LINK, Condition, Grant, Unmet, read_reply, read_unmet, unmet_by_contract
+from rmpa.bridge.direct.direct_route import Ask, Decided, DirectKey, Fallback, HangUp, Move, Path, ProbeNode, Release
 from rmpa.bridge.direct.io.nodes import direct_links, end_links, kernel_tells, report_failure, standing, standing_at
 from rmpa.bridge.direct.requests import CloseDirect, OpenDirect
-from rmpa.bridge.direct.subscriber_side import (
-    Ask,
-    Decided,
-    DirectKey,
-    DirectSubscriptions,
-    Fallback,
-    HangUp,
-    Move,
-    Path,
-    Probe,
-    Release,
-)
+from rmpa.bridge.direct.subscriber_side import DirectSubscriptions
 from rmpa.bridge.policy import is_own
+from rmpa.bridge.session.peer_rpc import UNKNOWN_QUESTION
 from rmpa.bridge.topics.audience import compares_names
 from rmpa.bridge.topics.io.direct_moves import SubscriberMoves
 from rmpa.core.contract import Transport
@@ -41,7 +32,7 @@ from rmpa.runtime.machine_timer import MachineTimer
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping
 
-    from rmpa.bridge.direct.subscriber_side import DirectAction
+    from rmpa.bridge.direct.direct_route import DirectAction
     from rmpa.bridge.messages import Source
     from rmpa.bridge.session.peer_rpc import PeerRpc
     from rmpa.bridge.session.peer_session import PeerSession
@@ -55,8 +46,6 @@ if TYPE_CHECKING:
     from rmpa.ros.node.publication import Publication
 
 _log = logging.getLogger(__name__)
-_UNKNOWN: Final = "does not know the question"
-"""In the response of an agent of an earlier release (``PeerRpc``)."""
 MEASURING: Final = "/rmpa_topic_"
 """Names of nodes of ``rmpa topic hz|bw|delay|echo`` begin so; they are relayed, so that the agents measure."""
 
@@ -388,7 +377,7 @@ class DirectImporter:
         session, entry = self._sessions.get(key.peer), self._imports.get(key.peer, key.source)
         found: Grant | Unmet
         if session is None or not session.linked or entry is None:
-            found = Unmet(Condition.OFFERED, "its module has no link")
+            found = NO_LINK
         else:
             limit = self._asking.setdefault(key.peer, asyncio.Semaphore(limits.DIRECT_ASKS))
             async with limit:
@@ -405,7 +394,7 @@ class DirectImporter:
             value = await self._rpc.request(session, requests.OPEN, requests.write(asked), limits.DIRECT_ASK_TIMEOUT)
             return read_reply(value, key.source.node)
         except PeerRefused as error:
-            older = _UNKNOWN in error.reason
+            older = UNKNOWN_QUESTION in error.reason
             return Unmet(Condition.RELEASE if older else Condition.AGENT, str(error))
         except RemoteProtocolError as error:
             return Unmet(Condition.RELEASE, f"{session.link.name}: {error}")
@@ -436,7 +425,7 @@ class DirectImporter:
             match action:
                 case Ask(key, attempt):
                     self._start(self._ask(key, attempt), f"ask for {key.source}")
-                case Probe(peer, grant):
+                case ProbeNode(peer, grant):
                     self._start(self._probe(peer, grant), f"probe {grant.node}")
                 case Decided(key):
                     self._decided(key)

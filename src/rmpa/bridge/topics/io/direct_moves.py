@@ -11,6 +11,7 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
+from rmpa.bridge.direct.direct_route import DirectState, Path
 from rmpa.bridge.direct.io.nodes import (
     bus_links,
     direct_links,
@@ -21,14 +22,14 @@ from rmpa.bridge.direct.io.nodes import (
     standing,
     until,
 )
-from rmpa.bridge.direct.subscriber_side import DirectState, Path
 from rmpa.bridge.policy import is_own
 from rmpa.bridge.topics.remote_topic import RouteState
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Mapping
 
-    from rmpa.bridge.direct.subscriber_side import DirectKey, DirectRoute, DirectSubscriptions
+    from rmpa.bridge.direct.direct_route import DirectKey, DirectRoute
+    from rmpa.bridge.direct.subscriber_side import DirectSubscriptions
     from rmpa.bridge.messages import Source
     from rmpa.bridge.session.peer_sessions import PeerSessions
     from rmpa.bridge.topics.imports import Imports
