@@ -1,0 +1,1 @@
+"""The Foxglove WebSocket protocol, server side: messages (``protocol``) and one client's session (``session``)."""

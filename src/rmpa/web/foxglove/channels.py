@@ -1,0 +1,237 @@
+"""The channels and services that a Foxglove client is offered, from the graph and the definitions of its types.
+
+A topic has one channel for each of its types: where publishers disagree there are several, which differ in their
+schema. A channel or a service is offered once its definition is known, and has an id that is never used again.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, TypeVar
+
+from rmpa.core.names import is_type_name
+from rmpa.web import limits
+from rmpa.web.foxglove.protocol import (
+    ENCODING,
+    SCHEMA_ENCODING,
+    Advertise,
+    AdvertiseServices,
+    Channel,
+    RemoveStatus,
+    Service,
+    ServiceSchema,
+    Status,
+    StatusLevel,
+    Unadvertise,
+    UnadvertiseServices,
+)
+from rmpa.web.hub import requests
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+    from rmpa.web.foxglove.protocol import ServerMessage
+    from rmpa.web.hub.requests import GraphChanged
+
+_SEPARATOR: Final = "=" * 80
+_T = TypeVar("_T")
+
+
+@dataclass(slots=True)
+class _Type:
+    """A type that the hub was asked for: its request's handle, and its definition once that is known."""
+
+    handle: int
+    name: str
+    service: bool
+    described: requests.Described | None = None
+    warned: bool = False
+
+
+class ChannelTable:
+    """Channels and services of one client.
+
+    Args:
+        next_handle: Makes a new handle.
+        services: Whether the client may call services; else it is offered none.
+    """
+
+    def __init__(self, next_handle: Callable[[], int], *, services: bool) -> None:
+        self._next_handle = next_handle
+        self._with_services = services
+        self._channel_ids = itertools.count(1)
+        self._service_ids = itertools.count(1)
+        self._types: dict[tuple[str, bool], _Type] = {}
+        self._asked: dict[int, _Type] = {}
+        self._searched: dict[int, str] = {}
+        self._found: dict[str, str | None] = {}
+        self._wanted: dict[tuple[str, str], None] = {}
+        self._wanted_services: dict[tuple[str, str], None] = {}
+        self._by_key: dict[tuple[str, str], Channel] = {}
+        self._services_by_key: dict[tuple[str, str], Service] = {}
+        self.channels: dict[int, Channel] = {}
+        """What is offered, by id."""
+        self.services: dict[int, Service] = {}
+        """Likewise."""
+
+    def owns(self, handle: int) -> bool:
+        """Whether the hub's answers with this handle belong here."""
+        return handle in self._asked or handle in self._searched
+
+    def update(self, graph: GraphChanged) -> Iterator[ServerMessage | requests.Request]:
+        """Offer what is new in the graph, withdraw what is gone, and ask for the types that are not known yet."""
+        self._wanted = {
+            (topic.name, type_): None
+            for topic in graph.topics
+            if topic.publishers
+            for type_ in topic.types
+            if is_type_name(type_)
+        }
+        if self._with_services:
+            yield from self._want_services(graph)
+        yield from self._forget_types()
+        for _, type_ in self._wanted:
+            yield from self._describe(type_, service=False)
+        for _, type_ in self._wanted_services:
+            yield from self._describe(type_, service=True)
+        yield from self._offer()
+
+    def answer(
+        self, answer: requests.Described | requests.ServiceFound | requests.Failed
+    ) -> Iterator[ServerMessage | requests.Request]:
+        """What follows from the hub's answer about a type or a service."""
+        handle = answer.handle
+        if handle in self._searched:
+            yield from self._service_found(self._searched.pop(handle), answer)
+            return
+        asked = self._asked[handle]
+        if isinstance(answer, requests.Failed):
+            asked.warned = True
+            advice = f"; {answer.remedy}" if answer.remedy else ""
+            what = "service" if asked.service else "topic"
+            text = f"no {what} of type {asked.name} is shown: {answer.error}{advice}"
+            yield Status(level=StatusLevel.WARNING, message=text, id=_status_id(asked))
+        elif isinstance(answer, requests.Described):
+            asked.described = answer
+            if asked.warned:
+                asked.warned = False
+                yield RemoveStatus(status_ids=(_status_id(asked),))
+            yield from self._offer()
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    def _want_services(self, graph: GraphChanged) -> Iterator[requests.Request]:
+        present = {service.name for service in graph.services}
+        self._found = {name: type_ for name, type_ in self._found.items() if name in present}
+        self._wanted_services = {}
+        for service in graph.services:
+            type_ = service.type or self._found.get(service.name)
+            if type_ and is_type_name(type_):
+                self._wanted_services[service.name, type_] = None
+            elif type_ is None or service.name not in self._found:
+                self._found[service.name] = ""
+                handle = self._next_handle()
+                self._searched[handle] = service.name
+                yield requests.FindService(handle, service.name)
+
+    def _service_found(
+        self, name: str, answer: requests.Described | requests.ServiceFound | requests.Failed
+    ) -> Iterator[ServerMessage | requests.Request]:
+        if isinstance(answer, requests.ServiceFound) and name in self._found and is_type_name(answer.type):
+            self._found[name] = answer.type
+            self._wanted_services[name, answer.type] = None
+            yield from self._describe(answer.type, service=True)
+            yield from self._offer()
+
+    def _forget_types(self) -> Iterator[ServerMessage]:
+        wanted = {(type_, False) for _, type_ in self._wanted} | {(type_, True) for _, type_ in self._wanted_services}
+        for key in self._types.keys() - wanted:
+            asked = self._types.pop(key)
+            del self._asked[asked.handle]
+            if asked.warned:
+                yield RemoveStatus(status_ids=(_status_id(asked),))
+
+    def _describe(self, name: str, *, service: bool) -> Iterator[requests.Request]:
+        if (name, service) not in self._types:
+            handle = self._next_handle()
+            self._types[name, service] = self._asked[handle] = _Type(handle, name, service)
+            yield requests.Describe(handle, name, service)
+
+    def _offer(self) -> Iterator[ServerMessage]:
+        gone = [key for key in self._by_key if key not in self._wanted]
+        if gone:
+            ids = tuple(self._by_key.pop(key).id for key in gone)
+            for each in ids:
+                del self.channels[each]
+            yield Unadvertise(channel_ids=ids)
+        new = [channel for key in self._wanted if key not in self._by_key and (channel := self._channel(*key))]
+        for channel in new:
+            self._by_key[channel.topic, channel.schema_name] = self.channels[channel.id] = channel
+        yield from (Advertise(channels=part) for part in _parts(new, lambda channel: len(channel.schema)))
+        yield from self._offer_services()
+
+    def _offer_services(self) -> Iterator[ServerMessage]:
+        gone = [key for key in self._services_by_key if key not in self._wanted_services]
+        if gone:
+            ids = tuple(self._services_by_key.pop(key).id for key in gone)
+            for each in ids:
+                del self.services[each]
+            yield UnadvertiseServices(service_ids=ids)
+        missing = (key for key in self._wanted_services if key not in self._services_by_key)
+        new = [service for key in missing if (service := self._service(*key))]
+        for service in new:
+            self._services_by_key[service.name, service.type] = self.services[service.id] = service
+        sized = _parts(new, lambda service: len(service.request.schema) + len(service.response.schema))
+        yield from (AdvertiseServices(services=part) for part in sized)
+
+    def _channel(self, topic: str, type_: str) -> Channel | None:
+        described = self._types[type_, False].described
+        if described is None:
+            return None
+        return Channel(
+            id=next(self._channel_ids),
+            topic=topic,
+            encoding=ENCODING,
+            schema_name=type_,
+            schema_encoding=SCHEMA_ENCODING,
+            schema=schema_text(described.text),
+        )
+
+    def _service(self, name: str, type_: str) -> Service | None:
+        described = self._types[type_, True].described
+        if described is None:
+            return None
+        request, response = (
+            ServiceSchema(
+                encoding=ENCODING,
+                schema_name=f"{type_}{half}",
+                schema_encoding=SCHEMA_ENCODING,
+                schema=schema_text(text),
+            )
+            for half, text in (("Request", described.text), ("Response", described.response))
+        )
+        return Service(id=next(self._service_ids), name=name, type=type_, request=request, response=response)
+
+
+def schema_text(definition: str) -> str:
+    """A definition as a schema: without a separator line at its beginning, which parsers of ``ros1msg`` refuse."""
+    return definition.removeprefix(_SEPARATOR).removeprefix("\n") if definition.startswith("=") else definition
+
+
+def _status_id(asked: _Type) -> str:
+    return f"{'service' if asked.service else 'message'} type {asked.name}"
+
+
+def _parts(items: Iterable[_T], size: Callable[[_T], int]) -> Iterator[tuple[_T, ...]]:
+    part: list[_T] = []
+    total = 0
+    for item in items:
+        more = size(item)
+        if part and total + more > limits.FOXGLOVE_ADVERTISE_BYTES:
+            yield tuple(part)
+            part, total = [], 0
+        part.append(item)
+        total += more
+    if part:
+        yield tuple(part)

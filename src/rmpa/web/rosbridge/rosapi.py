@@ -1,0 +1,364 @@
+"""The services of rosapi, computed from a snapshot of the graph in memory: no question goes to a master.
+
+Names, requests and responses are those of rosbridge_suite's package rosapi (branch ros1). They are answered here,
+whether or not they are also offered as ROS services (`Rosapi.call_bytes`).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias
+from urllib.parse import urlsplit
+
+from rmpa.core.errors import RmpaError
+from rmpa.ros.types.service_types import ServiceType
+from rmpa.web.rosbridge import limits
+from rmpa.web.rosbridge.protocol import OpError, graph_name, type_name
+from rmpa.web.rosbridge.typedefs import typedefs_of
+from rmpa.web.values.codec import MessageCodec, codec_for
+
+if TYPE_CHECKING:
+    from rmpa.ros.types.messages import MessageType
+    from rmpa.web.hub.requests import GraphService, GraphTopic, ParamValue
+
+Values: TypeAlias = dict[str, Any]
+NAMESPACE: Final = "/rosapi/"
+_NANO: Final = 1_000_000_000
+_ACTION_TOPICS: Final = ("cancel", "feedback", "goal", "result", "status")
+
+
+class GraphView(Protocol):
+    """A snapshot of the mesh as the local core shows it. Names are global."""
+
+    @property
+    def topics(self) -> Mapping[str, GraphTopic]:
+        """By name, in order of names."""
+
+    @property
+    def services(self) -> Mapping[str, GraphService]:
+        """By name, in order of names."""
+
+    @property
+    def nodes(self) -> Sequence[str]:
+        """In order of names."""
+
+    @property
+    def params(self) -> Mapping[str, ParamValue]:
+        """The tree of parameters: dictionaries within dictionaries; the root's keys have no slash."""
+
+
+class TypeSource(Protocol):
+    """Finds definitions: those that rmpa brings, this machine's, and those that peers described."""
+
+    def message(self, name: str) -> MessageType:
+        """A message type; raises `DefinitionError` if none is known."""
+
+    def service(self, name: str) -> ServiceType:
+        """A service type; raises `DefinitionError` if none is known."""
+
+
+@dataclass(frozen=True, slots=True)
+class SetParameter:
+    """The answer waits until the hub has set a parameter."""
+
+    name: str
+    value: ParamValue
+
+
+@dataclass(frozen=True, slots=True)
+class DeleteParameter:
+    """The answer waits until the hub has deleted a parameter."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class FindType:
+    """The answer is the type of this service, which the graph does not know and the hub is to find."""
+
+    service: str
+
+
+Todo: TypeAlias = SetParameter | DeleteParameter | FindType
+
+
+class Rosapi:
+    """Answers the services of rosapi.
+
+    Args:
+        graph: The snapshot; always the present one.
+        types: Finds definitions.
+        ros_time_ns: The present ROS time in nanoseconds: UTC, or that of ``/clock``.
+    """
+
+    def __init__(self, graph: GraphView, types: TypeSource, ros_time_ns: Callable[[], int]) -> None:
+        self._graph = graph
+        self._types = types
+        self._ros_time_ns = ros_time_ns
+        self._services: Mapping[str, tuple[str, Callable[[Any], Values | Todo]]] = {
+            "topics": ("Topics", self._topics),
+            "topics_for_type": ("TopicsForType", self._topics_for_type),
+            "topics_and_raw_types": ("TopicsAndRawTypes", self._topics_and_raw_types),
+            "topic_type": ("TopicType", self._topic_type),
+            "publishers": ("Publishers", self._publishers),
+            "subscribers": ("Subscribers", self._subscribers),
+            "services": ("Services", lambda _: {"services": list(graph.services)}),
+            "services_for_type": ("ServicesForType", self._services_for_type),
+            "service_type": ("ServiceType", self._service_type),
+            "service_node": ("ServiceNode", self._service_node),
+            "service_host": ("ServiceHost", self._service_host),
+            "service_providers": ("ServiceProviders", self._service_providers),
+            "service_request_details": ("ServiceRequestDetails", self._service_request_details),
+            "service_response_details": ("ServiceResponseDetails", self._service_response_details),
+            "message_details": ("MessageDetails", self._message_details),
+            "nodes": ("Nodes", lambda _: {"nodes": list(graph.nodes)}),
+            "node_details": ("NodeDetails", self._node_details),
+            "action_servers": ("GetActionServers", self._action_servers),
+            "get_param": ("GetParam", self._get_param),
+            "set_param": ("SetParam", self._set_param),
+            "has_param": ("HasParam", self._has_param),
+            "search_param": ("SearchParam", self._search_param),
+            "delete_param": ("DeleteParam", self._delete_param),
+            "get_param_names": ("GetParamNames", self._get_param_names),
+            "get_time": ("GetTime", self._get_time),
+        }
+
+    @property
+    def services(self) -> dict[str, str]:
+        """The type of each service by its global name."""
+        return {f"{NAMESPACE}{name}": f"rosapi/{kind}" for name, (kind, _) in self._services.items()}
+
+    def offers(self, service: str) -> bool:
+        """Whether a global name is that of a service of rosapi."""
+        return service.startswith(NAMESPACE) and service.removeprefix(NAMESPACE) in self._services
+
+    def call(self, service: str, arguments: Any) -> Values | Todo:
+        """Answer a call.
+
+        Args:
+            service: A global name that `offers` knows.
+            arguments: An object of the request's fields, a list of them, or None.
+
+        Returns:
+            The response's fields; or what the hub has to do first: `finish` then makes the response.
+
+        Raises:
+            RmpaError: The arguments do not fit, or ask for something that is not there.
+        """
+        kind, answer = self._services[service.removeprefix(NAMESPACE)]
+        codec = codec_for(ServiceType(f"rosapi/{kind}").request)
+        # Once to bytes and back: each field is there, and of its type.
+        request = codec.json_values(memoryview(codec.write_arguments(arguments, 0).payload))
+        return answer(request)
+
+    def call_bytes(self, service: str, request: memoryview) -> bytes | Todo:
+        """Answer a call of a ROS service; as `call`, in ROS 1 bytes."""
+        types = ServiceType(self.services[service])
+        values = self.call(service, codec_for(types.request).json_values(request))
+        return self.response_codec(service).write(values, 0).payload if isinstance(values, dict) else values
+
+    def response_codec(self, service: str) -> MessageCodec:
+        """Converts a service's responses."""
+        return codec_for(ServiceType(self.services[service]).response)
+
+    @staticmethod
+    def finish(todo: Todo, found: str = "") -> Values:
+        """The response after the hub has done what was to do; `found` is the type of a service."""
+        return {"type": found} if isinstance(todo, FindType) else {}
+
+    # --- topics ---------------------------------------------------------------------------------------------------
+
+    def _topics(self, _: Any) -> Values:
+        topics = self._graph.topics
+        return {"topics": list(topics), "types": [_first_type(each) for each in topics.values()]}
+
+    def _topics_and_raw_types(self, _: Any) -> Values:
+        values = self._topics(_)
+        texts = {name: self._full_text(name) for name in set(values["types"])}
+        return values | {"typedefs_full_text": [texts[name] for name in values["types"]]}
+
+    def _full_text(self, name: str) -> str:
+        try:
+            return self._types.message(name).definition if name else ""
+        except RmpaError:
+            return ""  # as rosapi does: the client then knows the name only
+
+    def _topics_for_type(self, request: Any) -> Values:
+        kind = type_name(request["type"])
+        return {"topics": [each.name for each in self._graph.topics.values() if kind in each.types]}
+
+    def _topic_type(self, request: Any) -> Values:
+        topic = self._topic(request)
+        return {"type": _first_type(topic) if topic else ""}
+
+    def _publishers(self, request: Any) -> Values:
+        topic = self._topic(request)
+        return {"publishers": list(topic.publishers) if topic else []}
+
+    def _subscribers(self, request: Any) -> Values:
+        topic = self._topic(request)
+        return {"subscribers": list(topic.subscribers) if topic else []}
+
+    def _topic(self, request: Any) -> GraphTopic | None:
+        return self._graph.topics.get(graph_name(request["topic"]))
+
+    def _action_servers(self, _: Any) -> Values:
+        topics = self._graph.topics
+        found = (name.removesuffix("/goal") for name in topics if name.endswith("/goal") and name != "/goal")
+        return {
+            "action_servers": [each for each in found if all(f"{each}/{part}" in topics for part in _ACTION_TOPICS)]
+        }
+
+    # --- services -------------------------------------------------------------------------------------------------
+
+    def _services_for_type(self, request: Any) -> Values:
+        kind = type_name(request["type"])
+        return {"services": [each.name for each in self._graph.services.values() if each.type == kind]}
+
+    def _service(self, request: Any) -> GraphService | None:
+        return self._graph.services.get(graph_name(request["service"]))
+
+    def _service_type(self, request: Any) -> Values | Todo:
+        name = graph_name(request["service"])
+        if self.offers(name):
+            return {"type": self.services[name]}
+        service = self._graph.services.get(name)
+        if service is not None and not service.type:
+            return FindType(name)
+        return {"type": service.type if service else ""}
+
+    def _service_node(self, request: Any) -> Values:
+        service = self._service(request)
+        return {"node": service.providers[0] if service and service.providers else ""}
+
+    def _service_host(self, request: Any) -> Values:
+        service = self._service(request)
+        try:
+            return {"host": (urlsplit(service.uri).hostname or "") if service else ""}
+        except ValueError:
+            return {"host": ""}
+
+    def _service_providers(self, request: Any) -> Values:
+        # rosapi's own answer compares types, though its field is named service: both are understood.
+        asked = request["service"]
+        found = [
+            each for each in self._graph.services.values() if each.type == asked or each.name == graph_name(asked)
+        ]
+        return {"providers": [node for each in found for node in each.providers]}
+
+    # --- types ----------------------------------------------------------------------------------------------------
+
+    def _message_details(self, request: Any) -> Values:
+        return {"typedefs": typedefs_of(self._types.message(type_name(request["type"])))}
+
+    def _service_request_details(self, request: Any) -> Values:
+        return {"typedefs": typedefs_of(self._types.service(type_name(request["type"])).request)}
+
+    def _service_response_details(self, request: Any) -> Values:
+        return {"typedefs": typedefs_of(self._types.service(type_name(request["type"])).response)}
+
+    # --- nodes and time -------------------------------------------------------------------------------------------
+
+    def _node_details(self, request: Any) -> Values:
+        node = graph_name(request["node"])
+        topics = self._graph.topics.values()
+        return {
+            "subscribing": [each.name for each in topics if node in each.subscribers],
+            "publishing": [each.name for each in topics if node in each.publishers],
+            "services": [each.name for each in self._graph.services.values() if node in each.providers],
+        }
+
+    def _get_time(self, _: Any) -> Values:
+        secs, nsecs = divmod(max(0, self._ros_time_ns()), _NANO)
+        return {"time": {"secs": secs, "nsecs": nsecs}}
+
+    # --- parameters -----------------------------------------------------------------------------------------------
+
+    def _parameter(self, name: str) -> tuple[bool, ParamValue]:
+        """Whether a global name is there, and its value."""
+        value: ParamValue = dict(self._graph.params)
+        for part in filter(None, name.split("/")):
+            if not isinstance(value, Mapping) or part not in value:
+                return False, None
+            value = value[part]
+        return True, value
+
+    def _get_param(self, request: Any) -> Values:
+        there, value = self._parameter(graph_name(request["name"]))
+        default = request["default"]
+        if not there and default:
+            try:
+                value = json.loads(default)
+            except (ValueError, RecursionError):
+                value = default
+        return {"value": json.dumps(value, default=_binary)}
+
+    def _set_param(self, request: Any) -> Values | Todo:
+        try:
+            value = json.loads(request["value"])
+        except RecursionError:
+            raise OpError("the value of set_param is nested too deep") from None
+        except ValueError as error:
+            problem = f"the value of set_param is JSON, in a string: {error}"
+            raise OpError(problem, 'a text is written with its quotes, "\\"text\\""') from None
+        _check_depth(value)
+        return SetParameter(graph_name(request["name"]), value)
+
+    def _has_param(self, request: Any) -> Values:
+        return {"exists": self._parameter(graph_name(request["name"]))[0]}
+
+    def _search_param(self, request: Any) -> Values:
+        # As rospy.search_param of the node /rosapi: first below its name, then upwards.
+        name = request["name"]
+        if name.startswith("/"):
+            there = self._parameter(graph_name(name))[0]
+            return {"global_name": graph_name(name) if there else ""}
+        first = graph_name(name).split("/")[1]
+        for namespace in (NAMESPACE, "/"):
+            if self._parameter(f"{namespace}{first}")[0]:
+                return {"global_name": graph_name(f"{namespace}{name}")}
+        return {"global_name": ""}
+
+    def _delete_param(self, request: Any) -> Values | Todo:
+        name = graph_name(request["name"])
+        return DeleteParameter(name) if self._parameter(name)[0] else {}
+
+    def _get_param_names(self, _: Any) -> Values:
+        names: list[str] = []
+        todo: list[tuple[str, ParamValue]] = [("", dict(self._graph.params))]
+        while todo:
+            name, value = todo.pop()
+            if isinstance(value, Mapping) and (value or not name):
+                todo += [(f"{name}/{key}", inner) for key, inner in value.items()]
+            else:
+                names.append(name)
+        return {"names": sorted(names)}
+
+
+def _first_type(topic: GraphTopic) -> str:
+    return topic.types[0] if topic.types else ""
+
+
+def _binary(value: object) -> object:
+    """Values of parameters that JSON has not: bytes are base64 there."""
+    import base64  # noqa: PLC0415 - a rare value
+
+    return base64.b64encode(value).decode() if isinstance(value, bytes) else str(value)
+
+
+def _check_depth(value: object) -> None:
+    """Refuse a parameter that is nested too deep.
+
+    Raises:
+        OpError: It is.
+    """
+    todo = [(value, 1)]
+    while todo:
+        inner, depth = todo.pop()
+        if not isinstance(inner, dict | list):
+            continue
+        if depth > limits.PARAMETER_DEPTH_MAX:
+            raise OpError(f"the value of set_param is nested deeper than {limits.PARAMETER_DEPTH_MAX}")
+        todo += [(each, depth + 1) for each in (inner.values() if isinstance(inner, dict) else inner)]

@@ -1,0 +1,585 @@
+"""A Foxglove client's session with a hub that the test plays."""
+
+from __future__ import annotations
+
+import itertools
+import struct
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rmpa.core.errors import LocalProtocolError
+from rmpa.web import limits
+from rmpa.web.foxglove import protocol
+from rmpa.web.foxglove.session import Rights
+from rmpa.web.hub import requests
+from rmpa.web.hub.requests import GraphService, GraphTopic
+from tests.web.foxglove.client import CHATTER, SET_BOOL, Client, described, message
+
+# --- opening, channels ---
+
+
+def test_a_client_hears_first_of_the_server_and_that_it_is_ros_1() -> None:
+    client = Client()
+    info = client.json[0]
+    assert info["op"] == "serverInfo"
+    assert info["metadata"] == {"ROS_DISTRO": "noetic"}
+    assert info["supportedEncodings"] == ["ros1"]
+    assert info["sessionId"] == "run-1"
+    assert set(info["capabilities"]) == {
+        *("clientPublish", "parameters", "parametersSubscribe", "services", "connectionGraph", "assets")
+    }
+
+
+def test_a_client_without_rights_is_offered_nothing_but_data_and_graph() -> None:
+    assert Client(Rights()).json[0]["capabilities"] == ["connectionGraph"]
+    assert Client(Rights(), sim_time=True).json[0]["capabilities"] == ["time", "connectionGraph"]
+
+
+def test_a_session_opens_once() -> None:
+    with pytest.raises(LocalProtocolError):
+        Client().session.open()
+
+
+def test_a_topic_is_offered_with_the_full_text_of_its_definition() -> None:
+    client = Client()
+    client.graph(GraphTopic("/odom", ("nav_msgs/Odometry",), ("/base",)))
+    (channel,) = client.of("advertise")[0]["channels"]
+    assert channel["topic"] == "/odom"
+    assert channel["schemaName"] == "nav_msgs/Odometry"
+    assert (channel["encoding"], channel["schemaEncoding"]) == ("ros1", "ros1msg")
+    assert "MSG: geometry_msgs/PoseWithCovariance\n" in channel["schema"]
+    assert not channel["schema"].startswith("=")
+
+
+def test_two_types_on_one_topic_are_two_channels() -> None:
+    client = Client()
+    client.graph(GraphTopic("/x", ("std_msgs/String", "std_msgs/Bool"), ("/a", "/b")))
+    (advertised,) = client.of("advertise")[-1:]
+    names = {c["schemaName"]: c["id"] for m in client.of("advertise") for c in m["channels"]}
+    assert names.keys() == {"std_msgs/String", "std_msgs/Bool"}, advertised
+    client.subscribe(names["std_msgs/Bool"])
+    assert client.last(requests.Subscribe).type == "std_msgs/Bool"
+
+
+def test_topics_without_publishers_or_type_are_not_offered() -> None:
+    client = Client()
+    client.graph(GraphTopic("/a", ("std_msgs/String",), (), ("/n",)), GraphTopic("/b", ("*",), ("/n",)))
+    assert not client.of("advertise")
+
+
+def test_an_id_is_never_used_again() -> None:
+    client = Client()
+    client.graph(CHATTER)
+    client.graph()
+    assert client.of("unadvertise") == [{"op": "unadvertise", "channelIds": [1]}]
+    client.graph(CHATTER)
+    assert client.of("advertise")[-1]["channels"][0]["id"] == 2
+
+
+def test_a_graph_that_did_not_change_says_nothing() -> None:
+    client = Client()
+    client.send({"op": "subscribeConnectionGraph"})
+    client.graph(CHATTER, SET_BOOL)
+    before = len(client.json)
+    client.graph(CHATTER, SET_BOOL)
+    assert len(client.json) == before
+
+
+def test_an_unknown_type_is_told_and_offered_once_it_is_known() -> None:
+    client = Client(knows=False)
+    client.graph(CHATTER)
+    asked = client.last(requests.Describe)
+    client.hub(requests.Failed(asked.handle, "no definition of std_msgs/String", "install its package"))
+    (status,) = client.of("status")
+    assert status["level"] == 1
+    assert "install its package" in status["message"]
+    assert not client.of("advertise")
+    client.hub(described(asked))
+    assert client.of("removeStatus") == [{"op": "removeStatus", "statusIds": [status["id"]]}]
+    assert client.of("advertise")[0]["channels"][0]["topic"] == "/chatter"
+
+
+def test_the_warning_about_a_type_ends_with_its_last_topic() -> None:
+    client = Client(knows=False)
+    client.graph(CHATTER)
+    asked = client.last(requests.Describe)
+    client.hub(requests.Failed(asked.handle, "no definition"))
+    client.graph()
+    assert client.of("removeStatus")
+    client.hub(described(asked))
+    assert not client.of("advertise")
+
+
+def test_a_type_is_asked_for_once() -> None:
+    client = Client()
+    client.graph(*(GraphTopic(f"/t{n}", ("std_msgs/String",), ("/n",)) for n in range(50)))
+    assert sum(isinstance(each, requests.Describe) for each in client.asked) == 1
+
+
+def test_many_channels_come_in_several_messages(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "FOXGLOVE_ADVERTISE_BYTES", 1000)
+    client = Client()
+    client.graph(*(GraphTopic(f"/t{n}", ("nav_msgs/Odometry",), ("/n",)) for n in range(4)))
+    assert [len(m["channels"]) for m in client.of("advertise")] == [1, 1, 1, 1]
+
+
+# --- subscriptions ---
+
+
+def test_messages_reach_the_subscription_untouched() -> None:
+    client = Client()
+    client.graph(CHATTER)
+    handle = client.subscribe()
+    payload = memoryview(b"\x02\x00\x00\x00hi")
+    client.hub(requests.Received(handle, "/chatter", "std_msgs/String", payload, 9, latched=True))
+    (frame,) = client.frames
+    assert frame.header == struct.pack("<BIQ", 1, 7, 9)
+    assert frame.payload is payload
+
+
+def test_messages_of_an_ended_subscription_are_not_sent() -> None:
+    client = Client()
+    client.graph(CHATTER)
+    handle = client.subscribe()
+    client.send({"op": "unsubscribe", "subscriptionIds": [7]})
+    assert client.last(requests.Unsubscribe).handle == handle
+    client.hub(message(handle, "/chatter", b""))
+    assert not client.frames
+    assert client.subscribe() != handle
+
+
+def test_a_withdrawn_channel_ends_its_subscription() -> None:
+    client = Client()
+    client.graph(CHATTER)
+    handle = client.subscribe()
+    client.graph()
+    assert client.last(requests.Unsubscribe).handle == handle
+    client.graph(CHATTER)
+    client.subscribe(channel=2)
+    assert not client.errors
+
+
+def test_wrong_subscriptions_are_refused_and_the_right_ones_kept() -> None:
+    client = Client()
+    client.graph(CHATTER, GraphTopic("/b", ("std_msgs/String",), ("/n",)))
+    pairs = [(7, 1), (7, 2), (8, 1), (9, 99), (10, 2)]
+    client.send({"op": "subscribe", "subscriptions": [{"id": i, "channelId": c} for i, c in pairs]})
+    assert len(client.errors) == 3
+    assert [each.topic for each in client.asked if isinstance(each, requests.Subscribe)] == ["/chatter", "/b"]
+    client.send({"op": "unsubscribe", "subscriptionIds": [99, 7]})
+    assert len(client.errors) == 4
+
+
+def test_subscriptions_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "FOXGLOVE_SUBSCRIPTIONS_MAX", 1)
+    client = Client()
+    client.graph(CHATTER, GraphTopic("/b", ("std_msgs/String",), ("/n",)))
+    client.subscribe(1, 1)
+    client.subscribe(2, 2)
+    assert "limit" in client.errors[0]
+
+
+def test_a_failed_subscription_is_told_and_can_be_ended() -> None:
+    client = Client()
+    client.graph(CHATTER)
+    handle = client.subscribe()
+    client.hub(requests.Failed(handle, "md5 sums differ", "rebuild the talker"))
+    assert client.errors == ["md5 sums differ; rebuild the talker"]
+    client.send({"op": "unsubscribe", "subscriptionIds": [7]})
+    assert len(client.errors) == 1
+
+
+# --- time ---
+
+
+def test_the_clock_is_sent_on_and_stamps_the_messages() -> None:
+    client = Client(sim_time=True)
+    clock = client.last(requests.Subscribe)
+    assert clock.topic == "/clock"
+    client.graph(CHATTER)
+    handle = client.subscribe()
+    client.hub(message(handle, "/chatter", b"", stamp=77))
+    client.hub(message(clock.handle, "/clock", struct.pack("<II", 3, 4)))
+    client.hub(message(clock.handle, "/clock", b"broken"))
+    client.hub(message(handle, "/chatter", b"", stamp=78))
+    first, time, second = (bytes(frame) for frame in client.frames)
+    assert first == struct.pack("<BIQ", 1, 7, 77)
+    assert time == struct.pack("<BQ", 2, 3_000_000_004)
+    assert second == struct.pack("<BIQ", 1, 7, 3_000_000_004)
+
+
+# --- publishing ---
+
+
+def advertise(number: int = 3, topic: str = "/cmd", encoding: str = "ros1", type_: str = "std_msgs/String") -> Any:
+    channel = {"id": number, "topic": topic, "encoding": encoding, "schemaName": type_}
+    return {"op": "advertise", "channels": [channel]}
+
+
+def test_a_client_publishes() -> None:
+    client = Client()
+    client.send(advertise(topic="cmd"))
+    handle = client.last(requests.Advertise).handle
+    assert client.last(requests.Advertise) == requests.Advertise(handle, "/cmd", "std_msgs/String")
+    client.send(struct.pack("<BI", 1, 3) + b"\x02\x00\x00\x00hi")
+    assert client.last(requests.Publish) == requests.Publish(handle, memoryview(b"\x02\x00\x00\x00hi"))
+    client.send({"op": "unadvertise", "channelIds": [3]})
+    assert client.last(requests.Unadvertise).handle == handle
+    client.send(struct.pack("<BI", 1, 3))
+    assert "not advertised" in client.errors[0]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        advertise(encoding="json"),
+        advertise(type_="String"),
+        advertise(topic="/a b"),
+        advertise(topic=""),
+        advertise(topic="/"),
+    ],
+)
+def test_a_topic_that_cannot_be_published_is_refused(wrong: Any) -> None:
+    client = Client()
+    client.send(wrong)
+    assert len(client.errors) == 1
+    assert not any(isinstance(each, requests.Advertise) for each in client.asked)
+
+
+def test_published_topics_are_bounded_and_numbers_are_used_once() -> None:
+    client = Client()
+    for number in range(limits.FOXGLOVE_ADVERTISED_MAX):
+        client.send(advertise(number))
+    client.send(advertise(0))
+    client.send(advertise(9999))
+    assert len(client.errors) == 2
+    assert sum(isinstance(each, requests.Advertise) for each in client.asked) == limits.FOXGLOVE_ADVERTISED_MAX
+
+
+def test_messages_of_a_failed_publisher_are_dropped_without_a_status_each() -> None:
+    client = Client()
+    client.send(advertise())
+    client.hub(requests.Failed(client.last(requests.Advertise).handle, "its type is not known"))
+    for _ in range(10):
+        client.send(struct.pack("<BI", 1, 3))
+    assert client.errors == ["its type is not known"]
+    assert not any(isinstance(each, requests.Publish) for each in client.asked)
+
+
+# --- services ---
+
+
+def call(service: int, number: int, payload: bytes = b"\x01", encoding: bytes = b"ros1") -> bytes:
+    return struct.pack("<BIII", 2, service, number, len(encoding)) + encoding + payload
+
+
+def test_a_service_is_offered_and_called() -> None:
+    client = Client()
+    client.graph(SET_BOOL)
+    (service,) = client.of("advertiseServices")[0]["services"]
+    assert service["name"] == "/set_bool"
+    assert service["request"]["schema"].strip().startswith("bool data")
+    assert service["response"]["schemaName"] == "std_srvs/SetBoolResponse"
+    client.send(call(service["id"], 12))
+    asked = client.last(requests.CallService)
+    assert (asked.service, asked.type, asked.request) == ("/set_bool", "std_srvs/SetBool", b"\x01")
+    client.hub(requests.ServiceResult(asked.handle, ok=True, payload=b"\x01\x00\x00\x00\x00"))
+    assert bytes(client.frames[0]) == struct.pack("<BIII", 3, 1, 12, 4) + b"ros1\x01\x00\x00\x00\x00"
+    client.hub(requests.ServiceResult(asked.handle, ok=True))
+    assert len(client.frames) == 1
+
+
+def test_calls_that_fail_say_why() -> None:
+    client = Client()
+    client.graph(SET_BOOL)
+    client.send(call(1, 1))
+    client.hub(requests.ServiceResult(client.last(requests.CallService).handle, ok=False, error="no motor"))
+    client.send(call(1, 2))
+    client.hub(requests.Failed(client.last(requests.CallService).handle, "timed out", "is it hanging?"))
+    client.send(call(77, 3))
+    client.send(call(1, 4, encoding=b"json"))
+    failures = {each["callId"]: each["message"] for each in client.of("serviceCallFailure")}
+    assert failures.keys() == {1, 2, 3, 4}
+    assert failures[1] == "no motor"
+    assert failures[2] == "timed out; is it hanging?"
+    assert "'json'" in failures[4]
+
+
+def test_waiting_calls_are_bounded() -> None:
+    client = Client()
+    client.graph(SET_BOOL)
+    for number in range(limits.FOXGLOVE_CALLS_MAX + 1):
+        client.send(call(1, number))
+    (failure,) = client.of("serviceCallFailure")
+    assert failure["callId"] == limits.FOXGLOVE_CALLS_MAX
+
+
+def test_the_type_of_a_service_is_searched_where_the_graph_does_not_say_it() -> None:
+    client = Client()
+    for _ in range(2):
+        client.graph(GraphService("/set_bool", "", ("/server",)))
+    (asked,) = (each for each in client.asked if isinstance(each, requests.FindService))
+    client.hub(requests.ServiceFound(asked.handle, "std_srvs/SetBool"))
+    assert client.of("advertiseServices")[0]["services"][0]["type"] == "std_srvs/SetBool"
+    client.graph(GraphService("/set_bool", "", ("/server",)))
+    assert not client.of("unadvertiseServices")
+    client.graph()
+    assert client.of("unadvertiseServices") == [{"op": "unadvertiseServices", "serviceIds": [1]}]
+
+
+def test_a_service_without_a_type_that_is_found_is_not_offered() -> None:
+    client = Client()
+    client.graph(GraphService("/s", "", ("/server",)))
+    client.hub(requests.Failed(client.last(requests.FindService).handle, "does not answer"))
+    assert not client.of("advertiseServices")
+
+
+# --- parameters, graph, assets ---
+
+
+def test_parameters_are_read_followed_and_set() -> None:
+    client = Client()
+    client.send({"op": "getParameters", "parameterNames": [], "id": "r1"})
+    client.hub(requests.ParamsChanged(client.last(requests.GetParams).handle, {"/rate": 2.0}))
+    rate = {"name": "/rate", "type": "float64", "value": 2.0}
+    assert client.of("parameterValues") == [{"op": "parameterValues", "parameters": [rate], "id": "r1"}]
+    client.send({"op": "subscribeParameterUpdates", "parameterNames": ["/rate"]})
+    client.hub(requests.ParamsChanged(client.last(requests.FollowParams).handle, {"/rate": None}))
+    assert client.of("parameterValues")[-1]["parameters"] == [{"name": "/rate"}]
+    client.send({"op": "setParameters", "parameters": [{"name": "/rate", "value": 3, "type": "float64"}]})
+    assert client.last(requests.SetParam).value == 3.0
+    client.send({"op": "unsubscribeParameterUpdates", "parameterNames": []})
+    assert client.last(requests.UnfollowParams).handle == client.last(requests.FollowParams).handle
+    client.send({"op": "setParameters", "parameters": [{"name": "rate", "value": 3}], "id": "r2"})
+    assert "/base/rate" in client.errors[0]
+
+
+def test_a_parameter_that_cannot_be_set_is_told() -> None:
+    client = Client()
+    client.send({"op": "setParameters", "parameters": [{"name": "/a", "value": 1}], "id": "r"})
+    client.hub(requests.Failed(client.last(requests.SetParam).handle, "the core refuses it"))
+    assert client.errors == ["the core refuses it"]
+    assert client.of("parameterValues")[0]["id"] == "r"
+
+
+def test_the_graph_comes_whole_and_then_by_its_changes() -> None:
+    client = Client()
+    client.graph(CHATTER, SET_BOOL)
+    client.send({"op": "subscribeConnectionGraph"})
+    (first,) = client.of("connectionGraphUpdate")
+    assert first["publishedTopics"] == [{"name": "/chatter", "publisherIds": ["/talker"]}]
+    assert first["subscribedTopics"] == [{"name": "/chatter", "subscriberIds": ["/listener"]}]
+    assert first["advertisedServices"] == [{"name": "/set_bool", "providerIds": ["/server"]}]
+    client.graph(GraphTopic("/chatter", ("std_msgs/String",), ("/talker",)))
+    second = client.of("connectionGraphUpdate")[-1]
+    assert second["publishedTopics"] == []
+    assert second["subscribedTopics"] == [{"name": "/chatter", "subscriberIds": []}]
+    assert second["removedServices"] == ["/set_bool"]
+    client.graph()
+    assert client.of("connectionGraphUpdate")[-1]["removedTopics"] == ["/chatter"]
+    client.send({"op": "unsubscribeConnectionGraph"})
+    client.graph(CHATTER)
+    assert len(client.of("connectionGraphUpdate")) == 3
+
+
+names = st.sampled_from(["/a", "/b", "/c"])
+nodes = st.lists(names, unique=True, max_size=2).map(tuple)
+graphs = st.dictionaries(names, st.tuples(nodes, nodes), max_size=3)
+
+
+@given(st.lists(st.tuples(graphs, st.dictionaries(names, nodes, max_size=3)), max_size=6))
+def test_a_client_that_applies_all_updates_has_the_graph(
+    steps: list[tuple[dict[str, tuple[Any, Any]], dict[str, tuple[str, ...]]]],
+) -> None:
+    client = Client(Rights())
+    client.send({"op": "subscribeConnectionGraph"})
+    published: dict[str, list[str]] = {}
+    subscribed: dict[str, list[str]] = {}
+    served: dict[str, list[str]] = {}
+    for topics, services in steps:
+        seen = len(client.of("connectionGraphUpdate"))
+        client.graph(
+            *(GraphTopic(name, ("std_msgs/String",), *ends) for name, ends in topics.items()),
+            *(GraphService(name, "std_srvs/Empty", providers) for name, providers in services.items()),
+        )
+        for update in client.of("connectionGraphUpdate")[seen:]:
+            published |= {each["name"]: each["publisherIds"] for each in update["publishedTopics"]}
+            subscribed |= {each["name"]: each["subscriberIds"] for each in update["subscribedTopics"]}
+            served |= {each["name"]: each["providerIds"] for each in update["advertisedServices"]}
+            for name in update["removedTopics"]:
+                published.pop(name, None)
+                subscribed.pop(name, None)
+            for name in update["removedServices"]:
+                del served[name]
+        assert {n: tuple(i) for n, i in published.items() if i} == {n: e[0] for n, e in topics.items() if e[0]}
+        assert {n: tuple(i) for n, i in subscribed.items() if i} == {n: e[1] for n, e in topics.items() if e[1]}
+        assert {n: tuple(i) for n, i in served.items()} == services
+
+
+def fetch(uri: str, number: int = 5) -> dict[str, Any]:
+    return {"op": "fetchAsset", "uri": uri, "requestId": number}
+
+
+def test_a_file_of_a_package_is_fetched() -> None:
+    client = Client()
+    client.send(fetch("package://robot/meshes/base.stl"))
+    asked = client.last(requests.FetchAsset)
+    assert asked.uri == "package://robot/meshes/base.stl"
+    client.hub(requests.AssetFetched(asked.handle, b"solid"))
+    assert bytes(client.frames[0]) == struct.pack("<BIBI", 4, 5, 0, 0) + b"solid"
+    client.send(fetch("package://robot/none"))
+    client.hub(requests.Failed(client.last(requests.FetchAsset).handle, "no such file"))
+    assert bytes(client.frames[1]) == struct.pack("<BIBI", 4, 5, 1, 12) + b"no such file"
+
+
+@pytest.mark.parametrize(
+    "uri",
+    [
+        "file:///etc/passwd",
+        "http://127.0.0.1/x",
+        "/etc/passwd",
+        "package://",
+        "package://robot",
+        "package://robot/",
+        "package:///etc/passwd",
+        "package://robot/../../etc/passwd",
+        "package://../x",
+        "package://robot/%2e%2e/x",
+        "package://robot/..\\x",
+        "package://robot/a\x00b",
+        "package://robot//etc/passwd",
+    ],
+)
+def test_nothing_but_files_of_packages_is_fetched(uri: str) -> None:
+    client = Client()
+    client.send(fetch(uri))
+    assert not any(isinstance(each, requests.FetchAsset) for each in client.asked)
+    assert bytes(client.frames[0])[:6] == struct.pack("<BIB", 4, 5, 1)
+
+
+def test_assets_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    client = Client()
+    for number in range(limits.FOXGLOVE_ASSETS_MAX + 1):
+        client.send(fetch("package://robot/x", number))
+    assert len(client.frames) == 1
+    monkeypatch.setattr(limits, "FOXGLOVE_ASSET_MAX", 3)
+    client.hub(requests.AssetFetched(client.last(requests.FetchAsset).handle, b"long"))
+    assert bytes(client.frames[1])[5] == 1
+
+
+# --- rights, errors, the end ---
+
+
+@pytest.mark.parametrize(
+    "forbidden",
+    [
+        advertise(),
+        struct.pack("<BI", 1, 3),
+        {"op": "getParameters", "parameterNames": []},
+        {"op": "setParameters", "parameters": [{"name": "/a", "value": 1}]},
+        {"op": "subscribeParameterUpdates", "parameterNames": []},
+        fetch("package://robot/x"),
+        call(1, 1),
+    ],
+    ids=str,
+)
+def test_a_client_without_the_right_is_refused_and_told(forbidden: Any) -> None:
+    client = Client(Rights())
+    client.graph(SET_BOOL)
+    before = list(client.asked)
+    client.send(forbidden)
+    assert client.asked == before
+    texts = [*client.errors, *(each["message"] for each in client.of("serviceCallFailure"))]
+    texts += [bytes(frame).decode("latin1") for frame in client.frames]
+    assert any("ask for a role that may" in text for text in texts)
+
+
+def test_a_client_that_may_read_parameters_cannot_set_them() -> None:
+    client = Client(Rights(read_parameters=True))
+    client.send({"op": "setParameters", "parameters": [{"name": "/a", "value": 1}]})
+    assert client.errors
+    assert not any(isinstance(each, requests.SetParam) for each in client.asked)
+
+
+def test_a_malformed_message_is_told_and_too_many_end_the_session() -> None:
+    client = Client()
+    client.send({"op": "nonsense"})
+    assert "nonsense" in client.errors[0]
+    assert not client.closed
+    for _ in range(int(limits.FOXGLOVE_STATUS_BURST)):
+        client.send(b"")
+    assert [each.code for each in client.closed] == [1008]
+
+
+def test_what_a_client_may_not_do_is_refused_quietly_after_many_times_but_never_ends_the_session() -> None:
+    client = Client(Rights())
+    for _ in range(1000):
+        client.send(struct.pack("<BI", 1, 3))
+    assert not client.closed
+    assert len(client.errors) == limits.FOXGLOVE_STATUS_BURST
+    client.send(struct.pack("<BI", 1, 3), now=10.0)
+    assert len(client.errors) == limits.FOXGLOVE_STATUS_BURST + 1
+
+
+def test_everything_is_released_when_the_client_is_gone() -> None:
+    client = Client(sim_time=True)
+    client.graph(CHATTER, SET_BOOL)
+    client.subscribe()
+    client.send(advertise())
+    client.send(call(1, 1))
+    client.send({"op": "subscribeParameterUpdates", "parameterNames": ["/a"]})
+    clock, graph = (
+        next(each.handle for each in client.asked if isinstance(each, kind))
+        for kind in (requests.Subscribe, requests.FollowGraph)
+    )
+    assert set(client.session.close()) == {
+        requests.Unsubscribe(client.last(requests.Subscribe).handle),
+        requests.Unsubscribe(clock),
+        requests.Unadvertise(client.last(requests.Advertise).handle),
+        requests.CancelCall(client.last(requests.CallService).handle),
+        requests.UnfollowParams(client.last(requests.FollowParams).handle),
+        requests.UnfollowGraph(graph),
+    }
+
+
+def test_answers_that_come_too_late_are_ignored() -> None:
+    client = Client()
+    late: list[requests.Answer] = [
+        message(99, "/x", b""),
+        requests.ParamsChanged(99, {"/a": 1}),
+        requests.ServiceResult(99, ok=True),
+        requests.ServiceFound(99, "std_srvs/Empty"),
+        requests.Described(99, "std_msgs/String", ""),
+        requests.AssetFetched(99, b""),
+        requests.Failed(99, "gone"),
+        requests.GraphChanged(99, (CHATTER,), ()),
+    ]
+    before = len(client.json), len(client.asked)
+    for answer in late:
+        client.hub(answer)
+    assert (len(client.json), len(client.asked)) == before
+    assert not client.frames
+
+
+def test_a_server_says_and_withdraws_its_own_status() -> None:
+    client = Client()
+    client.do([client.session.status(protocol.StatusLevel.WARNING, "slow", "slow /scan")])
+    client.do([client.session.remove_status("slow /scan")])
+    assert client.json[-2:] == [
+        {"op": "status", "level": 1, "message": "slow", "id": "slow /scan"},
+        {"op": "removeStatus", "statusIds": ["slow /scan"]},
+    ]
+
+
+def test_handles_are_never_used_again() -> None:
+    client = Client()
+    client.graph(CHATTER, SET_BOOL)
+    for number in itertools.islice(itertools.count(), 5):
+        client.subscribe(1, number)
+        client.send({"op": "unsubscribe", "subscriptionIds": [number]})
+    opening = (requests.Subscribe, requests.FollowGraph, requests.Describe)
+    handles = [each.handle for each in client.asked if isinstance(each, opening)]
+    assert len(handles) == len(set(handles))

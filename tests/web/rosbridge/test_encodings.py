@@ -1,0 +1,160 @@
+from __future__ import annotations
+
+import base64
+import io
+import json
+import struct
+import zlib
+
+import cbor2
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rmpa.core.errors import LimitExceeded
+from rmpa.ros.types.messages import MessageType
+from rmpa.web.rosbridge import encodings, limits
+from rmpa.web.rosbridge.encodings import Compression, PublishFrames, decode_png, encode_cbor_raw, encode_png
+from rmpa.web.rosbridge.protocol import OpError
+from rmpa.web.values.codec import codec_for
+
+pillow = pytest.importorskip("PIL.Image", reason="pillow, which checks pictures, comes with the extra lab")
+STRING = codec_for(MessageType("std_msgs/String"))
+HELLO = memoryview(b"\x05\0\0\0hello")
+
+
+def _pixels(text: str) -> bytes:
+    """The pixels of a picture, by another decoder."""
+    with pillow.open(io.BytesIO(base64.b64decode(text))) as picture:
+        assert picture.mode == "RGB"
+        return np.asarray(picture).tobytes()
+
+
+def test_json_bytes() -> None:
+    frame = PublishFrames().encode("/chat", HELLO, Compression.NONE, STRING)
+    assert frame.data == b'{"op":"publish","topic":"/chat","msg":{"data":"hello"}}'
+    assert not frame.binary
+
+
+def test_cbor_bytes() -> None:
+    frame = PublishFrames().encode("/c", HELLO, Compression.CBOR, STRING)
+    assert frame.binary
+    assert bytes(frame.data) == bytes.fromhex(
+        "a3"  # a map of 3
+        "626f70 677075626c697368"  # op: publish
+        "65746f706963 622f63"  # topic: /c
+        "636d7367 a1 6464617461 6568656c6c6f"  # msg: {data: hello}
+    )
+
+
+def test_cbor_raw_bytes() -> None:
+    frame = encode_cbor_raw("/c", HELLO, 1_700_000_000_000_000_005)
+    assert frame.binary
+    assert bytes(frame.data) == bytes.fromhex(
+        "a3 626f70 677075626c697368 65746f706963 622f63 636d7367"
+        "a3 6473656373 1a6553f100 656e73656373 05 656279746573 49 0500000068656c6c6f"
+    )
+
+
+@pytest.mark.parametrize("size", [0, 1, 23, 24, 255, 256, 65535, 65536, 70_000])
+def test_cbor_raw_of_any_size_is_read_by_another_decoder_and_is_not_copied(size: int) -> None:
+    payload = memoryview(bytes(size))
+    frame = encode_cbor_raw("/c", payload, 3_000_000_009)
+    assert frame.parts[-1] is payload
+    want = {"op": "publish", "topic": "/c", "msg": {"secs": 3, "nsecs": 9, "bytes": bytes(size)}}
+    assert cbor2.loads(bytes(frame.data)) == want
+
+
+def test_each_message_is_encoded_once_for_all_clients(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = PublishFrames()
+    first = frames.encode("/a", HELLO, Compression.CBOR, STRING)
+    assert frames.encode("/a", HELLO, Compression.CBOR, STRING) is first
+    assert frames.encode("/a", HELLO, Compression.NONE, STRING) is not first
+    assert frames.encode("/b", HELLO, Compression.CBOR, STRING) is not first
+    assert frames.encode("/a", memoryview(bytes(HELLO)), Compression.CBOR, STRING) is not first
+
+
+def test_shared_messages_are_bounded() -> None:
+    frames = PublishFrames()
+    big = codec_for(MessageType("std_msgs/UInt8MultiArray"))
+    size = limits.SHARED_BYTES // 5
+    for _ in range(6):
+        payload = memoryview(big.write({"data": bytes(size)}, 0).payload)
+        frames.encode("/a", payload, Compression.CBOR, big)
+    assert sum(frame.size + len(payload) for payload, frame in frames._kept.values()) <= limits.SHARED_BYTES
+    for number in range(limits.SHARED_FRAMES * 2):
+        frames.encode(f"/{number}", HELLO, Compression.NONE, STRING)
+    assert len(frames._kept) <= limits.SHARED_FRAMES
+
+
+@pytest.mark.parametrize("size", [0, 1, 2, 3, 4, 11, 12, 13, 100, 4099])
+def test_a_png_is_read_by_another_decoder(size: int) -> None:
+    text = json.dumps({"op": "x", "data": "é" * size})
+    (part,) = encode_png(text.encode()).parts
+    op = msgspec.json.decode(part)
+    assert op["op"] == "png"
+    pixels = _pixels(op["data"])
+    assert json.loads(pixels) == json.loads(text)
+    assert pixels.rstrip(b"\n") == text.encode()
+    assert json.loads(decode_png(op["data"])) == json.loads(text)
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "L"])
+@settings(max_examples=25, deadline=None)
+@given(st.data())
+def test_pictures_of_another_encoder_are_read(mode: str, data: st.DataObject) -> None:
+    channels = {"RGB": 3, "RGBA": 4, "L": 1}[mode]
+    width, height = data.draw(st.integers(1, 9)), data.draw(st.integers(1, 9))
+    text = data.draw(st.text(st.characters(max_codepoint=127), min_size=0, max_size=width * height * channels))
+    raw = text.ljust(width * height * channels).encode()
+    file = io.BytesIO()
+    pillow.frombytes(mode, (width, height), raw).save(file, "png")
+    assert decode_png(base64.b64encode(file.getvalue()).decode()) == raw.decode()
+
+
+def _picture(lines: bytes, width: int, height: int, *, bits: int = 8, packed: bytes | None = None) -> str:
+    raw = encodings._SIGNATURE + encodings._chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, 2, 0, 0, 0))
+    raw += encodings._chunk(b"IDAT", zlib.compress(lines) if packed is None else packed)
+    return base64.b64encode(raw + encodings._chunk(b"IEND", b"")).decode()
+
+
+@pytest.mark.parametrize("kind", range(5))
+def test_every_filter_of_png_is_undone(kind: int) -> None:
+    lines = b"\x00abcdef" + bytes((kind,)) + bytes(range(6))
+    text = _picture(lines, 2, 2)
+    assert decode_png(text).encode() == _pixels(text)
+
+
+def test_hostile_pictures_are_refused() -> None:
+    with pytest.raises(OpError, match="base64"):
+        decode_png("no base64!")
+    with pytest.raises(OpError, match="no PNG"):
+        decode_png("AAAA")
+    with pytest.raises(OpError, match="ends too early"):
+        decode_png(_picture(b"", 1, 1)[:40])
+    with pytest.raises(OpError, match="8 bits"):
+        decode_png(_picture(bytes(4), 1, 1, bits=16))
+    with pytest.raises(LimitExceeded):
+        decode_png(_picture(b"", 0xFFFFFFFF, 0xFFFFFFFF))
+    with pytest.raises(OpError, match="unpacked"):
+        decode_png(_picture(b"", 1, 1, packed=b"nonsense"))
+    with pytest.raises(OpError, match="has 4 bytes, not 7"):
+        decode_png(_picture(bytes(4), 2, 1))
+    with pytest.raises(OpError, match="filter 5"):
+        decode_png(_picture(b"\x05abc", 1, 1))
+    with pytest.raises(OpError, match="UTF-8"):
+        decode_png(_picture(b"\x00\xff\xff\xff", 1, 1))
+
+
+def test_a_bomb_is_unpacked_up_to_its_picture_only() -> None:
+    # 100 MB of zeros in a picture of one pixel: what is beyond the pixel is never unpacked.
+    assert decode_png(_picture(bytes(100_000_000), 1, 1)) == "\0\0\0"
+
+
+def test_unknown_compressions_are_refused() -> None:
+    assert Compression.parse(None) is Compression.NONE
+    assert Compression.parse("cbor-raw") is Compression.CBOR_RAW
+    with pytest.raises(OpError, match="none, png, cbor or cbor-raw"):
+        Compression.parse("zip")

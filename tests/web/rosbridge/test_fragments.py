@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rmpa.core.errors import LimitExceeded
+from rmpa.web.rosbridge import limits
+from rmpa.web.rosbridge.fragments import Assembler, split
+from rmpa.web.rosbridge.protocol import Frame, OpError
+
+if TYPE_CHECKING:
+    import random
+
+
+def _decoded(frames: list[Frame]) -> list[dict[str, Any]]:
+    return [msgspec.json.decode(frame.data) for frame in frames]
+
+
+def test_fragments_in_bytes() -> None:
+    first, second = split(Frame((b'{"op":', b'"x"}'), handle=3), 6, "i")
+    assert bytes(first.data) == b'{"op":"fragment","id":"i","data":"{\\"op\\":","num":0,"total":2}'
+    assert bytes(second.data) == b'{"op":"fragment","id":"i","data":"\\"x\\"}","num":1,"total":2}'
+    assert first.handle == second.handle == 3
+
+
+def test_what_fits_and_what_is_binary_stays_whole() -> None:
+    whole = Frame((b"12345",))
+    assert split(whole, 5, 1) == [whole]
+    binary = Frame((b"12345",), binary=True)
+    assert split(binary, 1, 1) == [binary]
+    characters = Frame(("ééé".encode(),))
+    assert split(characters, 3, 1) == [characters]
+
+
+@given(st.text(st.characters(exclude_categories=["Cs"]), min_size=1), st.integers(1, 20), st.randoms())
+def test_fragments_come_together_in_any_order(text: str, size: int, rng: random.Random) -> None:
+    frames = split(Frame((text.encode(),)), size, 7)
+    if len(frames) == 1:
+        return
+    assembler = Assembler()
+    ops = _decoded(frames)
+    assert all(len(op["data"]) <= size for op in ops)
+    rng.shuffle(ops)
+    ops.insert(1, ops[0])  # a repeated one
+    results = [assembler.add("fragment", 7, op["num"], op["total"], op["data"], 0) for op in ops]
+    assert results[-1] == text
+    assert not any(results[:-1])
+    assert assembler.next_timer() is None
+
+
+def test_more_fragments_than_allowed_are_not_made() -> None:
+    with pytest.raises(OpError, match="ask for a fragment_size of 2 or more"):
+        split(Frame((b"x" * (limits.FRAGMENTS_MAX + 1),)), 1, 1)
+
+
+@pytest.mark.parametrize(("num", "total"), [(-1, 2), (2, 2), (0, 0), (0, -1)])
+def test_impossible_numbers_are_refused(num: int, total: int) -> None:
+    with pytest.raises(OpError, match="cannot be"):
+        Assembler().add("fragment", "i", num, total, "x", 0)
+
+
+def test_totals_that_disagree_drop_the_message() -> None:
+    assembler = Assembler()
+    assembler.add("fragment", "i", 0, 2, "x", 0)
+    with pytest.raises(OpError, match="disagree"):
+        assembler.add("fragment", "i", 1, 3, "x", 0)
+    assert assembler.next_timer() is None
+
+
+def test_incomplete_messages_are_bounded_in_number_and_bytes() -> None:
+    assembler = Assembler()
+    with pytest.raises(LimitExceeded):
+        assembler.add("fragment", "i", 0, limits.FRAGMENTS_MAX + 1, "x", 0)
+    for number in range(limits.FRAGMENTED_MESSAGES_MAX * 3):
+        assembler.add("fragment", number, 0, 2, "x", 0)
+    assert len(assembler._messages) == limits.FRAGMENTED_MESSAGES_MAX
+    third = "x" * (limits.FRAGMENTED_MAX // 3)
+    for number in range(10):
+        assembler.add("fragment", f"big{number}", 0, 2, third, 0)
+        assert assembler._bytes <= limits.FRAGMENTED_MAX
+    for number in range(2):
+        assembler.add("fragment", "long", number, 5, third, 0)
+    with pytest.raises(LimitExceeded):
+        assembler.add("fragment", "long", 2, 5, third, 0)
+    assert assembler._bytes <= limits.FRAGMENTED_MAX
+    assert assembler._bytes == sum(each.size for each in assembler._messages.values())
+
+
+def test_a_message_whose_next_fragment_is_overdue_is_dropped() -> None:
+    assembler = Assembler()
+    assembler.add("fragment", "a", 0, 3, "x", 0)
+    assembler.add("fragment", "a", 1, 3, "y", 10)
+    assert assembler.next_timer() == 10 + limits.FRAGMENT_TIMEOUT
+    assert not list(assembler.expire(9 + limits.FRAGMENT_TIMEOUT))
+    assert list(assembler.expire(10 + limits.FRAGMENT_TIMEOUT)) == ["a"]
+    assert assembler.add("fragment", "a", 2, 3, "z", 80) is None

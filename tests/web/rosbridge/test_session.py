@@ -1,0 +1,467 @@
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import cbor2
+import pytest
+
+from rmpa.ros.types.messages import MessageType
+from rmpa.web.hub.requests import (
+    Advertise,
+    Failed,
+    Publish,
+    Received,
+    Subscribe,
+    Unadvertise,
+    Unsubscribe,
+)
+from rmpa.web.rosbridge import limits
+from rmpa.web.rosbridge.encodings import PublishFrames, decode_png
+from rmpa.web.rosbridge.protocol import OPS
+from tests.web.rosbridge.hub import NOW_NS, Client
+
+STRING = "std_msgs/String"
+HELLO = b"\x05\0\0\0hello"
+
+
+# --- subscribing -------------------------------------------------------------------------------------------------
+
+
+def test_a_subscriber_gets_messages_in_json() -> None:
+    client = Client()
+    request = client.one(Subscribe, client.send("subscribe", topic="/t", type=STRING))
+    assert (request.topic, request.type) == ("/t", STRING)
+    client.publish(request.handle, STRING, {"data": "hello"})
+    (frame,) = client.frames()
+    assert frame.data == b'{"op":"publish","topic":"/t","msg":{"data":"hello"}}'
+    assert (frame.binary, frame.handle) == (False, request.handle)
+
+
+def test_the_topic_is_called_as_the_client_wrote_it() -> None:
+    client = Client()
+    request = client.one(Subscribe, client.send("subscribe", topic="t", type="std_msgs/msg/String"))
+    assert (request.topic, request.type) == ("/t", STRING)
+    client.publish(request.handle, STRING, {"data": "hello"})
+    assert client.received()[0]["topic"] == "t"
+
+
+def test_each_compression() -> None:
+    client = Client()
+    for compression in ("none", "png", "cbor", "cbor-raw"):
+        request = client.one(
+            Subscribe, client.send("subscribe", topic=f"/{compression[-3:]}", compression=compression)
+        )
+        client.publish(request.handle, STRING, {"data": "hello"})
+    none, png, cbor, raw = client.received()
+    assert none == {"op": "publish", "topic": "/one", "msg": {"data": "hello"}}
+    assert json.loads(decode_png(png["data"])) == {"op": "publish", "topic": "/png", "msg": {"data": "hello"}}
+    assert cbor == {"op": "publish", "topic": "/bor", "msg": {"data": "hello"}}
+    secs, nsecs = divmod(NOW_NS, 10**9)
+    assert raw["msg"] == {"secs": secs, "nsecs": nsecs, "bytes": HELLO}
+
+
+def test_cbor_raw_needs_no_definition() -> None:
+    client = Client()
+    request = client.one(Subscribe, client.send("subscribe", topic="/t", type="x/Y", compression="cbor-raw"))
+    client.answer(Received(request.handle, "/t", "x/Y", memoryview(b"abc"), 0))
+    assert client.received()[0]["msg"]["bytes"] == b"abc"
+
+
+def test_several_subscriptions_are_one_with_the_best_of_all() -> None:
+    client = Client()
+    handle = client.one(Subscribe, client.send("subscribe", id="a", topic="/t", throttle_rate=1000)).handle
+    assert not client.send("subscribe", id="b", topic="/t", throttle_rate=100, compression="cbor")
+    assert not client.send("subscribe", id="c", topic="/t", throttle_rate=500, compression="png")
+    for _ in range(10):
+        client.publish(handle, STRING, {"data": "hello"})
+        client.now += 0.05
+    frames = client.frames()
+    assert len(frames) == 5
+    assert all(frame.binary for frame in frames)
+    assert not client.send("unsubscribe", id="b", topic="/t")
+    client.now += 0.5
+    client.publish(handle, STRING, {"data": "hello"})
+    assert client.received()[0]["op"] == "png"
+    assert not client.send("unsubscribe", id="a", topic="/t")
+    assert client.send("unsubscribe", id="c", topic="/t") == [Unsubscribe(handle)]
+    client.publish(handle, STRING, {"data": "late"})
+    assert not client.received()
+
+
+def test_unsubscribe_without_an_id_ends_all() -> None:
+    client = Client()
+    handle = client.one(Subscribe, client.send("subscribe", id="a", topic="/t")).handle
+    client.send("subscribe", id="b", topic="/t")
+    assert client.send("unsubscribe", topic="/t") == [Unsubscribe(handle)]
+
+
+def test_throttled_messages_wait_in_the_queue_and_then_come() -> None:
+    client = Client()
+    op = {"topic": "/t", "throttle_rate": 1000, "queue_length": 2}
+    handle = client.one(Subscribe, client.send("subscribe", **op)).handle
+    for number in range(5):
+        client.publish(handle, STRING, {"data": str(number)})
+    assert [each["msg"]["data"] for each in client.received()] == ["0"]
+    client.advance(0.9)
+    assert not client.received()
+    client.advance(0.1)
+    assert [each["msg"]["data"] for each in client.received()] == ["3"]
+    client.advance(10)
+    assert [each["msg"]["data"] for each in client.received()] == ["4"]
+    assert client.session.dropped == 2
+
+
+def test_long_messages_come_in_fragments_of_the_smallest_size() -> None:
+    client = Client()
+    handle = client.one(Subscribe, client.send("subscribe", id="a", topic="/t", fragment_size=50)).handle
+    client.send("subscribe", id="b", topic="/t", fragment_size=30)
+    client.publish(handle, STRING, {"data": "x" * 100})
+    client.publish(handle, STRING, {"data": "y" * 100})
+    got = client.received()
+    assert {each["op"] for each in got} == {"fragment"}
+    assert all(len(each["data"]) <= 30 for each in got)
+    first, second = ("".join(each["data"] for each in got if each["id"] == mid) for mid in (0, 1))
+    assert json.loads(first)["msg"]["data"] == "x" * 100
+    assert json.loads(second)["msg"]["data"] == "y" * 100
+
+
+def test_clients_of_one_topic_share_the_encoded_message() -> None:
+    frames = PublishFrames()
+    clients = [Client(frames) for _ in range(2)]
+    payload = memoryview(HELLO)
+    for client in clients:
+        handle = client.one(Subscribe, client.send("subscribe", topic="/t")).handle
+        client.answer(Received(handle, "/t", STRING, payload, 0))
+    (first,), (second,) = (client.frames() for client in clients)
+    assert first.parts is second.parts
+
+
+def test_a_broken_message_is_reported_once() -> None:
+    client = Client()
+    handle = client.one(Subscribe, client.send("subscribe", topic="/t")).handle
+    for _ in range(3):
+        client.answer(Received(handle, "/t", STRING, memoryview(b"\xff\xff\xff\xff"), 0))
+    assert "message of /t: 4 bytes are not a std_msgs/String" in client.error()
+    client.publish(handle, STRING, {"data": "ok"})
+    assert client.received()[0]["msg"] == {"data": "ok"}
+
+
+def test_another_type_than_the_topic_has_is_refused() -> None:
+    client = Client()
+    client.graph.add_topic("/t", STRING)
+    assert not client.send("subscribe", topic="/t", type="std_msgs/Int8")
+    assert "/t has the type std_msgs/String, not std_msgs/Int8" in client.error()
+    client.send("subscribe", topic="/new", type=STRING)
+    client.send("subscribe", topic="/new", type="std_msgs/Int8")
+    assert "is subscribed as std_msgs/String" in client.error()
+
+
+def test_a_subscription_that_the_hub_refuses_is_reported_and_may_begin_again() -> None:
+    client = Client()
+    handle = client.one(Subscribe, client.send("subscribe", id="i", topic="/t")).handle
+    client.answer(Failed(handle, "not allowed", "ask for the role operator"))
+    (status,) = client.received()
+    assert status["id"] == "i"
+    assert status["msg"] == "subscribe /t: not allowed; ask for the role operator"
+    assert client.one(Subscribe, client.send("subscribe", topic="/t")).handle != handle
+
+
+# --- publishing --------------------------------------------------------------------------------------------------
+
+
+def test_a_client_publishes() -> None:
+    client = Client()
+    request = client.one(Advertise, client.send("advertise", topic="t", type=STRING, latch=True, queue_size=5))
+    assert (request.topic, request.type, request.latch) == ("/t", STRING, True)
+    assert client.send("publish", topic="/t", msg={"data": "hello"}) == [Publish(request.handle, HELLO)]
+    assert not client.received()
+
+
+def test_a_message_without_all_fields_is_published_with_a_warning() -> None:
+    client = Client()
+    client.send("set_level", level="warning")
+    client.send("advertise", topic="/t", type="geometry_msgs/Point")
+    (publish,) = client.send("publish", id="p", topic="/t", msg={"x": 1})
+    assert isinstance(publish, Publish)
+    assert bytes(publish.payload) == bytes(6) + b"\xf0\x3f" + bytes(16)
+    (status,) = client.received()
+    assert (status["level"], status["id"]) == ("warning", "p")
+    assert status["msg"].endswith("were not given: y, z")
+
+
+@pytest.mark.parametrize("value", ["NaN", "Infinity", "-Infinity"])
+def test_what_python_clients_write_for_not_a_number_is_taken(value: str) -> None:
+    client = Client()
+    client.send("advertise", topic="/t", type="std_msgs/Float64")
+    (publish,) = client.send_raw(f'{{"op": "publish", "topic": "/t", "msg": {{"data": {value}}}}}')
+    assert isinstance(publish, Publish)
+    assert bytes(publish.payload)[-2] & 0xF0 == 0xF0
+
+
+def test_a_publisher_is_withdrawn_ten_seconds_after_the_last_id_unadvertised_it() -> None:
+    client = Client()
+    handle = client.one(Advertise, client.send("advertise", id="a", topic="/t", type=STRING)).handle
+    assert not client.send("advertise", id="b", topic="/t", type=STRING)
+    client.send("unadvertise", id="a", topic="/t")
+    client.advance(60)
+    assert not client.session.requests_to_send()
+    client.send("unadvertise", id="b", topic="/t")
+    client.advance(limits.UNADVERTISE_DELAY - 0.1)
+    assert not client.session.requests_to_send()
+    client.send("advertise", id="c", topic="/t", type=STRING)
+    client.advance(60)
+    assert not client.session.requests_to_send()
+    client.send("unadvertise", topic="/t")
+    client.advance(limits.UNADVERTISE_DELAY)
+    assert client.session.requests_to_send() == [Unadvertise(handle)]
+
+
+def test_a_topic_of_the_graph_may_be_published_without_advertising() -> None:
+    client = Client()
+    client.graph.add_topic("/t", STRING)
+    advertise, publish = client.send("publish", topic="/t", msg={"data": "hello"})
+    assert isinstance(advertise, Advertise)
+    assert advertise.type == STRING
+    assert publish == Publish(advertise.handle, HELLO)
+    assert not client.send("publish", topic="/unknown", msg={})
+    assert "advertise it first" in client.error()
+
+
+def test_a_topic_has_one_type() -> None:
+    client = Client()
+    client.graph.add_topic("/t", STRING)
+    assert not client.send("advertise", topic="/t", type="std_msgs/Int8")
+    assert "has the type std_msgs/String" in client.error()
+    client.send("advertise", topic="/mine", type=STRING)
+    assert not client.send("advertise", topic="/mine", type="std_msgs/Int8")
+    assert "is advertised as std_msgs/String" in client.error()
+    assert not client.send("advertise", topic="/x", type="no_such/Type")
+    assert "no_such/Type" in client.error()
+
+
+def test_binary_frames_are_ops_in_cbor() -> None:
+    client = Client()
+    client.send("advertise", topic="/t", type="std_msgs/UInt8MultiArray")
+    message = {"layout": {"dim": [], "data_offset": 0}, "data": b"\x01\x02"}
+    (publish,) = client.send_raw(cbor2.dumps({"op": "publish", "topic": "/t", "msg": message}))
+    assert isinstance(publish, Publish)
+    assert bytes(publish.payload).endswith(b"\x02\0\0\0\x01\x02")
+
+
+# --- fragments, status, authentication ---------------------------------------------------------------------------
+
+
+def test_ops_in_fragments_and_pictures_are_done() -> None:
+    client = Client()
+    text = json.dumps({"op": "advertise", "topic": "/t", "type": STRING})
+    assert not client.send("fragment", id=1, data=text[20:], num=1, total=2)
+    assert client.send("fragment", id=1, data=text[:20], num=0, total=2)
+    other = Client()
+    handle = other.one(Subscribe, other.send("subscribe", topic="/p", compression="png")).handle
+    other.publish(handle, STRING, {"data": "hello"})
+    (op,) = other.received()
+    # The picture holds the op publish, of a topic that is known nowhere.
+    client.send("png", **{key: op[key] for key in ("data",)})
+    assert "publish /p" in client.error()
+    half = len(op["data"]) // 2
+    client.send("png", id="x", num=0, total=2, data=op["data"][:half])
+    client.send("png", id="x", num=1, total=2, data=op["data"][half:])
+    assert "publish /p" in client.error()
+
+
+def test_fragments_within_fragments_end() -> None:
+    client = Client()
+    text = json.dumps({"op": "set_level", "level": "info"})
+    for _ in range(3):
+        text = json.dumps({"op": "fragment", "id": "i", "num": 0, "total": 1, "data": text})
+    client.send_raw(text)
+    assert "once only" in client.error()
+
+
+def test_an_incomplete_message_is_dropped_with_a_warning() -> None:
+    client = Client()
+    client.send("set_level", level="warning")
+    client.send("fragment", id="i", data="{", num=0, total=2)
+    client.advance(limits.FRAGMENT_TIMEOUT)
+    (status,) = client.received()
+    assert (status["level"], status["id"]) == ("warning", "i")
+
+
+def test_levels_of_status_messages() -> None:
+    client = Client()
+    for level, count in (("none", 0), ("error", 1), ("warning", 2), ("info", 3)):
+        client.send("set_level", level=level)
+        client.received()
+        client.send("advertise", topic="/t", type=STRING)
+        client.send("unsubscribe", topic="/unknown")
+        client.send("nonsense")
+        assert len(client.received()) == count
+    client.send("set_level", level="loud")
+    assert "none, error, warning, info" in client.error()
+
+
+def test_without_authentication_nothing_is_done() -> None:
+    auth = {"mac": "m", "client": "c", "dest": "d", "rand": "r", "t": 1, "level": "l", "end": 2}
+    client = Client(verify=lambda op: op.mac == "m")
+    assert not client.send("advertise", topic="/t", type=STRING)
+    assert "authenticate first" in client.error()
+    assert client.session.refused
+    wrong = Client(verify=lambda op: op.mac == "m")
+    wrong.send("auth", **auth | {"mac": "x"})
+    assert wrong.session.refused
+    good = Client(verify=lambda op: op.mac == "m")
+    good.send("auth", **auth)
+    assert not good.session.refused
+    assert good.send("advertise", topic="/t", type=STRING)
+    assert Client().send("auth", **auth) == []
+
+
+def test_all_that_a_client_had_ends_with_it() -> None:
+    client = Client()
+    (subscribe,) = client.send("subscribe", topic="/t", throttle_rate=1000, queue_length=5)
+    (advertise,) = client.send("advertise", topic="/u", type=STRING)
+    client.session.close()
+    assert client.session.requests_to_send() == [Unsubscribe(subscribe.handle), Unadvertise(advertise.handle)]
+    assert client.session.next_timer() is None
+
+
+# --- malformed and hostile ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("data", "says"),
+    [
+        ("", "not JSON"),
+        ("{", "not JSON"),
+        ("[]", "not a list"),
+        ("1", "not a int"),
+        ("{}", "no 'op'"),
+        ('{"op": 5}', "no 'op'"),
+        ('{"receiver": "/x", "msg": []}', "rosbridge v1"),
+        ('{"op": "dance"}', "unknown op 'dance'"),
+        ('{"op": "subscribe"}', "missing required field `topic`"),
+        ('{"op": "subscribe", "topic": 5}', "Expected `str`"),
+        ('{"op": "subscribe", "topic": "/t", "throttle_rate": "fast"}', "throttle_rate"),
+        ('{"op": "subscribe", "topic": "/t", "throttle_rate": -1}', "throttle_rate is 0 or more"),
+        ('{"op": "subscribe", "topic": "/t", "queue_length": NaN}', "queue_length is 0 or more"),
+        ('{"op": "subscribe", "topic": "/t", "fragment_size": 0}', "fragment_size is 1 or more"),
+        ('{"op": "subscribe", "topic": "/t", "compression": "zip"}', "unknown compression"),
+        ('{"op": "subscribe", "topic": "a b"}', "not a ROS name"),
+        ('{"op": "subscribe", "topic": ""}', "1 to 1024 characters"),
+        ('{"op": "subscribe", "topic": "/t", "type": "../etc"}', "not a type's name"),
+        ('{"op": "subscribe", "topic": "/t", "id": {}}', "id"),
+        ('{"op": "subscribe", "topic": "/t", "id": 99999999999999999999}', "64 bits"),
+        ('{"op": "subscribe", "topic": "/t", "id": "\\ud800"}', "not JSON"),
+        ('{"op": "subscribe", "topic": "\ud800"}', "not JSON"),
+        ('{"op": "fragment", "id": "i", "num": 0, "total": 1, "data": "nonsense"}', "not JSON"),
+        ('{"op": "fragment", "num": 0, "total": 1, "data": ""}', "missing required field `id`"),
+        ('{"op": "png", "data": "AAAA", "num": 0}', "'id', 'num' and 'total'"),
+        ('{"op": "service_response", "service": "/s", "id": "i", "result": true}', "is not advertised"),
+        ('{"op": "unadvertise_service", "service": "/s"}', "is not advertised"),
+        ('{"op": "advertise_action", "action": "/a", "type": "x/Y"}', "cannot offer an action"),
+        (b"\xff", "CBOR"),
+        (b"\x9b\xff\xff\xff\xff\xff\xff\xff\xff", "CBOR"),
+        (b"\x5b\x00\x00\x00\xff\xff\xff\xff\xff", "CBOR"),
+        (b"\x81" * 100_000, "CBOR"),
+        (b"\xa1\x01\x02", "no 'op'"),
+        ("[" * 1_000_000, "too deep"),
+        ('{"op": "publish", "topic": "/t", "msg": ' + '{"a":' * 100_000, "too deep"),
+        ("x" * (limits.FRAME_MAX + 1), "exceeds the limit"),
+    ],
+)  # fmt: skip
+def test_what_is_malformed_is_answered_by_an_error(data: str | bytes, says: str) -> None:
+    client = Client()
+    assert not client.send_raw(data)
+    assert says in client.error()
+
+
+def test_the_error_has_the_id_of_the_op() -> None:
+    client = Client()
+    client.send("subscribe", id="mine", topic=7)
+    (status,) = client.received()
+    assert status["id"] == "mine"
+
+
+def test_what_a_client_may_have_is_bounded() -> None:
+    client = Client()
+    for number in range(limits.SUBSCRIPTIONS_MAX + 5):
+        client.send("subscribe", topic=f"/t{number}")
+    assert len(client.received()) == 5
+    for number in range(limits.SUBSCRIBERS_MAX + 4):
+        client.send("subscribe", topic="/t1", id=number)
+    assert len(client.received()) == 5
+    for number in range(limits.ADVERTISED_MAX + 5):
+        client.send("advertise", topic=f"/t{number}", type=STRING)
+    assert len(client.received()) == 5
+
+
+def test_every_op_is_known() -> None:
+    assert OPS.keys() >= {
+        "advertise", "unadvertise", "publish", "subscribe", "unsubscribe", "call_service", "advertise_service",
+        "unadvertise_service", "service_response", "fragment", "png", "auth", "set_level", "status",
+        "send_action_goal", "cancel_action_goal", "advertise_action", "unadvertise_action", "action_feedback",
+        "action_result",
+    }  # fmt: skip
+
+
+# --- actions -----------------------------------------------------------------------------------------------------
+
+TEST = "actionlib/Test"
+
+
+def _goal(client: Client, **values: Any) -> tuple[dict[str, int], Publish]:
+    requests = client.send("send_action_goal", action="/f", action_type=TEST, **values)
+    *begun, publish = requests
+    assert isinstance(publish, Publish)
+    return {each.topic: each.handle for each in begun if isinstance(each, Subscribe | Advertise)}, publish
+
+
+def _result(client: Client, part: str, handle: int, goal_id: str, status: int, number: int) -> None:
+    values = {"status": {"goal_id": {"id": goal_id}, "status": status}, part: {part: number}}
+    client.publish(handle, f"{TEST}Action{part.title()}", values)
+
+
+@pytest.mark.parametrize(("status", "code", "ok"), [(3, 4, True), (4, 6, False), (2, 5, False), (5, 6, False)])
+def test_a_goal_goes_to_actionlib_and_its_result_comes_back(status: int, code: int, ok: bool) -> None:
+    client = Client()
+    handles, publish = _goal(client, id="g", args={"goal": 5}, feedback=True)
+    assert handles.keys() == {"/f/result", "/f/feedback", "/f/goal", "/f/cancel"}
+    assert publish.handle == handles["/f/goal"]
+    kind = MessageType(f"{TEST}ActionGoal")
+    goal = kind.to_plain(kind.deserialize(publish.payload))
+    assert goal["goal"] == {"goal": 5}
+    goal_id = goal["goal_id"]["id"]  # type: ignore[index,call-overload]
+    _result(client, "feedback", handles["/f/feedback"], goal_id, 1, 1)
+    _result(client, "feedback", handles["/f/feedback"], "of another client", 1, 7)
+    (cancel,) = client.send("cancel_action_goal", id="g", action="/f")
+    assert isinstance(cancel, Publish)
+    assert cancel.handle == handles["/f/cancel"]
+    assert goal_id.encode() in bytes(cancel.payload)
+    _result(client, "result", handles["/f/result"], goal_id, status, 2)
+    feedback, result = client.received()
+    assert feedback == {"op": "action_feedback", "action": "/f", "id": "g", "values": {"feedback": 1}}
+    assert result == {
+        "op": "action_result", "action": "/f", "id": "g", "values": {"result": 2}, "status": code, "result": ok,
+    }  # fmt: skip
+    _result(client, "result", handles["/f/result"], goal_id, status, 2)
+    assert not client.received()
+
+
+def test_feedback_comes_only_where_it_was_asked_for() -> None:
+    client = Client()
+    handles, publish = _goal(client, id="g", args=[5])
+    kind = MessageType(f"{TEST}ActionGoal")
+    goal_id = kind.deserialize(publish.payload).goal_id.id
+    _result(client, "feedback", handles["/f/feedback"], goal_id, 1, 1)
+    assert not client.received()
+
+
+def test_an_action_that_the_hub_refuses_ends_its_goals() -> None:
+    client = Client()
+    handles, _ = _goal(client, id="g", args={"goal": 5})
+    requests = client.answer(Failed(handles["/f/goal"], "read-only"))
+    status, result = client.received()
+    assert status["level"] == "error"
+    assert (result["op"], result["id"], result["result"]) == ("action_result", "g", False)
+    assert {type(each) for each in requests} == {Unsubscribe, Unadvertise}

@@ -1,0 +1,241 @@
+"""/metrics: what Prometheus reads, its own linter's opinion, and the dashboard that uses it."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from prometheus_client.openmetrics.parser import text_string_to_metric_families as parse_openmetrics
+from prometheus_client.parser import text_string_to_metric_families
+
+from rmpa.bridge.data.qos_events import QosEventKind
+from rmpa.observe.snapshot import Snapshot, TopicInfo
+from rmpa.web import limits
+from rmpa.web.metrics import EVENT_KINDS, exposition, metrics
+from tests.web.snapshots import AGENT, FULL, SERVICE, peer, route
+
+DOCS = Path(__file__).parents[2] / "docs"
+DASHBOARD = DOCS / "grafana" / "rmpa.json"
+PAGE = DOCS / "metrics.md"
+PROMTOOL = shutil.which("promtool")
+with_promtool = pytest.mark.skipif(PROMTOOL is None, reason="promtool is not installed (apt install prometheus)")
+ROUTE = {"topic": "/image", "peer": "arm", "node": "/camera", "direction": "in"}
+
+
+def samples(snapshot: Snapshot | None) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
+    text = exposition(snapshot)[0].decode()
+    found = {}
+    for family in text_string_to_metric_families(text):
+        assert family.documentation, family.name
+        for sample in family.samples:
+            key = sample.name, frozenset(sample.labels.items())
+            assert key not in found, f"{key} comes twice"
+            found[key] = sample.value
+    return found
+
+
+def value(name: str, labels: dict[str, str], snapshot: Snapshot | None = FULL) -> float:
+    return samples(snapshot)[name, frozenset(labels.items())]
+
+
+@pytest.mark.parametrize(
+    ("name", "labels", "expected"),
+    [
+        ("rmpa_up", {}, 1),
+        ("rmpa_agent_info", {"module": "base", "version": "0.1.0", "domain": "3"}, 1),
+        ("rmpa_agent_cpu_usage_ratio", {}, 0.125),
+        ("rmpa_agent_resident_memory_bytes", {}, 50e6),
+        ("rmpa_agent_fd_refusals_total", {}, 2),
+        ("rmpa_topics", {}, 2),
+        ("rmpa_topics_crossing", {}, 1),
+        ("rmpa_topics_mismatched", {}, 1),
+        ("rmpa_nodes_unreachable", {}, 1),
+        ("rmpa_discards_total", {"reason": "beacon.malformed"}, 11),
+        ("rmpa_peers", {"state": "linked"}, 1),
+        ("rmpa_peers", {"state": "refused"}, 0),
+        ("rmpa_peer_linked", {"peer": "hand"}, 0),
+        ("rmpa_peer_hidden", {"peer": "arm", "kind": "topics", "at": "here"}, 8),
+        ("rmpa_link_clock_offset_seconds", {"peer": "arm"}, -0.25),
+        ("rmpa_link_start_time_seconds", {"peer": "arm"}, 1_000_050.0),
+        ("rmpa_link_receive_bytes_total", {"peer": "arm"}, 1000),
+        ("rmpa_route_messages_total", ROUTE, 600),
+        ("rmpa_route_lost_messages_total", ROUTE, 2),
+        ("rmpa_route_discarded_messages_total", ROUTE | {"reason": "late"}, 5),
+        ("rmpa_route_contract_events_total", ROUTE | {"event": "deadline_missed"}, 7),
+        ("rmpa_route_latency_seconds", ROUTE | {"quantile": "0.99"}, 0.009),
+        ("rmpa_route_last_message_timestamp_seconds", ROUTE, 1_000_099.95),
+        ("rmpa_service_calls_total", {"service": "/set_bool", "peer": "arm", "direction": "in"}, 9),
+        (
+            "rmpa_service_latency_seconds",
+            {"service": "/set_bool", "peer": "arm", "direction": "in", "quantile": "0.5"},
+            0.1,
+        ),
+    ],
+)
+def test_each_figure_of_the_snapshot_has_its_unit(name: str, labels: dict[str, str], expected: float) -> None:
+    assert value(name, labels) == pytest.approx(expected)
+
+
+def test_events_of_a_contract_begin_at_0_so_that_an_alarm_sees_the_first() -> None:
+    assert set(EVENT_KINDS) == set(QosEventKind)
+    strict = msgspec.structs.replace(route(), contract={"deadline": 0.1}, events={"messages_lost": 3})
+    free = msgspec.structs.replace(route(), events={})
+    for each, expected in ((strict, dict.fromkeys(EVENT_KINDS, 0.0) | {"messages_lost": 3.0}), (free, {})):
+        snapshot = Snapshot(agent=AGENT, taken=1.0, topics=(TopicInfo(name="/t", routes=(each,)),))
+        name = "rmpa_route_contract_events_total"
+        shown = {dict(labels)["event"]: count for (n, labels), count in samples(snapshot).items() if n == name}
+        assert shown == expected
+
+
+def test_without_an_agent_there_is_one_metric_that_says_so() -> None:
+    assert samples(None) == {("rmpa_up", frozenset()): 0.0}
+
+
+def test_what_is_not_known_is_left_out() -> None:
+    found = samples(Snapshot(agent=msgspec.structs.replace(AGENT, cpu=None, rss=None, files=None), taken=1.0))
+    assert not any("cpu" in name or "fds" in name for name, _ in found)
+
+
+def test_services_that_each_node_has_show_once_they_are_called() -> None:
+    names = {dict(labels).get("service") for _, labels in samples(FULL)}
+    assert "/camera/get_loggers" not in names
+    assert "/home" in names
+
+
+def test_the_number_of_time_series_is_bounded_and_what_is_left_out_is_counted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(limits, "METRIC_ROUTES", 3)
+    monkeypatch.setattr(limits, "METRIC_PEERS", 2)
+    routes = tuple(route(node=f"/n{number}") for number in range(5))
+    snapshot = Snapshot(
+        agent=AGENT,
+        taken=1.0,
+        peers=tuple(peer(f"p{number}") for number in range(6)),
+        topics=(TopicInfo(name="/t", routes=routes),),
+    )
+    found = samples(snapshot)
+    assert found["rmpa_metrics_omitted", frozenset({("kind", "route")})] == 2
+    assert found["rmpa_metrics_omitted", frozenset({("kind", "peer")})] == 4
+    assert sum(name == "rmpa_route_messages_total" for name, _ in found) == 3
+    assert found["rmpa_peers", frozenset({("state", "linked")})] == 6
+
+
+def test_hostile_names_break_nothing() -> None:
+    names = ('a"b\\c\nd', "x" * 1000, "x" * 1001, "caf\udce9", "")
+    snapshot = Snapshot(agent=AGENT, taken=1.0, peers=tuple(peer(name) for name in names))
+    found = samples(snapshot)
+    shown = [dict(labels)["peer"] for name, labels in found if name == "rmpa_peer_linked"]
+    assert 'a"b\\c\nd' in shown
+    assert len(shown) == 4
+    assert max(map(len, shown)) == limits.METRIC_LABEL_CHARACTERS
+
+
+def test_a_scraper_that_asks_for_openmetrics_gets_it() -> None:
+    body, content_type = exposition(FULL, "application/openmetrics-text;version=1.0.0")
+    assert content_type.startswith("application/openmetrics-text")
+    families = list(parse_openmetrics(body.decode()))  # type: ignore[no-untyped-call]
+    assert len(families) > 40
+    assert exposition(FULL)[1].startswith("text/plain")
+
+
+@with_promtool
+def test_prometheus_own_linter_finds_nothing() -> None:
+    assert PROMTOOL is not None
+    checked = subprocess.run(
+        [PROMTOOL, "check", "metrics"], check=False, input=exposition(FULL)[0], capture_output=True, timeout=30
+    )
+    assert checked.returncode == 0, checked.stderr.decode() + checked.stdout.decode()
+    assert not checked.stderr.strip()
+
+
+# --- the dashboard ---
+
+
+def expressions() -> list[str]:
+    found: list[str] = []
+
+    def walk(part: Any) -> None:
+        if isinstance(part, dict):
+            found.extend(part[key] for key in ("expr", "definition") if isinstance(part.get(key), str))
+            for each in part.values():
+                walk(each)
+        elif isinstance(part, list):
+            for each in part:
+                walk(each)
+
+    walk(json.loads(DASHBOARD.read_text(encoding="utf-8")))
+    return found
+
+
+def test_the_dashboard_uses_metrics_and_labels_that_there_are() -> None:
+    found = samples(FULL)
+    names = {name for name, _ in found}
+    labels = {label for _, pairs in found for label, _ in pairs} | {"instance", "job"}
+    assert expressions()
+    for expression in expressions():
+        used = set(re.findall(r"\brmpa_\w+", expression))
+        assert used, expression
+        assert used <= names, f"{expression}: there is no {used - names}"
+        for inside in re.findall(r"\{([^}]*)\}", expression):
+            assert set(re.findall(r"(\w+)\s*[=!]", inside)) <= labels, expression
+
+
+def test_the_dashboard_shows_what_goes_wrong() -> None:
+    text = " ".join(expressions())
+    for name in (
+        "rmpa_up",
+        "rmpa_peer_linked",
+        "rmpa_route_lost_messages_total",
+        "rmpa_route_discarded_messages_total",
+    ):
+        assert name in text
+
+
+@with_promtool
+def test_each_query_of_the_dashboard_is_valid_promql(tmp_path: Path) -> None:
+    assert PROMTOOL is not None
+    queries = [each for each in expressions() if not each.startswith("label_values")]
+    rules = [
+        {"record": f"check:{number}", "expr": re.sub(r"\$\w+", "x", each.replace("$__rate_interval", "5m"))}
+        for number, each in enumerate(queries)
+    ]
+    file = tmp_path / "rules.json"
+    file.write_text(json.dumps({"groups": [{"name": "dashboard", "rules": rules}]}), encoding="utf-8")
+    checked = subprocess.run([PROMTOOL, "check", "rules", str(file)], check=False, capture_output=True, timeout=30)
+    assert checked.returncode == 0, checked.stdout.decode() + checked.stderr.decode()
+
+
+@with_promtool
+def test_the_alarms_of_the_page_are_valid_rules_about_metrics_that_there_are(tmp_path: Path) -> None:
+    assert PROMTOOL is not None
+    rules = next(
+        block for block in re.findall(r"```yaml\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL) if "expr:" in block
+    )
+    file = tmp_path / "rules.yaml"
+    file.write_text(rules, encoding="utf-8")
+    checked = subprocess.run([PROMTOOL, "check", "rules", str(file)], check=False, capture_output=True, timeout=30)
+    assert checked.returncode == 0, checked.stdout.decode() + checked.stderr.decode()
+    assert set(re.findall(r"rmpa_\w+", rules)) <= {name for name, _ in samples(FULL)}
+
+
+def test_the_page_has_a_row_for_each_metric() -> None:
+    rows = re.findall(r"^\| `(rmpa_\w+)` \| (\w+) \| ([^|]+) \| ([^|]+) \|$", PAGE.read_text("utf-8"), re.MULTILINE)
+    written = {name: (kind, set(re.findall(r"\w+", labels)), meaning) for name, kind, labels, meaning in rows}
+    known = {
+        family.samples[0].name: (family.type, set(family.samples[0].labels), family.documentation)
+        for family in metrics(FULL)
+    }
+    assert written == known
+
+
+def test_a_service_has_one_series_for_each_peer() -> None:
+    services = tuple(msgspec.structs.replace(SERVICE, peer=name, calls=number) for number, name in enumerate("ab"))
+    snapshot = Snapshot(agent=AGENT, taken=1.0, services=services)
+    assert value("rmpa_service_calls_total", {"service": "/set_bool", "peer": "b", "direction": "in"}, snapshot) == 1
