@@ -20,7 +20,8 @@ class Series:
         style: ``points`` for samples, ``line``, ``steps`` for a distribution function, ``bars``; ``spans`` for thick
             horizontal bars, one for each pair of points: ``x`` where it begins and ends, ``y`` its row, twice;
             ``box`` for samples ``y`` grouped by their ``x`` (quartiles, p5 to p95, p99), groups equally far apart.
-        system: Decides the colour, the same in all figures: ``classic``, ``rmpa`` or something else.
+        system: Decides the colour, the same in all figures: ``classic``, ``rmpa``, ``direct``,
+            ``mixed`` or something else.
     """
 
     label: str

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Final, Self
 
 from lab.bed.processes import DEADLINE, BedError, CommandFailed, Deadline, Process, eventually
 from lab.bed.ros import free_port
+from rmpa.observe.io.control_client import ControlClient, choose_agent
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -74,6 +75,7 @@ class Agent:
         config: Text of its ``rmpa.toml``; empty for none.
         runtime_dir: Directory of control sockets; default: one for each ``home``, as of one user.
         log_level: As of ``--log-level``.
+        prefix: Words before the command of ``rmpa up``, such as ``setpriv`` with its options.
     """
 
     host: Host
@@ -85,6 +87,7 @@ class Agent:
     config: str = ""
     runtime_dir: Path | None = None
     log_level: str = "debug"
+    prefix: Sequence[str] = ()
     process: Process = field(init=False)
     ready_after: float = field(init=False, default=0.0)
     """Seconds from exec to READY=1."""
@@ -128,7 +131,7 @@ class Agent:
             path = self.home / f"{self.name}.toml"
             path.write_text(self.config, encoding="utf-8")
             words += ["--config", str(path)]
-        return self.host.command([*words, *self.flags])
+        return self.host.command([*self.prefix, *words, *self.flags])
 
     @property
     def pid(self) -> int:
@@ -181,6 +184,15 @@ class Agent:
         env = {**self.env, "RMPA_AGENT": self.name}  # several may share the runtime directory
         with Process(self.host.command([RMPA, *words]), env=env) as process:
             return process.wait(timeout), process.output
+
+    def snapshot(self) -> Snapshot:
+        """What it says of itself.
+
+        Raises:
+            UnreachableError: It does not answer.
+        """
+        with ControlClient(choose_agent(self.env, self.name).path) as client:
+            return client.snapshot()
 
     def peers(self) -> dict[str, dict[str, object]]:
         """What ``rmpa peer list --json`` says, by peer name."""

@@ -7,13 +7,15 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
-from lab.bed import namespaces, ros
+from lab.bed import namespaces, ros, transport
 from lab.bed.agents import Agent
 from lab.bed.namespaces import MACHINE, Host, Lab
 from lab.bed.ros import Ros, free_port
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from lab.bed.plan import Transport
 
 TEST_NODES: Final = Path(__file__).parents[2] / "tests" / "interop" / "nodes"
 """Nodes of the tests of which some are measured as well."""
@@ -41,15 +43,16 @@ class Bed:
         return self._lab
 
     def shell(self, host: Host = MACHINE, port: int = 0) -> Ros:
-        """A ROS user's shell."""
+        """A ROS user's shell; its nodes can be reached at their host's address."""
         port = port or (11311 if host.namespace else free_port())
-        return self._stack.enter_context(Ros(host, self.home, port))
+        made = self._stack.enter_context(Ros(host, self.home, port))
+        made.env["ROS_IP"] = host.address
+        return made
 
     def classic(self, network: int = 0, name: str = "classic") -> tuple[Ros, Ros]:
         """Two shells as classic ROS has them: on two hosts of one network, with one rosmaster, on the first."""
         a, b = self.lab.hosts(f"{name}_a", f"{name}_b", network=network)
         here, there = self.shell(a), self.shell(b)
-        here.env["ROS_IP"], there.env["ROS_IP"] = a.address, b.address
         here.env["ROS_MASTER_URI"] = there.env["ROS_MASTER_URI"] = f"http://{a.address}:{here.port}"
         here.master()
         return here, there
@@ -62,9 +65,15 @@ class Bed:
         start: bool = True,
         multicast: str = "",
         flags: Sequence[str] = (),
+        way: Transport = "relay",
+        config: str = "",
     ) -> Agent:
-        """An agent as users run it; ready when this returns, unless ``start`` is false."""
-        made = Agent(host, self.home, name=name, log_level="warning", multicast=multicast, flags=flags)
+        """An agent as users run it; ready when this returns, unless ``start`` is false.
+
+        ``way`` is the transport of what no contract in ``config`` gives another one; the rest is as of ``Agent``.
+        """
+        config += transport.settings(way)
+        made = Agent(host, self.home, name=name, log_level="warning", multicast=multicast, flags=flags, config=config)
         agent = self._stack.enter_context(made)
         if start:
             agent.start()

@@ -7,6 +7,8 @@ from typing import Literal
 
 Kind = Literal["classic", "rmpa"]
 """Which system: one roscore for all hosts, or one agent and core on each host."""
+Transport = Literal["relay", "direct"]
+"""How RMPA brings messages from module to module: through both agents, or straight from node to node."""
 Size = Literal["short", "full"]
 Client = Literal["rospy", "roscpp", "own"]
 """Whose nodes: those of the two ROS client libraries, or our own where ROS is not installed."""

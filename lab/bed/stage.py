@@ -17,7 +17,7 @@ from lab.bed.system import Classic, Rmpa
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from lab.bed.plan import Kind, Plan
+    from lab.bed.plan import Kind, Plan, Transport
     from lab.bed.system import Place, System
 
 PROGRAMS = ("source", "velocity", "sink")
@@ -75,6 +75,7 @@ class Stage:
         *,
         link: str | None = None,
         bands: bool = True,
+        way: Transport = "relay",
         config: str = "",
         flags: Sequence[str] = (),
         linked: bool = True,
@@ -86,7 +87,8 @@ class Stage:
             hosts: Their names; classic's roscore runs on ``pc``, else on the last.
             link: What each cable carries (``100mbit``); empty for unshaped; ``None``: as the plan says.
             bands: Whether packets leave by the kernel's usual three bands (``pfifo_fast``), as on a real interface.
-            config: Text of every agent's ``rmpa.toml``.
+            way: The transport of what no contract in ``config`` gives another one; classic ROS has but one.
+            config: Further text of every agent's ``rmpa.toml``.
             flags: Further words for ``rmpa up``.
             linked: Whether to wait until every agent is linked with every other (classic: until the master answers).
         """
@@ -98,7 +100,7 @@ class Stage:
             if kind == "classic":
                 made = Classic(place, hosts, home)
             else:
-                made = Rmpa(place, hosts, home, config=config, flags=flags)
+                made = Rmpa(place, hosts, home, way=way, config=config, flags=flags)
             robot = stack.enter_context(made)
             robot.boot(linked=linked)
             yield robot

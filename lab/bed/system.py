@@ -15,19 +15,20 @@ from typing import TYPE_CHECKING, Final, Protocol, Self
 
 import psutil
 
+from lab.bed import transport
 from lab.bed.agents import RMPA, Agent, last_link
 from lab.bed.processes import BedError, Deadline
 from lab.bed.ros import NODES, PYTHON, Ros, compiled, words
 from rmpa.core.errors import UnreachableError
-from rmpa.observe.io.control_client import ControlClient, choose_agent
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     from lab.bed.namespaces import Host
-    from lab.bed.plan import Client, Kind
+    from lab.bed.plan import Client, Kind, Transport
     from lab.bed.processes import Process
+    from lab.bed.transport import Pair
     from rmpa.observe.snapshot import Snapshot
 
 _UP: Final = 30.0
@@ -86,6 +87,9 @@ class System(abc.ABC):
         hosts: Their names.
         home: An existing directory for files and logs.
     """
+
+    _way: Transport | None = None
+    """The transport between its modules; ``None`` where there are none."""
 
     def __init__(self, place: Place, hosts: Sequence[str], home: Path) -> None:
         self._place = place
@@ -159,6 +163,15 @@ class System(abc.ABC):
         if wait:
             process.wait_event("up", _UP)
         return process
+
+    def require_transport(self, pairs: Iterable[Pair], way: Transport | None = None) -> None:
+        """Make sure that publishers reach these subscribers by the system's transport, or by ``way``.
+
+        Raises:
+            BedError: They do not.
+        """
+        if wanted := way or self._way:
+            transport.require(wanted, pairs)
 
     def kill(self, host: str) -> None:
         """End a host as a pulled plug does."""
@@ -284,14 +297,23 @@ class Rmpa(System):
         place: As of ``System``; so are the next two.
         hosts: Also the agents' names.
         home: For files.
-        config: Text of every agent's ``rmpa.toml``.
+        way: The transport of what no contract in ``config`` gives another one.
+        config: Further text of every agent's ``rmpa.toml``.
         flags: Further words for ``rmpa up``.
     """
 
     def __init__(
-        self, place: Place, hosts: Sequence[str], home: Path, *, config: str = "", flags: Sequence[str] = ()
+        self,
+        place: Place,
+        hosts: Sequence[str],
+        home: Path,
+        *,
+        way: Transport = "relay",
+        config: str = "",
+        flags: Sequence[str] = (),
     ) -> None:
         super().__init__(place, hosts, home)
+        self._way = way
         self._agents = {
             name: Agent(
                 place.host(name),
@@ -299,7 +321,7 @@ class Rmpa(System):
                 name=name,
                 core_port=place.core_port(name),
                 log_level="warning",
-                config=config,
+                config=config + transport.settings(way),
                 flags=flags,
             )
             for name in hosts
@@ -350,10 +372,8 @@ class Rmpa(System):
 
     def _snapshot(self, host: str) -> Snapshot | None:
         """What its agent says of itself; ``None`` if it does not answer."""
-        agent = self._agents[host]
         try:
-            with ControlClient(choose_agent(agent.env, agent.name).path) as client:
-                return client.snapshot()
+            return self._agents[host].snapshot()
         except UnreachableError:
             return None
 
@@ -372,10 +392,15 @@ class Rmpa(System):
             agent.close()
 
     def _shell(self, host: str) -> Ros:
-        return Ros(self._place.host(host), self._home, self._place.core_port(host))
+        made = Ros(self._place.host(host), self._home, self._place.core_port(host))
+        made.env["ROS_IP"] = made.host.address  # as with classic ROS
+        return made
 
     def _boot(self, host: str) -> None:
-        self._agents[host].restart()
+        agent = self._agents[host]
+        agent.process.end()
+        agent.start()
+        agent.wait_ready(_LINKED)  # beside as many others as there are
 
     def _own(self, host: str) -> list[Process]:
         return [self._agents[host].process]

@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Final
 from lab.bed.bench import why_no_hosts, why_no_ros
 from lab.bed.namespaces import MACHINE
 from lab.bed.ros import NODES, Ros, compiled, free_port
+from lab.bed.transport import require
 from lab.usage import Meter, Usage
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
-    from lab.bed.agents import Agent
     from lab.bed.bench import Bed
+    from lab.bed.plan import Transport
     from lab.bed.processes import Process
 
 SIZES: Final = (64, 64 * 1024, 1024 * 1024)
@@ -39,6 +40,7 @@ class RoundTripPath:
         ping: The process that takes "SIZE COUNT FILE" lines.
         processes: Every process on the path, by name.
         still: Those that may be stopped (SIGSTOP) while others are measured: no other process supervises them.
+        transport: How messages cross where there are agents, which each round makes sure of.
     """
 
     key: str
@@ -46,17 +48,34 @@ class RoundTripPath:
     ping: Process
     processes: dict[str, Process]
     still: list[Process] = field(default_factory=list)
+    transport: Transport | None = None
 
     def round(self, size: int, count: int, scratch: Path) -> tuple[array[int], int, dict[str, Usage]]:
-        """Make ``count`` round trips; return their times in ns, the number lost, and the usage by process."""
+        """Make ``count`` round trips; return their times in ns, the number lost, and the usage by process.
+
+        Raises:
+            Deadline: They are not over in time.
+            BedError: Messages cross otherwise than they should.
+        """
         since = self.ping.mark_events()
         meter = Meter({name: process.pid for name, process in self.processes.items()})
         self.ping.tell(f"{size} {count} {scratch}")
         event = self.ping.wait_event("round", _ROUND_DEADLINE, since=since)
         usage = meter.read()
+        self.require_transport()
         samples = array("Q")
         samples.frombytes(scratch.read_bytes())
         return samples, int(str(event["lost"])), usage
+
+    def require_transport(self) -> None:
+        """Make sure that messages cross as they should.
+
+        Raises:
+            BedError: They do not.
+        """
+        if self.transport:
+            ping, pong = self.ping, self.processes["pong"]
+            require(self.transport, [(ping, pong), (pong, ping)])
 
     @contextmanager
     def awake(self) -> Iterator[None]:
@@ -141,25 +160,25 @@ def relays(bed: Bed) -> RoundTripPath:
     return _nodes("relays", "roscpp, two C++ relays", shell, shell, "roscpp", between, ask="/ping2", answer="/pong2")
 
 
-def agents_hosts(bed: Bed) -> RoundTripPath:
-    """Roscpp through two agents in two network namespaces."""
-    a, b = bed.lab.hosts("a", "b")
-    first, second = bed.agent(a, name="a"), bed.agent(b, name="b")
-    return _through("agents_hosts", "roscpp, two agents, two hosts", bed, first, second)
+def through(
+    key: str, title: str, transport: Transport, *, network: int | None = None, flags: Sequence[str] = ()
+) -> Callable[[Bed], RoundTripPath]:
+    """Roscpp by two agents: in two network namespaces, or without a network both on the real machine."""
 
+    def start(bed: Bed) -> RoundTripPath:
+        names = f"{key}_a", f"{key}_b"
+        hosts = bed.lab.hosts(*names, network=network) if network is not None else (MACHINE, MACHINE)
+        pair = [
+            bed.agent(host, name=name, flags=flags, way=transport) for host, name in zip(hosts, names, strict=True)
+        ]
+        here, there = (bed.shell(agent.host, agent.core_port) for agent in pair)
+        between = {f"agent {number}": agent.process for number, agent in enumerate(pair, 1)}
+        made = _nodes(key, title, here, there, "roscpp", between)
+        made.still, made.transport = [], transport
+        made.require_transport()
+        return made
 
-def agents_one_host(bed: Bed) -> RoundTripPath:
-    """Roscpp through two agents on the real machine."""
-    first, second = bed.agent(MACHINE, name="one"), bed.agent(MACHINE, name="two")
-    return _through("agents_one_host", "roscpp, two agents, one host", bed, first, second)
-
-
-def _through(key: str, title: str, bed: Bed, first: Agent, second: Agent) -> RoundTripPath:
-    between = {"agent 1": first.process, "agent 2": second.process}
-    here, there = (bed.shell(agent.host, agent.core_port) for agent in (first, second))
-    made = _nodes(key, title, here, there, "roscpp", between)
-    made.still = []
-    return made
+    return start
 
 
 def _nodes(
@@ -233,8 +252,14 @@ ENTRIES: Final[dict[str, Entry]] = {
         "cyclonedds",
     ),
     "pyzmq": Entry(script("pyzmq", "pyzmq, PAIR over TCP", "ping_zmq.py", freeze=True), "zmq"),
-    "agents_hosts": Entry(agents_hosts, needs=_HOSTS),
-    "agents_one_host": Entry(agents_one_host, needs=_ROS),
+    "agents_hosts": Entry(through("agents_hosts", "roscpp, two agents, two hosts", "relay", network=0), needs=_HOSTS),
+    "agents_one_host": Entry(through("agents_one_host", "roscpp, two agents, one host", "relay"), needs=_ROS),
+    "direct_hosts": Entry(
+        through("direct_hosts", "roscpp, RMPA direct, two hosts", "direct", network=1), needs=_HOSTS
+    ),
+    "direct_one_host": Entry(
+        through("direct_one_host", "roscpp, RMPA direct, one host", "direct", flags=("--domain", "1")), needs=_ROS
+    ),
 }
 """All ways to carry bytes from process to process, each at its best (Zenoh peer to peer, DDS over loopback alone)."""
 _LIBRARIES: Final = {"zenoh", "zenoh_shm", "cyclonedds", "pyzmq"}

@@ -7,18 +7,20 @@ nodes.
 
 from __future__ import annotations
 
+import time
 from array import array
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from lab import machine, samples, tables
 from lab.bed.bench import Bed
-from lab.bed.processes import Deadline
+from lab.bed.processes import BedError
 from lab.bench.contenders import ENTRIES, PATH, PEERS, SIZES
 from lab.bench.schedule import HostLateness
 from lab.figures import shapes
+from lab.findings import Claim
 from lab.results import finish
-from lab.usage import Usage, add
+from lab.usage import Meter, Usage, add
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,7 +35,16 @@ _WARM_UP: Final = 20
 """Round trips of each turn that are thrown away: caches and the processor's clock come up."""
 _BASE: Final = "roscpp_nodelay"
 _RELAYS: Final = "relays"
+_CABLE: Final = "roscpp_hosts"
+"""Roscpp over the same kind of cable as the agents'."""
 _OURS: Final = "agents_hosts"
+_DIRECT: Final = "direct_hosts"
+_DIRECT_LIMITS: Final = {"p50": 1.05, "p99": 1.15}
+_RELAYED_LIMIT: Final = 2.0
+_IDLE_LIMIT: Final = 0.5
+"""Percent of a core: what two looks at an idle agent differ by."""
+_IDLE_SECONDS: Final = 5.0
+"""A whole period of what agents do while nothing happens: the heartbeat's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,11 +117,15 @@ def _measure(
                 for one in [*taking_part[first:], *taking_part[:first]]:
                     try:
                         _turn(one, size, trips // plan.rounds, bed.home / "samples", scores)
-                    except Deadline as error:
-                        left_out[one.key] = f"stopped answering at {tables.size(size)}"
+                    except BedError as error:
+                        left_out[one.key] = f"stopped at {tables.size(size)}: {error}"
                         console.print(f"left out from here on: {one.key}: {error}", style="red", markup=False)
                         taking_part.remove(one)
         titles = {one.key: one.title for one in taking_part}
+        wanted = claims(scores)
+        for one in taking_part:
+            if one.key == _DIRECT:
+                wanted.append(_agents_claim(one, [score for (key, _), score in scores.items() if key == _DIRECT]))
     for size in plan.trips:
         console.print(_table(size, scores, titles))
     small = min(plan.trips)
@@ -121,7 +136,38 @@ def _measure(
         tables.size(size): {title: [trip / 2000 for trip in scores[key, size].trips] for key, title in titles.items()}
         for size in plan.trips
     }
-    return finish(console, name, asdict(plan), result, json, panels=shapes.shares(shown, "one way, µs"))
+    panels = shapes.shares(shown, "one way, µs")
+    return finish(console, name, asdict(plan), result, json, claims=wanted, panels=panels)
+
+
+def claims(scores: Scores) -> list[Claim]:
+    """What is to be reached, of those that were measured."""
+    made = []
+    for size in sorted({size for _, size in scores}):
+        for name, limit in _DIRECT_LIMITS.items():
+            if {(_DIRECT, size), (_CABLE, size)} <= scores.keys():
+                ours, base = (getattr(scores[key, size].one_way, name) for key in (_DIRECT, _CABLE))
+                text = f"{tables.size(size)}, {name}, RMPA direct / roscpp over the same cable"
+                made.append(Claim(text, tables.ratio(ours, base), limit))
+    smallest = min((size for _, size in scores), default=0)
+    for key, name, limit in ((_BASE, "roscpp direct", _RELAYED_LIMIT), (_RELAYS, "two relays", 1.0)):
+        if {(_OURS, smallest), (key, smallest)} <= scores.keys():
+            ours, base = (scores[of, smallest].one_way.p50 for of in (_OURS, key))
+            made.append(Claim(f"{tables.size(smallest)}, p50, two agents / {name}", tables.ratio(ours, base), limit))
+    return made
+
+
+def _agents_claim(one: RoundTripPath, scores: Sequence[TripScore]) -> Claim:
+    """What both agents used while their nodes talked directly, beyond what they use while nothing happens."""
+    agents = {name: process.pid for name, process in one.processes.items() if name.startswith("agent")}
+    meter = Meter(agents)
+    time.sleep(_IDLE_SECONDS)
+    idle = sum(used.percent for used in meter.read().values())
+    busy = [score.usage[name] for score in scores for name in agents]
+    wall = sum(used.wall for used in busy) / len(agents)
+    share = 100 * sum(used.cpu for used in busy) / wall
+    text = "processor time of both agents while nodes talk directly, less idle"
+    return Claim(text, round(share - idle, 3), _IDLE_LIMIT, unit="% of a core")
 
 
 def start_all(bed: Bed, keys: Sequence[str], left_out: dict[str, str], console: Console) -> list[RoundTripPath]:
@@ -132,7 +178,7 @@ def start_all(bed: Bed, keys: Sequence[str], left_out: dict[str, str], console: 
         if not reason:
             try:
                 made = ENTRIES[key].start(bed)
-            except Deadline as error:
+            except BedError as error:
                 reason = f"did not start: {error}"
             else:
                 for process in made.still:
@@ -155,7 +201,7 @@ def _turn(one: RoundTripPath, size: int, trips: int, scratch: Path, scores: Scor
 
 
 def _ratios(scores: Scores, key: str, size: int) -> dict[str, float | None]:
-    """The median as a multiple of direct roscpp's and of the relays'; and ours as a multiple of it."""
+    """The median as a multiple of direct roscpp's, of the relays' and of roscpp's over a cable; and ours of it."""
 
     def median(of: str) -> float | None:
         return scores[of, size].one_way.p50 if (of, size) in scores else None
@@ -164,6 +210,7 @@ def _ratios(scores: Scores, key: str, size: int) -> dict[str, float | None]:
         "to_roscpp": tables.ratio(median(key), median(_BASE)),
         "to_relays": tables.ratio(median(key), median(_RELAYS)),
         "agents_to_it": tables.ratio(median(_OURS), median(key)),
+        "to_roscpp_hosts": tables.ratio(median(key), median(_CABLE)),
     }
 
 
@@ -184,7 +231,19 @@ def rows(scores: Scores, titles: dict[str, str]) -> list[dict[str, object]]:
 
 
 def _table(size: int, scores: Scores, titles: dict[str, str]) -> Table:
-    heads = ("p50", "p95", "p99", "p99.9", "max", "trips", "lost", "to roscpp", "to relays", "agents to it")
+    heads = (
+        "p50",
+        "p95",
+        "p99",
+        "p99.9",
+        "max",
+        "trips",
+        "lost",
+        "to roscpp",
+        "to relays",
+        "agents to it",
+        "to roscpp, cable",
+    )
     table = tables.table_of(f"one way, {tables.size(size)}, µs", ("between the two nodes",), heads)
     for key, title in titles.items():
         row = scores[key, size].one_way

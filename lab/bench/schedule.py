@@ -10,7 +10,6 @@ import itertools
 import math
 import os
 import statistics
-import subprocess
 import time
 from array import array
 from dataclasses import asdict, dataclass, field
@@ -19,9 +18,9 @@ from typing import TYPE_CHECKING, Final
 import psutil
 
 from lab import machine, samples
-from lab.bed.agents import RMPA
 from lab.bed.processes import BedError, Deadline
 from lab.bed.ros import compiled
+from lab.bed.transport import require
 from lab.experiments import flow
 from lab.tables import usage_row
 from lab.usage import Meter, Usage, add
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
 
     from lab.bed.agents import Agent
     from lab.bed.bench import Bed
+    from lab.bed.plan import Transport
     from lab.bed.processes import Process
     from lab.bed.ros import Ros
 
@@ -49,8 +49,6 @@ _HOST_LATENESS: Final = 2.0
 """Seconds of sleeps, before and after, that tell how late the machine itself wakes."""
 NODE_PRIORITY: Final = 40
 """Of measuring nodes under SCHED_FIFO: below the agents', as a user's nodes would be."""
-_AGENT_PRIORITY: Final = 50
-"""What ``--realtime`` asks for by default."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,12 +139,20 @@ class MeasuredStream:
         target: Runs its ``sink``.
         topic: That the target listens to.
         between: The processes between them, by name.
+        transport: How its messages are to cross, which each round makes sure of; ``None`` where there are no agents.
     """
 
     def __init__(
-        self, bed: Bed, source: Process, target: Process, topic: str, between: Mapping[str, Process]
+        self,
+        bed: Bed,
+        source: Process,
+        target: Process,
+        topic: str,
+        between: Mapping[str, Process],
+        transport: Transport | None = None,
     ) -> None:
         self.source, self.target = source, target
+        self._transport = transport
         self.pids = {
             "publisher": source.pid,
             **{name: process.pid for name, process in between.items()},
@@ -164,9 +170,11 @@ class MeasuredStream:
 
         Raises:
             Deadline: None came.
+            BedError: They come by another transport.
         """
         deadline = time.monotonic() + _FLOWING_DEADLINE
         flow.wait_connected(self.source, timeout=_FLOWING_DEADLINE)
+        self._require_transport()
         while not self.run(64, 100.0, 0.1).sequence:
             if time.monotonic() > deadline:
                 raise Deadline(f"nothing of {self.source.name} came to {self.target.name}")
@@ -194,10 +202,15 @@ class MeasuredStream:
             raise BedError("begin() comes first")
         late = _numbers(flow.sent(self._begun), "late_ns")
         usage = self._meter.read()
+        self._require_transport()
         came = flow.noted(self.target, self._topics, self._home, self._begun.number, settle=_SETTLE)
         arrivals = parse(came, late, self._lead)
         arrivals.usage, arrivals.total = usage, len(late)
         return arrivals
+
+    def _require_transport(self) -> None:
+        if self._transport:
+            require(self._transport, [(self.source, self.target)])
 
 
 def parse(came: DataFrame, late: Sequence[int], lead: int) -> Arrivals:
@@ -223,6 +236,7 @@ class Way:
         there: The receiver's.
         agents: The agents between them; none in classic ROS.
         relayed: Whether a roscpp relay on each host takes each message on.
+        transport: How messages cross where there are agents.
     """
 
     key: str
@@ -231,9 +245,15 @@ class Way:
     there: Ros
     agents: list[Agent] = field(default_factory=list)
     relayed: bool = False
+    transport: Transport | None = None
 
-    def stream(self, bed: Bed, topic: str, *, queue: int = 100, fifo: int = 0) -> MeasuredStream:
-        """Start both nodes of one topic, under SCHED_FIFO if ``fifo`` is a priority."""
+    def stream(
+        self, bed: Bed, topic: str, *, queue: int = 100, fifo: int = 0, transport: Transport | None = None
+    ) -> MeasuredStream:
+        """Start both nodes of one topic, under SCHED_FIFO if ``fifo`` is a priority.
+
+        ``transport`` is the topic's own, where a contract gives it another one than the way has.
+        """
         prefix = ["chrt", "-f", str(fifo)] if fifo else []
 
         def node(shell: Ros, program: str, *words: str) -> Process:
@@ -248,7 +268,7 @@ class Way:
                 between[f"relay {number}"] = node(shell, "velocity", "--cmd", begin, "--vel", end)
         target = node(self.there, "sink", "--topics", end)
         source = node(self.here, "source", "--topic", topic)
-        made = MeasuredStream(bed, source, target, end, between)
+        made = MeasuredStream(bed, source, target, end, between, transport or self.transport)
         made.wait_flowing()
         return made
 
@@ -263,49 +283,60 @@ def relays(bed: Bed, network: int = 0) -> Way:
     return Way("relays", "roscpp, two relays", *bed.classic(network, "relays"), relayed=True)
 
 
-def agents(
-    bed: Bed,
-    *,
-    key: str = "agents",
-    title: str = "two agents",
-    network: int = 0,
-    flags: Sequence[str] = (),
-) -> Way:
+@dataclass(frozen=True, slots=True)
+class AgentPair:
+    """Two agents as a way from host to host.
+
+    Args:
+        key: Its name in JSON.
+        title: Its name in tables.
+        transport: Of what no contract in ``config`` gives another one.
+        config: Further text of their ``rmpa.toml``.
+    """
+
+    key: str
+    title: str
+    transport: Transport = "relay"
+    config: str = ""
+
+
+RELAYED: Final = AgentPair("agents", "two agents")
+DIRECT: Final = AgentPair("agents_direct", "RMPA direct", "direct")
+
+
+def agents(bed: Bed, kind: AgentPair = RELAYED, *, network: int = 0, flags: Sequence[str] = ()) -> Way:
     """Two agents on two hosts of a network of their own, linked."""
-    hosts = bed.lab.hosts(f"{key}_a", f"{key}_b", network=network)
-    pair = [bed.agent(host, name=host.name, flags=flags) for host in hosts]
+    hosts = bed.lab.hosts(f"{kind.key}_a", f"{kind.key}_b", network=network)
+    pair = [bed.agent(host, name=host.name, flags=flags, way=kind.transport, config=kind.config) for host in hosts]
     pair[0].wait_peer(pair[1].name)
     here, there = (bed.shell(agent.host, agent.core_port) for agent in pair)
-    return Way(key, title, here, there, pair)
+    return Way(kind.key, kind.title, here, there, pair, transport=kind.transport)
 
 
-def realtime_agents(bed: Bed, *, network: int = 0) -> tuple[Way, str]:
-    """Two agents with ``--realtime``, and how they got it: from outside where this rmpa has no such flag."""
-    shown = subprocess.run([RMPA, "up", "--help"], capture_output=True, text=True, check=True, timeout=30).stdout
-    flags = ["--realtime"] if "--realtime" in shown else []
-    way = agents(bed, key="agents_realtime", title="agents, --realtime", network=network, flags=flags)
-    how = "rmpa up --realtime"
-    if not flags:
-        how = f"chrt -f {_AGENT_PRIORITY} from outside: this rmpa has no --realtime"
-        way.title = "agents, chrt -f"
-        for agent in way.agents:
-            chrt = ["chrt", "--all-tasks", "--fifo", "--pid", str(_AGENT_PRIORITY), str(agent.pid)]
-            subprocess.run(chrt, check=True, timeout=10)
-    return way, f"{how}; {', '.join(sorted({_policy(agent.pid) for agent in way.agents}))}"
+def realtime_agents(
+    bed: Bed, kind: AgentPair = AgentPair("agents_realtime", "agents, --realtime"), *, network: int = 0
+) -> tuple[Way, str]:
+    """Two agents with ``--realtime``, and what they got."""
+    way = agents(bed, kind, network=network, flags=["--realtime"])
+    return way, f"rmpa up --realtime; {', '.join(sorted({_policy(agent.pid) for agent in way.agents}))}"
 
 
-def direct_and_agents(bed: Bed, *, realtime: bool) -> tuple[list[Way], int, str]:
-    """Classic ROS and two agents, each on a network of its own; the nodes' priority (0: none), and how all that ran.
+def direct_and_agents(
+    bed: Bed, kinds: Sequence[AgentPair] = (RELAYED,), *, realtime: bool
+) -> tuple[list[Way], int, str]:
+    """Classic ROS and pairs of agents, each on a network of its own; the nodes' priority (0: none), and how all ran.
 
     Args:
         bed: Where they are.
+        kinds: Which pairs.
         realtime: Whether nodes and agents run under SCHED_FIFO, so that other processes are out of the figures.
     """
     if not realtime:
-        return [direct(bed), agents(bed, network=1)], 0, "everything under SCHED_OTHER"
-    way, how = realtime_agents(bed, network=1)
-    way.key = "agents"
-    return [direct(bed), way], NODE_PRIORITY, f"nodes under SCHED_FIFO {NODE_PRIORITY}; agents: {how}"
+        ways = [agents(bed, kind, network=number) for number, kind in enumerate(kinds, 1)]
+        return [direct(bed), *ways], 0, "everything under SCHED_OTHER"
+    made = [realtime_agents(bed, kind, network=number) for number, kind in enumerate(kinds, 1)]
+    how = f"nodes under SCHED_FIFO {NODE_PRIORITY}; agents: {'; '.join(dict.fromkeys(how for _, how in made))}"
+    return [direct(bed), *(way for way, _ in made)], NODE_PRIORITY, how
 
 
 def _policy(pid: int) -> str:

@@ -9,21 +9,22 @@ from typing import Final
 
 import msgspec
 
-from rmpa import __version__
+import rmpa
 
-_PACKAGE: Final = Path(__file__).parents[1]
-_MEASURE_NOTHING: Final = ("cli/", "experiments/report/")
-"""Folders that may change while a run is made: they show what was measured."""
+_PACKAGES: Final = (Path(__file__).parents[1], Path(rmpa.__file__).parent)
+"""What measures, and what is measured."""
+_MEASURE_NOTHING: Final = ("cli/", "experiments/report/", "results/")
+"""Folders that may change while a run is made: they show what was measured, or are that."""
 
 
 class Code(msgspec.Struct, frozen=True, kw_only=True):
-    """One state of this package.
+    """One state of what measures and of what is measured.
 
     Attributes:
         version: Of the release.
         digest: Of all files that take part in measuring.
         commit: Of the clone that it runs from; empty where it is installed.
-        changed: Whether files of the package differ from that commit.
+        changed: Whether files differ from that commit.
     """
 
     version: str
@@ -32,16 +33,18 @@ class Code(msgspec.Struct, frozen=True, kw_only=True):
     changed: bool = False
 
 
-def code_here(package: Path = _PACKAGE) -> Code:
-    """The code that runs."""
-    commit, changed = _commit(package)
-    return Code(version=__version__, digest=digest(package), commit=commit, changed=changed)
+def code_here(*packages: Path) -> Code:
+    """The code that runs, of these folders; default: ``lab`` and ``rmpa``."""
+    packages = packages or _PACKAGES
+    commit = _commit(packages[0])[0]
+    changed = any(_commit(package)[1] for package in packages)
+    return Code(version=rmpa.__version__, digest=digest(*packages), commit=commit, changed=changed)
 
 
-def digest(package: Path) -> str:
-    """Twelve hexadecimal digits that change with any file of a package that takes part in measuring."""
+def digest(*packages: Path) -> str:
+    """Twelve hexadecimal digits that change with any file of these packages that takes part in measuring."""
     total = hashlib.sha256()
-    for path in sorted(package.rglob("*")):
+    for package, path in ((one, path) for one in packages for path in sorted(one.rglob("*"))):
         name = path.relative_to(package).as_posix()
         if path.is_file() and "__pycache__" not in path.parts and not name.startswith(_MEASURE_NOTHING):
             total.update(f"{name}\0".encode() + hashlib.sha256(path.read_bytes()).digest())

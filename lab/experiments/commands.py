@@ -43,7 +43,7 @@ Exit codes: 0 all was measured (whatever the figures say); 1 some of it could no
 \b
 Examples:
   python -m lab experiment run --short                   does everything work? a few minutes; not for figures to quote
-  sudo make experiment                          the whole evaluation, on hosts of its own; most of an hour
+  sudo make experiment                          the whole evaluation, on hosts of its own; over an hour
   python -m lab experiment run control rates --out mine  two of them, into ./mine
   python -m lab experiment run --out mine                go on there
   python -m lab experiment run rates --only rate=1000 --client roscpp

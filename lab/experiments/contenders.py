@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from lab.bed.plan import Kind
+    from lab.bed.plan import Kind, Transport
     from lab.experiments.model import Cell, Measured, Results, Value
+
+
+Way = Literal["relay", "direct", "mixed"]
+"""The transport of RMPA's topics; ``mixed``: some of them are direct."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,28 +25,41 @@ class Contender:
         system: Which system.
         nodelay: Whether subscribers ask for tcp_nodelay.
         relays: How many relays in C++ a message passes on its way.
+        way: The transport of RMPA's topics.
     """
 
     label: str
     system: Kind
     nodelay: bool = True
     relays: int = 0
+    way: Way = "relay"
 
     @property
     def settings(self) -> dict[str, Value]:
         """Those that tell it from the others in a cell.
 
-        ``nodelay`` is one of classic ROS: an agent sends at once whatever its subscribers ask for.
+        ``nodelay`` is one of classic ROS: an agent sends at once whatever its subscribers ask for. Runs from before
+        there was a direct transport have no ``transport``: what they measured was relayed.
         """
         if self.system == "rmpa":
-            return {"system": self.system}
+            return self.kind_settings
         relayed: dict[str, Value] = {"relays": self.relays} if self.relays else {}
         return {"system": self.system, "nodelay": self.nodelay, **relayed}
+
+    @property
+    def kind_settings(self) -> dict[str, Value]:
+        """Those that tell the system and its transport."""
+        return {"system": self.system} if self.way == "relay" else {"system": self.system, "transport": self.way}
+
+    @property
+    def look(self) -> str:
+        """What decides its colour in figures (``figures.colours``)."""
+        return self.system if self.way == "relay" else self.way
 
     def select(self, results: Results, **settings: Value) -> Iterator[tuple[Cell, Measured]]:
         """The cells of this one, and of no other, that have these settings."""
         for cell, measured in results.select(**self.settings, **settings):
-            if relays_of(cell) == self.relays:
+            if relays_of(cell) == self.relays and way_of(cell) == self.way:
                 yield cell, measured
 
 
@@ -53,6 +70,13 @@ DEFAULTS: Final = Contender("classic, nodelay off", "classic", nodelay=False)
 RELAYS: Final = Contender("classic, two relays", "classic", relays=2)
 """With as many processes between as RMPA has: a relay in C++ on either host, also with tcp_nodelay."""
 RMPA: Final = Contender("RMPA", "rmpa")
+"""Relayed: each message passes both agents."""
+DIRECT: Final = Contender("RMPA direct", "rmpa", way="direct")
+"""From node to node; the agents have only made it so."""
+MIXED: Final = Contender("RMPA, images direct", "rmpa", way="mixed")
+"""Images from node to node, commands through the agents."""
+COMPARED: Final = (CLASSIC, RMPA, DIRECT)
+"""Those that take turns in every experiment."""
 
 
 def turn(order: Sequence[Contender], number: int) -> list[Contender]:
@@ -64,6 +88,22 @@ def turn(order: Sequence[Contender], number: int) -> list[Contender]:
 def system_of(cell: Cell) -> Kind:
     """The kind of system that a cell asks for."""
     return "rmpa" if cell.settings["system"] == "rmpa" else "classic"
+
+
+def way_of(cell: Cell) -> Way:
+    """The transport that a cell asks for."""
+    found = cell.settings.get("transport")
+    return "direct" if found == "direct" else "mixed" if found == "mixed" else "relay"
+
+
+def transport_of(cell: Cell) -> Transport:
+    """The transport of the topics for which the experiment has no contract."""
+    return "direct" if way_of(cell) == "direct" else "relay"
+
+
+def contender_of(cell: Cell) -> Contender:
+    """The one that a cell is of, in experiments that have classic ROS at its best only."""
+    return {one.way: one for one in (RMPA, DIRECT, MIXED)}[way_of(cell)] if system_of(cell) == "rmpa" else CLASSIC
 
 
 def relays_of(cell: Cell) -> int:

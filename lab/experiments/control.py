@@ -6,6 +6,7 @@ each into a velocity order (VEL), the base takes those, and the pc receives both
 
 from __future__ import annotations
 
+import functools
 import itertools
 import random
 from dataclasses import dataclass
@@ -13,7 +14,19 @@ from typing import TYPE_CHECKING, Final, cast
 
 from lab import statistics
 from lab.experiments import flow
-from lab.experiments.contenders import CLASSIC, DEFAULTS, RELAYS, RMPA, nodelay_of, relays_of, system_of, turn
+from lab.experiments.contenders import (
+    CLASSIC,
+    COMPARED,
+    DEFAULTS,
+    DIRECT,
+    RELAYS,
+    RMPA,
+    nodelay_of,
+    relays_of,
+    system_of,
+    transport_of,
+    turn,
+)
 from lab.experiments.model import Cell, Measured
 from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
 from lab.frames import counting_from, pairs, source_periods
@@ -54,7 +67,7 @@ _MARGIN_MS: Final = 10.0
 _ROUNDS_NEEDED: Final = 3
 """Below that, one bad moment of the machine decides a ratio."""
 _JITTER_LIMIT: Final = 1.1
-_DELAY_LIMIT_MS: Final = 0.2
+_DELAY_LIMITS_MS: Final = {RMPA: 0.2, DIRECT: 0.05}
 _RELAYS_LIMIT: Final = 1.0
 """As many processes on the way, each at its best."""
 _POLLED_LIMIT: Final = 1.01
@@ -73,14 +86,15 @@ _PAPER: Final = {
 _ABOUT: Final = """\
 The paper's robot: *joystick* publishes CMD at 10 Hz on an absolute schedule, *velocity* answers with VEL, *base*
 subscribes to VEL, and *pc* to both. Each system has the same four hosts and the same nodes; with classic ROS the pc
-runs the one roscore, with RMPA each host has its agent. What is measured, all at the pc:
+runs the one roscore, with RMPA each host has its agent: *RMPA* is through these, *RMPA direct* from node to node.
+What is measured, all at the pc:
 
 * the **period** of CMD and of VEL: the time between two messages that follow each other;
 * the **control computation delay**: when VEL came less when the CMD with the same number came.
 
 The velocity node is *polled* at 10 Hz as the paper's was (it sends at its next tick, if a new command is there) or
 *event-driven* (it answers at once). When polled, the delay is the time from the command to the next tick, so it is
-decided by how the two schedules happen to lie. Both systems are given the same phases here, a new one each round:
+decided by how the two schedules happen to lie. All are given the same phases here, a new one each round:
 the joystick's schedule begins at a stated time (`phase_ms`) after a tick of the velocity node.
 
 Classic ROS runs with tcp_nodelay, its best setting. Beside it stand one round without it, and, with the
@@ -90,8 +104,8 @@ flow. Systems take turns; standard deviations are taken for each round, ratios o
 
 _NOTES: Final = (
     (
-        "With RMPA each message wakes two processes more than with classic ROS. At 10 Hz each is woken from an "
-        "idle processor and finds cold caches, which costs several times what it does at 1 kHz, most of all on a "
+        "Relayed by RMPA, each message wakes two processes more than with classic ROS. At 10 Hz each is woken from "
+        "an idle processor and finds cold caches, which costs several times what it does at 1 kHz, most of all on a "
         "virtual machine. Where relays in C++ stand beside it, they have what two more processes cost by "
         "themselves."
     ),
@@ -124,7 +138,7 @@ class Control:
         for number, phase in enumerate(given, 1):
             for (client, mode), shift in zip(itertools.product(clients, MODES), itertools.count(number)):
                 beside = [] if plan.short else _beside(mode, number)
-                for contender in (*turn([CLASSIC, RMPA], shift), *beside):
+                for contender in (*turn(COMPARED, shift), *beside):
                     settings: dict[str, Value] = {**contender.settings, "client": client, "mode": mode}
                     if mode == "polled":
                         settings["phase_ms"] = phase
@@ -141,7 +155,8 @@ class Control:
         mode = str(cell.settings["mode"])
         phase = cell.settings.get("phase_ms")  # an event-driven node has no schedule of its own
         relayed = relays_of(cell) > 0
-        with stage.system(system_of(cell), HOSTS) as system:
+        way = transport_of(cell)
+        with stage.system(system_of(cell), HOSTS, way=way) as system:
             if relayed:
                 _start_relays(system, "own" if client == "own" else "roscpp")
             at = _at if relayed else _direct
@@ -152,14 +167,17 @@ class Control:
                 "velocity", "velocity", client, cmd=cmd, vel=VEL, mode=mode, rate=RATE, nodelay=nodelay
             )
             source = system.node("joystick", "source", client, topic=CMD, phase=phase)
+            pairs = [(source, velocity), (source, pc), (velocity, base), (velocity, pc)]
+            system.require_transport(pairs)
             # An agent or a relay is the one local subscriber, however many are behind it.
-            subscribers = 1 if relayed or system.kind == "rmpa" else 2
+            subscribers = 1 if relayed or (system.kind == "rmpa" and way == "relay") else 2
             flow.wait_connected(source, subscribers)
             flow.wait_connected(velocity, subscribers)
             flow.wait_flowing(source, base, (VEL,), stage.scratch, least=1)
             flow.wait_flowing(source, pc, (CMD, VEL), stage.scratch, least=1)
             begun = flow.begin(source, stage.scratch, size=_SIZE, rate=RATE, count=_LEAD + _MESSAGES[stage.plan.size])
             sent = flow.sent(begun)
+            system.require_transport(pairs)
             tables = {
                 "pc": flow.noted(pc, (CMD, VEL), stage.scratch, begun.number),
                 "base": flow.noted(base, (VEL,), stage.scratch, begun.number),
@@ -174,11 +192,14 @@ class Control:
         claims: list[Claim] = []
         for client, mode in _measured(results):
             ways = {
-                contender: rounds(results, contender, client, mode) for contender in (RMPA, CLASSIC, RELAYS, DEFAULTS)
+                contender: rounds(results, contender, client, mode)
+                for contender in (RMPA, DIRECT, CLASSIC, RELAYS, DEFAULTS)
             }
             figures.append(_figure(ways, client, mode))
             grids.append(_grid(ways, client, mode))
-            claims.extend(_claims(ways, client, mode))
+            for contender in _DELAY_LIMITS_MS:
+                if ways[contender]:
+                    claims.extend(_claims(ways, contender, client, mode))
         return Findings(tuple(figures), tuple(grids), tuple(claims), _NOTES if figures else ())
 
 
@@ -285,33 +306,38 @@ def _measured(results: Results) -> Iterator[tuple[str, str]]:
 
 
 def _paired(
-    ways: Ways, figure: Callable[[ControlRound], float | None], base: Contender = CLASSIC
+    ways: Ways, figure: Callable[[ControlRound], float | None], one: Contender = RMPA, base: Contender = CLASSIC
 ) -> tuple[list[float | None], list[float | None]]:
-    """One figure of RMPA and of another contender, of the rounds that both have."""
-    ours, theirs = ways[RMPA], ways[base]
+    """One figure of two contenders, of the rounds that both have."""
+    ours, theirs = ways[one], ways[base]
     common = sorted(ours.keys() & theirs.keys())
     return [figure(ours[number]) for number in common], [figure(theirs[number]) for number in common]
 
 
-def _claims(ways: Ways, client: str, mode: str) -> Iterator[Claim]:
+def _claims(ways: Ways, contender: Contender, client: str, mode: str) -> Iterator[Claim]:
+    label, ours_is_papers = contender.label, contender == RMPA and mode == "polled"
     for quantity in ("cmd", "vel"):
         _, _, ours, theirs = _PAPER[quantity]
         yield Claim(
-            f"period sd of {quantity.upper()} at the pc, {mode}, {client}: RMPA / classic",
-            _ratio(*_paired(ways, lambda one, of=quantity: one.sd(of))),  # type: ignore[misc]  # a default for binding
+            f"period sd of {quantity.upper()} at the pc, {mode}, {client}: {label} / classic",
+            _ratio(*_paired(ways, functools.partial(ControlRound.sd, quantity=quantity), contender)),
             _JITTER_LIMIT,
-            paper=round(ours / theirs, 2) if mode == "polled" else None,
+            paper=round(ours / theirs, 2) if ours_is_papers else None,
         )
-    means = _paired(ways, lambda one: one.mean("delay"))
+    means = _paired(ways, lambda one: one.mean("delay"), contender)
     if mode == "polled":
         ours, theirs, _, _ = _PAPER["delay"]
-        text = f"mean control delay, polled, same phases, {client}: RMPA / classic"
-        yield Claim(text, _ratio(*means), _POLLED_LIMIT, paper=round(ours / theirs, 2))
+        text = f"mean control delay, polled, same phases, {client}: {label} / classic"
+        paper = round(ours / theirs, 2) if ours_is_papers else None
+        yield Claim(text, _ratio(*means), _POLLED_LIMIT, paper=paper)
         return
     more = [1e3 * (a - b) for a, b in zip(*means, strict=True) if a is not None and b is not None]
     value = statistics.median(more) if len(more) >= _ROUNDS_NEEDED else None
-    yield Claim(f"mean control delay, event, {client}: RMPA less classic", value, _DELAY_LIMIT_MS, unit="ms")
-    relayed = _ratio(*_paired(ways, lambda one: one.mean("delay"), RELAYS))
+    text = f"mean control delay, event, {client}: {label} less classic"
+    yield Claim(text, value, _DELAY_LIMITS_MS[contender], unit="ms")
+    if contender == DIRECT:
+        return
+    relayed = _ratio(*_paired(ways, lambda one: one.mean("delay"), base=RELAYS))
     yield Claim(f"mean control delay, event, {client}: RMPA / classic through relays in C++", relayed, _RELAYS_LIMIT)
 
 
@@ -322,6 +348,7 @@ def _ratio(ours: Sequence[float | None], theirs: Sequence[float | None]) -> floa
 
 def _grid(ways: Ways, client: str, mode: str) -> Grid:
     shown = [contender for contender in ways if ways[contender]]
+    ours = [contender for contender in (RMPA, DIRECT) if contender in shown] or [RMPA]
     rows: list[tuple[str, ...]] = []
     for quantity, title in [
         ("source", "Command Order, as it is sent"),
@@ -331,13 +358,13 @@ def _grid(ways: Ways, client: str, mode: str) -> Grid:
         row = [title]
         for figure in (ControlRound.mean, ControlRound.sd):
             row += [_of(ways[contender], figure, quantity) for contender in shown]
-        rows.append((*row, _ratio_text(ways, quantity)))
+        rows.append((*row, *(_ratio_text(ways, quantity, one) for one in ours)))
         if mode == "polled" and quantity in _PAPER:
-            rows.append(_paper_row(quantity, shown))
+            rows.append((*_paper_row(quantity, shown), *[""] * (len(ours) - 1)))
     heads = [f"{what}, {contender.label}" for what in ("mean", "sd") for contender in shown]
     return Grid(
         f"Table 1. {client}, {_NODES[mode]}; periods and delay, ms",
-        ("at the pc", *heads, "sd, RMPA / classic"),
+        ("at the pc", *heads, *(f"sd, {one.label} / classic" for one in ours)),
         rows,
         "Medians over rounds; the ratio is of neighbouring rounds, in brackets its 95 % interval over them.",
     )
@@ -347,8 +374,8 @@ def _of(found: dict[int, ControlRound], figure: Callable[[ControlRound, str], fl
     return counted(statistics.median(figure(one, quantity) for one in found.values()), _DIGITS, 1e3)
 
 
-def _ratio_text(ways: Ways, quantity: str) -> str:
-    found = statistics.ratio(*_paired(ways, lambda one: one.sd(quantity)))
+def _ratio_text(ways: Ways, quantity: str, contender: Contender) -> str:
+    found = statistics.ratio(*_paired(ways, lambda one: one.sd(quantity), contender))
     return "-" if found is None else str(found)
 
 
@@ -367,8 +394,8 @@ def _figure(ways: Ways, client: str, mode: str) -> Figure:
             "message",
             "delay, ms" if quantity == "delay" else "period, ms",
             tuple(
-                Series(f"{contender.label}, {client}", *_numbered(ways[contender], quantity), system=contender.system)
-                for contender in (CLASSIC, RMPA)
+                Series(f"{contender.label}, {client}", *_numbered(ways[contender], quantity), system=contender.look)
+                for contender in COMPARED
                 if ways[contender]
             ),
             distribution=True,
@@ -377,7 +404,7 @@ def _figure(ways: Ways, client: str, mode: str) -> Figure:
     ]
     caption = "Message by message as in the paper, which has a figure for each system; one round after the other."
     if mode == "polled":
-        caption += " The steps of the delay are the phases that both systems were given."
+        caption += " The steps of the delay are the phases that all systems were given."
     return Figure(
         f"fig-8-9-{client}-{mode}",
         f"Figs. 8 and 9. Periods and control computation delay: {client}, {_NODES[mode]}",

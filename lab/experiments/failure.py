@@ -13,9 +13,10 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
+from lab.bed import transport
 from lab.bed.processes import Deadline, eventually
 from lab.experiments import flow
-from lab.experiments.contenders import system_of
+from lab.experiments.contenders import COMPARED, system_of, transport_of
 from lab.experiments.failure_findings import FLOWS, RATE, SCENARIOS, findings
 from lab.experiments.model import Cell, Measured, Results
 from lab.frames import frame
@@ -70,6 +71,13 @@ NODES: Final = (
 )
 _BY_NAME: Final = {node.name: node for node in NODES}
 _KEYS: Final = {one.key for one in FLOWS}
+_PAIRS: Final = (
+    *(("stick", sink) for sink in ("log", "controller", "display")),
+    ("controller", "display"),
+    ("controller", "wheels"),
+    ("battery", "lamp"),
+)
+"""Nodes that publish, and those of other hosts that subscribe."""
 _LEADS: Final = (("stick", "log"), ("stick", "display"), ("stick", "wheels"), ("battery", "lamp"))
 """Sources, and the sinks at which all topics come if they send."""
 
@@ -123,6 +131,7 @@ class PaperRobot:
             flow.wait_flowing(
                 self._running[source], self._running[sink], topics, self._scratch, timeout=_FLOWING_WITHIN
             )
+        self.system.require_transport((self._running[one], self._running[other]) for one, other in _PAIRS)
         self.collect()
         self.rows.clear()
         self._send()
@@ -197,6 +206,11 @@ class PaperRobot:
     def _seen(self, since: int) -> set[Value]:
         """The flows of which something came since a moment, ns."""
         return {key for key, _, _, came in self.rows if isinstance(came, int) and came > since}
+
+    def direct(self) -> int:
+        """How many of the connections between hosts are from node to node."""
+        running = [(self._running.get(one), self._running.get(other)) for one, other in _PAIRS]
+        return sum(bool(one and other and transport.is_direct(one.pid, other.pid)) for one, other in running)
 
     # --- inside -------------------------------------------------------------------------------------------------
 
@@ -276,7 +290,8 @@ Four hosts: *joystick* sends CMD, *velocity* answers each with VEL, *base* takes
 * The **cable** of *velocity* is pulled out, and put in again: after 3 s and, in a run of its own, after 5 s.
 
 Nodes have fixed names; those of a host are started as soon as its agent is ready or its master answers. A message is
-lost if it was due between the failure and the end of the observation and never came. Where classic ROS does not
+lost if it was due between the failure and the end of the observation and never came. RMPA runs twice: through its
+agents, and *direct*, from node to node, as it is shown to be before anything fails. Where classic ROS does not
 recover, it gets one more chance: in the end whatever still runs from before the failure is started anew by hand.
 """
 
@@ -289,7 +304,7 @@ class Failure:
     about: Final = _ABOUT
 
     def cells(self, plan: Plan) -> list[Cell]:
-        """Each scenario with each client, both systems in turns."""
+        """Each scenario with each client, all in turns."""
         scenarios = (
             ["master"]
             if plan.short
@@ -298,17 +313,17 @@ class Failure:
         times = _SHORT if plan.short else _FULL
         seconds = 6.0 + times.before + times.node + times.away + times.after
         return [
-            Cell(self.name, {"system": system, "client": client, "scenario": scenario, "round": 1}, seconds)
+            Cell(self.name, {**one.kind_settings, "client": client, "scenario": scenario, "round": 1}, seconds)
             for client in (plan.clients[-1:] if plan.short else plan.clients)
             for scenario in scenarios
-            for system in ("classic", "rmpa")
+            for one in COMPARED
         ]
 
     def measure(self, cell: Cell, stage: Stage) -> Measured:
         """Let the robot run, let it fail, and take what came."""
         client: Client = cell.settings["client"]  # type: ignore[assignment]  # cells() put it there
         times = _SHORT if stage.plan.short else _FULL
-        with stage.system(system_of(cell), HOSTS) as system:
+        with stage.system(system_of(cell), HOSTS, way=transport_of(cell)) as system:
             robot = PaperRobot(system, client, stage)
             robot.begin()
             time.sleep(times.before)
@@ -317,12 +332,13 @@ class Failure:
             time.sleep(times.after)
             robot.collect()
             robot.note("end")
+            direct = robot.direct()
             by_hand = 0 if robot.back() else robot.by_hand(down)
         tables = {
             "flows": frame(("flow", "sequence", "due_ns", "came_ns"), robot.rows),
             "moments": frame(("what", "at_ns"), robot.moments),
         }
-        return Measured(tables, {"by_hand": by_hand, "rate": RATE})
+        return Measured(tables, {"by_hand": by_hand, "rate": RATE, "direct": direct, "connections": len(_PAIRS)})
 
     def findings(self, results: Results) -> Findings:
         """Say what was lost, and what came back."""

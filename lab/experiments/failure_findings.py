@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from lab.experiments.contenders import COMPARED, DIRECT, RMPA, contender_of
 from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
 from lab.statistics import flowing, outages
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
+    from lab.experiments.contenders import Contender
     from lab.experiments.model import Cell, Measured, Results
 
 RATE: Final = 50.0
@@ -198,13 +200,14 @@ def findings(results: Results) -> Findings:
 
 
 def _figures(results: Results) -> Iterable[Figure]:
-    """One for each scenario and client: both systems below each other, on the same rows."""
+    """One for each scenario and client: the systems below each other, on the same rows."""
     seen = dict.fromkeys((cell.settings["scenario"], cell.settings["client"]) for cell, _ in results.cells)
     for scenario, client in seen:
         panels = [
-            _timeline(str(system), str(client), measured)
-            for system in ("classic", "rmpa")
-            for _, measured in results.select(system=system, client=client, scenario=scenario)
+            _timeline(contender, str(client), measured)
+            for contender in COMPARED
+            for cell, measured in results.select(client=client, scenario=scenario)
+            if contender_of(cell) == contender
         ]
         yield Figure(
             f"failure-{scenario}-{client}",
@@ -215,7 +218,7 @@ def _figures(results: Results) -> Iterable[Figure]:
         )
 
 
-def _timeline(system: str, client: str, measured: Measured) -> Panel:
+def _timeline(contender: Contender, client: str, measured: Measured) -> Panel:
     moments = _moments(measured)
     zero = moments["down"]
     x: list[float] = []
@@ -225,16 +228,13 @@ def _timeline(system: str, client: str, measured: Measured) -> Panel:
             x += [(begin - zero) / 1e9, (end - zero) / 1e9]
             y += [row, row]
     return Panel(
-        f"{_NAMES[system]}, {client}",
+        f"{contender.label}, {client}",
         "since the failure, s",
         "",
-        (Series(_NAMES[system], x, y, "spans", system),),
+        (Series(contender.label, x, y, "spans", contender.look),),
         moments={_WORDS[what]: (at - zero) / 1e9 for what, at in moments.items() if what in _WORDS},
         names=tuple(flow.title for flow in FLOWS),
     )
-
-
-_NAMES: Final = {"classic": "classic", "rmpa": "RMPA"}
 
 
 def _grid(told: Sequence[tuple[Cell, list[FlowLosses]]]) -> Grid:
@@ -244,7 +244,7 @@ def _grid(told: Sequence[tuple[Cell, list[FlowLosses]]]) -> Grid:
             SCENARIOS[str(cell.settings["scenario"])].title,
             str(cell.settings["client"]),
             outcome.flow.title + (" *" if outcome.touched else ""),
-            _NAMES[str(cell.settings["system"])],
+            contender_of(cell).label,
             str(outcome.due),
             str(outcome.lost),
             str(outcome.late),
@@ -272,13 +272,6 @@ def _again(outcome: FlowLosses) -> str:
 
 
 def _claims(told: Sequence[tuple[Cell, list[FlowLosses]]]) -> Iterable[Claim]:
-    def of(system: str, *scenarios: str) -> list[list[FlowLosses]]:
-        return [
-            found
-            for cell, found in told
-            if cell.settings["system"] == system and cell.settings["scenario"] in (scenarios or SCENARIOS)
-        ]
-
     stock = [(cell, found) for cell, found in told if cell.settings["client"] != "own"]
     classic = [
         sum(not outcome.back for outcome in found)
@@ -287,27 +280,31 @@ def _claims(told: Sequence[tuple[Cell, list[FlowLosses]]]) -> Iterable[Claim]:
     ]
     text = "classic, the master's host killed and on again: flows that do not come back by themselves"
     yield Claim(text, min(classic, default=None), 1, at_least=True)
-    ours = of("rmpa")
-    never = [sum(not outcome.back for outcome in found) for found in ours]
-    yield Claim("RMPA, any failure: flows that do not come back by themselves", max(never, default=None), 0)
-    lost = [sum(outcome.lost for outcome in found if not outcome.touched) for found in ours]
-    yield Claim("RMPA, any failure: messages lost on flows of other hosts", max(lost, default=None), 0)
-    ups = [
-        outcome.after_up
-        for found in of("rmpa", "master", "host")
-        for outcome in found
-        if outcome.after_up is not None
-    ]
-    text = "RMPA: flows run again, from when the agent is ready and the node up, worst"
+    for contender in (RMPA, DIRECT):
+        ours = [(str(cell.settings["scenario"]), found) for cell, found in told if contender_of(cell) == contender]
+        if ours or contender == RMPA:
+            yield from _our_claims(contender.label, ours)
+
+
+def _our_claims(label: str, ours: Sequence[tuple[str, list[FlowLosses]]]) -> Iterable[Claim]:
+    """Of RMPA by one transport, from losses by scenario."""
+    never = [sum(not outcome.back for outcome in found) for _, found in ours]
+    yield Claim(f"{label}, any failure: flows that do not come back by themselves", max(never, default=None), 0)
+    lost = [sum(outcome.lost for outcome in found if not outcome.touched) for _, found in ours]
+    yield Claim(f"{label}, any failure: messages lost on flows of other hosts", max(lost, default=None), 0)
+    ups, cables = (
+        [
+            outcome.after_up
+            for scenario, found in ours
+            for outcome in found
+            if outcome.after_up is not None and scenario.startswith("cable") == cable
+        ]
+        for cable in (False, True)
+    )
+    text = f"{label}: flows run again, from when the agent is ready and the node up, worst"
     yield Claim(text, max(ups, default=None), _AGAIN_WITHIN, unit="s")
-    cables = [
-        outcome.after_up
-        for found in of("rmpa", "cable", "cable-long")
-        for outcome in found
-        if outcome.after_up is not None
-    ]
     if cables:
-        text = "RMPA: flows run again, from when the cable is in again, worst"
+        text = f"{label}: flows run again, from when the cable is in again, worst"
         yield Claim(text, max(cables), _AGAIN_WITHIN, unit="s")
 
 
@@ -323,6 +320,12 @@ def _notes(told: Sequence[tuple[Cell, Measured, list[FlowLosses]]]) -> Iterable[
             "The second after the restart counts from when the agent is ready and its host's nodes said that they"
             " are up: how long programs take to be loaded is not the architecture's. From the execution of the"
             f" agent, with all of that in it, the worst flow took {max(starts):.2f} s."
+        )
+    if direct := [measured.facts for cell, measured, _ in told if contender_of(cell) == DIRECT]:
+        again, all_of_them = (sum(_int(facts[name]) for facts in direct) for name in ("direct", "connections"))
+        yield (
+            f"RMPA direct: at the end of the observations {again} of {all_of_them} connections between hosts were"
+            " from node to node again; the others, if any, were relayed or not yet there."
         )
     for cell, measured, found in told:
         if (by_hand := measured.facts.get("by_hand")) and cell.settings["system"] == "classic":

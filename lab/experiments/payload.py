@@ -6,11 +6,12 @@ is almost linear".
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from lab import samples, statistics, words
-from lab.experiments.contenders import CLASSIC, RMPA, turn
+from lab.experiments.contenders import CLASSIC, COMPARED, DIRECT, RMPA, contender_of, turn
 from lab.experiments.model import Cell
 from lab.experiments.stream import LEAD, SETTLE, stream
 from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
@@ -47,14 +48,18 @@ _LONGEST: Final = {"short": 1.0, "full": 5.0}
 _SETUP: Final = 5.0
 _R2_LIMIT: Final = 0.99
 _SIZES_NEEDED: Final = 3
-_UNITS: Final = {"kbit": 1e3, "mbit": 1e6, "gbit": 1e9}
+_DIRECT_LIMIT: Final = 1.05
+"""Of the direct transport's p50 by classic ROS's, on a cable that is not shaped: the wire hides nothing there."""
+_DIRECT_SIZES: Final = (64 * _KB, _KB * _KB)
+_UNITS: Final = {"": 1.0, "k": 1e3, "m": 1e6, "g": 1e9}
 
 _ABOUT: Final = """\
 One stream from *joystick* to *pc*, one way, from the moment at which a message was due at its source to when the
 subscriber's callback has all of it. Messages of 1 KB to 1 MB (1 KB = 1,024 bytes), doubling, in batches of 100 and
 of 1,000; the rate is what the link carries at 70 %, 400 Hz at the most. In the batches of 1,000, sizes that would
 need more than five seconds of the link get as many messages as fit in, 100 at the least: 1 MB takes 88 ms of a link
-of 100 Mbit/s. The same again, in batches of 100, on a link that is not shaped.
+of 100 Mbit/s. The same again, in batches of 100, on a link that is not shaped. *RMPA* is through the agents, *RMPA
+direct* from node to node.
 
 A straight line is laid through the medians of the sizes, and another one through all samples; R² says how much of
 the variance it explains.
@@ -83,7 +88,7 @@ class Payload:
         made: list[Cell] = []
         for link, batch in kinds:
             for client in clients:
-                for contender in turn([CLASSIC, RMPA], len(made) // 2):
+                for contender in turn(COMPARED, len(made) // len(COMPARED)):
                     seconds = _SETUP + sum(
                         count / rate + LEAD + 2 * SETTLE for rate, count in steps(plan, link, batch).values()
                     )
@@ -105,7 +110,7 @@ class Payload:
         return Findings(
             tuple(_figures(found)),
             (*_grids(found), *([_lines(found)] if found else [])),
-            tuple(_claims(found, results.plan)),
+            (*_claims(found, results.plan), *_direct_claims(found)),
             _NOTES if any(kind.link != UNSHAPED for kind in found) else (),
         )
 
@@ -130,10 +135,9 @@ def bits_per_second(link: str) -> float:
     Raises:
         ValueError: It is not written so.
     """
-    for unit, factor in _UNITS.items():
-        if link.lower().endswith(unit):
-            return float(link[: -len(unit)]) * factor
-    raise ValueError(f"{link!r} is no rate such as 100mbit")
+    if not (found := re.fullmatch(r"(\d+(?:\.\d+)?)([kmg]?)bit", link.lower())):
+        raise ValueError(f"{link!r} is no rate such as 100mbit")
+    return float(found[1]) * _UNITS[found[2]]
 
 
 def name(size: int) -> str:
@@ -185,6 +189,8 @@ class Kind:
 
 
 Found = dict[Kind, dict["Contender", Ladder]]
+_ORDER: Final = (RMPA, DIRECT, CLASSIC)
+"""Of tables."""
 
 
 def _measured(results: Results) -> Found:
@@ -193,8 +199,7 @@ def _measured(results: Results) -> Found:
     for cell, measured in results.cells:
         batch = cell.settings["batch"]
         kind = Kind(str(cell.settings["client"]), str(cell.settings["link"]), batch if isinstance(batch, int) else 0)
-        contender = RMPA if cell.settings["system"] == RMPA.system else CLASSIC
-        found.setdefault(kind, {}).setdefault(contender, Ladder()).add(measured)
+        found.setdefault(kind, {}).setdefault(contender_of(cell), Ladder()).add(measured)
     return found
 
 
@@ -208,6 +213,15 @@ def _claims(found: Found, plan: Plan) -> Iterator[Claim]:
             yield Claim(text, line.r2 if line else None, _R2_LIMIT, at_least=True)
 
 
+def _direct_claims(found: Found) -> Iterator[Claim]:
+    for kind, ladders in found.items():
+        if kind.link == UNSHAPED and DIRECT in ladders and CLASSIC in ladders:
+            for size in _DIRECT_SIZES:
+                ours, theirs = (samples.summary(ladders[one].values.get(size, [])).p50 for one in (DIRECT, CLASSIC))
+                text = f"p50 of {name(size)}, {kind.client}, {_link(kind.link)}, {kind.batch}: RMPA direct / classic"
+                yield Claim(text, ours / theirs if ours and theirs else None, _DIRECT_LIMIT)
+
+
 def _lines(found: Found) -> Grid:
     rows = [
         (
@@ -219,7 +233,7 @@ def _lines(found: Found) -> Grid:
             *_line(ladders[contender], every=every),
         )
         for kind, ladders in found.items()
-        for contender in (RMPA, CLASSIC)
+        for contender in _ORDER
         if contender in ladders
         for every, what in ((False, "medians"), (True, "all samples"))
     ]
@@ -237,35 +251,37 @@ def _line(ladder: Ladder, *, every: bool) -> tuple[str, str, str, str]:
 
 def _grids(found: Found) -> Iterator[Grid]:
     for kind, ladders in found.items():
-        shown = [contender for contender in (RMPA, CLASSIC) if contender in ladders]
+        shown = [contender for contender in _ORDER if contender in ladders]
+        ours = [contender for contender in shown if contender is not CLASSIC]
         rows: list[tuple[str, ...]] = []
         for size in sorted({size for ladder in ladders.values() for size in ladder.values}):
             row = [name(size)]
-            medians: list[float | None] = []
+            medians: dict[Contender, float | None] = {}
             for contender in shown:
                 of = samples.summary(ladders[contender].values.get(size, []), ladders[contender].lost.get(size, 0))
-                medians.append(of.p50)
+                medians[contender] = of.p50
                 row += [
                     counted(of.p50),
                     counted(of.p95),
                     counted(of.largest),
                     f"{of.count} / {of.lost}",
                 ]
-            ours, theirs = medians if len(medians) > 1 else (None, None)
-            rows.append((*row, counted(ours / theirs if ours and theirs else None)))
+            base = medians.get(CLASSIC)
+            ratios = ((medians[one], base) for one in ours)
+            rows.append((*row, *(counted(a / b if a and b else None) for a, b in ratios)))
         heads = [f"{what}, {one.label}" for one in shown for what in ("p50", "p95", "largest", "came / lost")]
         title = f"Fig. 11 in figures: {kind.client}, {_link(kind.link)}, batches of {kind.batch}; latency, ms"
-        yield Grid(title, ("payload", *heads, "p50, RMPA / classic"), rows)
+        yield Grid(title, ("payload", *heads, *(f"p50, {one.label} / classic" for one in ours)), rows)
 
 
 def _figures(found: Found) -> Iterator[Figure]:
     for kind, ladders in found.items():
-        shown = [contender for contender in (CLASSIC, RMPA) if contender in ladders]
+        shown = [contender for contender in COMPARED if contender in ladders]
         labels = {one: f"{one.label}, {kind.client}" for one in shown}
-        points = [_points(ladders[one], labels[one], one.system) for one in shown]
-        lines = [series for one in shown for series in _drawn(ladders[one], labels[one], one.system)]
+        points = [_points(ladders[one], labels[one], one.look) for one in shown]
+        lines = [series for one in shown for series in _drawn(ladders[one], labels[one], one.look)]
         medians = [
-            Series(labels[one], *_columns(ladders[one].medians), style="line", system=one.system) for one in shown
+            Series(labels[one], *_columns(ladders[one].medians), style="line", system=one.look) for one in shown
         ]
         yield Figure(
             f"fig-11-{kind.client}-{kind.link}-{kind.batch}",

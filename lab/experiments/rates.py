@@ -9,7 +9,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from lab import samples, statistics
-from lab.experiments.contenders import CLASSIC, DEFAULTS, RELAYS, RMPA, nodelay_of, relays_of, turn
+from lab.experiments.contenders import (
+    CLASSIC,
+    COMPARED,
+    DEFAULTS,
+    DIRECT,
+    RELAYS,
+    RMPA,
+    nodelay_of,
+    relays_of,
+    turn,
+)
 from lab.experiments.model import Cell
 from lab.experiments.stream import SETTLE, stream
 from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
@@ -43,6 +53,11 @@ five such rates one of 7 %, and 1.2 leaves room for three of those."""
 _MS_TO_US: Final = 1e3
 _RELAYS_LIMIT: Final = 1.0
 """Python agents that are no slower than relays in C++."""
+_DIRECT_LIMITS: Final = {"p50": 1.05, "p99": 1.15}
+"""Of the direct transport at 1 kHz, by classic ROS over the same cable."""
+_WIDTH_LIMIT: Final = 1.1
+"""No wider than classic ROS: the widths of 10,000 messages have a standard error of 2 %, their ratio one of 3 %, and
+this leaves room for three of those."""
 
 _ABOUT: Final = """\
 One stream of 64 bytes from *joystick* to *pc*, one way: from the moment at which a message was **due** at its
@@ -54,14 +69,16 @@ network namespaces of one machine, with one clock.
 percentiles with fewer than ten samples beyond them are left out. The first tenth of a second of each step is not
 counted. Systems take turns.
 
-Classic ROS runs with tcp_nodelay. Beside it, in one round of 50 messages at each of the paper's rates and 1,000 at
+RMPA stands there twice: *RMPA*, through the agents, and *RMPA direct*, from node to node. Classic ROS runs with
+tcp_nodelay. Beside it, in one round of 50 messages at each of the paper's rates and 1,000 at
 1 kHz: classic ROS *without tcp_nodelay*, where Nagle's algorithm may hold a message back until the one before it
 was acknowledged; and classic ROS through *two relays* in C++ (roscpp, tcp_nodelay), one on each host, which tells
 what two more processes that must wake cost by themselves: much more at 10 Hz, from an idle processor, than at 1
 kHz.
 
 *Width* is p95 less p50. No widening is said when the width at 1 kHz is at most 1.2 times the median of those at 10
-to 50 Hz: their own sampling error is 7 %.
+to 50 Hz: their own sampling error is 7 %. The direct transport is held against classic ROS itself, on the same kind
+of cable: p50, p99 and width at 1 kHz.
 """
 
 
@@ -79,7 +96,7 @@ class Rates:
         for number in range(1, _ROUNDS[plan.size] + 1):
             beside = [DEFAULTS, RELAYS] if number == 1 and not plan.short else []
             for shift, client in enumerate(clients, number):
-                for contender in (*turn([CLASSIC, RMPA], shift), *beside):
+                for contender in (*turn(COMPARED, shift), *beside):
                     settings = {**contender.settings, "client": client, "round": number}
                     made.append(
                         Cell(self.name, settings, _seconds(_counts(plan, beside=contender in (DEFAULTS, RELAYS))))
@@ -99,7 +116,7 @@ class Rates:
         grids: list[Grid] = []
         claims: list[Claim] = []
         for client in results.plan.clients:
-            steps = {contender: _steps(results, contender, client) for contender in (RMPA, CLASSIC, RELAYS, DEFAULTS)}
+            steps = {contender: _steps(results, contender, client) for contender in _SHOWN}
             if not any(steps.values()):
                 continue
             figures.append(_figure(steps, client))
@@ -108,10 +125,14 @@ class Rates:
             claims.append(Claim(text, widening(steps[RMPA]), _WIDENING_LIMIT))
             text = f"p50 at 10 to 50 Hz, {client}: RMPA / classic through two relays in C++"
             claims.append(Claim(text, _slowly(steps[RMPA], steps[RELAYS]), _RELAYS_LIMIT))
+            claims.extend(_direct_claims(steps[DIRECT], steps[CLASSIC], client))
         return Findings(tuple(figures), tuple(grids), tuple(claims))
 
 
 EXPERIMENT: Final = Rates()
+
+
+_SHOWN: Final = (RMPA, DIRECT, CLASSIC, RELAYS, DEFAULTS)
 
 
 class RateStep:
@@ -162,6 +183,20 @@ def _slowly(steps: Steps, base: Steps) -> float | None:
     """The median over the paper's rates of one p50 by the other's."""
     medians = [(steps[rate].summary.p50, base[rate].summary.p50) for rate in PAPER if rate in steps and rate in base]
     return statistics.median(a / b for a, b in medians if a is not None and b)
+
+
+def _direct_claims(steps: Steps, base: Steps, client: str) -> Iterator[Claim]:
+    """The direct transport's figures by classic ROS's; none where it was not measured."""
+    if not steps:
+        return
+    text = f"p50 at 10 to 50 Hz, {client}: RMPA direct / classic"
+    yield Claim(text, _slowly(steps, base), _DIRECT_LIMITS["p50"])
+    ours, theirs = (of.get(1000, RateStep()) for of in (steps, base))
+    for name, limit in _DIRECT_LIMITS.items():
+        a, b = getattr(ours.summary, name), getattr(theirs.summary, name)
+        yield Claim(f"{name} at 1 kHz, {client}: RMPA direct / classic", a / b if a and b else None, limit)
+    width = ours.width / theirs.width if ours.width is not None and theirs.width else None
+    yield Claim(f"p95 less p50 at 1 kHz, {client}: RMPA direct / classic", width, _WIDTH_LIMIT)
 
 
 def _counts(plan: Plan, *, beside: bool) -> dict[int, int]:
@@ -216,17 +251,15 @@ def _grid(steps: Mapping[Contender, Steps], client: str) -> Grid:
 
 
 def _figure(steps: Mapping[Contender, Steps], client: str) -> Figure:
-    shown = [contender for contender in (CLASSIC, RMPA) if steps[contender]]
-    boxes = [_boxes(steps[contender], f"{contender.label}, {client}", contender.system) for contender in shown]
+    shown = [contender for contender in COMPARED if steps[contender]]
+    boxes = [_boxes(steps[contender], f"{contender.label}, {client}", contender.look) for contender in shown]
     curves = [
-        Series(f"{contender.label}, {name}", *_curve(steps[contender], name), style="line", system=contender.system)
+        Series(f"{contender.label}, {name}", *_curve(steps[contender], name), style="line", system=contender.look)
         for contender in shown
         for name in ("p50", "p95", "p99")
     ]
     tails = [
-        Series(
-            f"{contender.label}, {title}", *statistics.distribution(values), style="steps", system=contender.system
-        )
+        Series(f"{contender.label}, {title}", *statistics.distribution(values), style="steps", system=contender.look)
         for contender in shown
         for title, values in _ends(steps[contender])
     ]
@@ -243,7 +276,7 @@ def _figure(steps: Mapping[Contender, Steps], client: str) -> Figure:
 
 
 def _rates(steps: Mapping[Contender, Steps]) -> list[int]:
-    return sorted({rate for contender in (RMPA, CLASSIC) for rate in steps[contender]})
+    return sorted({rate for contender in COMPARED for rate in steps[contender]})
 
 
 def _ticks(steps: Mapping[Contender, Steps]) -> dict[str, float]:

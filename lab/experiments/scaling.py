@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from lab.bed.processes import Deadline
 from lab.experiments import flow
-from lab.experiments.contenders import system_of
+from lab.experiments.contenders import CLASSIC, COMPARED, DIRECT, RMPA, contender_of, system_of, transport_of
 from lab.experiments.model import Cell, Measured, Results
 from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
 from lab.frames import counting_from, frame, latencies, lost
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from lab.bed.processes import Process
     from lab.bed.stage import Stage
     from lab.bed.system import System
+    from lab.experiments.contenders import Contender
     from lab.experiments.model import Value
 
 FIRST: Final = "pc"
@@ -39,7 +40,6 @@ _LEAD_IN: Final = 0.5
 """Seconds of the probe flow that are thrown away."""
 _UP_WITHIN: Final = 60.0
 _JOINED_WITHIN: Final = 30.0
-_NAMES: Final = {"classic": "classic", "rmpa": "RMPA"}
 _LATENCY_LIMIT: Final = 1.1
 _MESH_LIMIT: Final = 2.0
 _ENOUGH: Final = 500
@@ -77,7 +77,8 @@ _SHORT: Final = ScalingTimes((2, 3), 1, 0.1, 1.0, 0.2, 0.5, 0.5)
 
 _ABOUT: Final = """\
 2 to 32 modules, each in a network namespace, all on this machine's processors. The first one (*pc*) sends to all
-others when it is asked to; a node on each of them listens. For each number of modules, both systems in turns:
+others when it is asked to; a node on each of them listens. For each number of modules classic ROS, RMPA through its
+agents and RMPA direct, from node to node, in turns:
 
 * the last module is switched off and on again: how long from its start until its node gets a message, and (RMPA)
   until every agent is linked with every other. A module of RMPA starts its agent and then its node, one of classic
@@ -96,18 +97,18 @@ class Scaling:
     about: Final = _ABOUT
 
     def cells(self, plan: Plan) -> list[Cell]:
-        """Each number of modules with both systems in turns, with the client that needs the least processor time."""
+        """Each number of modules with all in turns, with the client that needs the least processor time."""
         times = _times(plan)
         client = "roscpp" if "roscpp" in plan.clients else plan.clients[0]
         fixed = times.joins * (times.off + times.hello + 2.0) + times.settle + times.idle + times.probe + 5.0
         return [
             Cell(
                 self.name,
-                {"system": system, "client": client, "modules": modules, "round": 1},
-                fixed + modules * (1.0 if system == "rmpa" else 0.2),
+                {**one.kind_settings, "client": client, "modules": modules, "round": 1},
+                fixed + modules * (1.0 if one.system == "rmpa" else 0.2),
             )
             for modules in times.modules
-            for system in _NAMES
+            for one in COMPARED
         ]
 
     def measure(self, cell: Cell, stage: Stage) -> Measured:
@@ -115,12 +116,13 @@ class Scaling:
         times = _times(stage.plan)
         client: Client = cell.settings["client"]  # type: ignore[assignment]  # cells() put it there
         hosts = [FIRST, *(f"m{number}" for number in range(2, int(str(cell.settings["modules"])) + 1))]
-        with stage.system(system_of(cell), hosts) as system:
+        with stage.system(system_of(cell), hosts, way=transport_of(cell)) as system:
             hello = _greet(system, client, stage)
             joins = [_join(system, client, stage, hello, times) for _ in range(times.joins)]
             sink = system.node(hosts[1], "sink", client, topics=_PROBE, nodelay=True)
             source = system.node(FIRST, "source", client, topic=_PROBE)
             flow.wait_flowing(source, sink, [_PROBE], stage.scratch)
+            system.require_transport([(source, sink)])
             time.sleep(times.settle)
             idle, crossed = _idle(system, times.idle)
             meter = Meter({**system.pids(), "nodes: source": source.pid, "nodes: sink": sink.pid})
@@ -128,6 +130,7 @@ class Scaling:
             begun = flow.begin(source, stage.scratch, size=_SIZE, rate=_PROBE_RATE, count=count)
             sent = flow.sent(begun)
             busy = meter.read()
+            system.require_transport([(source, sink)])
             came = flow.noted(sink, [_PROBE], stage.scratch, begun.number)
         lead = round(_PROBE_RATE * _LEAD_IN)
         usage = [("idle", idle), ("probe", busy)]
@@ -146,7 +149,7 @@ class Scaling:
     def findings(self, results: Results) -> Findings:
         """Figures over the number of modules, the table and the claims."""
         steps = {
-            (str(cell.settings["system"]), int(str(cell.settings["modules"]))): _step(measured)
+            (contender_of(cell), int(str(cell.settings["modules"]))): _step(measured)
             for cell, measured in results.cells
         }
         if not steps:
@@ -284,7 +287,13 @@ def _float(value: object) -> float:
     return float(str(value))
 
 
-Steps = dict[tuple[str, int], ModulesStep]
+Steps = dict[tuple["Contender", int], ModulesStep]
+
+
+def _in_order(item: tuple[tuple[Contender, int], object]) -> tuple[int, int]:
+    """By modules, then as the contenders take turns."""
+    (contender, count), _ = item
+    return count, COMPARED.index(contender)
 
 
 def _figure(steps: Steps) -> Figure:
@@ -294,12 +303,12 @@ def _figure(steps: Steps) -> Figure:
     def lines(figure: str, *more: tuple[str, str]) -> tuple[Series, ...]:
         made = []
         for name, suffix in ((figure, ""), *more):
-            for system, title in _NAMES.items():
-                values = [(n, _of(steps.get((system, n)), name)) for n in modules]
+            for one in COMPARED:
+                values = [(n, _of(steps.get((one, n)), name)) for n in modules]
                 drawn = [(float(n), value) for n, value in values if value is not None]
                 if drawn:
-                    label = f"{title}{suffix}"
-                    made.append(Series(label, [x for x, _ in drawn], [y for _, y in drawn], "line", system))
+                    label = f"{one.label}{suffix}"
+                    made.append(Series(label, [x for x, _ in drawn], [y for _, y in drawn], "line", one.look))
         return tuple(made)
 
     def panel(title: str, ylabel: str, series: tuple[Series, ...], *, logy: bool = False) -> Panel:
@@ -338,12 +347,12 @@ def _grid(steps: Steps) -> Grid:
     heads = ("modules", "system", "p50, ms", "p99", "lost", "idle: % of a core, mean", "most", "all", "probe: all")
     more = ("its two nodes", "idle: bytes/s", "packets/s", "last start to all linked, s", "to its first message")
     rows = []
-    for (system, count), step in sorted(steps.items(), key=lambda item: (item[0][1], item[0][0])):
+    for (one, count), step in sorted(steps.items(), key=_in_order):
         figures = [counted(step.p50), counted(step.p99), str(step.lost)]
         used = [_of(step, "one"), max(step.idle, default=None), _of(step, "all"), sum(step.probe), step.nodes]
         joined = [counted(_of(step, "linked")), counted(_of(step, "first"))]
         crossed = [f"{step.bytes:.0f}", f"{step.packets:.1f}"]
-        rows.append((str(count), _NAMES[system], *figures, *(counted(value) for value in used), *crossed, *joined))
+        rows.append((str(count), one.label, *figures, *(counted(value) for value in used), *crossed, *joined))
     note = (
         "Processor time is of what the system itself runs: agents, or roscore, rosmaster and rosout; idle, and"
         " with the probe flow. Traffic is a module's mean, in and out: with RMPA the discovery's beacons and the"
@@ -354,13 +363,16 @@ def _grid(steps: Steps) -> Grid:
 
 def _claims(steps: Steps) -> Iterable[Claim]:
     counts = sorted({count for _, count in steps})
-    for many in counts[1:]:
-        ours, theirs = (_ratio(steps.get((kind, many)), steps.get((kind, counts[0]))) for kind in ("rmpa", "classic"))
-        value = ours / theirs if ours is not None and theirs else None
-        text = f"latency p50 with {many} modules / with {counts[0]}, RMPA, by classic's own ratio"
-        yield Claim(text, value, _LATENCY_LIMIT)
+    for contender in (RMPA, DIRECT):
+        for many in counts[1:] if any(one == contender for one, _ in steps) else ():
+            ours, theirs = (
+                _ratio(steps.get((one, many)), steps.get((one, counts[0]))) for one in (contender, CLASSIC)
+            )
+            value = ours / theirs if ours is not None and theirs else None
+            text = f"latency p50 with {many} modules / with {counts[0]}, {contender.label}, by classic's own ratio"
+            yield Claim(text, value, _LATENCY_LIMIT)
     for many in counts:
-        linked = _of(steps.get(("rmpa", many)), "linked")
+        linked = _of(steps.get((RMPA, many)), "linked")
         yield Claim(f"{many} modules: last start to all linked, median, RMPA", linked, _MESH_LIMIT, unit="s")
 
 
@@ -375,8 +387,8 @@ def _notes(steps: Steps) -> Iterable[str]:
         "All modules share this machine's processors; on a robot each brings its own. With RMPA a module joins later"
         " by what its agent takes to be loaded; classic ROS's master was there before."
     )
-    for (system, count), step in sorted(steps.items(), key=lambda item: item[0][1]):
-        if system == "rmpa" and sum(step.idle) > _BUSY:
+    for (one, count), step in sorted(steps.items(), key=_in_order):
+        if one == RMPA and sum(step.idle) > _BUSY:
             yield (
                 f"With {count} modules the agents together use {sum(step.idle):.0f} % of a core while nothing"
                 " happens: each pair of them keeps a link alive, four times a second. The probe flow waits for"

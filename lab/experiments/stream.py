@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, cast
 import pandas as pd
 
 from lab.experiments import flow
-from lab.experiments.contenders import nodelay_of, relays_of, system_of
+from lab.experiments.contenders import nodelay_of, relays_of, system_of, transport_of
 from lab.experiments.model import Measured
 from lab.frames import counting_from
 
@@ -68,7 +68,7 @@ class SteppedStream:
 def stream(cell: Cell, stage: Stage, step: str, *, link: str | None = None) -> Iterator[SteppedStream]:
     """Set up a cell's system with a source and a sink; messages flow when it is given out."""
     client, nodelay = cast("Client", cell.settings["client"]), nodelay_of(cell)
-    with stage.system(system_of(cell), HOSTS, link=link) as system:
+    with stage.system(system_of(cell), HOSTS, link=link, way=transport_of(cell)) as system:
         end = TOPIC
         for host in HOSTS[: relays_of(cell)]:
             begin, end = end, f"{end}_{host}"
@@ -77,5 +77,7 @@ def stream(cell: Cell, stage: Stage, step: str, *, link: str | None = None) -> I
         sink = system.node("pc", "sink", client, topics=end, queue=QUEUE, nodelay=nodelay)
         source = system.node("joystick", "source", client, topic=TOPIC, queue=QUEUE)
         flow.wait_connected(source)
+        system.require_transport([(source, sink)])
         flow.wait_flowing(source, sink, [end], stage.scratch)
         yield SteppedStream(stage, source, sink, end, step)
+        system.require_transport([(source, sink)])  # to the end

@@ -10,10 +10,10 @@ if TYPE_CHECKING:
 
     from lab.findings import Series
 
-_SYSTEMS: Final = {"classic": "#D55E00", "rmpa": "#0072B2"}
+_SYSTEMS: Final = {"classic": "#D55E00", "rmpa": "#0072B2", "direct": "#009E73", "mixed": "#CC79A7"}
 _OTHERS: Final = ("#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 _LINES: Final = ("solid", "dashed", "dotted", "dashdot")
-_MARKERS: Final = {"classic": "o^vD", "rmpa": "sPXd"}
+_MARKERS: Final = {"classic": "o^vD", "rmpa": "sPXd", "direct": "*<>h", "mixed": "p8H+"}
 _OTHER_MARKERS: Final = "*<>h"
 _SHADES: Final = (0.0, 0.4, -0.35, 0.6)
 """How far a further series of one system goes towards white, or (below 0) black."""

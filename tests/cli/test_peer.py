@@ -71,6 +71,7 @@ def test_info(place: Place, agent: Agent) -> None:
     assert code == 0
     assert "Round trip:   432 µs" in out
     assert "Clock:        -1.25 ms ± 216 µs (its clock less ours)" in out
+    assert "Direct:       1 of the subscribers here to its nodes, 2 of its subscribers to nodes here" in out
     assert "Topics that it publishes:" in out
     (row,) = (line for line in out.splitlines() if "/cmd" in line)
     assert " ".join(row.split()) == "/cmd sensor_msgs/Joy /joy_node open 600 10.0 Hz 412 µs ±216 µs 790 µs 9"

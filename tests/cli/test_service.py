@@ -231,3 +231,44 @@ def test_info_tells_what_crosses(
     )
     assert rmpa("info", "base:/add") == (0, " * from base: /adder, not here: /server serves it here\n", "")
     assert as_json(rmpa, "info", "base:/arm/enable", "--json")["mesh"][0]["calls"] == 9
+
+
+@pytest.mark.parametrize(
+    ("info", "listed", "told"),
+    [
+        ({"transport": "relay"}, "relayed", ""),
+        (
+            {"transport": "direct", "wanted": "auto", "address": "rosrpc://10.0.0.7:43817", "lookups": 12},
+            "direct",
+            "direct, at rosrpc://10.0.0.7:43817, 12 lookups answered so",
+        ),
+        (
+            {"transport": "relay", "wanted": "auto", "condition": "listening", "relayed_because": "on loopback only"},
+            "relayed (listening)",
+            "relayed (listening): on loopback only",
+        ),
+        ({"transport": "relay", "wanted": "auto"}, "relayed", "relayed; its module is being asked"),
+    ],
+    ids=["by rule", "direct", "a condition", "asked"],
+)
+def test_the_transport_of_a_peers_service(
+    rmpa: Rmpa,
+    served: RosCore,
+    place: Place,
+    agent: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
+    info: dict[str, Any],
+    listed: str,
+    told: str,
+) -> None:
+    found = ServiceInfo(name="/arm/enable", node="/arm", direction="in", peer="base", **info)
+    mine = ServiceInfo(name="/add", node="/server", direction="out", direct_callers=("base",))
+    agent("here", msgspec.structs.replace(with_core(served.uri), services=(mine, found)))
+    monkeypatch.setenv("RMPA_RUNTIME_DIR", str(place.path))
+    out = rmpa("info", "/arm/enable")[1]
+    assert (f"     transport  {told}\n" in out) if told else ("transport" not in out)
+    assert "     transport  direct for base\n" in rmpa("info", "/add")[1]
+    row = rmpa("list", "-v", "/arm")[1].splitlines()[1]
+    assert row.endswith(f"  {listed}")
+    as_listed = json.loads(rmpa("list", "/arm", "--json")[1])[0]
+    assert (as_listed["transport"], as_listed.get("condition", "")) == (info["transport"], info.get("condition", ""))

@@ -286,9 +286,10 @@ def test_the_agents_core_is_asked(place: Place, agent: Callable[..., None], core
     code, out, _ = place.run("topic", "info", "/cmd", "--agent", "base")
     assert code == 0
     assert "MD5: 5a9ea5f83505693b71e785041e67a8bb" in out
-    assert out.splitlines()[-12:] == [
+    assert out.splitlines()[-13:] == [
         " * from joystick: /joy_node open, 600 messages, last 50.00 ms ago",
         "     there      /stick/cmd",
+        "     transport  relayed for /velocity (5.0 s): the contract asks for a deadline (condition contract)",
         "     lane       express",
         "     rate       10.000 Hz, period 100 ms (sd 310 µs, min 98.80 ms, max 101 ms, p99 101 ms), jitter 820 µs",
         "     latency    p50 412 µs, p99 790 µs, max 1.20 ms, last 390 µs; each ± 216 µs",

@@ -6,7 +6,15 @@ import contextlib
 import socket
 import struct
 
-from rmpa.runtime.sock_diag import FOUND_SIZE, InetSocket, MalformedAnswer, destroy_request, read_dump, read_status
+from rmpa.runtime.sock_diag import (
+    FOUND_SIZE,
+    InetSocket,
+    MalformedAnswer,
+    destroy_request,
+    read_carried,
+    read_dump,
+    read_status,
+)
 
 _HEADER = struct.Struct("=IHHII")
 
@@ -18,8 +26,10 @@ def _answer(kind: int, flags: int, body: bytes) -> bytes:
 _FOUND = _answer(
     20, 2, destroy_request(InetSocket(2, 1, bytes(16), 1, bytes(16), 2, 0, (1, 2)))[20:92].ljust(72, b"\0")
 )
+_INFO = struct.pack("=HH", 4 + 136, 2) + bytes(120) + struct.pack("=QQ", 1 << 40, 7)
 SEEDS: list[bytes] = [
     b"",
+    _answer(20, 2, _FOUND[16:] + _INFO),
     _FOUND,
     _FOUND + _FOUND + _answer(3, 2, bytes(4)),
     _answer(2, 0, struct.pack("=i", -1) + bytes(16)),
@@ -47,6 +57,13 @@ def fuzz(data: bytes) -> None:
             raise AssertionError("a part of a socket was taken for the whole")
         if of.family == socket.AF_INET6:
             socket.inet_ntop(socket.AF_INET6, of.destination)
+    with contextlib.suppress(MalformedAnswer, OSError):
+        whole: list[bytes] = []
+        read_dump(data, whole, info=True)
+        for body in whole:
+            carried = read_carried(body)
+            if carried is not None and min(carried) < 0:
+                raise AssertionError("a negative number of bytes")
     with contextlib.suppress(MalformedAnswer):
         if read_status(data) < 0:
             raise AssertionError("a negative number of an error")

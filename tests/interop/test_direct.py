@@ -1,55 +1,280 @@
-"""Direct transport: messages go from node to node, and the agents only arrange it."""
+"""Direct transport: messages go from node to node where each condition holds, and are relayed where one does not."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import sys
+from typing import TYPE_CHECKING, Final
 
 import pytest
 
 from tests.interop.modules import Module, flows
+from tests.interop.ros import NODES, lacks
+from tests.interop.transports import (
+    AUTO,
+    direct_topics,
+    heard,
+    in_order,
+    links,
+    on_the_network,
+    reload,
+    steady,
+    unbroken,
+    wait_direct,
+    wait_direct_topics,
+    wait_relayed,
+)
 
 if TYPE_CHECKING:
-    from tests.interop.conftest import ModuleFactory
+    from pathlib import Path
+
+    from lab.bed.namespaces import Lab
+    from lab.bed.processes import Process
+    from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
-AUTO = '[bridge]\ntransport = "auto"\n'
-CLIENTS = [(s, p) for s in ("roscpp", "rospy") for p in ("roscpp", "rospy")]
-
-
-def direct_sockets(module: Module, other: Module) -> set[str]:
-    """The connections of a module's nodes to nodes of another one: those that are neither of its agent nor local."""
-    import subprocess
-
-    text = subprocess.run(
-        ["ip", "netns", "exec", module.host.namespace, "ss", "-tnHp", "state", "established"],
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
-    return {
-        line
-        for line in text.splitlines()
-        if str(other.host.address) in line and f"pid={module.agent.pid}," not in line
-    }
-
-
-def reachable(*modules: Module) -> None:
-    """Let the modules' nodes listen for the network: without ROS_IP, or with an address of it."""
-    for module in modules:
-        module.ros.env["ROS_IP"] = module.host.address
+CLIENTS: Final = [(s, p) for s in ("roscpp", "rospy") for p in ("roscpp", "rospy")]
+TERMS_HERE: Final = """
+[[contract]]
+topics = ["/relayed_here"]
+transport = "relay"
+[[contract]]
+topics = ["/reliable"]
+reliability = "reliable"
+[[contract]]
+topics = ["/kept"]
+durability = "transient_local"
+depth = 5
+[[contract]]
+topics = ["/limited"]
+max_rate = 1000.0
+[[peer]]
+name = "a"
+remap_in = { "/in_there" = "/in_here" }
+"""
+TERMS_THERE: Final = """
+[[contract]]
+topics = ["/relayed_there"]
+transport = "relay"
+[[contract]]
+topics = ["/urgent"]
+priority = "high"
+[[contract]]
+topics = ["/watched"]
+deadline = 5.0
+[[contract]]
+topics = ["/fresh"]
+lifespan = 5.0
+[[peer]]
+name = "b"
+remap_out = { "/out_there" = "/out_here" }
+"""
+RELAYS: Final = "[relay]\nenabled = true\n"
+BY_TERMS: Final = (
+    "/relayed_here",
+    "/relayed_there",
+    "/reliable",
+    "/kept",
+    "/limited",
+    "/urgent",
+    "/watched",
+    "/fresh",
+)
+FREE: Final = ("/free", "/free_too")
 
 
 @pytest.mark.parametrize(("subscriber", "publisher"), CLIENTS)
 def test_messages_go_from_node_to_node(modules: ModuleFactory, subscriber: str, publisher: str) -> None:
     a, b = modules("a", "b", config=AUTO)
-    reachable(a, b)
-    a.ros.node(publisher, "talker", topic="/chatter", rate=100)
+    on_the_network(a, b)
+    talker = a.ros.node(publisher, "talker", topic="/chatter", rate=100)
     listener = b.ros.node(subscriber, "listener", topic="/chatter")
-    flows(listener)
-    print(direct_sockets(b, a))
-    assert direct_sockets(b, a)
-    info = b.agent.rmpa("topic", "info", "/chatter")
-    print(info)
-    report = flows(listener, 100)
-    assert (report["gaps"], report["doubled"]) == (0, 0)
+    wait_direct(listener, talker)
+    unbroken(flows(listener, 100))
+
+
+def test_what_needs_the_agents_is_relayed_until_its_rules_change(modules: ModuleFactory, tmp_path: Path) -> None:
+    """Terms of a contract at either end, and another name at either end; the rest is direct all the time."""
+    a, b = modules("a", "b", config=AUTO)
+    on_the_network(a, b)
+    reload(tmp_path, a, AUTO + TERMS_THERE)
+    reload(tmp_path, b, AUTO + TERMS_HERE)
+    there = (*BY_TERMS, *FREE, "/in_there", "/out_there")
+    here = (*BY_TERMS, *FREE, "/in_here", "/out_here")
+    a.ros.roscpp("many_talker", topics=",".join(there), rate=50)
+    names = ("ears", "rospy_ears")
+    ears = [
+        b.ros.node(client, "many_listener", topics=",".join((*here, "/in_there", "/out_there")), name=name)
+        for client, name in zip(("roscpp", "rospy"), names, strict=True)
+    ]
+    for listener, name in zip(ears, names, strict=True):
+        heard(listener, here)
+        wait_direct_topics(b, f"/{name}", a, FREE)
+        steady(listener, here)
+    before = [heard(listener, FREE) for listener in ears]
+    reload(tmp_path, a, AUTO)
+    reload(tmp_path, b, AUTO)
+    for listener, name, rows in zip(ears, names, before, strict=True):
+        wait_direct_topics(b, f"/{name}", a, there)
+        after = steady(listener, there)
+        assert [after[topic]["gaps"] for topic in FREE] == [rows[topic]["gaps"] for topic in FREE]
+
+
+def test_nodes_that_are_bound_to_loopback_are_relayed(modules: ModuleFactory) -> None:
+    """ROS_IP=127.0.0.1 binds a publisher's sockets; a subscriber's node dials nothing else then."""
+    a, b = modules("a", "b", config=AUTO)
+    for client in ("roscpp", "rospy"):
+        a.ros.node(client, "many_talker", topics=f"/bound_{client}", rate=50)
+    on_the_network(a)
+    for client in ("roscpp", "rospy"):
+        a.ros.node(client, "many_talker", topics=f"/free_{client}", rate=50)
+    topics = [f"/{how}_{client}" for how in ("bound", "free") for client in ("roscpp", "rospy")]
+    bound = [
+        b.ros.node(client, "many_listener", topics=",".join(topics), name=f"bound_{client}")
+        for client in ("roscpp", "rospy")
+    ]
+    on_the_network(b)
+    free = [
+        b.ros.node(client, "many_listener", topics=",".join(topics), name=f"free_{client}")
+        for client in ("roscpp", "rospy")
+    ]
+    for listener in (*free, *bound):
+        for report in heard(listener, topics, 50).values():
+            in_order(report)
+    for client in ("roscpp", "rospy"):
+        wait_direct_topics(b, f"/free_{client}", a, ("/free_roscpp", "/free_rospy"))
+        assert direct_topics(b, f"/bound_{client}", a) == set()
+
+
+def test_a_firewall_between_the_nodes_makes_them_fall_back(modules: ModuleFactory) -> None:
+    """The agents' ports pass, those of nodes do not: from now on, and for who comes later; until it is open again."""
+    a, b = modules("a", "b", config=AUTO)
+    on_the_network(a, b)
+    talker = a.ros.roscpp("talker", topic="/chatter", rate=100)
+    listener = b.ros.rospy("listener", topic="/chatter")
+    wait_direct(listener, talker)
+    ports = ", ".join(_listening(talker))
+    _nft(a, "add table ip filter", "add chain ip filter input { type filter hook input priority 0 ; }")
+    _nft(a, f"add rule ip filter input iifname eth0 tcp dport {{ {ports} }} reject with tcp reset")
+    in_order(wait_relayed(listener, talker))
+    _nft(a, "flush chain ip filter input", f"add rule ip filter input iifname eth0 tcp dport {{ {ports} }} drop")
+    late = b.ros.roscpp("listener", topic="/chatter")
+    flows(late)
+    assert links(late, talker) == 0
+    _nft(a, "flush chain ip filter input")
+    for one in (late, listener):
+        in_order(wait_direct(one, talker, 60.0))
+
+
+def _nft(module: Module, *commands: str) -> None:
+    for command in commands:
+        module.ros.tool("nft", command)
+
+
+def _listening(process: Process) -> list[str]:
+    """The TCP ports at which a process listens."""
+    import subprocess
+
+    command = ["nsenter", "-t", str(process.pid), "-n", "ss", "-tlnpHO"]
+    table = subprocess.run(command, capture_output=True, text=True, check=True, timeout=20).stdout
+    return [line.split()[3].rpartition(":")[2] for line in table.splitlines() if f"pid={process.pid}," in line]
+
+
+@pytest.mark.parametrize("client", ["roscpp", "rospy"])
+def test_one_caller_id_is_direct_once(modules: ModuleFactory, client: str) -> None:
+    """Nodes of one name subscribe in two modules: the second is relayed until the first has gone."""
+    a, b, c = modules("a", "b", "c", config=AUTO)
+    on_the_network(a, b, c)
+    talker = a.ros.rospy("talker", topic="/chatter", rate=100)
+    first = b.ros.node(client, "listener", topic="/chatter", name="viewer")
+    wait_direct(first, talker)
+    other = c.ros.node(client, "listener", topic="/chatter", name="other")
+    second = c.ros.node(client, "listener", topic="/chatter", name="viewer")
+    flows(second)
+    wait_direct(other, talker)
+    assert (links(first, talker), links(second, talker)) == (1, 0)
+    unbroken(flows(first, 50))
+    first.terminate()
+    in_order(wait_direct(second, talker))
+    unbroken(flows(other))
+
+
+def test_what_comes_by_a_relay_is_relayed(lab: Lab, agent: AgentFactory, shell: ShellFactory) -> None:
+    """Modules a and c do not see each other; m is in both networks, and relays."""
+    hosts = [lab.host("a", 0), lab.host("m", 0, 1), lab.host("c", 1)]
+    a, m, c = (
+        Module(host, agent(host, name=host.name, config=AUTO + (RELAYS if host.name == "m" else "")), shell(host))
+        for host in hosts
+    )
+    on_the_network(a, m, c)
+    m.agent.wait_peer("a")
+    m.agent.wait_peer("c")
+    talker = a.ros.roscpp("talker", topic="/chatter", rate=100)
+    near, far = (module.ros.roscpp("listener", topic="/chatter") for module in (m, c))
+    wait_direct(near, talker)
+    unbroken(flows(far, 100))
+    assert links(far, talker) == 0
+
+
+@pytest.mark.skipif(bool(lacks("actionlib")), reason=lacks("actionlib"))
+@pytest.mark.parametrize("client", ["roscpp", "rospy"])
+def test_actions_work_because_their_topics_are_relayed(modules: ModuleFactory, client: str) -> None:
+    a, b = modules("a", "b", config=AUTO)
+    on_the_network(a, b)
+    a.ros.node(client, "action_server", name="counter", action="/count").wait_event("up")
+    asking = b.ros.node(client, "action_client", name="asking", action="/count", commands=True)
+    asking.wait_event("up")
+    for line in ("server 15", "send 20"):
+        asking.tell(line)
+    assert asking.wait_event("server")["found"]
+    assert asking.wait_event("done")["result"] == 20
+    assert direct_topics(a, "/counter", b) | direct_topics(b, "/asking", a) == set()
+
+
+@pytest.mark.parametrize("older", ["a", "b"])
+def test_with_an_agent_of_an_earlier_release_all_is_relayed(
+    lab: Lab, agent: AgentFactory, shell: ShellFactory, older: str
+) -> None:
+    earlier = {older: (sys.executable, str(NODES / "earlier_release.py"))}
+    a, b = (
+        Module(host, agent(host, name=host.name, config=AUTO, prefix=earlier.get(host.name, ())), shell(host))
+        for host in lab.hosts("a", "b")
+    )
+    a.agent.wait_peer("b")
+    on_the_network(a, b)
+    talker = a.ros.roscpp("talker", topic="/chatter", rate=100)
+    listener = b.ros.rospy("listener", topic="/chatter")
+    unbroken(flows(listener, 200))
+    assert links(listener, talker) == 0
+
+
+def test_measuring_tools_are_relayed_and_disturb_nothing(modules: ModuleFactory) -> None:
+    a, b = modules("a", "b", config=AUTO)
+    on_the_network(a, b)
+    talker = a.ros.rospy("talker", topic="/chatter", rate=100)
+    listener = b.ros.rospy("listener", topic="/chatter")
+    wait_direct(listener, talker)
+    code, said = b.agent.rmpa("topic", "hz", "/chatter", "--count", "200")
+    assert code == 0, said
+    assert "at the agent, from a" in said, said
+    assert links(listener, talker) == 1
+    unbroken(flows(listener, 100))
+
+
+@pytest.mark.parametrize("client", ["roscpp", "rospy"])
+def test_the_first_message_is_not_late(modules: ModuleFactory, client: str) -> None:
+    """One node subscribes to a relayed and to a direct topic of one publisher, which counts the same on both."""
+    a, b = modules("a", "b", config=f'{AUTO}\n[[contract]]\ntopics = ["/relayed"]\ntransport = "relay"\n')
+    on_the_network(a, b)
+    rate = 500
+    talker = a.ros.roscpp("many_talker", topics="/relayed,/direct", rate=rate)
+    b.wait_topic("/direct")
+    first = []
+    for _ in range(3):
+        listener = b.ros.node(client, "many_listener", topics="/direct,/relayed")
+        reports = heard(listener, ("/relayed", "/direct"), 50)
+        assert links(listener, talker) == 1
+        first.append([reports[topic]["sources"]["1"]["first"] for topic in ("/direct", "/relayed")])  # type: ignore[index]
+        unbroken(reports["/direct"])
+        listener.terminate()
+    assert min(direct - relayed for direct, relayed in first) <= rate * 0.1, first

@@ -11,15 +11,20 @@ from lab.bed.processes import eventually
 from tests.interop.modules import Module, flows
 from tests.interop.transports import (
     AUTO,
+    RELAY,
     connections,
     in_order,
     links,
     on_the_network,
+    reload,
     unbroken,
     wait_direct,
+    wait_relayed,
 )
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from lab.bed.namespaces import Lab
     from lab.bed.processes import Process
     from tests.interop.conftest import ModuleFactory
@@ -28,6 +33,8 @@ pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
 CLIENTS: Final = [(s, p) for s in ("roscpp", "rospy") for p in ("roscpp", "rospy")]
 RATE: Final = 100
+UNPRIVILEGED: Final = ("setpriv", "--bounding-set=-net_admin", "--inh-caps=-net_admin", "--")
+"""Runs an agent as root without the capability that ending connections of others takes."""
 
 
 def pair(modules: ModuleFactory, subscriber: str, publisher: str) -> tuple[Module, Module, Process, Process]:
@@ -59,7 +66,8 @@ def test_a_cable_that_is_out_for_long_ends_both_ends_connections(
     eventually(lambda: not _abroad(listener, a) and not _abroad(talker, b), 6.0, what="both ends have hung up")
     time.sleep(1.0)  # nothing may come back before the cable is in
     b.host.restore()
-    in_order(wait_direct(listener, talker))
+    b.agent.wait_peer("a")
+    in_order(wait_direct(listener, talker, 6.0))
 
 
 @pytest.mark.parametrize("client", ["roscpp", "rospy"])
@@ -108,23 +116,88 @@ def test_direct_messages_end_with_their_module(modules: ModuleFactory, side: str
 
 @pytest.mark.parametrize("client", ["roscpp", "rospy"])
 def test_a_host_with_another_address_is_direct_again(modules: ModuleFactory, client: str) -> None:
-    a, _, talker, listener = pair(modules, client, client)
-    # Bound to every address, as without ROS_IP; the name must lead there from here.
-    talker.kill()
-    a.ros.env.pop("ROS_IP")
-    a.ros.env["ROS_HOSTNAME"] = a.host.address
-    talker = a.ros.node(client, "talker", topic="/chatter", rate=RATE, name="speaker")
+    a, b = modules("a", "b", config=AUTO)
+    on_the_network(a, b)
+    # The node's own name leads to an address that stays, as a machine's host name does on Debian.
+    a.host.ip("address", "add", "10.78.0.1/32", "dev", "lo")
+    a.ros.env["ROS_IP"] = "10.78.0.1"
+    talker = a.ros.node(client, "talker", topic="/chatter", rate=RATE)
+    listener = b.ros.node(client, "listener", topic="/chatter")
     wait_direct(listener, talker)
     interface = a.host.cables[0].interface
-    a.host.ip("address", "add", "10.77.0.77/24", "brd", "+", "dev", interface)
     a.host.ip("address", "del", f"{a.host.address}/24", "dev", interface)
-    a.host.ip("address", "add", "10.77.0.77/24", "brd", "+", "dev", interface) if not _has(a, "10.77.0.77") else None
+    a.host.ip("address", "add", "10.77.0.77/24", "brd", "+", "dev", interface)
     in_order(wait_direct(listener, talker, 40.0))
     assert any(other.startswith("10.77.0.77:") for _, other in connections(listener))
 
 
-def _has(module: Module, address: str) -> bool:
-    return address in module.host.ip("address", "show")
+def test_a_publisher_without_a_queue_is_freed_from_a_vanished_subscriber(modules: ModuleFactory, lab: Lab) -> None:
+    """rospy without ``queue_size`` sends to each subscriber in turn, and blocks where one takes nothing more."""
+    a, b = modules("a", "b", config=AUTO)
+    on_the_network(a, b)
+    talker = a.ros.rospy("talker", topic="/chatter", rate=50, size=100_000, queue=-1)
+    abroad = b.ros.roscpp("listener", topic="/chatter")
+    wait_direct(abroad, talker)
+    at_home = a.ros.roscpp("listener", topic="/chatter")
+    flows(at_home, 50)
+    lab.power_off(b.host)
+    eventually(lambda: not _abroad(talker, b), 6.0, what="the connection to the vanished host has ended")
+    unbroken(flows(at_home, 50, 6.0))
+
+
+def test_without_the_right_to_end_connections_only_rospy_subscribers_stay(
+    modules: ModuleFactory, tmp_path: Path
+) -> None:
+    """roscpp moves by the list of publishers; rospy stays direct, which the agent says, and hears nothing twice."""
+    a, b = modules("a", "b", config=AUTO, prefix=UNPRIVILEGED)
+    on_the_network(a, b)
+    talker = a.ros.roscpp("talker", topic="/chatter", rate=RATE)
+    cpp, py = (b.ros.node(client, "listener", topic="/chatter") for client in ("roscpp", "rospy"))
+    for listener in (cpp, py):
+        wait_direct(listener, talker)
+    for changed in (b, a):
+        reload(tmp_path, changed, AUTO + RELAY)
+        in_order(wait_relayed(cpp, talker))
+        b.agent.process.wait_for("/listener_\\d.* stays connected .*see rmpa doctor")
+        assert links(py, talker) == 1
+        unbroken(flows(py, 100))
+        reload(tmp_path, changed, AUTO)
+        in_order(wait_direct(cpp, talker))
+        unbroken(flows(py, 100))
+        assert links(py, talker) == 1
+    # The cable is out for longer than a lease: neither hears anything twice when it is back.
+    b.host.cut()
+    b.agent.wait_no_peer("a")
+    a.agent.wait_no_peer("b")
+    b.host.restore()
+    in_order(wait_direct(cpp, talker))
+    eventually(lambda: links(py, talker) == 1, what="one connection")
+    in_order(flows(py, 300))
+    in_order(flows(cpp))
+    # A contract that forbids it leaves the connection, and does not add a second path.
+    reload(tmp_path, b, AUTO + RELAY)
+    in_order(wait_relayed(cpp, talker))
+    in_order(flows(py, 200))
+
+
+def test_a_node_that_was_direct_under_a_killed_agent_obeys_the_new_one(
+    modules: ModuleFactory, tmp_path: Path
+) -> None:
+    """The agent is killed, and started again with a contract that says relay: no subscriber keeps two paths."""
+    a, b = modules("a", "b", config=AUTO)
+    on_the_network(a, b)
+    talker = a.ros.roscpp("talker", topic="/chatter", rate=RATE)
+    listeners = [b.ros.node(client, "listener", topic="/chatter") for client in ("roscpp", "rospy")]
+    for listener in listeners:
+        wait_direct(listener, talker)
+    flows(listeners[0], 200)  # the new run knows the nodes that were registered for more than a second
+    b.agent.kill()
+    b.agent.config = AUTO + RELAY
+    b.agent.restart()
+    b.agent.wait_peer("a")
+    for listener in listeners:
+        in_order(wait_relayed(listener, talker))
+        in_order(flows(listener, 200))
 
 
 def _abroad(process: Process, other: Module) -> bool:

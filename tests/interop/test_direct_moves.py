@@ -7,8 +7,18 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from lab.bed.processes import eventually
-from tests.interop.modules import Module, flows
-from tests.interop.transports import AUTO, in_order, links, on_the_network, unbroken, wait_direct, wait_relayed
+from tests.interop.modules import flows
+from tests.interop.transports import (
+    AUTO,
+    RELAY,
+    in_order,
+    links,
+    on_the_network,
+    reload,
+    unbroken,
+    wait_direct,
+    wait_relayed,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -19,17 +29,9 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
 CLIENTS: Final = [(s, p) for s in ("roscpp", "rospy") for p in ("roscpp", "rospy")]
-RELAY: Final = '[[contract]]\ntopics = ["/chatter"]\ntransport = "relay"\n'
 RATE: Final = 100
 MOVE_GAP: Final = RATE * 2
 """Messages that may pass while a subscriber is moved: a tenth of a second in general, much more on a busy machine."""
-
-
-def reload(tmp_path: Path, module: Module, text: str) -> None:
-    """Give an agent other settings."""
-    (tmp_path / f"{module.name}.toml").write_text(text, encoding="utf-8")
-    code, said = module.agent.rmpa("reload")
-    assert code == 0, said
 
 
 def gaps(report: Event) -> int:

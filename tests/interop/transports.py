@@ -2,16 +2,35 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 from typing import TYPE_CHECKING, Final
 
-from lab.bed.processes import DEADLINE, eventually
+from lab.bed.processes import DEADLINE, Deadline, eventually
 from tests.interop.modules import Module, flows
+from tests.interop.ros import PYTHON
 
 if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable
+    from pathlib import Path
+
     from lab.bed.processes import Event, Process
 
 AUTO: Final = '[bridge]\ntransport = "auto"\n'
+_BUS_INFO: Final = """
+import json, sys, xmlrpc.client
+master, node = sys.argv[1:]
+uri = xmlrpc.client.ServerProxy(master).lookupNode("/test", node)[2]
+print(json.dumps(xmlrpc.client.ServerProxy(uri).getBusInfo("/test")[2]))
+"""
+RELAY: Final = '[[contract]]\ntopics = ["/chatter"]\ntransport = "relay"\n'
+
+
+def reload(tmp_path: Path, module: Module, text: str) -> None:
+    """Give an agent other settings."""
+    (tmp_path / f"{module.name}.toml").write_text(text, encoding="utf-8")
+    code, said = module.agent.rmpa("reload")
+    assert code == 0, said
 
 
 def on_the_network(*modules: Module) -> None:
@@ -40,6 +59,30 @@ def links(subscriber: Process, publisher: Process) -> int:
     return sum((other, own) in there for own, other in connections(subscriber))
 
 
+def direct_topics(module: Module, node: str, other: Module) -> set[str]:
+    """The topics that a node gets from nodes on another module's host, as the node itself says."""
+    rows = json.loads(module.ros.tool(PYTHON, "-c", _BUS_INFO, module.ros.uri, node))
+    inbound = [row for row in rows if row[2] == "i" and f"[{other.host.address}:" in str(row[6:])]
+    assert len(inbound) == len({row[4] for row in inbound}), inbound
+    return {row[4] for row in inbound}
+
+
+def wait_direct_topics(module: Module, node: str, other: Module, topics: Collection[str]) -> None:
+    """Wait until a node gets exactly these topics from nodes on another module's host."""
+    found: set[str] = set()
+
+    def as_wanted() -> bool:
+        found.clear()
+        found.update(direct_topics(module, node, other))
+        return found == set(topics)
+
+    try:
+        eventually(as_wanted)
+    except Deadline as error:
+        text = f"{node} of {module.name}: direct are {sorted(found)}, not {sorted(topics)}"
+        raise AssertionError(text) from error
+
+
 def wait_direct(subscriber: Process, publisher: Process, timeout: float = DEADLINE) -> Event:
     """Wait until a node is connected to another one, once, and hears it; return its report."""
     what = f"{subscriber.name} connected to {publisher.name}"
@@ -62,3 +105,36 @@ def in_order(report: Event) -> None:
 def unbroken(report: Event) -> None:
     """Fail unless a report says: each byte right, none doubled, moved or missing after the first."""
     assert (report["bad"], report["doubled"], report["gaps"]) == (0, 0, 0), report
+
+
+def heard(listener: Process, topics: Iterable[str], more: int = 10) -> dict[str, Event]:
+    """Wait until a listener of many topics has received so many further messages of each; return their reports."""
+    wanted = dict.fromkeys(topics, more)
+    for topic, report in _last(listener).items():
+        if topic in wanted:
+            wanted[topic] += int(str(report["count"]))
+
+    def enough(event: Event) -> bool:
+        rows = event["topics"]
+        assert isinstance(rows, dict)
+        return all(topic in rows and rows[topic]["count"] >= count for topic, count in wanted.items())
+
+    rows = listener.wait_event("report", where=enough, since=listener.mark_events())["topics"]
+    assert isinstance(rows, dict)
+    return rows
+
+
+def steady(listener: Process, topics: Iterable[str]) -> dict[str, Event]:
+    """Fail unless messages of all topics come one by one from now on, and each came in order before."""
+    begin, end = heard(listener, topics), heard(listener, topics, 25)
+    for topic in topics:
+        in_order(end[topic])
+        assert end[topic]["gaps"] == begin[topic]["gaps"], topic
+    return end
+
+
+def _last(listener: Process) -> dict[str, Event]:
+    reports = listener.events("report")
+    rows = reports[-1]["topics"] if reports else {}
+    assert isinstance(rows, dict)
+    return rows

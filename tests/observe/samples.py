@@ -5,6 +5,7 @@ from __future__ import annotations
 from rmpa.observe.snapshot import (
     AgentInfo,
     BoundInfo,
+    DirectFigures,
     EventInfo,
     FilesInfo,
     LatencyInfo,
@@ -13,6 +14,7 @@ from rmpa.observe.snapshot import (
     RouteInfo,
     SampleSpread,
     Snapshot,
+    SubscriberTransport,
     TopicInfo,
 )
 
@@ -67,6 +69,8 @@ SNAPSHOT = Snapshot(
             ),
             topics_in=1,
             topics_out=1,
+            direct_in=1,
+            direct_out=2,
         ),
         PeerInfo(
             name="pc",
@@ -131,6 +135,20 @@ SNAPSHOT = Snapshot(
                             kind="deadline_missed", count=3, text="no message for 610 ms; deadline 200 ms", ago=4.2
                         ),
                     ),
+                    transport="relay",
+                    condition="contract",
+                    condition_text="the contract asks for a deadline",
+                    subscribers=(
+                        SubscriberTransport(
+                            node="/velocity",
+                            transport="relay",
+                            state="relayed",
+                            since_ago=5.0,
+                            wanted="auto",
+                            condition="contract",
+                            text="the contract asks for a deadline",
+                        ),
+                    ),
                 ),
             ),
         ),
@@ -144,3 +162,27 @@ SNAPSHOT = Snapshot(
     counters={"beacon.malformed": 1},
     notes=("no multicast on eth0",),
 )
+
+VIEWER = SubscriberTransport(
+    node="/viewer",
+    transport="direct",
+    state="direct",
+    since_ago=180.0,
+    wanted="auto",
+    endpoint="10.0.0.2:41234",
+    missed=2,
+    connected=True,
+    figures=DirectFigures(messages=1801, bytes=180_100, dropped=0, rate=10.0, bandwidth=1000.0, window=3.0),
+)
+"""A subscriber that is connected directly."""
+DIRECT = RouteInfo(
+    peer="joystick",
+    node="/joy_node",
+    direction="in",
+    state="idle",
+    type="sensor_msgs/Joy",
+    contract={"transport": "auto"},
+    transport="direct",
+    subscribers=(VIEWER,),
+)
+"""A route that no message takes, because its only subscriber is direct."""

@@ -47,8 +47,8 @@ from rmpa.observe.snapshot import (
 from rmpa.ros.types.diagnostic_array import frame_array
 from tests.observe.doctor.test_firewall import IPTABLES_UFW, NFT_AGAINST, NFT_CLOSED, NFT_OPEN, NFT_OURS, PORTS
 from tests.observe.doctor.test_ros_environment import SHELL
-from tests.observe.samples import SNAPSHOT
-from tests.observe.why import test_services, test_topics
+from tests.observe.samples import DIRECT, SNAPSHOT, VIEWER
+from tests.observe.why import test_direct_stages, test_services, test_topics
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -80,6 +80,15 @@ def holed() -> PeerInfo:
     return msgspec.structs.replace(JOYSTICK, link=link)
 
 
+def with_stuck() -> Snapshot:
+    """A direct topic; another one whose subscriber has to be relayed and cannot be moved."""
+    caught = {"state": "relayed", "condition": "name", "text": "it has another name there", "stuck": "not permitted"}
+    stuck = msgspec.structs.replace(DIRECT, subscribers=(msgspec.structs.replace(VIEWER, **caught),))
+    cmd, odom = SNAPSHOT.topics
+    topics = (msgspec.structs.replace(cmd, routes=(DIRECT,)), msgspec.structs.replace(odom, routes=(stuck,)))
+    return msgspec.structs.replace(with_peers(JOYSTICK), topics=topics)
+
+
 def document(value: Sequence[object], lines: Sequence[str]) -> bytes:
     """As JSON, one object a line, and the lines behind it."""
     plain = (click.unstyle(line).encode() for line in lines)
@@ -96,6 +105,7 @@ def findings() -> Iterator[Check]:
         "few": with_files(near=True),
         "none": with_files(near=True, problem="node /x has to wait: none left; raise it"),
         "alone": with_peers(),
+        "stuck": with_stuck(),
         "holed": with_peers(holed()),
         "refused": with_peers(msgspec.structs.replace(PC, state="refused", conflicts=("no remedy",), last_error="")),
     }
@@ -176,6 +186,10 @@ def diagnoses() -> Iterator[Diagnosis]:
     for topic, *_ in test_topics.WARNINGS.values():
         yield from topic.walk()
     yield from test_topics.Case(there=None, refusal="it is older").walk()
+    yield from test_direct_stages.direct().walk()
+    yield from test_direct_stages.direct(relayed=True).walk()
+    for topic, *_ in (*test_direct_stages.FAILURES.values(), *test_direct_stages.UNTOLD.values()):
+        yield from topic.walk()
     yield test_services.walk()
     for here, there, *_ in test_services.FAILURES.values():
         yield test_services.walk(here, there)
@@ -213,6 +227,7 @@ def snapshots() -> Iterator[Snapshot]:
         out = msgspec.structs.replace(route, direction="out", state="away", kept=7, node="/mine")
         topics = (msgspec.structs.replace(topic, routes=(route, healthy, out)),)
         yield msgspec.structs.replace(with_peers(holed(), PC), topics=topics)
+    yield with_stuck()
     refused = msgspec.structs.replace(SNAPSHOT.topics[1], mismatches=("pc/viewer wants another md5",))
     gone = UnreachableInfo(node="/odd", uri="http://nosuch:1/", problem="no such name", ago=20.0, withdrawn=True)
     called = ServiceInfo(name="/add", node="/adder", direction="in", peer="joystick", calls=3, type="a/Add")
@@ -237,7 +252,12 @@ def diagnostics() -> bytes:
     return b"".join(messages)
 
 
-FILES: Final = {"doctor.txt": doctor, "why.txt": why, "diagnostics.bin": diagnostics}
+def shown() -> bytes:
+    """A direct route as ``--json`` has it: programs read these names."""
+    return b"\n".join(msgspec.json.format(msgspec.json.encode(one), indent=1) for one in (DIRECT, ROUTE)) + b"\n"
+
+
+FILES: Final = {"doctor.txt": doctor, "why.txt": why, "diagnostics.bin": diagnostics, "route.json": shown}
 
 
 @pytest.mark.parametrize(("file", "said"), FILES.items(), ids=FILES)

@@ -9,7 +9,7 @@ from rmpa.observe import limits
 from rmpa.observe.health import HERE, Health, diagnostic_status
 from rmpa.observe.snapshot import EventInfo, FilesInfo, PeerInfo, RouteInfo, ServiceInfo, Snapshot, UnreachableInfo
 from rmpa.ros.types.diagnostic_array import DiagnosticLevel, DiagnosticStatus
-from tests.observe.samples import SNAPSHOT
+from tests.observe.samples import DIRECT, SNAPSHOT, VIEWER
 
 CMD = "rmpa: joystick: /cmd"
 JOYSTICK, PC = SNAPSHOT.peers
@@ -290,3 +290,56 @@ def test_failed_calls_are_a_warning_once() -> None:
     assert (worse.level, worse.message) == (DiagnosticLevel.WARN, "1 of 2 calls failed: it sticks")
     after = judged(health, with_services(failed))[name]
     assert (after.level, after.message, after.values["failed"]) == (DiagnosticLevel.OK, "0 calls", "1")
+
+
+def test_a_direct_topic_tells_what_its_nodes_count() -> None:
+    status = judged(Health(), with_routes(DIRECT))[CMD]
+    text = "direct to 10.0.0.2:41234 for /viewer, 10.0 Hz"
+    assert (status.level, status.message) == (DiagnosticLevel.OK, text)
+    shown = {key: value for key, value in status.values.items() if key.startswith("direct /viewer ")}
+    assert shown == {
+        "direct /viewer to": "10.0.0.2:41234",
+        "direct /viewer since (s)": "180",
+        "direct /viewer missed": "2",
+        "direct /viewer rate (Hz)": "10",
+        "direct /viewer bandwidth (B/s)": "1000",
+        "direct /viewer messages": "1801",
+        "direct /viewer dropped": "0",
+    }
+    assert status.values["transport"] == "direct"
+    unknown = msgspec.structs.replace(VIEWER, figures=None, unmeasured="it does not tell")
+    route = msgspec.structs.replace(DIRECT, subscribers=(unknown,))
+    assert level(with_routes(route)) == (DiagnosticLevel.OK, "direct to 10.0.0.2:41234 for /viewer")
+
+
+def test_direct_and_relayed_subscribers_share_a_status() -> None:
+    both = msgspec.structs.replace(HEALTHY, transport="both", subscribers=(VIEWER,))
+    assert level(with_routes(both)) == (
+        DiagnosticLevel.OK,
+        "10.0 Hz, 0.41 ms; direct to 10.0.0.2:41234 for /viewer, 10.0 Hz",
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected", "text"),
+    [
+        ({"wanted": "auto"}, DiagnosticLevel.OK, "10.0 Hz, 0.41 ms"),
+        ({"wanted": "direct"}, DiagnosticLevel.WARN, "relayed for /viewer: no way"),
+        ({"wanted": "direct", "condition": "transport"}, DiagnosticLevel.OK, "10.0 Hz, 0.41 ms"),
+        ({"wanted": "direct", "condition": "measures"}, DiagnosticLevel.OK, "10.0 Hz, 0.41 ms"),
+        (
+            {"wanted": "auto", "transport": "direct", "endpoint": "10.0.0.2:41234", "stuck": "not permitted"},
+            DiagnosticLevel.WARN,
+            "direct to 10.0.0.2:41234 for /viewer, has to be relayed, but its connection cannot be ended",
+        ),
+    ],
+)
+def test_a_direct_contract_that_falls_back_is_a_warning(
+    changes: dict[str, object], expected: DiagnosticLevel, text: str
+) -> None:
+    relayed = {"transport": "relay", "state": "relayed", "endpoint": "", "condition": "reachable", "text": "no way"}
+    one = msgspec.structs.replace(VIEWER, figures=None, **(relayed | changes))
+    route = msgspec.structs.replace(HEALTHY, transport="relay", subscribers=(one,))
+    found, said = level(with_routes(route))
+    assert found is expected
+    assert said.startswith(text)

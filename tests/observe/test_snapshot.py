@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from rmpa.observe import snapshot as s
-from tests.observe.samples import SNAPSHOT
+from tests.observe.samples import SNAPSHOT, VIEWER
 
 
 def test_a_snapshot_survives_json() -> None:
@@ -19,6 +19,7 @@ def test_the_sample_uses_every_field() -> None:
     assert unused(SNAPSHOT.agent) == set()
     assert set.intersection(*map(unused, SNAPSHOT.peers)) == {"via"}, "none of them is relayed"
     assert unused(SNAPSHOT.topics[0].routes[0]) == {"kept", "problem", "limit"}
+    assert unused(VIEWER) == {"condition", "text", "stuck", "unmeasured", "silent"}, "it is direct"
 
 
 def test_a_topics_peers_are_those_it_comes_from() -> None:

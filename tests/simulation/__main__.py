@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
+from tests.simulation.direct_scenario import DirectScenario
 from tests.simulation.lanes_scenario import LanesScenario
 from tests.simulation.mesh_scenario import MeshScenario
 from tests.simulation.reliable_scenario import ReliableScenario
@@ -15,11 +16,13 @@ def main() -> int:
     """Print the trace and its hash; 1 if the peers do not agree, or a message was lost unseen."""
     parser = argparse.ArgumentParser(prog="python -m tests.simulation", description=__doc__)
     parser.add_argument("--seed", type=int, required=True)
-    parser.add_argument("--peers", type=int, default=2, help="not with --kind reliable, where there are always two")
-    parser.add_argument("--kind", choices=["rosters", "mesh", "lanes", "reliable"], default="rosters")
+    parser.add_argument("--peers", type=int, default=2, help="not with --kind reliable and direct")
+    parser.add_argument("--kind", choices=["rosters", "mesh", "lanes", "reliable", "direct"], default="rosters")
     arguments = parser.parse_args()
-    scenario: Scenario | ReliableScenario
-    if arguments.kind == "reliable":
+    scenario: Scenario | ReliableScenario | DirectScenario
+    if arguments.kind == "direct":
+        scenario = DirectScenario(arguments.seed, keep=True)
+    elif arguments.kind == "reliable":
         scenario = ReliableScenario(arguments.seed, keep=True)
     else:
         make = {"rosters": Scenario, "mesh": MeshScenario, "lanes": LanesScenario}[arguments.kind]

@@ -142,7 +142,8 @@ agents, one call of the publisher and one connection to it: a few milliseconds."
 DIRECT_ASK_TIMEOUT: Final = 5.0
 """Seconds that a peer has to answer a request for a direct connection; its publisher may be slow."""
 DIRECT_ASKS: Final = 16
-"""Requests for direct connections that this agent sends at a time; less than `ASKS_AT_ONCE`, so that others pass."""
+"""Requests for direct connections that this agent sends at a time; less than `ASKS_AT_ONCE`, so that others
+pass. Services of one peer have as many places for themselves, which they hold until they are probed."""
 DIRECT_NODE_TIMEOUT: Final = 2.0
 """Seconds that a local node has to answer a question about direct transport."""
 DIRECT_PORT_KNOWN: Final = 10.0
@@ -152,6 +153,8 @@ DIRECT_PROBE_TIMEOUT: Final = 1.0
 DIRECT_RETRY: Final = 30.0
 """Seconds after which a subscriber that was refused for a passing reason (the node does not answer, the port cannot
 be reached) is considered again."""
+DIRECT_RETRY_PAUSE: Final = 1.0
+"""Seconds between two requests for one subscriber that a peer's notifications cause."""
 DIRECT_CHECK: Final = 1.0
 """Seconds between two looks at the kernel's table, whether direct connections still stand."""
 DIRECT_SETTLE: Final = 2.0
@@ -160,7 +163,11 @@ DIRECT_MAX: Final = 1024
 """Direct connections that one peer may have to publishers of this module, and as many to its services."""
 DIRECT_ADOPT: Final = 10.0
 """Seconds that a new run of a peer's agent has to offer again what its earlier run left connected directly; after
-that the connections are ended."""
+that the connections are ended. Likewise the seconds that a peer has, after a new link, to ask again for what it
+uses."""
+DIRECT_KEEP: Final = 30.0
+"""Seconds that services which are called directly stay in the graph after their agent has crashed, as topics do
+(``core.limits.RESUME_WINDOW``). Their servers are probed each `DIRECT_CHECK` meanwhile."""
 DIRECT_BREAKS: Final = 3
 """A direct connection that broke so many times within `DIRECT_BREAKS_SPAN` seconds is relayed for `DIRECT_RETRY`."""
 DIRECT_BREAKS_SPAN: Final = 10.0

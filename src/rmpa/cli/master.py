@@ -41,15 +41,16 @@ class Master:
         """The error for a master that does not answer."""
         return UnreachableError("ROS master", f"{self.uri} ({self.source})", _REMEDY)
 
-    def snapshot(self, *, topics: tuple[str, ...] | None = None) -> Snapshot | None:
+    def snapshot(self, *, topics: tuple[str, ...] | None = None, figures: bool = False) -> Snapshot | None:
         """The snapshot of the master's agent; ``None`` without an agent, or if it does not answer.
 
         Args:
             topics: Only these topics are in it; ``None``: all, which takes the agent longer.
+            figures: Wait for the figures of direct connections, half a second at the first look.
         """
         if self.agent is not None:
             with contextlib.suppress(RmpaError), ControlClient(self.agent) as client:
-                return client.snapshot() if topics is None else client.call("snapshot", Snapshot, topics=topics)
+                return client.call("snapshot", Snapshot, topics=topics, figures=figures)
         return None
 
 

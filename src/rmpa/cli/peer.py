@@ -11,6 +11,7 @@ import click
 
 from rmpa.cli.options import agent_option, json_option
 from rmpa.cli.output import Column, duration, print_json, print_line, print_table, size, warn
+from rmpa.cli.topic_crossing import shown_state
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.core.stats import SampleSummary
@@ -142,7 +143,7 @@ def info(name: str, as_json: bool, agent: str | None) -> None:
 def _route_row(topic: TopicInfo, route: RouteInfo) -> list[str]:
     latency = route.latency
     return [
-        *(f"  {topic.name}", route.type or topic.type or "-", route.node, route.state),
+        *(f"  {topic.name}", route.type or topic.type or "-", route.node, shown_state(route)),
         str(route.messages),
         "-" if route.rate is None else f"{route.rate:.1f} Hz",
         "-" if latency is None else f"{duration(latency.p50)} ±{duration(latency.error)}",
@@ -174,6 +175,9 @@ def _facts(info: PeerInfo) -> list[tuple[str, str]]:
             ("Traffic", f"{size(link.bytes_in)} in, {size(link.bytes_out)} out, {size(link.queued)} queued"),
             ("Drops", f"{link.dropped} messages"),
         ]
+        if info.direct_in or info.direct_out:
+            ours = f"{info.direct_in} of the subscribers here to its nodes"
+            facts.append(("Direct", f"{ours}, {info.direct_out} of its subscribers to nodes here"))
         if link.packet is not None:
             facts.append(("Packets", f"of at most {link.packet} bytes to it"))
         if link.path_problem:

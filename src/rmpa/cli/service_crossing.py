@@ -22,6 +22,28 @@ def crossing(master: Master, wanted: GraphName) -> tuple[ServiceInfo, ...]:
     )
 
 
+def transports(master: Master) -> dict[str, ServiceInfo]:
+    """The peers' services in the master's graph, by name; empty without an agent."""
+    snapshot = master.snapshot(topics=())
+    return {info.name: info for info in (snapshot.services if snapshot is not None else ()) if info.transport}
+
+
+def transport_json(info: ServiceInfo | None) -> dict[str, str]:
+    """The transport of a peer's service, and the condition by which it is relayed; empty for others."""
+    if info is None:
+        return {}
+    return {"transport": info.transport} | ({"condition": info.condition} if info.condition else {})
+
+
+def transport_text(info: ServiceInfo | None) -> str:
+    """The transport of a peer's service in a few words; empty for others."""
+    if info is None:
+        return ""
+    if info.transport == "direct":
+        return "direct"
+    return f"relayed ({info.condition})" if info.condition and info.wanted != "relay" else "relayed"
+
+
 def print_crossing(infos: tuple[ServiceInfo, ...]) -> None:
     """Print whether a service may cross, each peer that offers it, and how its calls went."""
     for info in infos:
@@ -41,8 +63,19 @@ def _headline(info: ServiceInfo) -> str:
     return f"from {info.peer}: {info.node}{over_there}, {state}"
 
 
+def _transport(info: ServiceInfo) -> list[tuple[str, str]]:
+    if info.direct_callers:
+        return [("transport", f"direct for {', '.join(info.direct_callers)}")]
+    if info.transport == "direct":
+        return [("transport", f"direct, at {info.address}, {info.lookups} lookups answered so")]
+    if info.transport and info.wanted != "relay":
+        why = f" ({info.condition}): {info.relayed_because}" if info.condition else "; its module is being asked"
+        return [("transport", f"relayed{why}")]
+    return []
+
+
 def _facts(info: ServiceInfo) -> list[tuple[str, str]]:
-    facts = []
+    facts = _transport(info)
     if info.calls or info.active:
         under_way = f", {info.active} under way" if info.active else ""
         facts.append(("calls", f"{info.calls}, {info.failed} failed{under_way}"))

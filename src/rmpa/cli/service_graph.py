@@ -10,7 +10,7 @@ import click
 from rmpa.cli.graph import origin_json, origin_text, peers_of, print_names, read_name, read_namespace
 from rmpa.cli.options import GraphOptions, graph_options
 from rmpa.cli.output import Column, print_json, print_line, print_table, warn
-from rmpa.cli.service_crossing import crossing, print_crossing
+from rmpa.cli.service_crossing import crossing, print_crossing, transport_json, transport_text, transports
 from rmpa.cli.service_probe import known_type, probe, probe_all
 from rmpa.core.errors import RmpaError
 
@@ -45,17 +45,24 @@ def _service_json(graph: Graph, name: str, found: Probed | None = None) -> dict[
 def list_(namespace: str, verbose: bool, options: GraphOptions) -> None:
     """List services, all or those of a NAMESPACE.
 
-    A service that a peer offers has its name behind it: /add  [base].
+    A service that a peer offers has its name behind it: /add  [base]. With -v or --json it has its transport, too.
     """
     master, graph = options.graph()
     wanted = read_namespace(namespace, "service")
     names = [name for name in sorted(graph.services) if wanted.contains(name, peers_of(graph.services[name]))]
     found = asyncio.run(probe_all(master, names)) if verbose else {}
     if options.as_json:
-        print_json([_service_json(graph, name, found.get(name)) for name in names])
+        mesh = transports(master)
+        print_json([_service_json(graph, name, found.get(name)) | transport_json(mesh.get(name)) for name in names])
     elif verbose:
-        rows = [(name, _type_of(found[name]), origin_text(_node(graph, name, "unknown"))) for name in names]
-        print_table((Column("SERVICE"), Column("TYPE"), Column("NODE")), rows)
+        mesh = transports(master)
+        rows = [
+            (name, _type_of(found[name]), origin_text(_node(graph, name, "unknown")), transport_text(mesh.get(name)))
+            for name in names
+        ]
+        columns = (Column("SERVICE"), Column("TYPE"), Column("NODE"), Column("TRANSPORT"))
+        shown = len(columns) if mesh else len(columns) - 1
+        print_table(columns[:shown], [row[:shown] for row in rows])
     else:
         print_names(names, graph.services)
 

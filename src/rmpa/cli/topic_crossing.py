@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rmpa.cli.output import duration, printable, size
+from rmpa.observe.transport_text import route_texts, subscriber_text
 from rmpa.ros import limits
 
 if TYPE_CHECKING:
@@ -12,12 +13,18 @@ if TYPE_CHECKING:
 
     from rmpa.cli.graph import GraphName
     from rmpa.cli.master import Master
-    from rmpa.observe.snapshot import LatencyInfo, RouteInfo, TopicInfo
+    from rmpa.observe.snapshot import DirectFigures, LatencyInfo, RouteInfo, TopicInfo
 
 
-def ask_agent(master: Master, topic: str) -> TopicInfo | None:
-    """What the master's agent knows of a topic; ``None`` without an agent, or if it does not answer."""
-    snapshot = master.snapshot(topics=(topic,))
+def ask_agent(master: Master, topic: str, *, figures: bool = False) -> TopicInfo | None:
+    """What the master's agent knows of a topic; ``None`` without an agent, or if it does not answer.
+
+    Args:
+        master: The master.
+        topic: The topic.
+        figures: Wait for the figures of direct connections.
+    """
+    snapshot = master.snapshot(topics=(topic,), figures=figures)
     return next((info for info in snapshot.topics if info.name == topic), None) if snapshot is not None else None
 
 
@@ -78,10 +85,46 @@ def oversized_text(route: RouteInfo) -> str:
     return f"{route.oversized} left out {where}, the last of {last}; at most {most} cross: send parts"
 
 
+def shown_state(route: RouteInfo) -> str:
+    """The state of a route, where its messages pass the agents or not: ``open``, ``direct``, ``open and direct``."""
+    if route.transport == "direct":
+        return "direct"
+    return f"{route.state} and direct" if route.transport == "both" else route.state
+
+
+def transport_lines(route: RouteInfo) -> Iterator[tuple[str, str]]:
+    """The transport of each subscriber, and the figures of the direct ones: label and text of each line."""
+    if not route.subscribers:
+        yield from (("transport", text) for text in route_texts(route))
+    for one in route.subscribers:
+        since = duration(one.since_ago) if one.since_ago is not None else ""
+        missed = f"; {one.missed} messages missed while it was moved" if one.missed else ""
+        yield "transport", subscriber_text(one, since) + missed
+        if one.figures is not None:
+            yield "", figures_text(one.figures, route.node if one.state == "granted" else one.node)
+        if one.unmeasured:
+            yield "", one.unmeasured
+
+
+def figures_text(figures: DirectFigures, node: str) -> str:
+    """The figures of a direct connection, by the statistics of a node at its end."""
+    flow = [f"{figures.rate:.1f} Hz"] if figures.rate is not None else []
+    if figures.bandwidth is not None:
+        flow.append(f"{size(figures.bandwidth)}/s over {duration(figures.window)}")
+    if figures.messages is not None:
+        flow.append(f"{figures.messages} messages")
+    if figures.dropped is not None:
+        flow.append(f"{figures.dropped} dropped by its queue")
+    if figures.counted_by == "kernel":
+        return f"{', '.join(flow)}, as the kernel counts"
+    return f"{', '.join(flow)}, as {node} counts"
+
+
 def facts(route: RouteInfo) -> Iterator[tuple[str, str]]:
     """All that the agent knows of a route: label and text of each line."""
     if route.wire:
         yield "there", route.wire
+    yield from transport_lines(route)
     if route.lane:
         yield "lane", route.lane
     if route.direction == "in" and route.messages:

@@ -9,7 +9,7 @@ import click
 from rmpa.cli.graph import origin_json, origin_text, peers_mark, peers_of, print_names, read_name, read_namespace
 from rmpa.cli.options import GraphOptions, graph_options
 from rmpa.cli.output import duration, print_json, print_line, printable, warn
-from rmpa.cli.topic_crossing import ask_agent, facts
+from rmpa.cli.topic_crossing import ask_agent, facts, shown_state
 from rmpa.core.errors import RmpaError
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def info(topic: str, options: GraphOptions) -> None:
     wanted = read_name(topic)
     master, graph = options.graph()
     graph.require_topic(wanted.name)
-    crossing = ask_agent(master, wanted.name)
+    crossing = ask_agent(master, wanted.name, figures=True)
     if options.as_json:
         print_json(_topic_json(graph, wanted.name) | {"mesh": crossing})
         return
@@ -116,7 +116,8 @@ def _print_crossing(crossing: TopicInfo, wanted: GraphName) -> None:
             continue
         way = "from" if route.direction == "in" else "to"
         last = "" if route.age is None else f", last {duration(route.age)} ago"
-        print_line(f" * {way} {route.peer}: {route.node} {route.state}, {route.messages} messages{last}")
+        relayed = f", {route.messages} messages{last}" if route.transport != "direct" or route.messages else ""
+        print_line(f" * {way} {route.peer}: {route.node} {shown_state(route)}{relayed}")
         for label, text in facts(route):
             print_line(f"     {label:<10} {text}")
         if route.problem:

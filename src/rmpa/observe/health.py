@@ -12,13 +12,14 @@ from rmpa.core.open_files import remedy
 from rmpa.observe import limits
 from rmpa.observe.check import FAIL, OK, STALE, WARN, Check
 from rmpa.observe.health_values import agent_values, link_values, number, route_values, service_values
+from rmpa.observe.transport_text import fallbacks, stuck, subscriber_text
 from rmpa.ros.types.diagnostic_array import DiagnosticLevel, DiagnosticStatus
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from rmpa.observe.check import CheckLevel
-    from rmpa.observe.snapshot import PeerInfo, RouteInfo, ServiceInfo, Snapshot, TopicInfo
+    from rmpa.observe.snapshot import PeerInfo, RouteInfo, ServiceInfo, Snapshot, SubscriberTransport, TopicInfo
 
 HERE: Final = "rmpa: this module"
 """The name of the agent's own status."""
@@ -247,6 +248,8 @@ def _judge_route(topic: TopicInfo, route: RouteInfo, new: Counter[str]) -> tuple
         return FAIL, "; ".join(topic.mismatches)
     if route.problem:
         return WARN, route.problem
+    if troubled := [*stuck(route), *fallbacks(route)]:
+        return WARN, "; ".join(subscriber_text(one) for one in troubled)
     deadline = route.contract.get("deadline")
     if isinstance(deadline, float) and route.age is not None and route.age > deadline:
         return WARN, f"no message for {route.age:.3g} s; deadline {deadline:.3g} s"
@@ -256,6 +259,19 @@ def _judge_route(topic: TopicInfo, route: RouteInfo, new: Counter[str]) -> tuple
 
 
 def _flowing(route: RouteInfo) -> str:
+    direct = [_directly(one) for one in route.subscribers if one.transport == "direct"]
+    if direct and route.transport == "direct":
+        return "; ".join(direct)
+    return "; ".join([_relayed(route), *direct])
+
+
+def _directly(one: SubscriberTransport) -> str:
+    """A direct subscriber, with its rate where it is known."""
+    rate = f", {one.figures.rate:.1f} Hz" if one.figures is not None and one.figures.rate is not None else ""
+    return f"{subscriber_text(one)}{rate}"
+
+
+def _relayed(route: RouteInfo) -> str:
     if route.state == "idle":
         return "nobody here listens"
     if route.rate is None:

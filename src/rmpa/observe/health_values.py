@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from rmpa.observe.transport_text import BY_RULE
+
 if TYPE_CHECKING:
-    from rmpa.observe.snapshot import PeerInfo, RouteInfo, SampleSpread, ServiceInfo, Snapshot
+    from rmpa.observe.snapshot import PeerInfo, RouteInfo, SampleSpread, ServiceInfo, Snapshot, SubscriberTransport
 
 
 def number(value: float | None, scale: float = 1.0) -> str:
@@ -84,6 +86,8 @@ def route_values(route: RouteInfo) -> dict[str, str]:
         "node": route.node,
         "type": route.type,
         "state": route.state,
+        "transport": route.transport,
+        "relayed by": route.condition if route.condition != BY_RULE else "",
         "lane": route.lane,
         "rate (Hz)": number(route.rate),
         "bandwidth (B/s)": number(route.bandwidth),
@@ -102,9 +106,26 @@ def route_values(route: RouteInfo) -> dict[str, str]:
     if route.messages or route.dropped or route.lost:
         counted = ("messages", "lost", "late", "expired", "dropped")
         known |= {name: str(getattr(route, name)) for name in counted}
+    for one in route.subscribers:
+        known |= _direct_values(one)
     known |= {f"contract {key}": str(value) for key, value in route.contract.items()}
     known |= {f"events {kind}": str(count) for kind, count in route.events.items()}
     return _known(known)
+
+
+def _direct_values(one: SubscriberTransport) -> dict[str, str]:
+    """The figures of a subscriber that is connected directly."""
+    if one.transport != "direct":
+        return {}
+    known = {"to": one.endpoint, "since (s)": number(one.since_ago), "missed": str(one.missed or "")}
+    if (figures := one.figures) is not None:
+        known |= {
+            "rate (Hz)": number(figures.rate),
+            "bandwidth (B/s)": number(figures.bandwidth),
+            "messages": "" if figures.messages is None else str(figures.messages),
+            "dropped": "" if figures.dropped is None else str(figures.dropped),
+        }
+    return {f"direct {one.node} {key}": value for key, value in known.items()}
 
 
 def _milliseconds(what: str, spread: SampleSpread | None, *fields: str) -> dict[str, str]:

@@ -165,6 +165,8 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
         topics_out: The number of topics that it is offered.
         via: The name of the peer that relays its topics, if one does.
         beyond: What either side hides of the other by its limits.
+        direct_in: Subscribers here that are connected to its nodes directly.
+        direct_out: Its subscribers that may connect to nodes here directly.
     """
 
     name: str
@@ -184,6 +186,8 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
     topics_out: int = 0
     via: str = ""
     beyond: tuple[BoundInfo, ...] = ()
+    direct_in: int = 0
+    direct_out: int = 0
 
 
 class SampleSpread(msgspec.Struct, kw_only=True, frozen=True):
@@ -251,10 +255,71 @@ class EventInfo(msgspec.Struct, kw_only=True, frozen=True):
     ago: float
 
 
+class DirectFigures(msgspec.Struct, kw_only=True, frozen=True):
+    """The figures of a direct connection, by the statistics of a node at its end (``getBusStats``).
+
+    Attributes:
+        messages: Since the connection was made, by the node's counter of 32 bits; ``None`` if the node does not say.
+        bytes: Of these, likewise.
+        dropped: Messages that a subscriber's own queue dropped; ``None``: not known, as for all of rospy.
+        rate: Messages a second.
+        bandwidth: Bytes a second.
+        window: The time that both are measured over, seconds.
+        counted_by: ``node``, or ``kernel`` where the node does not tell: bytes alone.
+    """
+
+    messages: int | None = None
+    bytes: int = 0
+    dropped: int | None = None
+    rate: float | None = None
+    bandwidth: float | None = None
+    window: float = 0.0
+    counted_by: str = "node"
+
+
+class SubscriberTransport(msgspec.Struct, kw_only=True, frozen=True):
+    """The transport of one subscriber of a route: of a local one (``in``), or of a peer's (``out``).
+
+    Attributes:
+        node: The subscriber, by its name in its own graph.
+        transport: The path of its messages now: ``direct``, ``relay``, or empty while it has none.
+        state: What is decided: ``asking`` (the peer is asked), ``probing`` (the publisher's port is tried),
+            ``direct`` or ``relayed``; of outgoing routes ``granted``.
+        since_ago: Seconds since a direct connection was answered, else since the state began; ``None``: not known.
+        wanted: The transport that the contract of the subscriber's module asks for; empty for ``out``.
+        endpoint: ``address:port`` of the publisher's node while the transport is direct; ``out``: the port alone.
+        condition: The condition of direct transport that does not hold (docs/contracts.md), if it is relayed.
+        text: That as text, ready to read.
+        missed: Messages that were seen to pass while it was moved between transports.
+        stuck: Why its direct connection cannot be ended although it has to be relayed; empty: nothing is wrong.
+        connected: Whether its direct connection stands, by the node and the kernel; ``None``: nobody looked.
+        figures: Of its direct connection, while somebody looks; see ``unmeasured``.
+        unmeasured: Why the node tells no figures although somebody looks, ready to read.
+        silent: Whether the node that was asked for them did not answer.
+    """
+
+    node: str
+    transport: str = ""
+    state: str = ""
+    since_ago: float | None = None
+    wanted: str = ""
+    endpoint: str = ""
+    condition: str = ""
+    text: str = ""
+    missed: int = 0
+    stuck: str = ""
+    connected: bool | None = None
+    figures: DirectFigures | None = None
+    unmeasured: str = ""
+    silent: bool = False
+
+
 class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):
     """The route of one source, a publisher of a topic at one node, between this module and a peer.
 
     Figures are of the messages that an open route brought in the last minute, within the bounds of its statistics.
+    Messages of direct transport do not pass the agents: ``state`` and all figures are of the relayed transport alone,
+    those of direct connections stand in ``subscribers``.
 
     Attributes:
         peer: The peer it comes from, or goes to.
@@ -262,7 +327,8 @@ class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):
         direction: ``in`` or ``out``.
         state: Of incoming routes ``idle`` (no subscriber), ``opening``, ``open``, ``lingering``, ``waiting`` (it
             failed and is tried again) or ``hidden`` (see ``problem``); of outgoing ones ``open`` or ``away`` (the
-            peer has no link, and reliable messages are kept or counted for it).
+            peer has no link, and reliable messages are kept or counted for it) or ``idle`` (its subscribers there
+            are connected directly).
         type: The message type that the source has.
         md5: Of that type; empty before it is known.
         messages: Messages that crossed since the route was opened.
@@ -289,6 +355,13 @@ class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):
         problem: Why nothing flows, ready to read; empty if nothing is wrong.
         wire: The topic's name at the peer, where that differs.
         limit: The limit that hides it, ``nodes`` or ``topics``; empty if none does.
+        transport: How its messages go: ``direct``, ``relay``, ``both`` (its subscribers differ), or empty while none
+            is in use.
+        condition: Why a subscriber is relayed: the condition of direct transport that does not hold
+            (docs/contracts.md); empty where none is relayed.
+        condition_text: That as text, ready to read.
+        subscribers: The subscribers that have, or may get, a direct connection, by name. ``in``: of this module, if
+            its contract's transport is ``direct`` or ``auto``; ``out``: of the peer, if one was granted.
     """
 
     peer: str
@@ -320,6 +393,10 @@ class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):
     problem: str = ""
     wire: str = ""
     limit: str = ""
+    transport: str = ""
+    condition: str = ""
+    condition_text: str = ""
+    subscribers: tuple[SubscriberTransport, ...] = ()
 
 
 class TopicInfo(msgspec.Struct, kw_only=True, frozen=True):
@@ -369,7 +446,14 @@ class ServiceInfo(msgspec.Struct, kw_only=True, frozen=True):
         type: ``package/Name``; empty before a client has asked for it.
         md5: Of that type, likewise.
         callers: ``out``: the peers that have it open.
-        calls: Calls across the mesh so far.
+        transport: ``in``: ``direct`` (clients call the server itself) or ``relay``; empty for ``out``.
+        wanted: The transport that the rules of this module ask for: ``relay``, ``direct`` or ``auto``.
+        condition: ``in``: the condition of direct transport that does not hold, in one word; empty if none is known.
+        relayed_because: That condition's fact, ready to read.
+        address: ``in``: where clients call the server directly, ``rosrpc://address:port``; else empty.
+        lookups: ``in``: lookups that were answered with that address.
+        direct_callers: ``out``: the peers whose nodes may call the server directly.
+        calls: Calls across the mesh so far; direct ones pass no agent, and are not counted.
         failed: Of these, those that ended with an error.
         active: Calls under way.
         latency: Of the last successful calls; ``in``: from a client's request to its reply, ``out``: the server's
@@ -389,6 +473,13 @@ class ServiceInfo(msgspec.Struct, kw_only=True, frozen=True):
     type: str = ""
     md5: str = ""
     callers: tuple[str, ...] = ()
+    transport: str = ""
+    wanted: str = "relay"
+    condition: str = ""
+    relayed_because: str = ""
+    address: str = ""
+    lookups: int = 0
+    direct_callers: tuple[str, ...] = ()
     calls: int = 0
     failed: int = 0
     active: int = 0

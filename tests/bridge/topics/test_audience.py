@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.topics.audience import audience, is_watched
+from rmpa.bridge.topics.audience import audience, compares_names, is_watched
 
 
 @pytest.mark.parametrize(
@@ -30,3 +30,15 @@ def test_nodes_are_named_once_in_order_and_nobody_else() -> None:
 
 def test_no_more_are_named_than_a_message_may_hold() -> None:
     assert len(audience(f"/n{number}" for number in range(1000))) == limits.AUDIENCE_MAX
+
+
+def test_all_topics_of_an_action_compare_names() -> None:
+    of_actions = {
+        "actionlib/TestActionGoal",
+        "actionlib_msgs/GoalID",
+        "actionlib_msgs/GoalStatusArray",
+        "actionlib/TestActionFeedback",
+        "actionlib/TestActionResult",
+    }
+    assert all(compares_names(name) for name in of_actions)
+    assert not compares_names("std_msgs/String")

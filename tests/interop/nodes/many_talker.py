@@ -1,4 +1,4 @@
-"""Publish numbered, checksummed payloads on many topics of one node (rospy); options and events as of many_talker.cpp."""
+"""Publish numbered, checksummed payloads on many topics of one node (rospy); all as in many_talker.cpp."""
 
 import sys
 import time

@@ -14,7 +14,7 @@ from lab.bed.processes import Deadline, Process
 from lab.bed.ros import NODES
 from lab.bench import contenders
 from lab.bench.contenders import ENTRIES, PEERS, Entry
-from lab.bench.roundtrips import TripScore, rows, start_all
+from lab.bench.roundtrips import TripScore, claims, rows, start_all
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -57,6 +57,21 @@ def test_each_is_compared_with_roscpp_and_ours_with_it() -> None:
     titles = {"roscpp_nodelay": "roscpp", "zenoh": "zenoh"}
     found = {row["contender"]: (row["to_roscpp"], row["agents_to_it"]) for row in rows(scores, titles)}
     assert found == {"roscpp_nodelay": (1.0, 1.6), "zenoh": (0.8, 2.0)}
+
+
+def test_the_direct_transport_is_held_against_roscpp_over_the_same_cable() -> None:
+    def score(us: int) -> TripScore:
+        return TripScore(array("Q", [2000 * us] * 980 + [4000 * us] * 20))
+
+    scores = {
+        (key, 64): score(us) for key, us in (("roscpp_hosts", 100), ("direct_hosts", 104), ("agents_hosts", 150))
+    }
+    found = {claim.text: (claim.value, claim.reached) for claim in claims(scores)}
+    assert found == {
+        "64 B, p50, RMPA direct / roscpp over the same cable": (1.04, True),
+        "64 B, p99, RMPA direct / roscpp over the same cable": (1.04, True),
+    }
+    assert claims({("agents_hosts", 64): score(150)}) == []
 
 
 def test_everybody_of_the_issue_takes_part() -> None:

@@ -57,3 +57,16 @@ def test_a_clone_knows_its_commit_and_whether_it_was_changed(tmp_path: Path) -> 
     assert (code_here(where).commit, code_here(where).changed) == (commit, False)
     (where / "mesh.py").write_text("x = 2\n")
     assert (code_here(where).commit, code_here(where).changed) == (commit, True)
+
+
+@pytest.mark.git
+def test_what_is_measured_counts_as_what_measures_does(tmp_path: Path) -> None:
+    measures, measured = package(tmp_path / "lab"), package(tmp_path / "src")
+    git(tmp_path, "init", "-q")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "-q", "-m", "x")
+    before = code_here(measures, measured)
+    (measured / "mesh.py").write_text("x = 2\n")
+    after = code_here(measures, measured)
+    assert (before.changed, after.changed) == (False, True)
+    assert before.digest != after.digest

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from lab.bed.plan import Plan
-from lab.experiments.contenders import CLASSIC, DEFAULTS, RMPA
+from lab.experiments.contenders import CLASSIC, DEFAULTS, DIRECT, RMPA, contender_of
 from lab.experiments.control import CMD, EXPERIMENT, VEL, evaluate, phases, rounds
 from lab.experiments.model import Cell, Measured, Results
 from lab.frames import frame
@@ -54,6 +54,8 @@ def claim(claims: tuple[Claim, ...], words: str) -> Claim:
 
 
 def by_system(cell: Cell) -> Measured:
+    if contender_of(cell) == DIRECT:
+        return made(0.315, 1.05, 60.0 if cell.settings["mode"] == "polled" else 0.46)
     if cell.settings["system"] == "rmpa":
         return made(0.6, 0.9, 60.3 if cell.settings["mode"] == "polled" else 0.5)
     return made(0.3, 1.0, 60.0 if cell.settings["mode"] == "polled" else 0.4)
@@ -63,10 +65,10 @@ def by_system(cell: Cell) -> Measured:
 
 
 def test_systems_take_turns_and_another_one_begins_each_round() -> None:
-    cells = [cell for cell in EXPERIMENT.cells(FULL) if cell.settings["round"] == 4]
-    pairs = [tuple(cell.settings["system"] for cell in cells[at : at + 2]) for at in range(0, len(cells), 2)]
-    assert set(pairs) == {("classic", "rmpa"), ("rmpa", "classic")}
-    assert pairs[0] != pairs[1]
+    cells = [contender_of(cell) for cell in EXPERIMENT.cells(FULL) if cell.settings["round"] == 4]
+    turns = [tuple(cells[at : at + 3]) for at in range(0, len(cells), 3)]
+    assert all({*one} == {CLASSIC, RMPA, DIRECT} for one in turns)
+    assert len({one[0] for one in turns}) == len(turns)
 
 
 def test_both_systems_get_the_same_phase_in_a_round() -> None:
@@ -114,7 +116,7 @@ def test_periods_and_delays_of_a_round() -> None:
 
 def test_the_claims_hold_each_round_against_its_neighbour() -> None:
     claims = EXPERIMENT.findings(run(FULL, by_system)).claims
-    cmd, vel = claim(claims, "CMD at the pc, polled"), claim(claims, "VEL at the pc, polled")
+    cmd, vel = (claim(claims, f"{of} at the pc, polled, roscpp: RMPA / classic") for of in ("CMD", "VEL"))
     assert cmd.value == pytest.approx(2.0)
     assert vel.value == pytest.approx(0.9)
     assert (cmd.reached, cmd.paper) == (False, 1.86)
@@ -123,7 +125,7 @@ def test_the_claims_hold_each_round_against_its_neighbour() -> None:
     # 0.5 and 0.4 ms at the even messages; at the odd ones VEL is 0.3 ms later than CMD, and 0.7.
     assert later.value == pytest.approx(0.1 + 50 / 101 * (0.3 - 0.7))
     assert later.reached
-    polled = claim(claims, "control delay, polled")
+    polled = claim(claims, "control delay, polled, same phases, roscpp: RMPA / classic")
     assert polled.value == pytest.approx((60.3 + 50 / 101 * 0.3) / (60.0 + 50 / 101 * 0.7))
     assert polled.reached
     assert polled.paper == pytest.approx(0.59)
@@ -146,7 +148,7 @@ def test_one_bad_round_does_not_decide_a_ratio() -> None:
         return made(30.0, 30.0, 60.0) if bad else made(0.3, 0.3, 60.0)
 
     claims = EXPERIMENT.findings(run(FULL, measure)).claims
-    assert claim(claims, "CMD at the pc, event").value == pytest.approx(1.0)
+    assert claim(claims, "CMD at the pc, event, roscpp: RMPA / classic").value == pytest.approx(1.0)
 
 
 def test_a_round_that_failed_on_one_side_is_left_out_on_both() -> None:
@@ -156,7 +158,25 @@ def test_a_round_that_failed_on_one_side_is_left_out_on_both() -> None:
         return by_system(cell)
 
     claims = EXPERIMENT.findings(run(FULL, measure)).claims
-    assert claim(claims, "CMD at the pc, polled").value == pytest.approx(2.0)
+    assert claim(claims, "CMD at the pc, polled, roscpp: RMPA / classic").value == pytest.approx(2.0)
+
+
+def test_the_direct_transport_is_held_against_classic_ros_more_strictly() -> None:
+    claims = EXPERIMENT.findings(run(FULL, by_system)).claims
+    cmd = claim(claims, "CMD at the pc, event, roscpp: RMPA direct / classic")
+    assert cmd.value == pytest.approx(1.05)
+    assert (cmd.limit, cmd.reached) == (1.1, True)
+    later = claim(claims, "control delay, event, roscpp: RMPA direct less classic")
+    assert later.value == pytest.approx(0.06 + 50 / 101 * (0.735 - 0.7))
+    assert (later.limit, later.reached) == (0.05, False)
+
+
+def test_a_run_from_before_there_was_a_direct_transport_says_nothing_of_it() -> None:
+    old = run(FULL, lambda cell: None if contender_of(cell) == DIRECT else by_system(cell))
+    found = EXPERIMENT.findings(old)
+    assert not [one.text for one in found.claims if "direct" in one.text]
+    assert claim(found.claims, "CMD at the pc, polled").value == pytest.approx(2.0)
+    assert found.grids[0].columns[-1] == "sd, RMPA / classic"
 
 
 def test_two_rounds_say_nothing() -> None:
@@ -169,18 +189,14 @@ def test_two_rounds_say_nothing() -> None:
 def test_table_1_has_the_papers_figures_beside_ours() -> None:
     grids = EXPERIMENT.findings(run(FULL, by_system)).grids
     polled, event = grids
-    assert polled.columns[1:7] == (
-        "mean, RMPA",
-        "mean, classic",
-        "mean, classic, nodelay off",
-        "sd, RMPA",
-        "sd, classic",
-        "sd, classic, nodelay off",
-    )
+    shown = ("RMPA", "RMPA direct", "classic", "classic, nodelay off")
+    assert polled.columns[1:9] == tuple(f"{what}, {one}" for what in ("mean", "sd") for one in shown)
+    assert polled.columns[9:] == ("sd, RMPA / classic", "sd, RMPA direct / classic")
     rows = {row[0]: row[1:] for row in polled.rows}
-    assert rows["Command Order"][3:5] == ("0.603", "0.3015")
-    assert rows["Command Order, in the paper"] == ("99.9", "99.9", "", "0.5059", "0.2724", "", "1.86")
-    assert rows["Control Computation Delay, in the paper"][:2] == ("61.3", "103.8")
+    assert rows["Command Order"][4:7] == ("0.603", "0.3166", "0.3015")
+    assert [ratio.split()[0] for ratio in rows["Command Order"][8:]] == ["2", "1.05"]
+    assert rows["Command Order, in the paper"] == ("99.9", "", "99.9", "", "0.5059", "", "0.2724", "", "1.86", "")
+    assert rows["Control Computation Delay, in the paper"][:3] == ("61.3", "", "103.8")
     assert all("paper" not in row[0] for row in event.rows)
     assert all(len(row) == len(grid.columns) for grid in grids for row in grid.rows)
 
@@ -189,8 +205,8 @@ def test_the_figures_show_each_round_after_the_other() -> None:
     polled, event = EXPERIMENT.findings(run(FULL, by_system)).figures
     assert polled.name != event.name
     cmd, _, delay = polled.panels
-    assert {series.system for series in cmd.series} == {"classic", "rmpa"}
-    assert [len(series.x) for series in cmd.series] == [400, 400]
+    assert [series.system for series in cmd.series] == ["classic", "rmpa", "direct"]
+    assert [len(series.x) for series in cmd.series] == [400, 400, 400]
     assert delay.series[0].y[0] == pytest.approx(60.0)
     assert len(delay.series[0].y) == 404
 

@@ -41,8 +41,8 @@ def measured(rows: Sequence[tuple[Value, ...]], restarted: int = 0, **moments: i
     return Measured(tables, {"by_hand": restarted, "rate": RATE})
 
 
-def cell(scenario: str, system: str = "rmpa", client: str = "roscpp") -> Cell:
-    return Cell("failure", {"system": system, "client": client, "scenario": scenario, "round": 1})
+def cell(scenario: str, system: str = "rmpa", client: str = "roscpp", **more: Value) -> Cell:
+    return Cell("failure", {"system": system, **more, "client": client, "scenario": scenario, "round": 1})
 
 
 def outcome_of(key: str, found: list[FlowLosses]) -> FlowLosses:
@@ -61,7 +61,8 @@ def test_each_flow_is_noted_by_a_node_that_there_is() -> None:
 
 def test_both_systems_take_turns_and_without_cables_none_is_cut() -> None:
     settings = [one.settings for one in EXPERIMENT.cells(Plan())]
-    assert [one["system"] for one in settings] == ["classic", "rmpa"] * (len(settings) // 2)
+    turns = [("classic", None), ("rmpa", None), ("rmpa", "direct")]
+    assert [(one["system"], one.get("transport")) for one in settings] == turns * (len(settings) // 3)
     assert {one["scenario"] for one in settings} == set(SCENARIOS)
     loopback = EXPERIMENT.cells(Plan(bed="loopback", clients=("own",), link=""))
     assert {one.settings["scenario"] for one in loopback} == {"master", "host"}
@@ -149,6 +150,18 @@ def test_a_message_lost_elsewhere_breaks_the_claim() -> None:
     ours = measured(run(("state-joystick", range(200, 203))), on=300 * STEP, on_up=310 * STEP)
     found = claims((cell("host"), ours))["RMPA, any failure: messages lost on flows of other hosts"]
     assert (found.value, found.reached) == (3, False)
+
+
+def test_the_direct_transport_has_claims_and_a_timeline_of_its_own() -> None:
+    lost = measured(run(("state-joystick", range(200, 203))), on=300 * STEP, on_up=310 * STEP)
+    told = Measured(lost.tables, {**lost.facts, "direct": 5, "connections": 6})
+    kept = measured(run(), on=300 * STEP, on_up=310 * STEP)
+    found = EXPERIMENT.findings(Results(Plan(), [(cell("host"), kept), (cell("host", transport="direct"), told)]))
+    values = {claim.text: claim.value for claim in found.claims}
+    assert values["RMPA, any failure: messages lost on flows of other hosts"] == 0
+    assert values["RMPA direct, any failure: messages lost on flows of other hosts"] == 3
+    assert [panel.series[0].system for panel in found.figures[0].panels] == ["rmpa", "direct"]
+    assert any("5 of 6 connections between hosts" in note for note in found.notes)
 
 
 def test_of_our_own_nodes_classic_ros_is_not_judged() -> None:

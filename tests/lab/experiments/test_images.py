@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 
 from lab.bed.plan import Plan
-from lab.experiments.images import EXPERIMENT, bits, bytes_per_second
-from lab.experiments.model import Cell, Measured, Results
+from lab.experiments.contenders import CLASSIC, DIRECT, MIXED, RMPA, contender_of
+from lab.experiments.images import EXPERIMENT, bytes_per_second
+from lab.experiments.model import Cell, Measured, Results, Value
 from lab.findings import Claim, Findings
 from lab.frames import frame
 
@@ -14,8 +15,8 @@ MB = 1024 * 1024
 PERIOD = 10_000_000
 
 
-def cell(system: str, turn: int = 1, client: str = "roscpp") -> Cell:
-    return Cell("images", {"system": system, "client": client, "nodelay": True, "round": turn})
+def cell(system: str, turn: int = 1, client: str = "roscpp", **more: Value) -> Cell:
+    return Cell("images", {"system": system, **more, "client": client, "nodelay": True, "round": turn})
 
 
 def measured(beside_ms: list[float], *, link: str = "100mbit", image_ms: float = 90.0) -> Measured:
@@ -40,19 +41,9 @@ def claims(*cells: tuple[Cell, Measured]) -> dict[str, Claim]:
 
 
 def test_each_round_another_system_begins() -> None:
-    settings = [one.settings for one in EXPERIMENT.cells(Plan())]
-    assert [one["system"] for one in settings if one["client"] == "rospy"] == ["classic", "rmpa", "rmpa", "classic"]
-    assert len(EXPERIMENT.cells(Plan(size="short"))) == 2
-
-
-@pytest.mark.parametrize(("link", "rate"), [("100mbit", 1e8), ("2.5gbit", 2.5e9), ("800kbit", 8e5), ("", None)])
-def test_a_rate_is_read_as_tc_writes_it(link: str, rate: float | None) -> None:
-    assert bits(link) == rate
-
-
-def test_what_is_no_rate_is_refused() -> None:
-    with pytest.raises(ValueError, match="'fast' is no rate such as 100mbit"):
-        bits("fast")
+    cells = [contender_of(one) for one in EXPERIMENT.cells(Plan()) if one.settings["client"] == "rospy"]
+    assert cells == [CLASSIC, RMPA, DIRECT, MIXED, RMPA, DIRECT, MIXED, CLASSIC]
+    assert [contender_of(one) for one in EXPERIMENT.cells(Plan(size="short"))] == [CLASSIC, RMPA, DIRECT]
 
 
 def test_only_images_that_came_in_the_span_count() -> None:
@@ -72,6 +63,18 @@ def test_the_claims_hold_a_percentile_of_all_rounds() -> None:
     assert found["commands beside images, p99, classic, roscpp"].value == pytest.approx(20.0)
     assert found["images' share of the cable, RMPA, roscpp"].value == pytest.approx(8 * MB / 0.09 / 1e8, rel=1e-3)
     assert all(claim.reached for claim in found.values())
+
+
+def test_commands_beside_direct_images_are_held_against_both_relayed() -> None:
+    found = claims(
+        (cell("rmpa"), measured([0.5] * 985 + [1.0] * 15)),
+        (cell("rmpa", transport="direct"), measured([5.0] * 1000)),
+        (cell("rmpa", transport="mixed"), measured([0.5] * 985 + [1.2] * 15)),
+    )
+    text = "commands beside images, p99, roscpp: images direct, commands relayed / both relayed"
+    assert found[text].value == pytest.approx(1.2)
+    assert found[text].reached is False
+    assert found["commands beside images, p99, RMPA, roscpp"].value == pytest.approx(1.0)
 
 
 def test_of_few_commands_nothing_is_claimed() -> None:
@@ -101,7 +104,7 @@ def test_a_message_that_came_twice_counts_once() -> None:
     doubled = Measured(
         {**told.tables, "commands": frame(told.tables["commands"].columns, [*rows, rows[-1]])}, told.facts
     )
-    beside = findings((cell("rmpa"), doubled)).grids[0].rows[3]
+    beside = findings((cell("rmpa"), doubled)).grids[0].rows[1]
     assert beside[8] == "1000"
 
 

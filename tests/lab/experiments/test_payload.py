@@ -47,7 +47,9 @@ def test_sizes_double_from_1_kb_to_1_mb() -> None:
     assert [name(size) for size in SIZES["full"]][::5] == ["1 KB", "32 KB", "1 MB"]
 
 
-@pytest.mark.parametrize(("link", "bits"), [("100mbit", 1e8), ("1gbit", 1e9), ("500Kbit", 5e5), ("2.5mbit", 2.5e6)])
+@pytest.mark.parametrize(
+    ("link", "bits"), [("100mbit", 1e8), ("1gbit", 1e9), ("500Kbit", 5e5), ("2.5mbit", 2.5e6), ("800bit", 800)]
+)
 def test_links_are_written_as_tc_has_them(link: str, bits: float) -> None:
     assert bits_per_second(link) == bits
 
@@ -73,7 +75,7 @@ def test_only_batches_of_a_thousand_are_cut_short() -> None:
 
 
 def test_the_plans_link_comes_first_and_none_is_beside_it() -> None:
-    assert [(cell.settings["link"], cell.settings["batch"]) for cell in EXPERIMENT.cells(FULL)][::2] == [
+    assert [(cell.settings["link"], cell.settings["batch"]) for cell in EXPERIMENT.cells(FULL)][::3] == [
         ("100mbit", 100),
         ("100mbit", 1000),
         (UNSHAPED, 100),
@@ -86,25 +88,39 @@ def test_the_plans_link_comes_first_and_none_is_beside_it() -> None:
 
 def test_a_line_is_found_as_it_was_made() -> None:
     found = EXPERIMENT.findings(run(FULL, lambda _: made(straight)))
-    assert len(found.claims) == 4  # two batches, through medians and all samples; the unshaped link is beside them
-    assert [claim.value for claim in found.claims] == pytest.approx([1.0] * 4)
+    # Two batches, through medians and all samples; on the unshaped link two sizes of the direct transport.
+    assert len(found.claims) == 4 + 2
+    assert [claim.value for claim in found.claims] == pytest.approx([1.0] * 6)
     assert all(claim.reached for claim in found.claims)
     lines = found.grids[-1]
     assert {row[5:] for row in lines.rows} == {("0.5", "80", "102", "1.00000")}
-    assert len(lines.rows) == 2 * 2 * 3
+    assert len(lines.rows) == 3 * 2 * 3
 
 
-def test_only_rmpa_is_claimed() -> None:
+def test_only_rmpas_line_is_claimed() -> None:
     def measure(cell: Cell) -> Measured:
         bent = cell.settings["system"] == "classic"
         return made(lambda kb, number: 5000.0 if bent else straight(kb, number))
 
-    assert all(claim.reached for claim in EXPERIMENT.findings(run(FULL, measure)).claims)
+    claims = EXPERIMENT.findings(run(FULL, measure)).claims
+    assert all(claim.reached for claim in claims if "R²" in claim.text)
+
+
+def test_the_direct_transport_is_held_against_classic_ros_where_the_wire_hides_nothing() -> None:
+    def measure(cell: Cell) -> Measured:
+        slower = 1.1 if cell.settings.get("transport") == "direct" else 1.0
+        return made(lambda kb, number: slower * straight(kb, number))
+
+    claims = [one for one in EXPERIMENT.findings(run(FULL, measure)).claims if "direct" in one.text]
+    assert ["64 KB" in one.text for one in claims] == [True, False]
+    assert all("not shaped" in one.text for one in claims)
+    assert [one.value for one in claims] == pytest.approx([1.1, 1.1])
+    assert not any(one.reached for one in claims)
 
 
 def test_a_bend_is_seen() -> None:
     found = EXPERIMENT.findings(run(FULL, lambda _: made(lambda kb, _number: 500.0 + 0.08 * kb * kb)))
-    assert {claim.reached for claim in found.claims} == {False}
+    assert {claim.reached for claim in found.claims if "R²" in claim.text} == {False}
 
 
 def test_one_late_message_is_in_all_samples_and_not_in_the_medians() -> None:
@@ -112,7 +128,7 @@ def test_one_late_message_is_in_all_samples_and_not_in_the_medians() -> None:
         return straight(kb, number) + (2e6 if number == 3 and kb == 1 else 0.0)
 
     claims = EXPERIMENT.findings(run(FULL, lambda _: made(late))).claims
-    reached = {claim.text.rpartition(" ")[2]: claim.reached for claim in claims}
+    reached = {claim.text.rpartition(" ")[2]: claim.reached for claim in claims if "R²" in claim.text}
     assert reached == {"medians": True, "samples": False}
 
 
@@ -151,6 +167,7 @@ def test_the_figure_has_every_message_and_a_line_of_the_same_label() -> None:
 
 def test_what_failed_is_left_out() -> None:
     cells = [cell for cell in EXPERIMENT.cells(FULL) if cell.settings["system"] == "rmpa"]
+    assert {cell.settings.get("transport") for cell in cells} == {None, "direct"}
     found = EXPERIMENT.findings(Results(FULL, [(cell, made(straight)) for cell in cells]))
-    assert all("classic" not in head for grid in found.grids[:-1] for head in grid.columns[:-1])
+    assert all("classic" not in head for grid in found.grids[:-1] for head in grid.columns[:-2])
     assert EXPERIMENT.findings(Results(FULL, [])).figures == ()

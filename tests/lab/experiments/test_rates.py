@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from lab.bed.plan import Plan
+from lab.experiments.contenders import CLASSIC, DIRECT, RMPA, contender_of
 from lab.experiments.model import Cell, Measured, Results
 from lab.experiments.rates import EXPERIMENT, PAPER
 from lab.frames import frame
@@ -56,9 +57,10 @@ def test_the_full_run_has_the_papers_batches_and_ten_thousand_beyond() -> None:
 
 
 def test_systems_take_turns_and_another_one_begins_each_round() -> None:
-    cells = [cell.settings for cell in EXPERIMENT.cells(FULL)]
-    assert [cell["system"] for cell in cells if cell["round"] == 1][:2] == ["rmpa", "classic"]
-    assert [cell["system"] for cell in cells if cell["round"] == 2] == ["classic", "rmpa"]
+    planned = EXPERIMENT.cells(FULL)
+    assert [contender_of(cell) for cell in planned][:3] == [RMPA, DIRECT, CLASSIC]
+    assert [contender_of(cell) for cell in planned if cell.settings["round"] == 2] == [DIRECT, CLASSIC, RMPA]
+    cells = [cell.settings for cell in planned]
     beside = [cell for cell in cells if cell.get("relays") or cell.get("nodelay") is False]
     assert [cell["round"] for cell in beside] == [1, 1]
 
@@ -92,6 +94,22 @@ def test_relays_are_the_bound_that_rmpa_must_not_exceed() -> None:
     rows = rows_of(found.grids[0])
     assert rows["10 Hz", "classic"]["p50"] == "100"
     assert rows["10 Hz", "classic, two relays"]["p50"] == "400"
+
+
+def test_the_direct_transport_is_held_against_classic_ros_at_1_khz() -> None:
+    counts = {**LADDER, 1000: 500}  # in two rounds 1000, which p99 needs
+
+    def measure(cell: Cell) -> Measured:
+        slower = 20 if contender_of(cell) == DIRECT else 0
+        return made(counts, lambda rate, number: ramp(2)(rate, number) + slower)
+
+    claims = {one.text: one for one in EXPERIMENT.findings(run(FULL, measure)).claims}
+    p50, p99 = (claims[f"{name} at 1 kHz, roscpp: RMPA direct / classic"] for name in ("p50", "p99"))
+    assert [p50.value, p99.value] == pytest.approx([320 / 300, 418 / 398])
+    assert (p50.reached, p99.reached) == (False, True)
+    assert claims["p95 less p50 at 1 kHz, roscpp: RMPA direct / classic"].value == pytest.approx(1.0)
+    old = Results(FULL, [one for one in run(FULL, measure).cells if contender_of(one[0]) != DIRECT])
+    assert not [one.text for one in EXPERIMENT.findings(old).claims if "direct" in one.text]
 
 
 def rows_of(grid: Grid) -> dict[tuple[str, str], dict[str, str]]:
@@ -128,12 +146,12 @@ def test_what_never_came_is_counted() -> None:
 def test_the_figure_has_every_message_the_percentiles_and_both_ends() -> None:
     (figure,) = EXPERIMENT.findings(run(FULL, lambda _: made(LADDER, ramp(1)))).figures
     boxes, curves, tails = figure.panels
-    assert {series.system for series in boxes.series} == {"classic", "rmpa"}
+    assert [series.system for series in boxes.series] == ["classic", "rmpa", "direct"]
     assert len(boxes.series[0].x) == 400 * len(LADDER)
     assert sorted(boxes.ticks.values()) == sorted(LADDER)
     medians = [series for series in curves.series if "p50" in series.label]
     assert all(series.y == [250.0] * len(LADDER) for series in medians)
-    assert len(tails.series) == 4
+    assert len(tails.series) == 6
     assert all(max(series.y) == 1.0 for series in tails.series)
 
 

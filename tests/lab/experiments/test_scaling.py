@@ -11,8 +11,8 @@ from lab.findings import Findings
 from lab.frames import frame
 
 
-def cell(system: str, modules: int) -> Cell:
-    return Cell("scaling", {"system": system, "client": "roscpp", "modules": modules, "round": 1})
+def cell(system: str, modules: int, **more: Value) -> Cell:
+    return Cell("scaling", {"system": system, **more, "client": "roscpp", "modules": modules, "round": 1})
 
 
 def measured(latency_ms: float, idle: list[float], linked: list[float | None], messages: int = 600) -> Measured:
@@ -45,8 +45,9 @@ RESULTS = Results(
 
 def test_the_number_of_modules_grows_and_the_systems_take_turns() -> None:
     settings = [one.settings for one in EXPERIMENT.cells(Plan())]
-    assert [one["modules"] for one in settings[::2]] == [2, 4, 8, 16, 32]
-    assert [one["system"] for one in settings] == ["classic", "rmpa"] * 5
+    assert [one["modules"] for one in settings[::3]] == [2, 4, 8, 16, 32]
+    turns = [("classic", None), ("rmpa", None), ("rmpa", "direct")]
+    assert [(one["system"], one.get("transport")) for one in settings] == turns * 5
     assert {one["client"] for one in settings} == {"roscpp"}
     assert {one.settings["client"] for one in EXPERIMENT.cells(Plan(clients=("rospy",)))} == {"rospy"}
 
@@ -84,6 +85,15 @@ def test_growth_is_held_against_what_classic_ros_did_on_the_same_machine() -> No
     assert growth.reached is False
     linked = [claim for claim in claims if "all linked" in claim.text]
     assert [claim.value for claim in linked] == [pytest.approx(0.4), pytest.approx(1.75)]
+
+
+def test_the_direct_transport_has_a_row_a_line_and_a_claim_of_its_own() -> None:
+    straight = [(cell("rmpa", n, transport="direct"), measured(0.2, [0.5], [0.3])) for n in (2, 32)]
+    found = EXPERIMENT.findings(Results(Plan(), [*RESULTS.cells, *straight]))
+    assert [row[1] for row in found.grids[0].rows[:3]] == ["classic", "RMPA", "RMPA direct"]
+    growth = next(claim for claim in found.claims if "RMPA direct" in claim.text)
+    assert growth.value == pytest.approx(0.5)
+    assert {series.system for series in found.figures[0].panels[0].series} == {"classic", "rmpa", "direct"}
 
 
 def test_of_few_messages_nothing_is_claimed() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import msgspec
@@ -9,12 +10,12 @@ import pytest
 
 from rmpa.observe.check import Check, CheckLevel
 from rmpa.observe.why.diagnosis import Diagnosis
-from rmpa.observe.why.services import ServiceAtClient, ServiceAtServer, diagnose_service
+from rmpa.observe.why.services import ServiceAtClient, ServiceAtServer, ServiceTransport, diagnose_service
 
 BEGIN = (Check("peer", CheckLevel.OK, "known"), Check("link", CheckLevel.OK, "linked"))
 THERE = ServiceAtServer(node="/arm", service="/move", rule="services.allow has '/**'")
 HERE = ServiceAtClient(wire="/move", offered=True, node="/arm", registered=True, answer="a/Move, md5 123", calls=3)
-ORDER = ("peer", "link", "server", "policy there", "offer", "shown", "graph", "answer", "calls")
+ORDER = ("peer", "link", "server", "policy there", "offer", "shown", "graph", "transport", "answer", "calls")
 
 
 def walk(
@@ -30,6 +31,33 @@ def test_a_service_that_can_be_called() -> None:
     assert tuple(stage.name for stage in found.stages) == ORDER
     assert found.stages[-1].text == "3 from here, 0 of them failed"
     assert msgspec.convert(msgspec.to_builtins(found), Diagnosis) == found
+
+
+TRANSPORTS: dict[str, tuple[ServiceTransport, CheckLevel, str]] = {
+    "by rule": (ServiceTransport(), CheckLevel.OK, 'transport is "relay" here'),
+    "direct": (ServiceTransport("auto", "rosrpc://10.0.0.1:9"), CheckLevel.OK, "direct: .* at rosrpc://10.0.0.1:9"),
+    "asked": (ServiceTransport("direct"), CheckLevel.OK, "robot is being asked"),
+    "auto": (
+        ServiceTransport("auto", "", "listening", "on loopback only"),
+        CheckLevel.OK,
+        "relayed.*listening.*only",
+    ),
+    "direct in vain": (
+        ServiceTransport("direct", "", "listening", "on loopback only"),
+        CheckLevel.WARN,
+        "although .*listening.*only",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", TRANSPORTS)
+def test_the_transport_is_named_with_its_condition(name: str) -> None:
+    transport, level, text = TRANSPORTS[name]
+    found = walk(replace(HERE, transport=transport))
+    assert found.flows
+    [stage] = [stage for stage in found.stages if stage.name == "transport"]
+    assert stage.level is level
+    assert re.search(text, stage.text)
 
 
 FAILURES: dict[str, tuple[ServiceAtClient, ServiceAtServer | None, str, str, str]] = {
@@ -89,8 +117,8 @@ def test_the_first_stage_that_fails(
     assert remedy in found.failed.remedy
 
 
-def test_every_stage_behind_the_link_can_fail_but_the_calls() -> None:
-    assert {stage for _, _, stage, _, _ in FAILURES.values()} == set(ORDER) - {"peer", "link", "calls"}
+def test_every_stage_behind_the_link_can_fail_but_transport_and_calls() -> None:
+    assert {stage for _, _, stage, _, _ in FAILURES.values()} == set(ORDER) - {"peer", "link", "transport", "calls"}
 
 
 def test_without_a_link_nothing_else_is_judged() -> None:

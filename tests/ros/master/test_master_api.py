@@ -211,6 +211,22 @@ def test_purge_leaves_a_service_of_another_node(master: Master) -> None:
     assert master.value("lookupService", "/x", "/s") == RPC + "1"
 
 
+def test_lookups_may_be_answered_for_each_caller(master: Master) -> None:
+    asked: list[tuple[str, str, str, str]] = []
+
+    def lookup(service: str, uri: str, caller: str, api: str) -> str:
+        asked.append((service, uri, caller, api))
+        return "rosrpc://10.0.0.7:9" if api == B else ""
+
+    master("registerService", "/server", "/s", RPC, A)
+    master("registerSubscriber", "/near", "/t", STRING, B)
+    master.api.service_lookup = lookup
+    assert master.value("lookupService", "/near", "/s") == "rosrpc://10.0.0.7:9"
+    assert master.value("lookupService", "/unknown", "/s") == RPC
+    assert master("lookupService", "/near", "/none").code == -1
+    assert asked == [("/s", RPC, "/near", B), ("/s", RPC, "/unknown", "")]
+
+
 def test_states_are_snapshots(master: Master) -> None:
     master("registerPublisher", "/p", "/t", STRING, A)
     state = master.api.state()

@@ -563,3 +563,55 @@ async def test_contract_depth_bounds_each_subscribers_queue() -> None:
     early.close()
     late.close()
     owner.close()
+
+
+async def test_a_held_subscriber_counts_as_connected_while_others_are_served(held: Owner) -> None:
+    links = [await held.subscriber(callerid=name) for name in ("/one", "/two")]
+    assert held.publication.callers == {"/one", "/two"}
+    seen: list[frozenset[str]] = []
+    held.publication._on_listeners = lambda: seen.append(held.publication.callers)
+    held.publication.describe(STRING)
+    assert set(seen) == {frozenset({"/one", "/two"})}, "not one of them seems to have left meanwhile"
+    assert held.publication.listeners == ("/one", "/two")
+    assert held.said == ["first"]
+    for link in links:
+        link.close()
+
+
+@pytest.mark.trap(42)
+async def test_one_subscriber_is_hung_up_on_and_the_others_stay(known: Owner) -> None:
+    links = {name: await known.subscriber(callerid=name) for name in ("/one", "/two")}
+    for link in links.values():
+        await link.header()
+    assert known.publication.hang_up("/one")
+    assert await links["/one"].ended()
+    assert known.publication.callers == {"/two"}
+    known.publication.publish_framed(frame_message(b"still"))
+    assert await links["/two"].message() == b"still"
+    assert not known.publication.hang_up("/one")
+    assert known.publication.hang_up("/two")
+    assert known.said == ["first", "last"]
+    for link in links.values():
+        link.close()
+
+
+@pytest.mark.trap(42)
+async def test_a_latched_message_that_was_had_by_another_path_is_not_sent_again() -> None:
+    owner = Owner(LATCHED)
+    owner.publication.publish_framed(frame_message(b"old"))
+    owner.publication.spare("/moved", owner.publication.latched)
+    links = {name: await owner.subscriber(callerid=name) for name in ("/moved", "/late")}
+    for link in links.values():
+        await link.header()
+    owner.publication.publish_framed(frame_message(b"new"))
+    assert await links["/late"].message() == b"old"
+    assert await links["/moved"].message() == b"new"
+    # Once only: it has missed nothing the next time.
+    links["/moved"].close()
+    await until(lambda: owner.publication.subscribers == 1)
+    again = await owner.subscriber(callerid="/moved")
+    await again.header()
+    assert await again.message() == b"new"
+    for link in (again, links["/late"]):
+        link.close()
+    owner.close()

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import asyncio
 from typing import TYPE_CHECKING
 
 import pytest
@@ -10,11 +11,11 @@ from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.node.subscription import Subscription
 from rmpa.ros.wire.tcpros import frame_message
-from rmpa.ros.wire.xmlrpc import RosFault
+from rmpa.ros.wire.xmlrpc import RosFault, RosReply
 from tests.ros.node.peers import STRING, RawSubscriber, until
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Awaitable
 
 
 @pytest.fixture
@@ -127,3 +128,51 @@ async def test_a_port_in_use_is_a_clear_error_and_leaves_nothing_open(node: Slav
     port = int(node.uri.rsplit(":", 1)[1].strip("/"))
     with pytest.raises(StartError, match=f"port {port} is already in use"):
         await SlaveNode("/q", "127.0.0.1", "", port=port).start()
+
+
+@pytest.mark.parametrize("other", [RosReply(1, "there", ["TCPROS", "10.0.0.1", 45225]), RosReply(0, "no", []), None])
+@pytest.mark.trap(42)
+async def test_the_answer_to_request_topic_may_take_its_time(node: SlaveNode, other: RosReply | None) -> None:
+    asked: list[str] = []
+    known = asyncio.Event()
+
+    async def decide() -> RosReply | None:
+        await known.wait()
+        return other
+
+    def request(caller: str) -> Awaitable[RosReply | None] | None:
+        asked.append(caller)
+        return None if caller == "/plain" else decide()
+
+    node.add_publication(Publication("/t", "/p", STRING, on_request=request))
+    own = await call_api(node.uri, "requestTopic", "/plain", "/t", [["TCPROS"]])
+    waiting = asyncio.create_task(call_api(node.uri, "requestTopic", "/viewer", "/t", [["TCPROS"]]))
+    await until(lambda: "/viewer" in asked)
+    # Meanwhile the node answers others.
+    assert await call_api(node.uri, "requestTopic", "/plain", "/t", [["TCPROS"]]) == own
+    known.set()
+    assert await waiting == (own if other is None else other)
+    # Topics that it does not have are not asked about.
+    assert (await call_api(node.uri, "requestTopic", "/viewer", "/none", [["TCPROS"]])).code != 1
+    assert asked == ["/plain", "/viewer", "/plain"]
+
+
+async def test_a_caller_that_leaves_while_it_waits_ends_the_wait(node: SlaveNode) -> None:
+    ended = asyncio.Event()
+    begun = asyncio.Event()
+
+    async def decide() -> RosReply | None:
+        begun.set()
+        try:
+            await asyncio.Event().wait()
+        finally:
+            ended.set()
+        return None
+
+    node.add_publication(Publication("/t", "/p", STRING, on_request=lambda _: decide()))
+    waiting = asyncio.create_task(call_api(node.uri, "requestTopic", "/s", "/t", [["TCPROS"]]))
+    async with asyncio.timeout(20.0):
+        await begun.wait()
+        waiting.cancel()
+        await node.close()
+        await ended.wait()

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
+from rmpa.bridge.messages import is_crossing_name
 from rmpa.core.contract import Transport, needs_agents
 from rmpa.core.errors import RemoteProtocolError
 
@@ -34,6 +35,8 @@ class Condition(StrEnum):
     """It is no topic whose publisher compares the names of its subscribers."""
     RELEASE = "release"
     """The peer's agent knows direct transport."""
+    AGENT = "agent"
+    """The peer's agent answers in time."""
     OFFERED = "offered"
     """The peer offers the topic or service now."""
     NODE = "node"
@@ -58,6 +61,9 @@ class Condition(StrEnum):
     """The local core can answer each node by itself: services only."""
 
 
+_PASSING: Final = frozenset({Condition.AGENT, Condition.NODE, Condition.REACHABLE, Condition.STABLE, Condition.LIMIT})
+
+
 @dataclass(frozen=True, slots=True)
 class Unmet:
     """A condition that does not hold, and the fact as text for the user."""
@@ -68,7 +74,7 @@ class Unmet:
     @property
     def lasting(self) -> bool:
         """Whether only a change that is noticed can make it hold, so that trying again by time is of no use."""
-        return self.condition not in {Condition.NODE, Condition.REACHABLE, Condition.STABLE, Condition.LIMIT}
+        return self.condition not in _PASSING
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +105,7 @@ def read_reply(value: object, node: str) -> Grant | Unmet:
     if isinstance(value, dict):
         port, probe = value.get("port"), value.get("probe", "")
         if isinstance(port, int) and not isinstance(port, bool) and 0 < port < 1 << 16 and isinstance(probe, str):
-            return Grant(port, node, probe if len(probe) <= _TEXT_MAX else "")
+            return Grant(port, node, probe if is_crossing_name(probe) else "")
         why, text = value.get("why"), value.get("text", "")
         if isinstance(why, str) and isinstance(text, str):
             return read_unmet(why, text)
@@ -107,12 +113,12 @@ def read_reply(value: object, node: str) -> Grant | Unmet:
 
 
 def read_unmet(why: str, text: str) -> Unmet:
-    """Read a condition that a peer names; one of a later release counts as ``RELEASE``."""
+    """Read a condition that a peer names; one of a later release counts as ``RELEASE``. The text is safe to show."""
     try:
         condition = Condition(why)
     except ValueError:
         condition = Condition.RELEASE
-    return Unmet(condition, text[:_TEXT_MAX])
+    return Unmet(condition, "".join(one if one.isprintable() else "�" for one in text[:_TEXT_MAX]))
 
 
 def reply_of(found: Grant | Unmet) -> dict[str, object]:

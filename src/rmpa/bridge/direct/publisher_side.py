@@ -79,6 +79,12 @@ class DirectGrants:
         self._count: dict[int, int] = {}
         self._refused: dict[Source, dict[int, None]] = {}
         """Peers to tell when something changes that made a source be refused (a dict, for its order)."""
+        self._refusals: dict[int, dict[Source, None]] = {}
+        """The same by peer, to bound them: a peer names the sources."""
+        self._away: dict[Source, dict[int, None]] = {}
+        """Peers to tell when a source that was granted to them is published again."""
+        self._unconfirmed: dict[int, set[tuple[Source, str]]] = {}
+        """The grants from before a peer's present link that it has not asked for again."""
 
     def __iter__(self) -> Iterator[tuple[Source, int, str, Granted]]:
         """Every grant: source, peer, subscriber."""
@@ -114,8 +120,21 @@ class DirectGrants:
         return unmet
 
     def refuse(self, peer: int, source: Source) -> None:
-        """Remember that a peer was refused a source, for ``Retry``."""
+        """Remember that a peer was refused a source, for ``Retry``; at most ``limits.DIRECT_MAX`` for each peer."""
+        refusals = self._refusals.setdefault(peer, {})
+        refusals[source] = None
         self._refused.setdefault(source, {})[peer] = None
+        if len(refusals) > limits.DIRECT_MAX:
+            self._forget_refusal(peer, next(iter(refusals)))
+
+    def refused(self, peer: int, source: Source, subscriber: str) -> list[GrantAction]:
+        """Refuse a subscriber: an earlier grant of it ends, and others that were refused may try again."""
+        self.refuse(peer, source)
+        if not self._drop(peer, source, subscriber):
+            return []
+        actions = [one for one in self.changed(source) if one.peer != peer]
+        self.refuse(peer, source)
+        return actions
 
     def grant(self, peer: int, source: Source, subscriber: str, granted: Granted) -> None:
         """Note a grant; one of the same subscriber is replaced."""
@@ -123,12 +142,33 @@ class DirectGrants:
         if (peer, subscriber) not in grants:
             self._count[peer] = self._count.get(peer, 0) + 1
         grants[peer, subscriber] = granted
+        self._confirm(peer, source, subscriber)
 
     def release(self, peer: int, source: Source, subscriber: str) -> list[GrantAction]:
         """Forget a grant that its subscriber does not use any more."""
         if not self._drop(peer, source, subscriber):
             return []
         return self.changed(source)
+
+    def has(self, peer: int, source: Source, subscriber: str) -> bool:
+        """Whether a subscriber has a grant."""
+        return (peer, subscriber) in self._grants.get(source, {})
+
+    def link_up(self, peer: int) -> None:
+        """Handle a peer's new link: it asks again for what it uses; see ``expire``."""
+        found = {(source, subscriber) for source, owner, subscriber, _ in self if owner == peer}
+        if found:
+            self._unconfirmed[peer] = found
+
+    def expire(self, peer: int) -> list[GrantAction]:
+        """End the grants that a peer has not asked for again since its last link began.
+
+        Its subscribers have gone while it had no link. Call this ``limits.DIRECT_ADOPT`` after ``link_up``.
+        """
+        actions: list[GrantAction] = []
+        for source, subscriber in sorted(self._unconfirmed.pop(peer, ())):
+            actions += self.release(peer, source, subscriber)
+        return actions
 
     def local_subscriber(self, topic: str, node: str) -> list[GrantAction]:
         """Withdraw the grants whose caller id a local subscriber of the topic has from now on."""
@@ -147,7 +187,10 @@ class DirectGrants:
 
     def changed(self, source: Source) -> list[GrantAction]:
         """Let the peers that were refused a source try again: something has changed."""
-        return [Retry(peer, source) for peer in self._refused.pop(source, {})]
+        peers = list(self._refused.get(source, ()))
+        for peer in peers:
+            self._forget_refusal(peer, source)
+        return [Retry(peer, source) for peer in peers]
 
     def withdraw(self, source: Source, unmet: Unmet) -> list[GrantAction]:
         """Withdraw every grant for a source."""
@@ -158,10 +201,25 @@ class DirectGrants:
         return [Withdraw(peer, source, "", unmet) for peer in peers]
 
     def gone(self, source: Source) -> None:
-        """Forget a source that is not offered any more; the peers learn it by the advertisement."""
+        """Forget the grants of a source whose publisher has left; see ``published``."""
         for peer, subscriber, _ in self.of(source):
             self._drop(peer, source, subscriber)
-        self._refused.pop(source, None)
+            self._away.setdefault(source, {})[peer] = None
+        while len(self._away) > limits.DIRECT_MAX:
+            del self._away[next(iter(self._away))]
+
+    def published(self, source: Source, uri: str) -> list[GrantAction]:
+        """Handle the registration of a publisher: what was granted for an earlier run of its node is withdrawn.
+
+        Args:
+            source: The source.
+            uri: The slave API of the node.
+        """
+        unmet = Unmet(Condition.NODE, f"{source.node} has restarted")
+        if any(granted.uri != uri for _, _, granted in self.of(source)):
+            return self.withdraw(source, unmet)
+        away = self._away.pop(source, {})
+        return [*(Withdraw(peer, source, "", unmet) for peer in away), *self.changed(source)]
 
     def judge_again(self, unmet: Callable[[Source, int, Granted], Unmet | None]) -> list[GrantAction]:
         """Withdraw the grants that the rules do not allow any more.
@@ -190,13 +248,17 @@ class DirectGrants:
     def peer_gone(self, peer: int) -> list[GrantAction]:
         """Forget a peer for good; names that it held are free."""
         freed: list[GrantAction] = []
-        for waiting in self._refused.values():
-            waiting.pop(peer, None)
+        for source in list(self._refusals.get(peer, ())):
+            self._forget_refusal(peer, source)
+        for peers in self._away.values():
+            peers.pop(peer, None)
+        self._away = {source: peers for source, peers in self._away.items() if peers}
         for source, owner, subscriber, _ in list(self):
             if owner == peer:
                 self._drop(peer, source, subscriber)
                 freed += self.changed(source)
         self._count.pop(peer, None)
+        self._unconfirmed.pop(peer, None)
         return freed
 
     def _drop(self, peer: int, source: Source, subscriber: str) -> bool:
@@ -206,4 +268,17 @@ class DirectGrants:
         if not grants:
             del self._grants[source]
         self._count[peer] -= 1
+        self._confirm(peer, source, subscriber)
         return True
+
+    def _forget_refusal(self, peer: int, source: Source) -> None:
+        peers, sources = self._refused.get(source, {}), self._refusals.get(peer, {})
+        peers.pop(peer, None)
+        sources.pop(source, None)
+        if not peers:
+            self._refused.pop(source, None)
+        if not sources:
+            self._refusals.pop(peer, None)
+
+    def _confirm(self, peer: int, source: Source, subscriber: str) -> None:
+        self._unconfirmed.get(peer, set()).discard((source, subscriber))

@@ -11,7 +11,7 @@ import msgspec
 
 from rmpa.bridge import limits
 from rmpa.bridge.messages import Source, check_contract, is_crossing_name
-from rmpa.core.contract import Contract  # noqa: TC001 - msgspec reads the annotation
+from rmpa.core.contract import Contract  # noqa: TC001 - msgspec reads the annotations
 from rmpa.core.errors import RemoteProtocolError
 
 OPEN: Final = "direct.open"

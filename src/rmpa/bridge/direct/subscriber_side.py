@@ -15,10 +15,11 @@ back.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, field
 from enum import Enum, auto
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
@@ -87,6 +88,8 @@ class DirectRoute:
         breaks: When its direct connections broke, monotonic seconds.
         answered_at: When it was last answered, monotonic seconds.
         missed: Messages that passed while it was moved, as far as they were seen.
+        held: Whether the peer may hold a grant for it.
+        asked_at: When the peer was last asked, monotonic seconds.
         stuck: Why its direct connection cannot be ended although it has to be relayed; empty: it can.
     """
 
@@ -103,6 +106,8 @@ class DirectRoute:
     breaks: deque[float] = field(default_factory=lambda: deque(maxlen=limits.DIRECT_BREAKS))
     answered_at: float = 0.0
     missed: int = 0
+    held: bool = False
+    asked_at: float = -math.inf
     stuck: str = ""
 
 
@@ -170,6 +175,14 @@ class Fallback:
     unmet: Unmet
 
 
+_UNSTABLE: Final = Unmet(
+    Condition.STABLE,
+    f"its direct connection broke {limits.DIRECT_BREAKS} times in {limits.DIRECT_BREAKS_SPAN:g} s",
+)
+_TWICE: Final = Unmet(
+    Condition.LATCHED, "it latches, and a move would deliver its last message twice: subscribe again"
+)
+_NO_LINK: Final = Unmet(Condition.OFFERED, "its module has no link")
 DirectAction = Ask | Probe | Decided | Move | HangUp | Release | Fallback
 
 
@@ -192,8 +205,12 @@ class DirectSubscriptions:
         self._of: dict[tuple[int, Source], dict[str, DirectKey]] = {}
         self._reached: set[tuple[int, int]] = set()
         """Peers and ports that were probed with success over the present link."""
+        self._unreached: dict[tuple[int, int], tuple[float, Unmet]] = {}
+        """Peers and ports that a probe did not reach, until when no other is made, and why. A firewall that drops
+        packets delays only the first subscriber of a node."""
         self._probing: set[tuple[int, int]] = set()
         self._timers: TimerQueue[DirectKey] = TimerQueue()
+        self._attempts = 0
 
     def __iter__(self) -> Iterator[tuple[DirectKey, DirectRoute]]:
         """Every subscriber with its state; changes during the iteration are allowed."""
@@ -228,12 +245,13 @@ class DirectSubscriptions:
             self._of.setdefault((key.peer, key.source), {})[key.subscriber] = key
             route.local = True  # so that it is asked for below
             route.path = Path.RELAY if self._is_relayed(key) else Path.NONE
+        warn = wanted is Transport.DIRECT and route.wanted is not wanted
         route.wanted = wanted
-        if unmet is not None:
-            if route.unmet == unmet:
-                return []
+        if unmet is not None and (route.unmet != unmet or not route.local):
             return self._relay(key, route, unmet, now, local=True)
-        return self._ask(key, route, now) if route.local else []
+        if unmet is None and route.local:
+            return self._ask(key, route, now)
+        return [Fallback(key, route.unmet)] if warn and route.unmet is not None else []
 
     def remove(self, key: DirectKey, *, hang_up: bool = True) -> list[DirectAction]:
         """Forget a subscriber: it has unsubscribed, or its source has left the local graph.
@@ -251,13 +269,14 @@ class DirectSubscriptions:
         if not names:
             del self._of[key.peer, key.source]
         self._timers.set(key, None)
-        held = self._held(route)
+        # While it is asked, the peer may grant it after a Release has passed: the response is released instead.
+        held = route.held and route.state is not DirectState.ASKING
         actions: list[DirectAction] = [Decided(key)]
         if hang_up and route.path is Path.DIRECT and route.endpoint is not None:
             actions.append(HangUp(key, route.endpoint))
         return [Release(key), *actions] if held else actions
 
-    # --- its requests -----------------------------------------------------------------------------------------------
+    # --- its requests --------------------------------------------------------------------------------------------
 
     def decision(self, key: DirectKey) -> Grant | Unmet | None:
         """The answer for a subscriber: a grant, or why it is relayed; ``None`` while it is not decided."""
@@ -268,8 +287,8 @@ class DirectSubscriptions:
             return route.grant
         return route.unmet if route.state is DirectState.RELAYED else None
 
-    def answered(self, key: DirectKey, endpoint: tuple[str, int] | None, now: float) -> None:
-        """Note what a subscriber's ``requestTopic`` was answered.
+    def answered(self, key: DirectKey, endpoint: tuple[str, int] | None, now: float) -> list[DirectAction]:
+        """Note what a subscriber's ``requestTopic`` was answered; it is moved if the decision has changed meanwhile.
 
         Args:
             key: The subscriber.
@@ -277,10 +296,24 @@ class DirectSubscriptions:
             now: Monotonic seconds.
         """
         route = self._routes.get(key)
-        if route is not None:
-            route.path = Path.DIRECT if endpoint is not None else Path.RELAY
-            route.endpoint, route.answered_at = endpoint, now
-            route.stranded, route.stuck = False, ""
+        if route is None:
+            return []
+        route.path = Path.DIRECT if endpoint is not None else Path.RELAY
+        route.endpoint, route.answered_at = endpoint, now
+        route.stranded, route.stuck = False, ""
+        return [Move(key)] if self.misplaced(key) else []
+
+    def misplaced(self, key: DirectKey) -> bool:
+        """Whether a subscriber's path differs from the decision, so that it has to be moved."""
+        route = self._routes.get(key)
+        if route is None or route.state not in {DirectState.DIRECT, DirectState.RELAYED}:
+            return False
+        if route.path is Path.NONE:
+            return route.stranded
+        if route.state is DirectState.RELAYED:
+            return route.path is Path.DIRECT
+        granted = route.grant.port if route.grant is not None else 0
+        return route.endpoint is None or route.endpoint[1] != granted
 
     def hung_up(self, key: DirectKey) -> None:
         """Note that a subscriber has no connection to the source any more, and waits for being called back."""
@@ -297,18 +330,39 @@ class DirectSubscriptions:
         latched = route.unmet is not None and route.unmet.condition is Condition.LATCHED
         return self._ask(key, route, now) if latched else []
 
+    def arrived(self, key: DirectKey, now: float) -> list[DirectAction]:
+        """Note that a subscriber is connected to the proxy; roscpp connects again without asking again."""
+        route = self._routes.get(key)
+        if route is None or route.path is not Path.NONE:
+            return []
+        route.path, route.stranded = Path.RELAY, False
+        return self._direct(key, route, now) if route.state is DirectState.DIRECT else []
+
     # --- the peer ---------------------------------------------------------------------------------------------------
 
     def replied(self, key: DirectKey, attempt: int, found: Grant | Unmet, now: float) -> list[DirectAction]:
-        """Take the response to ``Ask``; one to an earlier attempt is ignored."""
+        """Take the response to ``Ask``; a grant that is not needed any more is released.
+
+        ``Condition.AGENT`` means that no response came: the peer may hold a grant all the same.
+        """
         route = self._routes.get(key)
-        if route is None or route.state is not DirectState.ASKING or route.attempt != attempt:
-            return []
+        if route is None:
+            return [Release(key)] if isinstance(found, Grant) else []
+        if route.state is not DirectState.ASKING or route.attempt != attempt:
+            # While it is asked again, or has a later grant, a Release would end that one.
+            if route.state is not DirectState.RELAYED or not isinstance(found, Grant):
+                return []
+            route.held = False
+            return [Release(key)]
         if isinstance(found, Unmet):
+            route.held = found.condition is Condition.AGENT
             return self._relay(key, route, found, now)
         route.grant = found
         if (key.peer, found.port) in self._reached:
             return self._direct(key, route, now)
+        until, unmet = self._unreached.get((key.peer, found.port), (now, None))
+        if unmet is not None and now < until:
+            return self._relay(key, route, unmet, now)
         self._enter(route, DirectState.PROBING, now)
         if (key.peer, found.port) in self._probing:
             return []
@@ -327,15 +381,21 @@ class DirectSubscriptions:
         if (peer, port) not in self._probing:
             return []  # of an earlier link
         self._probing.remove((peer, port))
-        if not problem:
+        unmet = Unmet(Condition.REACHABLE, problem)
+        if problem:
+            self._unreached[peer, port] = (now + limits.DIRECT_RETRY, unmet)
+            if len(self._unreached) > limits.DIRECT_MAX:
+                del self._unreached[next(iter(self._unreached))]
+        else:
             self._reached.add((peer, port))
+            self._unreached.pop((peer, port), None)
         actions: list[DirectAction] = []
         for key, route in self:
             waits = route.state is DirectState.PROBING and key.peer == peer
             if not waits or route.grant is None or route.grant.port != port:
                 continue
             if problem:
-                actions += self._relay(key, route, Unmet(Condition.REACHABLE, problem), now)
+                actions += self._relay(key, route, unmet, now)
             else:
                 actions += self._direct(key, route, now)
         return actions
@@ -353,26 +413,35 @@ class DirectSubscriptions:
         actions: list[DirectAction] = []
         for name, route in self.of(peer, source):
             key = DirectKey(peer, source, name)
-            if subscriber not in {"", name} or not self._held(route):
-                continue
-            if route.grant is not None:
-                self._reached.discard((peer, route.grant.port))
-            route.grant = None
-            if unmet.condition is Condition.NODE:
+            if subscriber not in {"", name} or route.grant is None:
+                continue  # without a grant: the response to the last request comes later, and counts
+            self._reached.discard((peer, route.grant.port))
+            route.grant, route.held = None, False
+            route.breaks.append(now)
+            if unmet.condition is not Condition.NODE:
+                actions += self._relay(key, route, unmet, now)
+            elif self._unstable(route, now):
+                actions += self._relay(key, route, _UNSTABLE, now)
+            else:
                 actions += self._hang_up(key, route)
                 actions += self._ask(key, route, now)
-            else:
-                actions += self._relay(key, route, unmet, now)
         return actions
 
     def retry(self, peer: int, source: Source, now: float) -> list[DirectAction]:
-        """Ask again for the subscribers of a source that the peer refused: something has changed there."""
-        return [
-            action
-            for name, route in self.of(peer, source)
-            if route.state is DirectState.RELAYED and not route.local
-            for action in self._ask(DirectKey(peer, source, name), route, now)
-        ]
+        """Ask again for the subscribers of a source that the peer refused: something has changed there.
+
+        Each is asked for at most once in ``limits.DIRECT_RETRY_PAUSE``.
+        """
+        actions: list[DirectAction] = []
+        for name, route in self.of(peer, source):
+            if route.state is not DirectState.RELAYED or route.local or _waits(route):
+                continue
+            key, due = DirectKey(peer, source, name), route.asked_at + limits.DIRECT_RETRY_PAUSE
+            if now < due:
+                self._timers.set(key, due)
+            else:
+                actions += self._ask(key, route, now)
+        return actions
 
     def broken(self, key: DirectKey, now: float) -> list[DirectAction]:
         """Handle a direct connection that is gone although its subscriber and its source are still there."""
@@ -383,13 +452,16 @@ class DirectSubscriptions:
         if route.grant is not None:
             self._reached.discard((key.peer, route.grant.port))
         route.breaks.append(now)
-        many = len(route.breaks) == limits.DIRECT_BREAKS and now - route.breaks[0] < limits.DIRECT_BREAKS_SPAN
-        if many:
-            text = f"its direct connection broke {limits.DIRECT_BREAKS} times in {limits.DIRECT_BREAKS_SPAN:g} s"
-            actions = self._relay(key, route, Unmet(Condition.STABLE, text), now)
-            return [Release(key, broken=True), *(one for one in actions if not isinstance(one, Release))]
         route.grant = None
-        return [Release(key, broken=True), *self._ask(key, route, now)]
+        if route.state is DirectState.ASKING:
+            return []  # the response decides
+        released: list[DirectAction] = [Release(key, broken=True)] if route.held else []
+        route.held = False
+        if route.state is DirectState.RELAYED:
+            return [*released, Move(key)]
+        if self._unstable(route, now):
+            return [*released, *self._relay(key, route, _UNSTABLE, now)]
+        return [*released, *self._ask(key, route, now)]
 
     # --- links ------------------------------------------------------------------------------------------------------
 
@@ -403,19 +475,21 @@ class DirectSubscriptions:
                 be reached, or has left, and they are ended.
         """
         self._reached = {one for one in self._reached if one[0] != peer}
+        self._unreached = {one: why for one, why in self._unreached.items() if one[0] != peer}
         self._probing = {one for one in self._probing if one[0] != peer}
         actions: list[DirectAction] = []
         for key, route in self:
             if key.peer != peer:
                 continue
             self._timers.set(key, None)
-            route.attempt += 1
-            if crashed and route.state is DirectState.DIRECT:
+            route.attempt = 0
+            asked_again = route.state is not DirectState.RELAYED and route.path is Path.DIRECT
+            if crashed and (route.state is DirectState.DIRECT or asked_again):
                 continue
             actions += self._hang_up(key, route)
             if not (route.state is DirectState.RELAYED and route.local):
                 self._enter(route, DirectState.RELAYED, now)
-                route.unmet, route.grant = Unmet(Condition.OFFERED, "its module has no link"), None
+                route.unmet, route.grant = _NO_LINK, None
                 actions.append(Decided(key))
         return actions
 
@@ -439,16 +513,16 @@ class DirectSubscriptions:
         actions: list[DirectAction] = []
         for key in self._timers.take(now):
             route = self._routes.get(key)
-            if route is not None and route.state is DirectState.RELAYED:
+            if route is not None and route.state is DirectState.RELAYED and not route.local:
                 actions += self._ask(key, route, now)
         return actions
 
     # --- inside -----------------------------------------------------------------------------------------------------
 
     @staticmethod
-    def _held(route: DirectRoute) -> bool:
-        """Whether the peer may hold a grant for this subscriber."""
-        return route.state is not DirectState.RELAYED
+    def _unstable(route: DirectRoute, now: float) -> bool:
+        many = len(route.breaks) == limits.DIRECT_BREAKS
+        return many and now - route.breaks[0] < limits.DIRECT_BREAKS_SPAN
 
     @staticmethod
     def _enter(route: DirectRoute, state: DirectState, now: float) -> None:
@@ -457,9 +531,14 @@ class DirectSubscriptions:
             route.unmet, route.local = None, False
 
     def _ask(self, key: DirectKey, route: DirectRoute, now: float) -> list[DirectAction]:
+        if route.path is Path.RELAY and self._is_latched(key):
+            # Known before it is asked for: two modules with a subscriber of one name would free it for each other.
+            return self._relay(key, route, _TWICE, now)
         self._timers.set(key, None)
         self._enter(route, DirectState.ASKING, now)
-        route.attempt += 1
+        self._attempts += 1
+        route.attempt, route.asked_at = self._attempts, now
+        route.grant, route.held = None, True
         return [Ask(key, route.attempt)]
 
     def _hang_up(self, key: DirectKey, route: DirectRoute) -> list[DirectAction]:
@@ -472,8 +551,7 @@ class DirectSubscriptions:
 
     def _direct(self, key: DirectKey, route: DirectRoute, now: float) -> list[DirectAction]:
         if route.path is Path.RELAY and self._is_latched(key):
-            text = "it latches, and a move would deliver its last message twice: subscribe again"
-            return self._relay(key, route, Unmet(Condition.LATCHED, text), now)
+            return self._relay(key, route, _TWICE, now)
         self._enter(route, DirectState.DIRECT, now)
         if route.path is Path.DIRECT and route.grant is not None and route.endpoint is not None:
             same = route.endpoint[1] == route.grant.port
@@ -484,13 +562,19 @@ class DirectSubscriptions:
     def _relay(
         self, key: DirectKey, route: DirectRoute, unmet: Unmet, now: float, *, local: bool = False
     ) -> list[DirectAction]:
-        granted = route.grant is not None or (local and self._held(route))
+        granted, route.grant = route.grant is not None, None
+        if granted:
+            route.held = False
         self._enter(route, DirectState.RELAYED, now)
-        route.unmet, route.local, route.grant = unmet, local, None
-        route.attempt += 1
+        route.unmet, route.local, route.attempt = unmet, local, 0
         self._timers.set(key, None if unmet.lasting else now + limits.DIRECT_RETRY)
         actions: list[DirectAction] = [Release(key)] if granted else []
         if route.wanted is Transport.DIRECT and unmet.condition is not Condition.TRANSPORT:
             actions.append(Fallback(key, unmet))
         actions.append(Decided(key))
         return [*actions, Move(key)] if route.stranded or route.path is Path.DIRECT else actions
+
+
+def _waits(route: DirectRoute) -> bool:
+    """Whether a subscriber's connections broke repeatedly, so that only time makes it direct again."""
+    return route.unmet is not None and route.unmet.condition is Condition.STABLE

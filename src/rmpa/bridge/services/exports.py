@@ -174,6 +174,12 @@ class ServiceExports:
         """The count of services that are offered to no peer because there are too many (``limits.services``)."""
         return self._catalogue.beyond
 
+    def local(self, peer: int, wire: str) -> str | None:
+        """The local service that is offered to a peer by a name on the wire; ``None`` if there is none."""
+        known = self._catalogue.peer(peer)
+        service = known.by_wire.get(wire) if known is not None else None
+        return service if service is not None and service in self.offered else None
+
     def about(self, service: str) -> ServiceAbout | None:
         """What a service's server has said of it; ``None`` while that is unknown."""
         return self._about.get(service)

@@ -286,6 +286,28 @@ class ServiceImports:
         del self._peers[peer]
         return actions
 
+    def keep(self, peer: int, services: Collection[str]) -> list[ImportAction]:
+        """Remove the services of a peer without a link, except some shown ones that are called directly.
+
+        Args:
+            peer: The peer's number.
+            services: The names here of those that stay until ``gone``, or until the peer has a link again.
+        """
+        known = self._peers.get(peer)
+        if known is None:
+            return []
+        actions = self.link_down(peer)
+        known.give_up()
+        for wire, remote in list(known.entries.items()):
+            if not remote.shown or remote.name not in services:
+                actions += self._remove(peer, wire, f"{known.name} is gone")
+        return actions
+
+    def lost(self, peer: int, service: str, reason: str) -> list[ImportAction]:
+        """Remove a service that ``keep`` has kept: its server does not answer any more."""
+        remote = self.get(peer, service)
+        return self._remove(peer, remote.wire, reason) if remote is not None else []
+
     # --- what peers offer --------------------------------------------------------------------------------------
 
     def portions(self, peer: int, message: AdvertiseServices) -> Iterator[Change[ServiceOffer, str]]:

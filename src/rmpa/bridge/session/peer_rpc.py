@@ -12,7 +12,7 @@ import inspect
 import itertools
 import logging
 from collections.abc import Awaitable, Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+UNKNOWN_QUESTION: Final = "does not know the question"
+"""In the response of an agent of an earlier release."""
 Handler = Callable[["PeerSession", dict[str, Any]], Awaitable[object] | object]
 Listener = Callable[["PeerSession", dict[str, Any]], None]
 
@@ -141,7 +143,7 @@ class PeerRpc(Part):
     async def _respond(self, session: PeerSession, ask: Request) -> None:
         handler = self._handlers.get(ask.what)
         if handler is None:
-            text = f"this agent does not know the question {ask.what!r}"
+            text = f"this agent {UNKNOWN_QUESTION} {ask.what!r}"
             self._send(session, Response(ask.number, ok=False, error=text, remedy="install the same release on both"))
             return
         try:

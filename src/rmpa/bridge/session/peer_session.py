@@ -72,6 +72,11 @@ class PeerSession:
         return "127.0.0.1" if self.same_machine else self.link.remote_endpoint[0]
 
     @property
+    def own_address(self) -> str:
+        """The address at which the peer reaches the nodes of this module; see ``address``."""
+        return "127.0.0.1" if self.same_machine else self.link.local_address
+
+    @property
     def due(self) -> float | None:
         """When something kept for the absent peer expires next, monotonic seconds; ``None`` while it has a link."""
         return None if self.wait is None else self.away_since + self.wait

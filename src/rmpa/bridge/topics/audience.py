@@ -20,11 +20,22 @@ if TYPE_CHECKING:
 
 _GOAL: Final = "ActionGoal"
 _CANCEL: Final = "actionlib_msgs/GoalID"
+_STATUS: Final = "actionlib_msgs/GoalStatusArray"
+_ANSWERS: Final = ("ActionResult", "ActionFeedback")
 
 
 def is_watched(type_name: str) -> bool:
     """Whether publishers of this type check their listeners' names; judged by type, as topics can be remapped."""
     return type_name.endswith(_GOAL) or type_name == _CANCEL
+
+
+def compares_names(type_name: str) -> bool:
+    """Whether a topic is of an action, whose client compares the names in the headers of all five topics.
+
+    rospy's client wants one name as listener of goals and cancellations, and as publisher of status, result and
+    feedback; roscpp's leaves the last two out. So all have to come by the agents, which give a remote node one name.
+    """
+    return is_watched(type_name) or type_name == _STATUS or type_name.endswith(_ANSWERS)
 
 
 def audience(caller_ids: Iterable[str]) -> tuple[str, ...]:

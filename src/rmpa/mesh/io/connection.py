@@ -51,6 +51,8 @@ _SILENCE: Final = frozenset(
     {errno.ETIMEDOUT, errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ENETDOWN, errno.ECONNRESET, errno.EPIPE}
 )
 """Errors of a connection that the remote side gave up after a silence, or whose process died with bytes unread."""
+_ENDED_THERE: Final = frozenset({errno.ECONNRESET, errno.EPIPE})
+"""Errors of a connection that the remote kernel ended: by a reset, EPIPE after the end of the stream had come."""
 
 _ANSWERED: Final = -1
 """Takes the place of a probe's stamp."""
@@ -383,8 +385,8 @@ class Connection:
 
     def _lost(self, error: Exception | None) -> None:
         self.silent = isinstance(error, OSError) and error.errno in _SILENCE
-        reset = isinstance(error, OSError) and error.errno == errno.ECONNRESET
-        self.crashed = self._machine.state is ConnectionState.UP and (error is None or reset)
+        ended = error is None or (isinstance(error, OSError) and error.errno in _ENDED_THERE)
+        self.crashed = self._machine.state is ConnectionState.UP and ended
         reason = f"{self.name} closed the connection" if error is None else f"connection to {self.name} lost: {error}"
         self._machine.lost(reason)
 

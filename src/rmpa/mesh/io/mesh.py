@@ -268,7 +268,7 @@ class Mesh:
         link = self._links.pop(connection.id, None)
         if link is not None:
             link.silent = link.silent or connection.silent
-            link.crashed = connection.crashed
+            link.crashed = link.crashed or connection.crashed
             if discarded := link.discard():
                 self.counters.add("link.discarded", discarded)
             self._peering.link_down(link.id, reason, now, silent=link.silent)
@@ -322,7 +322,8 @@ class Mesh:
                 down = self._links.get(output.link_id, ended)
                 if down is not None:
                     down.silent = down.silent or replaced
-                    down.crashed = down.crashed or replaced
+                    # The link of a peer that restarted within its lease: its agent died, the host is there.
+                    down.crashed = down.crashed or replaced or output.cause is LinkDownCause.RESTARTED
                     down.use(None)
                     self._on_link_down(down, output)
             case LinkRefused():

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 from rmpa.core.open_files import remedy
 from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.observe.doctor.machine import judge_peer_clock
+from rmpa.observe.transport_text import fallbacks, stuck, subscriber_text
+from rmpa.observe.transport_text import remedy as remedy_for
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -58,6 +60,16 @@ def _agent(snapshot: Snapshot, version: str) -> Iterator[Check]:
         yield Check("peer", WARN, text, advice, where=here)
     for peer in snapshot.peers:
         yield from _peer(here, peer)
+    yield from _transport(snapshot)
+
+
+def _transport(snapshot: Snapshot) -> Iterator[Check]:
+    """Subscribers that are relayed although a contract says "direct", or are direct although they must not be."""
+    for topic in snapshot.topics:
+        for route in topic.routes:
+            for one in (*stuck(route), *fallbacks(route)):
+                text = f"of {route.peer}: {subscriber_text(one)}"
+                yield Check("transport", WARN, text, remedy_for(one), where=topic.name)
 
 
 def _unreachable(info: UnreachableInfo) -> Check:

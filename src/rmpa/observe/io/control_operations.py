@@ -68,10 +68,15 @@ class ControlOperations:
 
     def snapshot(self, args: Args) -> Snapshot:
         """``topics``: the only ones that are wanted, or ``None`` for everything."""
-        topics = args.get("topics")
-        if topics is not None and not isinstance(topics, list):
-            raise ConfigError("topics", f"{topics!r} is not a list of topics")
-        return self._snapshots.build(frozenset(map(str, topics)) if topics is not None else None)
+        return self._snapshots.build(_topics(args))
+
+    def snapshot_or_figures(self, args: Args) -> Snapshot | Awaitable[Snapshot]:
+        """As ``snapshot``; ``figures``: whether to ask the nodes of direct connections for theirs before."""
+        return self._with_figures(args) if args.get("figures") is True else self.snapshot(args)
+
+    async def _with_figures(self, args: Args) -> Snapshot:
+        await self._snapshots.sampler.settle(_topics(args))
+        return self.snapshot(args)
 
     async def ping(self, args: Args) -> PingReply:
         """``peer``: its name or GUID; ``count``: the number of pings."""
@@ -155,6 +160,18 @@ class ControlOperations:
         raise UnreachableError("linked peer", repr(peer), f"did you mean {similar}?" if similar else remedy)
 
 
+def _topics(args: Args) -> frozenset[str] | None:
+    """The argument ``topics``.
+
+    Raises:
+        ConfigError: It is no list.
+    """
+    topics = args.get("topics")
+    if topics is not None and not isinstance(topics, list):
+        raise ConfigError("topics", f"{topics!r} is not a list of topics")
+    return frozenset(map(str, topics)) if topics is not None else None
+
+
 def _request(args: Args, known: Collection[str]) -> str:
     """The argument ``what``: the name of a request to a peer.
 
@@ -184,7 +201,7 @@ class Operation:
 
 
 OPERATIONS: Final = (
-    Operation("snapshot", ControlOperations.snapshot, Snapshot),
+    Operation("snapshot", ControlOperations.snapshot_or_figures, Snapshot),
     Operation("ping", ControlOperations.ping, PingReply),
     Operation("why", ControlOperations.why, tuple[Diagnosis, ...]),
     Operation("reload", ControlOperations.reload, ReloadReply),

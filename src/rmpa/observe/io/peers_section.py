@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import msgspec
 
+from rmpa.observe.io.direct_section import direct_counts
 from rmpa.observe.shared_address import mark_shared_addresses
 from rmpa.observe.snapshot import BoundInfo, LinkInfo, PeerInfo
 from rmpa.runtime.event_loop import yield_to_data
@@ -70,7 +71,10 @@ class PeersSection:
                 ours = self._bridge.topics.exports.topics_for(session.peer)
                 yield_to_data()
                 beyond = self._beyond(session)
-                info = msgspec.structs.replace(info, topics_in=theirs, topics_out=ours, beyond=beyond)
+                to_it, from_it = direct_counts(self._bridge, session.peer)
+                info = msgspec.structs.replace(
+                    info, topics_in=theirs, topics_out=ours, beyond=beyond, direct_in=to_it, direct_out=from_it
+                )
             infos.append(info)
         relayed = self._relayed({info.instance: info for info in infos})
         infos = [info for info in infos if info.instance not in {one.instance for one in relayed}]

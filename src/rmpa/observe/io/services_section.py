@@ -49,6 +49,13 @@ class ServicesSection:
             type=about.type if about else "",
             md5=about.md5 if about else "",
             callers=callers,
+            wanted=self._services.rules.transport(service).value,
+            direct_callers=tuple(
+                sorted(
+                    self._services.imports.peer_name(peer)
+                    for peer in self._services.direct_exports.grants.peers(service)
+                )
+            ),
             crosses=decision.allowed,
             policy=decision.rule,
             **_figures(self._services.served.get(service)),
@@ -76,8 +83,21 @@ class ServicesSection:
             crosses=decision.allowed,
             policy=decision.rule,
             hidden=remote.hidden,
+            **self._transport(peer, remote),
             **figures,
         )
+
+    def _transport(self, peer: int, remote: RemoteService) -> dict[str, Any]:
+        """The fields of a peer's service that say by which transport it is called."""
+        wanted = self._services.rules.transport(remote.name).value
+        if not remote.shown:
+            return {"wanted": wanted}
+        direct = self._services.direct_imports.answer(peer, remote.name)
+        if direct is not None:
+            return {"wanted": wanted, "transport": "direct", "address": direct.uri, "lookups": direct.lookups}
+        found = {"wanted": wanted, "transport": "relay"}
+        unmet = self._services.direct_imports.unmet(peer, remote.name)
+        return found if unmet is None else found | {"condition": unmet.condition.value, "relayed_because": unmet.text}
 
 
 def _figures(stats: CallStats | None) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import psutil
 
 import rmpa
 from rmpa.observe import limits
+from rmpa.observe.io.direct_section import DirectSection
 from rmpa.observe.io.peers_section import PeersSection, own_text
 from rmpa.observe.io.services_section import ServicesSection
 from rmpa.observe.io.topics_section import TopicsSection, unreachable_infos
@@ -82,7 +83,11 @@ class SnapshotBuilder:
         self._cpu: float | None = None
         self._cpu_known = time.monotonic()
         self._peers = PeersSection(sources.bridge, sources.limit_reports)
-        self._topics = TopicsSection(settings, sources.core, sources.bridge, sources.clocks)
+        self.direct = DirectSection(sources.core, sources.bridge)
+        """What is known of direct transport."""
+        self.sampler = self.direct.sampler
+        """The figures of direct connections, which are read only while somebody looks."""
+        self._topics = TopicsSection(settings, sources.core, sources.bridge, sources.clocks, self.direct)
         self._services = ServicesSection(sources.services)
 
     @property

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.topics.exports import LocalSource
     from rmpa.bridge.topics.remote_topic import RemoteTopic
     from rmpa.config.settings import Settings
+    from rmpa.observe.io.direct_section import DirectSection
     from rmpa.observe.io.peer_clocks import PeerClocks
     from rmpa.ros.core.api import Core
 
@@ -64,12 +65,16 @@ class TopicsSection:
         core: Its ROS core.
         bridge: Its bridge.
         clocks: Those of its peers.
+        direct: Reads what is known of direct transport.
     """
 
-    def __init__(self, settings: Settings, core: Core, bridge: Bridge, clocks: PeerClocks) -> None:
+    def __init__(
+        self, settings: Settings, core: Core, bridge: Bridge, clocks: PeerClocks, direct: DirectSection
+    ) -> None:
         self._core = core
         self._clocks = clocks
         self._bridge = bridge
+        self._direct = direct
         self._clock = SystemClock()
         self.reload(settings)
 
@@ -185,6 +190,8 @@ class TopicsSection:
             limit="nodes" if entry.crowded else "",
             **_events(flow.watch if flow is not None else past, now),
         )
+        own = self._contracts.of(entry.topic, entry.type)
+        info = self._direct.inbound(info, at.peer, source, entry.topic, own, now)
         if flow is None:
             return info
         return msgspec.structs.replace(
@@ -206,9 +213,16 @@ class TopicsSection:
                 continue
             yield_to_data()
             yield source, None, list(self._bridge.topics.mismatches(source))
-            for peer in list(self._bridge.topics.exports.flowing(source)):
+            flowing = list(self._bridge.topics.exports.flowing(source))
+            for peer in flowing:
                 contract = self._bridge.topics.exports.contract(source, peer)
-                yield source, self._export(source, local, peer, names.get(peer, ""), contract), []
+                info = self._export(source, local, peer, names.get(peer, ""), contract)
+                yield source, self._direct.outbound(info, peer, source), []
+            for peer in self._direct.granted(source):
+                session = self._bridge.sessions.get(peer)
+                if peer not in flowing and session is not None:
+                    info = self._export(source, local, peer, session.link.name, None)
+                    yield source, self._direct.outbound(msgspec.structs.replace(info, state="idle"), peer, source), []
             for peer, away in self._bridge.topics.exports.absent(source).items():
                 if peer not in names or self._bridge.topics.exports.contract(source, peer) is None:
                     yield source, self._away(self._export(source, local, peer, "", away), peer), []

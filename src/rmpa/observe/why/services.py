@@ -2,7 +2,7 @@
 
 The stages::
 
-    peer ─ link ─ server ─ policy there ─ offer ─ shown ─ graph ─ answer ─ calls
+    peer ─ link ─ server ─ policy there ─ offer ─ shown ─ graph ─ transport ─ answer ─ calls
 """
 
 from __future__ import annotations
@@ -42,6 +42,23 @@ class ServiceAtServer(msgspec.Struct, frozen=True, kw_only=True):
 
 
 @dataclass(frozen=True, slots=True)
+class ServiceTransport:
+    """How the nodes of a module call a service of a peer.
+
+    Args:
+        wanted: The transport that the module's rules ask for.
+        address: Where they call the server directly; empty if the calls are relayed.
+        condition: The condition of direct transport that does not hold, in one word; empty if none is known.
+        problem: That condition's fact.
+    """
+
+    wanted: str = "relay"
+    address: str = ""
+    condition: str = ""
+    problem: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class ServiceAtClient:
     """What the clients' agent knows of a service of one peer.
 
@@ -51,6 +68,7 @@ class ServiceAtClient:
         node: Its node at the peer.
         hidden: Why it is not shown here, or empty.
         registered: Whether the local core sends clients to it.
+        transport: How the nodes of this module call it.
         answer: The type and md5 sum that a probe brought; empty if it was refused.
         refusal: Why the probe was refused, or empty.
         calls: The number of calls from here.
@@ -64,6 +82,7 @@ class ServiceAtClient:
     node: str = ""
     hidden: str = ""
     registered: bool = False
+    transport: ServiceTransport = ServiceTransport()
     answer: str = ""
     refusal: str = ""
     calls: int = 0
@@ -118,6 +137,7 @@ def _stages(
         remedy = f"it is put there again within {limits.RECONCILE_INTERVAL:g} s; if not, the agent's log says why"
         yield Check("graph", FAIL, "the local core does not have it", remedy)
     yield Check("graph", OK, "the local core sends clients to it")
+    yield _transport(peer, here.transport)
     yield _answer(peer, here)
     yield _calls(here)
 
@@ -153,6 +173,19 @@ def _unhide(hidden: str) -> str:
     return "a graph has one provider for each service; give one of them another name (prefix or remap_in of [[peer]])"
 
 
+def _transport(peer: str, found: ServiceTransport) -> Check:
+    if found.address:
+        return Check("transport", OK, f"direct: clients call the server itself, at {found.address}")
+    if found.wanted == "relay":
+        return Check("transport", OK, 'relayed by both agents: transport is "relay" here')
+    if not found.condition:
+        return Check("transport", OK, f"relayed by both agents; {peer} is being asked for direct calls")
+    if found.wanted == "direct" and found.condition != "transport":
+        text = f'relayed although transport is "direct" ({found.condition}): {found.problem}'
+        return Check("transport", WARN, text, "docs/services.md says what each condition needs")
+    return Check("transport", OK, f"relayed by both agents ({found.condition}): {found.problem}")
+
+
 def _answer(peer: str, here: ServiceAtClient) -> Check:
     if here.answer:
         return Check("answer", OK, f"its server answers: {here.answer}")
@@ -163,6 +196,8 @@ def _answer(peer: str, here: ServiceAtClient) -> Check:
 
 def _calls(here: ServiceAtClient) -> Check:
     text = f"{here.calls} from here, {here.failed} of them failed"
+    if here.transport.address:
+        text = f"{text}; direct ones are not counted"
     if here.mismatch:
         return Check("calls", WARN, here.mismatch, "build both sides with one version of the service")
     if here.problem:

@@ -2,8 +2,10 @@
 
 Pure: what both ends know goes in, stages come out, and the first that fails says what to do. The stages::
 
-    peer ─ link ─ publisher ─ policy there ─ offer ─ limit ─ policy here ─ type ─ graph ─ subscriber ─ md5 ─ route
-         ─ sent ─ arrived ─ contract ─ reader
+    peer ─ link ─ publisher ─ policy there ─ offer ─ limit ─ policy here ─ type ─ graph ─ subscriber ─ md5 ─ transport
+         ─ route ─ sent ─ arrived ─ contract ─ reader
+
+Of subscribers that are connected directly ``direct_stages`` judges what follows the transport.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from rmpa.mesh import limits as mesh_limits
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check
 from rmpa.observe.why.diagnosis import Diagnosis, until_failure
+from rmpa.observe.why.direct_stages import adrift_stages, connected_directly, direct_stages, transport
 from rmpa.ros import limits as ros_limits
 
 if TYPE_CHECKING:
@@ -115,6 +118,11 @@ def diagnose_topic(ends: BothEnds, peer: str, later: BothEnds | None = None, wir
     name = known.name if known is not None else peer
     wire = wire or topic
     begin = peer_stages(snapshot, peer)
+    if begin[-1].name == "link" and begin[-1].level is FAIL:
+        left = [route for route in _routes((later or ends).here, name) if connected_directly(route)]
+        if left:
+            stages = [(route.node, (*begin[:-1], *adrift_stages(begin[-1], route))) for route in left]
+            return tuple(Diagnosis.of(found, name=topic, peer=name, to=to, node=node) for node, found in stages)
     if begin[-1].level is not FAIL:
         begin += (_published(ends, name, wire),)
     if begin[-1].level is FAIL:
@@ -202,6 +210,12 @@ def _source_stages(ends: BothEnds, later: BothEnds | None, peer: str, node: str,
     yield _in_graph(ends.here, route)
     yield from _subscriber(ends.here, route)
     now, report_now = _route(later, peer, node) or route, _report(later, node) or report
+    relayed = bool(ends.here.proxy(node).connections)
+    yield transport(now)
+    if connected_directly(now):
+        yield from direct_stages(now, report_now, relayed=relayed)
+        if not relayed:
+            return
     yield _open_route(now, report_now, peer)
     if ends.there is not None and ends.there.path_problem:
         yield Check("path", WARN, f"{peer} says: {ends.there.path_problem}", ends.there.path_remedy)
@@ -297,11 +311,16 @@ def _subscriber(here: TopicAtSubscriber, route: RouteInfo) -> Iterator[Check]:
     connections, refused = proxy.connections, proxy.mismatches
     topics = [topic for topic in here.snapshot.topics if topic.name == here.topic]
     listed = topics[0].subscribers if topics else ()
-    if not connections:
+    direct = connected_directly(route)
+    undecided = [one.node for one in route.subscribers if one.state in ("asking", "probing")]
+    if not connections and not direct:
         if refused:
             yield Check("subscriber", OK, f"{', '.join(listed) or 'a node'} wants it")
             remedy = "build both sides with one version of the message; `rosmsg md5 TYPE` on both shows which differs"
             yield Check("md5", FAIL, "; ".join(refused), remedy)
+        elif undecided:
+            text = f"{', '.join(undecided)} subscribes, and whether it may be connected directly is not decided yet"
+            yield Check("subscriber", FAIL, text, "ask again in a moment; it is relayed if the peer does not answer")
         elif listed:
             text = f"{', '.join(listed)} subscribes, but has not connected to its proxy"
             files = here.snapshot.agent.files
@@ -323,7 +342,12 @@ def _subscriber(here: TopicAtSubscriber, route: RouteInfo) -> Iterator[Check]:
             text = f"no node here subscribes to {here.topic}, so nothing is sent"
             yield Check("subscriber", FAIL, text, f"that is no fault; to try it: rmpa topic echo {here.topic}")
         return
-    yield Check("subscriber", OK, f"{', '.join(dict.fromkeys(c.node for c in connections))} connected to its proxy")
+    there = ["connected to its proxy"] if connections else []
+    names = [", ".join(dict.fromkeys(c.node for c in connections))] if connections else []
+    if direct:
+        names.append(", ".join(one.node for one in direct))
+        there.append("was answered the publisher's own address")
+    yield Check("subscriber", OK, "; ".join(map(" ".join, zip(names, there, strict=True))))
     if refused:
         yield Check("md5", WARN, "; ".join(refused), "build both sides with one version of the message")
     elif route.md5:

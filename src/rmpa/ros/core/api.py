@@ -72,6 +72,18 @@ class Core(Protocol):
     def on_change(self, callback: Callable[[GraphChange], None]) -> None:
         """Call ``callback`` in the loop after each change of a registration."""
 
+    def on_lookup(self, callback: Callable[[str, str, str, str], str]) -> bool:
+        """Let ``callback`` answer ``lookupService`` for each caller.
+
+        Args:
+            callback: ``(service, uri, caller id, slave API)``: the URI to answer in place of the registered ``uri``,
+                or an empty text. The slave API is the caller's; empty if no node of that name is registered. It is
+                called for each lookup of a registered service, and must return at once.
+
+        Returns:
+            Whether this core can do so: a real roscore cannot.
+        """
+
     def unreachable(self) -> Mapping[str, Unreachable]:
         """The registered nodes to which connecting fails, by name; the caller must not change the mapping."""
 

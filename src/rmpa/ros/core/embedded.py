@@ -200,6 +200,10 @@ class RosCore(Core):
     def on_change(self, callback: Callable[[GraphChange], None]) -> None:
         self._listeners.add(callback)
 
+    def on_lookup(self, callback: Callable[[str, str, str, str], str]) -> bool:
+        self._api.service_lookup = callback
+        return True
+
     def notes(self) -> tuple[str, ...]:
         """Problems with storing the core's state; the core itself runs as long as the agent."""
         return self.persistence.notes() if self.persistence is not None else ()

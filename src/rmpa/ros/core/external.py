@@ -215,6 +215,9 @@ class ExternalCore(Core):
     def on_change(self, callback: Callable[[GraphChange], None]) -> None:
         self._listeners.add(callback)
 
+    def on_lookup(self, callback: Callable[[str, str, str, str], str]) -> bool:  # noqa: ARG002 - a roscore has no such hook
+        return False
+
     def unreachable(self) -> Mapping[str, Unreachable]:
         return self._liveness.unreachable
 

@@ -55,6 +55,8 @@ class MasterApi:
         self._on_shutdown = on_shutdown
         self.registrations = Registrations()
         self.parameters = params.Parameters()
+        self.service_lookup: Callable[[str, str, str, str], str] | None = None
+        """Answers ``lookupService`` for each caller; see ``Core.on_lookup``."""
         self._methods = self._table()
 
     # --- calling ----------------------------------------------------------------------------------------------
@@ -214,10 +216,12 @@ class MasterApi:
         found = self.registrations.unregister_service(service, uri, caller_id)
         return _unregistered(caller_id, service, found=found)
 
-    def _lookup_service(self, _caller_id: str, service: str) -> RosReply:
+    def _lookup_service(self, caller_id: str, service: str) -> RosReply:
         uri = self.registrations.service_uri(service)
         if uri is None:
             return RosReply(ERROR, f"nobody provides {service}", "")
+        if self.service_lookup is not None:
+            uri = self.service_lookup(service, uri, caller_id, self.registrations.node_api(caller_id) or "") or uri
         return RosReply(SUCCESS, f"the provider of {service}", uri)
 
     # --- topics -----------------------------------------------------------------------------------------------

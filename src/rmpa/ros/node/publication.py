@@ -115,6 +115,11 @@ class Publication:
         return tuple(connection.caller_id for connection in self._open)
 
     @property
+    def callers(self) -> frozenset[str]:
+        """The caller ids of all subscribers that are connected, held ones included."""
+        return frozenset(connection.caller_id for connection in (*self._open, *self._held))
+
+    @property
     def dropped(self) -> int:
         """Messages dropped for slow subscribers, those that have disconnected included."""
         return self._dropped_before + sum(connection.dropped for connection in self._open)
@@ -179,13 +184,13 @@ class Publication:
                 connection.close()
         self._description = description
         self._reply = reply
-        held, self._held = self._held, ()
-        for connection in held:
+        for connection in self._held:
             problem = check_subscriber(connection.fields, self.topic, self.caller_id, description)
             if problem is None:
                 self._serve(connection)
             else:
                 self._refuse(connection, problem)
+            self._held = tuple(other for other in self._held if other is not connection)
         if before and not self.subscribers:
             self._on_last()
         return len(old)
@@ -272,6 +277,7 @@ class Publication:
     def forget_latched(self) -> None:
         """Drop the latched messages, because their source is gone or will send them again."""
         self._latched.clear()
+        self._had.clear()
 
     def hang_up(self, caller_id: str) -> bool:
         """Close the connections of one subscriber; return whether there was one."""

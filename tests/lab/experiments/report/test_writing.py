@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from lab.bed.plan import Plan
+from lab.experiments.model import Cell
 from lab.experiments.report import write_report
+from lab.experiments.store import Store
 from rmpa.core.errors import ConfigError
 from tests.lab.experiments.report.runs import Known, Latencies, make_run
 
@@ -36,11 +38,19 @@ def test_the_page_has_claims_figures_tables_and_the_manifest(tmp_path: Path) -> 
     assert "rmpa experiment run --out 'a run'" in page
     assert "| cpu | Some \\| CPU |" in page
     assert "short run" not in page
+    assert "from node to node" not in page
     assert "On loopback" not in page
     assert "Incomplete" not in page
     assert written.missing == ""
     assert [path.name for path in written.figures] == ["fig-10-rates.png", "fig-10-rates.svg"]
     assert list(written.findings) == ["rates"]
+
+
+def test_a_run_with_direct_cells_says_what_that_is(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run")
+    Store.load(run).expect("rates", "", [Cell("rates", {"system": "rmpa", "transport": "direct", "round": 1})])
+    page = write_report(run, Known()).markdown.read_text(encoding="utf-8")
+    assert "*RMPA direct* is from node to node. Before and after" in page
 
 
 class _Page(HTMLParser):

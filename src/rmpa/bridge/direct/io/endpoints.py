@@ -12,6 +12,7 @@ from rmpa.bridge.policy import OWN_NODE
 from rmpa.core.errors import RmpaError
 from rmpa.ros.environment import is_loopback
 from rmpa.ros.http.client import call_api
+from rmpa.ros.wire.services import parse_service_uri
 from rmpa.ros.wire.slave_api import TCPROS
 from rmpa.ros.wire.xmlrpc import RosFault
 from rmpa.runtime.tcp_connections import listening_addresses
@@ -65,10 +66,11 @@ class LocalEndpoints:
             uri: Its registered URI, ``rosrpc://host:port``.
             service: The service.
         """
-        text = uri.rpartition(":")[2].rstrip("/")
-        if not uri.startswith("rosrpc://") or not text.isdecimal() or not 0 < int(text) < 1 << 16:
+        try:
+            _, port = parse_service_uri(uri)
+        except RmpaError:
             return Unmet(Condition.NODE, f"{node} registered {uri[:100]!r} for {service}")
-        return self._judge(session, node, int(text), service)
+        return self._judge(session, node, port, service)
 
     def forget(self, uri: str) -> None:
         """Forget a node's port: the node has ended or broken a connection."""
@@ -84,18 +86,16 @@ class LocalEndpoints:
     def _judge(self, session: PeerSession, node: str, port: int, probe: str) -> Grant | Unmet:
         """Checks by the kernel's table that the port's listening socket can be reached from the peer."""
         addresses = listening_addresses(port)
-        local = session.link.local_address
         if addresses is None:
             return Unmet(Condition.LISTENING, "the kernel does not say where its node listens")
         if not addresses:
             return Unmet(Condition.LISTENING, f"{node} does not listen on this module's machine (port {port})")
-        if addresses & _EVERY_ADDRESS or local in addresses:
-            return Grant(port, node, probe)
-        if session.same_machine and any(is_loopback(address) for address in addresses):
+        if addresses & _EVERY_ADDRESS or session.own_address in addresses:
             return Grant(port, node, probe)
         if all(is_loopback(address) for address in addresses):
             return Unmet(Condition.LISTENING, f"{node} listens on loopback only: {_REMEDY}")
-        return Unmet(Condition.LISTENING, f"{node} listens at {', '.join(sorted(addresses))}, not at {local}")
+        text = f"{node} listens at {', '.join(sorted(addresses))}, not at {session.own_address}"
+        return Unmet(Condition.LISTENING, text)
 
     def _probe_service(self, node: str) -> str:
         """A service of a node: rospy and roscpp nodes have their logger services."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import logging
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
@@ -13,11 +15,13 @@ from rmpa.ros.wire.xmlrpc import RosFault
 from rmpa.runtime.tcp_connections import connections, end_connections
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
+    from rmpa.core.counters import Counters
     from rmpa.ros.wire.bus import BusLink
     from rmpa.runtime.tcp_connections import TcpConnection
 
+_log = logging.getLogger(__name__)
 MASTER: Final = "/master"
 """The caller id of ``publisherUpdate``, as rosmaster has it."""
 _STANDING: Final = frozenset({"ESTABLISHED", "SYN_SENT", "CLOSE_WAIT"})
@@ -51,6 +55,17 @@ async def bus_links(uri: str) -> list[BusLink] | None:
     return read_bus_info(value)
 
 
+async def until(condition: Callable[[], bool], seconds: float) -> bool:
+    """Wait until a condition holds; return whether it did within these seconds."""
+    loop = asyncio.get_running_loop()
+    deadline = loop.time() + seconds
+    while not condition():
+        if loop.time() >= deadline:
+            return False
+        await asyncio.sleep(limits.DIRECT_LOOK)
+    return True
+
+
 async def direct_links(uri: str, topic: str, endpoint: tuple[str, int]) -> list[BusLink] | None:
     """The connections of a subscriber, for one topic, to a publisher's address; ``None`` if it does not answer."""
     links = await bus_links(uri)
@@ -65,20 +80,47 @@ def standing(endpoint: tuple[str, int]) -> set[int]:
     return {one.local[1] for one in found if one.state in _STANDING}
 
 
+def connecting(endpoint: tuple[str, int]) -> list[TcpConnection]:
+    """The connections from this machine to an address that wait for its first answer."""
+    return [one for one in connections(remote=endpoint) or [] if one.state == "SYN_SENT"]
+
+
+def end_these(found: list[TcpConnection]) -> str:
+    """End connections; return why it failed, or empty."""
+    return _end(found)
+
+
 def end_to(endpoint: tuple[str, int], ports: set[int] | None = None) -> str:
     """End connections from this machine to a publisher's address.
 
     Args:
         endpoint: The address and port.
-        ports: The local ports of those to end; ``None``: all.
+        ports: The local ports of those to end: other programs may be connected there too. ``None``: all of them.
 
     Returns:
         Empty if none is left, else why they could not be ended.
     """
     found = connections(remote=endpoint)
-    if found is None or ports is None:
-        return _end(found)
-    return _end([one for one in found if one.local[1] in ports])
+    return _end(None if found is None else [one for one in found if ports is None or one.local[1] in ports])
+
+
+async def end_links(endpoint: tuple[str, int], links: Iterable[BusLink]) -> str:
+    """End connections of a subscriber to a publisher's address, if they still stand; wait until they are gone.
+
+    Args:
+        endpoint: The address and port.
+        links: As ``direct_links`` returned them.
+
+    Returns:
+        Empty if none is left, else why they could not be ended.
+    """
+    ports = {link.local_port for link in links if link.local_port is not None}
+    if not ports & standing(endpoint):
+        return ""
+    problem = end_to(endpoint, ports)
+    if await until(lambda: not ports & standing(endpoint), limits.DIRECT_MOVE_WAIT):
+        return ""
+    return problem or "the kernel does not end it"
 
 
 def end_from(port: int, address: str) -> str:
@@ -96,3 +138,10 @@ def _end(found: list[TcpConnection] | None) -> str:
     except OSError as error:
         return error.strerror or str(error)
     return ""
+
+
+def report_failure(task: asyncio.Task[None], counters: Counters) -> None:
+    """Log and count the exception of a task that has ended, if there is one."""
+    if not task.cancelled() and (error := task.exception()) is not None:
+        counters.add("direct.failed")
+        _log.error("! %s failed", task.get_name(), exc_info=error)

@@ -38,10 +38,13 @@ from rmpa.bridge.services.imports import (
     Withdraw,
 )
 from rmpa.bridge.services.io.calls import Budgets, Caller, CallStats
+from rmpa.bridge.services.io.direct_exporter import DirectServiceExporter
+from rmpa.bridge.services.io.direct_importer import DirectServiceImporter
 from rmpa.bridge.services.io.serving import Serving
 from rmpa.bridge.services.rules import ServiceRules
 from rmpa.bridge.session.graph_driver import GraphDriver
 from rmpa.bridge.session.part import Part
+from rmpa.bridge.session.peer_session import PeerState
 from rmpa.core.counters import RefusalLog
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
@@ -149,6 +152,22 @@ class Services(Part):
         )
         self._act = self._driver.act
         self._serving = Serving(core, self.exports, sessions, self._budgets, self._act)
+        self.direct_exports = DirectServiceExporter(
+            core, self.exports, rules, sessions, rpc, on_warning=self._driver.warn, counters=counters
+        )
+        """Direct calls of peers' nodes to local servers."""
+        self.direct_imports = DirectServiceImporter(
+            core,
+            self.imports,
+            rules,
+            sessions,
+            rpc,
+            proxy_uri=self._proxy_uri,
+            on_lost=lambda peer, service, problem: self._act(self.imports.lost(peer, service, problem)),
+            on_warning=self._driver.warn,
+            counters=counters,
+        )
+        """Direct calls of local nodes to peers' servers."""
         rpc.on_notification(_MISMATCH, self._told_of_mismatch)
 
     def __iter__(self) -> Iterator[ShownService]:
@@ -184,7 +203,10 @@ class Services(Part):
                 self.imports.apply_rules(rules, self._limit_settings),
             )
         )
+        self.direct_exports.reload(rules)
+        self.direct_imports.reload(rules)
         for shown in yielding_to_data(list(self._shown.values()), every=16):
+            self.direct_imports.shown(shown.peer, shown.service)
             timeout, endpoint = rules.timeout(shown.service), shown.endpoint
             if endpoint is not None and endpoint.timeout != timeout:
                 endpoint.timeout = timeout
@@ -202,6 +224,7 @@ class Services(Part):
     async def close(self) -> None:
         """End all calls and all connections to servers."""
         self._driver.close()
+        await self.direct_imports.close()
         await self._serving.close()
 
     def link_up(self, session: PeerSession) -> None:
@@ -214,21 +237,36 @@ class Services(Part):
         self._act(self.exports.link_up(peer, link.name, instance))
         for shown in [one for one in self._shown.values() if one.peer == peer and (one.waiting or one.asking)]:
             self._want(shown)
+        self.direct_imports.link_up(session)
         self._driver.schedule()
 
     def link_down(self, session: PeerSession) -> None:
         """Fail the calls under way; the peer's services stay in the graph until ``grace_over`` or ``gone``."""
+        self.direct_imports.link_down(session, crashed=session.link.crashed)
+        self.direct_exports.link_down(session, crashed=session.link.crashed)
         self._driver.link_down(session)
         self._act(self.imports.link_down(session.peer))
         self._act(self.exports.link_down(session.peer))
 
     def grace_over(self, session: PeerSession) -> bool:
-        """Remove the peer's services: no service is kept for a peer that stays away."""
+        """Remove the peer's services; if its agent has crashed, those that are called directly stay for a time."""
+        adrift = self.direct_imports.adrift(session.peer)
+        if not adrift:
+            self._act(self.imports.gone(session.peer))
+            return False
+        self._act(self.imports.keep(session.peer, adrift))
+        return True
+
+    def outlasted(self, session: PeerSession, seconds: float) -> float | None:
+        """Remove services that were kept for direct calls; return until when they stay."""
+        if seconds < limits.DIRECT_KEEP and self.direct_imports.adrift(session.peer):
+            return limits.DIRECT_KEEP
         self._act(self.imports.gone(session.peer))
-        return False
+        return None
 
     def gone(self, session: PeerSession) -> None:
         """Remove the peer's services, and what else is known of the peer."""
+        self.direct_imports.gone(session)
         self._act(self.imports.gone(session.peer))
         self._act(self.imports.unlinked(session.peer))
         self._budgets.pop(session.peer, None)
@@ -301,6 +339,7 @@ class Services(Part):
             self._act(self.imports.local(service, local.node if local is not None else None))
             offered = local if local is not None and not self._withdrawn(service, local.node) else None
             self._act(self.exports.graph(service, offered or self._to_relay(service, providers)))
+            self.direct_exports.server(service, self.exports.offered.get(service))
 
     def _withdrawn(self, service: str, node: str) -> bool:
         """Whether the core found a server unreachable and withdrew it, and no peer has its service open."""
@@ -337,6 +376,7 @@ class Services(Part):
                 shown = self._shown.get((action.peer, action.service))
                 if shown is not None and shown.endpoint is not None:
                     shown.endpoint.description = None
+                self.direct_imports.renewed(action.peer, action.service)
 
     # --- peers' services here ----------------------------------------------------------------------------------
 
@@ -353,6 +393,7 @@ class Services(Part):
             action.peer, action.service, action.node, self.imports.peer_name(action.peer)
         )
         session.proxies.hold(action.node, f"service {action.service}", lambda proxy: self._expose(shown, proxy))
+        self.direct_imports.shown(action.peer, action.service)
 
     def _expose(self, shown: ShownService, proxy: SlaveNode) -> None:
         """Register a service at its proxy, which exists now; do nothing if the service was withdrawn meanwhile."""
@@ -370,6 +411,11 @@ class Services(Part):
         proxy.add_service(shown.endpoint)
         self._register(shown, proxy)
 
+    def _proxy_uri(self, peer: int, service: str) -> str:
+        """The address of the proxy of a peer's service; empty if there is none."""
+        shown = self._shown.get((peer, service))
+        return shown.proxy.service_uri if shown is not None and shown.proxy is not None else ""
+
     def _register(self, shown: ShownService, proxy: SlaveNode) -> None:
         providers = self._core.state().services.get(shown.service, {})
         if any(node != proxy.name for node in providers):
@@ -383,6 +429,7 @@ class Services(Part):
         shown = self._shown.pop((action.peer, action.service), None)
         if shown is None:
             return
+        self.direct_imports.hidden(action.peer, action.service)
         proxy = shown.proxy
         text = f"service [{shown.service}] of {shown.peer_name}: {action.reason}"
         self._fail_waiting(shown, text)
@@ -413,9 +460,12 @@ class Services(Part):
 
     def _want(self, shown: ShownService) -> None:
         """Open a service, unless its peer has no link now: then the next ``link_up``, or ``gone``, ends the wait."""
-        remote = self.imports.get(shown.peer, shown.service)
+        remote, session = self.imports.get(shown.peer, shown.service), self._sessions.get(shown.peer)
         if remote is None or not remote.shown:
             self._fail_waiting(shown, f"service [{shown.service}] of {shown.peer_name} has just gone")
+        elif session is not None and session.state is PeerState.AWAY:
+            text = f"service [{shown.service}]: the agent of {shown.peer_name} has crashed, only direct calls work"
+            self._fail_waiting(shown, text)
         elif remote.state is ServiceRouteState.IDLE and not self.imports.is_away(shown.peer):
             self._act(self.imports.want(shown.peer, shown.service, asyncio.get_running_loop().time()))
 

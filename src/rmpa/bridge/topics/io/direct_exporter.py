@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from typing import TYPE_CHECKING, Any
 
+from rmpa.bridge import limits
 from rmpa.bridge.direct import requests
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, reply_of, unmet_by_contract
 from rmpa.bridge.direct.io.nodes import end_from
@@ -12,7 +14,7 @@ from rmpa.bridge.direct.publisher_side import DirectGrants, EndConnections, Gran
 from rmpa.bridge.direct.requests import DirectClosed, RetryDirect
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import is_own
-from rmpa.bridge.topics.audience import is_watched
+from rmpa.bridge.topics.audience import compares_names
 from rmpa.core.contract import combine
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
 
@@ -64,6 +66,7 @@ class DirectExporter:
         self._counters = counters
         self.grants = DirectGrants()
         """The grants in force."""
+        self._expiries: dict[int, asyncio.TimerHandle] = {}
         rpc.on_request(requests.OPEN, self._open)
         rpc.on_notification(requests.CLOSE, self._close)
 
@@ -85,30 +88,41 @@ class DirectExporter:
             if not change.added:
                 self._endpoints.forget(change.api)
                 self.grants.gone(source)
-            elif any(granted.uri != change.api for _, _, granted in self.grants.of(source)):
-                unmet = Unmet(Condition.NODE, f"{change.node} has restarted")
-                self._act(self.grants.withdraw(source, unmet))
             else:
-                self._act(self.grants.changed(source))
+                self._act(self.grants.published(source, change.api))
 
     def policy_changed(self) -> None:
         """Withdraw the grants for sources that are not offered any more to their peers."""
         self._act(self.grants.judge_again(self._unmet_by_rules))
 
+    def link_up(self, session: PeerSession) -> None:
+        """Let the peer ask again for what it uses; the other grants from before its link end a little later."""
+        self.grants.link_up(session.peer)
+        loop = asyncio.get_running_loop()
+        expire = loop.call_later(limits.DIRECT_ADOPT, lambda: self._act(self.grants.expire(session.peer)))
+        self._expiries[session.peer] = expire
+
     def link_down(self, session: PeerSession, *, crashed: bool) -> None:
         """End the publishers' connections to a peer that cannot be reached; unless only its agent has died.
 
-        On this machine no host can vanish, and other modules use the same addresses.
+        On this machine no connection outlives its process, and the nodes of all modules have the same address.
         """
+        if (expiry := self._expiries.pop(session.peer, None)) is not None:
+            expiry.cancel()
         if not crashed and not session.same_machine:
             self._act(self.grants.unreachable(session.peer))
 
     def gone(self, session: PeerSession) -> None:
         """Forget the grants of a peer."""
+        if (expiry := self._expiries.pop(session.peer, None)) is not None:
+            expiry.cancel()
         self._act(self.grants.peer_gone(session.peer))
 
     async def close(self) -> None:
         """Cancel the questions to local nodes; direct connections go on."""
+        for expiry in self._expiries.values():
+            expiry.cancel()
+        self._expiries.clear()
         await self._endpoints.close()
 
     # --- requests --------------------------------------------------------------------------------------------------
@@ -124,29 +138,37 @@ class DirectExporter:
         source = asked.source
         unmet = self._unmet(session, source, asked)
         if unmet is not None:
-            return unmet
-        local = self._exports.offered[source]
-        found = await self._endpoints.of_topic(session, source.node, local.uri, source.topic)
+            return self._refused(session, asked, unmet)
+        uri = self._uri(source)
+        found = await self._endpoints.of_topic(session, source.node, uri, source.topic)
         if isinstance(found, Unmet):
-            self.grants.refuse(session.peer, source)
-            return found
+            return self._refused(session, asked, found)
         # The graph may have changed meanwhile.
         unmet = self._unmet(session, source, asked)
+        if unmet is None and self._uri(source) != uri:
+            unmet = Unmet(Condition.NODE, f"{source.node} has restarted just now")
         if unmet is not None:
-            return unmet
-        if self._exports.offered[source].uri != local.uri:
-            return Unmet(Condition.NODE, f"{source.node} has restarted just now")
-        granted = Granted(asked.contract, found.port, local.uri)
+            return self._refused(session, asked, unmet)
+        granted = Granted(asked.contract, found.port, uri)
         self.grants.grant(session.peer, source, asked.subscriber, granted)
         self._counters.add("direct.granted")
         _log.debug("< %s: %s connects to %s directly", session.link.name, asked.subscriber, source)
         return found
 
+    def _refused(self, session: PeerSession, asked: requests.OpenDirect, unmet: Unmet) -> Unmet:
+        self._act(self.grants.refused(session.peer, asked.source, asked.subscriber))
+        return unmet
+
+    def _uri(self, source: Source) -> str:
+        """The slave API of a publisher now; the exports learn a new one a little later."""
+        return self._core.state().publishers.get(source.topic, {}).get(source.node, "")
+
     def _unmet(self, session: PeerSession, source: Source, asked: requests.OpenDirect) -> Unmet | None:
         unmet = self._unmet_by_rules(source, session.peer, Granted(asked.contract, 0, ""))
         if unmet is not None:
-            self.grants.refuse(session.peer, source)
             return unmet
+        if not self._uri(source):
+            return Unmet(Condition.OFFERED, f"{source.node} has just left")
         subscribers = self._core.state().subscribers.get(source.topic, {})
         return self.grants.judge(session.peer, source, asked.subscriber, subscribers)
 
@@ -160,16 +182,16 @@ class DirectExporter:
         offered = self._exports.offered[source]
         if offered.origin is not None:
             return Unmet(Condition.OWN_SOURCE, "it comes by a relay")
-        if is_watched(offered.type):
-            return Unmet(Condition.ACTION, f"publishers of {offered.type} compare the names of their subscribers")
+        if compares_names(offered.type):
+            return Unmet(Condition.ACTION, f"actions compare the names of the nodes at {offered.type}")
         return unmet_by_contract(
             combine(self._contracts.of(source.topic, offered.type), granted.asked), "the publisher's module"
         )
 
     def _close(self, session: PeerSession, args: dict[str, Any]) -> None:
         closed = requests.read_close(args)
-        if closed.broken and (local := self._exports.offered.get(closed.source)) is not None:
-            self._endpoints.forget(local.uri)
+        if closed.broken and self.grants.has(session.peer, closed.source, closed.subscriber):
+            self._endpoints.forget(self._uri(closed.source))
             self._core.suspect(closed.node)
         self._act(self.grants.release(session.peer, closed.source, closed.subscriber))
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.bridge import limits
 from rmpa.bridge.direct import requests
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, read_unmet, unmet_by_contract
-from rmpa.bridge.direct.io.nodes import direct_links, standing
+from rmpa.bridge.direct.io.nodes import direct_links, end_links, report_failure, standing
 from rmpa.bridge.direct.requests import CloseDirect, OpenDirect
 from rmpa.bridge.direct.subscriber_side import (
     Ask,
@@ -25,10 +25,10 @@ from rmpa.bridge.direct.subscriber_side import (
     Release,
 )
 from rmpa.bridge.policy import is_own
-from rmpa.bridge.topics.audience import is_watched
+from rmpa.bridge.topics.audience import compares_names
 from rmpa.bridge.topics.io.direct_moves import SubscriberMoves
 from rmpa.core.contract import Transport
-from rmpa.core.errors import RmpaError
+from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.ros.environment import host_of, is_loopback
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
 from rmpa.ros.node.probe import probe
@@ -53,8 +53,10 @@ if TYPE_CHECKING:
     from rmpa.ros.node.publication import Publication
 
 _log = logging.getLogger(__name__)
+_UNKNOWN: Final = "does not know the question"
+"""In the response of an agent of an earlier release (``PeerRpc``)."""
 MEASURING: Final = "/rmpa_topic_"
-"""The names of the nodes of ``rmpa topic hz|bw|delay|echo`` begin so; relayed, so that the agents measure."""
+"""Names of nodes of ``rmpa topic hz|bw|delay|echo`` begin so; they are relayed, so that the agents measure."""
 
 
 class DirectImporter:
@@ -95,6 +97,8 @@ class DirectImporter:
         self._counters = counters
         self.routes = DirectSubscriptions(self._is_latched, self._is_relayed)
         """The state of each subscriber."""
+        self._timer = MachineTimer(self.routes.next_timer, lambda now: self._act(self.routes.handle_timer(now)))
+        self._waiting: dict[DirectKey, list[asyncio.Future[None]]] = {}
         self._moves = SubscriberMoves(
             core,
             imports,
@@ -105,14 +109,16 @@ class DirectImporter:
             on_warning=on_warning,
             counters=counters,
         )
-        self._timer = MachineTimer(self.routes.next_timer, lambda now: self._act(self.routes.handle_timer(now)))
-        self._waiting: dict[DirectKey, list[asyncio.Future[None]]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
-        self._adrift: list[RemoteTopic] = []
-        """The sources that are kept because of direct subscribers while their agent is gone."""
-        self._asking = asyncio.Semaphore(limits.DIRECT_ASKS)
+        self._adrift: dict[int, list[RemoteTopic]] = {}
+        """The sources of each peer that are kept because of direct subscribers while its agent is gone."""
+        self._strays: dict[tuple[Source, str], tuple[str, int]] = {}
+        """Direct connections that a crashed agent left, by source and subscriber: the publisher's endpoint."""
+        self._asking: dict[int, asyncio.Semaphore] = {}
         self._checking: asyncio.TimerHandle | None = None
         self._closed = False
+        self._started = self._now()
+        """Subscribers may have direct connections from before this moment, of an earlier run of this agent."""
         rpc.on_notification(requests.CLOSED, self._closed_there)
         rpc.on_notification(requests.RETRY, self._retry)
 
@@ -140,7 +146,7 @@ class DirectImporter:
             if change.added:
                 self._consider(peer, source, change.node, change.api)
             else:
-                # It has closed its connection, or is dead; a new node of its name must not be made to hang up.
+                # It ends its connections itself; it may subscribe again while a call from here is on its way.
                 self._act(self.routes.remove(DirectKey(peer, source, change.node), hang_up=False))
 
     def shown(self, peer: int, source: Source) -> None:
@@ -184,8 +190,8 @@ class DirectImporter:
             return Unmet(Condition.OWN_SOURCE, f"it is {entry.origin.name}'s, and comes by a relay")
         if entry.topic != source.topic:
             return Unmet(Condition.NAME, f"it is {source.topic} in the publisher's module")
-        if is_watched(entry.type):
-            return Unmet(Condition.ACTION, f"publishers of {entry.type} compare the names of their subscribers")
+        if compares_names(entry.type):
+            return Unmet(Condition.ACTION, f"actions compare the names of the nodes at {entry.type}")
         if node.startswith(MEASURING):
             return Unmet(Condition.MEASURES, "rmpa's own tools measure by the agents")
         if is_loopback(host_of(uri)) and not session.same_machine:
@@ -199,39 +205,77 @@ class DirectImporter:
 
     def _is_relayed(self, key: DirectKey) -> bool:
         publication = self._publication(key.peer, key.source)
-        return publication is not None and key.subscriber in publication.listeners
+        return publication is not None and key.subscriber in publication.callers
 
     # --- what subscribers ask ---------------------------------------------------------------------------------------
 
     def request(self, peer: int, source: Source, subscriber: str) -> Awaitable[RosReply | None] | None:
         """Answer a subscriber's ``requestTopic`` at the proxy of a source; see ``Publication.on_request``."""
         key = DirectKey(peer, source, subscriber)
-        if self.routes.get(key) is None:
+        if self.routes.get(key) is None and not self._is_new and not self._moves.is_stuck(key):
             return None
         return self._answer(key)
 
-    async def _answer(self, key: DirectKey) -> RosReply | None:
-        decision = self.routes.decision(key)
-        if decision is None:
-            decision = await self._decision(key)
-        entry, session = self._imports.get(key.peer, key.source), self._sessions.get(key.peer)
-        if entry is None or session is None:
-            return None
-        if not isinstance(decision, Grant):
-            self.routes.answered(key, None, self._now())
-            return None
-        endpoint = (session.address, decision.port)
-        uri = self._moves.uri(key.subscriber, entry.topic)
-        adopted = bool(uri and standing(endpoint) and await direct_links(uri, entry.topic, endpoint))
-        self.routes.answered(key, endpoint, self._now())
-        self._watch()
-        if adopted:
-            # It has been connected since an earlier run of this agent; a second connection would double messages.
-            _log.info("= %s: %s is connected directly already", session.link.name, key.subscriber)
-            return RosReply(0, "connected to the publisher already", [])
-        return RosReply(1, f"ready on {endpoint[0]}:{endpoint[1]}", [TCPROS, endpoint[0], endpoint[1]])
+    @property
+    def _is_new(self) -> bool:
+        """Whether subscribers may still have direct connections of an earlier run of this agent."""
+        return self._now() < self._started + limits.DIRECT_ADOPT
 
-    async def _decision(self, key: DirectKey) -> Grant | Unmet | None:
+    async def _answer(self, key: DirectKey) -> RosReply | None:
+        if self.routes.decision(key) is None:
+            await self._decision(key)
+        entry, topic = self._imports.get(key.peer, key.source), key.source.topic
+        uri = self._moves.uri(key.subscriber, topic)
+        stray = self._strays.get((key.source, key.subscriber))
+        session = self._sessions.get(key.peer)
+        decision = self.routes.decision(key)
+        direct = (session.address, decision.port) if session is not None and isinstance(decision, Grant) else None
+        for endpoint in dict.fromkeys(one for one in (stray, self._endpoint(key), direct) if one is not None):
+            # A connection from an earlier answer, or an earlier run of an agent: a second one would double messages.
+            if not uri or not standing(endpoint) or not (links := await direct_links(uri, topic, endpoint)):
+                continue
+            if endpoint == direct and self.routes.decision(key) == decision:
+                _log.info("= %s: %s is connected directly already", key.source, key.subscriber)
+                return self._answered(key, direct, RosReply(0, "connected to the publisher already", []))
+            if problem := await end_links(endpoint, links):
+                self._act(self.routes.answered(key, endpoint, self._now()))
+                self._moves.stuck(key, endpoint, problem)
+                return RosReply(0, "connected to the publisher directly still", [])
+        if direct is None and entry is not None and session is not None:
+            left = await self._left_by_others(key, entry.topic, session.address)
+            if left is not None:
+                return left
+        if self.routes.decision(key) != decision or direct is None:
+            return self._answered(key, None, None)  # it is moved if it is direct by now
+        reply = RosReply(1, f"ready on {direct[0]}:{direct[1]}", [TCPROS, direct[0], direct[1]])
+        return self._answered(key, direct, reply)
+
+    async def _left_by_others(self, key: DirectKey, topic: str, address: str) -> RosReply | None:
+        """Ends direct connections that no present decision knows of; the answer to give if one cannot be ended."""
+        if not self._is_new and not self._moves.is_stuck(key):
+            return None
+        endpoint, problem = await self._moves.end_unknown(key, topic, address)
+        if endpoint is None:
+            return None
+        self._act(self.routes.answered(key, endpoint, self._now()))
+        if (route := self.routes.get(key)) is not None:
+            route.stuck = problem
+        self._watch()
+        return RosReply(0, f"connected to {endpoint[0]}:{endpoint[1]} still", [])
+
+    def _endpoint(self, key: DirectKey) -> tuple[str, int] | None:
+        """Where a subscriber was connected directly by its last answer."""
+        route = self.routes.get(key)
+        return route.endpoint if route is not None and route.path is Path.DIRECT else None
+
+    def _answered(self, key: DirectKey, endpoint: tuple[str, int] | None, reply: RosReply | None) -> RosReply | None:
+        self._strays.pop((key.source, key.subscriber), None)
+        self._act(self.routes.answered(key, endpoint, self._now()))
+        self._watch()
+        return reply
+
+    async def _decision(self, key: DirectKey) -> None:
+        """Waits for the decision about a subscriber, at most ``limits.DIRECT_HOLD``."""
         future: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._waiting.setdefault(key, []).append(future)
         try:
@@ -245,19 +289,22 @@ class DirectImporter:
                 waiting.remove(future)
             if not waiting:
                 self._waiting.pop(key, None)
-        return self.routes.decision(key)
 
     def listeners_changed(self, peer: int, source: Source) -> None:
-        """Note which subscribers have left the proxy of a source."""
+        """Note which subscribers have left the proxy of a source, or have come back to it by themselves."""
         routes = self.routes.of(peer, source)
         if not routes:
             return
         publication = self._publication(peer, source)
-        there = set(publication.listeners) if publication is not None else set()
-        for name, route in routes:
+        there = publication.callers if publication is not None else frozenset()
+        for name, _ in routes:
             key = DirectKey(peer, source, name)
-            if route.path is Path.RELAY and name not in there and key not in self._moves:
+            if key in self._moves:
+                continue
+            if name not in there:
                 self._act(self.routes.left(key, self._now()))
+            else:
+                self._act(self.routes.arrived(key, self._now()))
 
     # --- links ------------------------------------------------------------------------------------------------------
 
@@ -266,9 +313,8 @@ class DirectImporter:
         for key, route in self.routes.connected():
             if key.peer == session.peer and route.endpoint is not None and route.endpoint[0] != session.address:
                 self._act([Move(key)])  # the peer has another address now
-        for entry in self._adrift:
+        for entry in self._adrift.pop(session.peer, ()):
             entry.direct = False
-        self._adrift.clear()
         self._act(self.routes.link_up(session.peer, self._now()))
 
     def link_down(self, session: PeerSession, *, crashed: bool) -> None:
@@ -279,7 +325,7 @@ class DirectImporter:
             direct = any(route.path is Path.DIRECT for _, route in self.routes.of(session.peer, source))
             if entry is not None and direct:
                 entry.direct = True  # they were made to hang up above unless only the agent has died
-                self._adrift.append(entry)
+                self._adrift.setdefault(session.peer, []).append(entry)
 
     def gone(self, session: PeerSession, *, hang_up: bool) -> None:
         """Forget every subscriber of a peer.
@@ -288,23 +334,29 @@ class DirectImporter:
             session: The peer.
             hang_up: End their connections, rather than leave them to the peer's next agent.
         """
-        left: list[tuple[DirectKey, tuple[str, int]]] = []
+        left: dict[tuple[Source, str], tuple[str, int]] = {}
         for key, route in self.routes:
             if key.peer == session.peer:
                 if not hang_up and route.path is Path.DIRECT and route.endpoint is not None:
-                    left.append((key, route.endpoint))
+                    left[key.source, key.subscriber] = route.endpoint
                 self._act(self.routes.remove(key, hang_up=hang_up))
+        self._adrift.pop(session.peer, None)
+        self._asking.pop(session.peer, None)
         if left and not self._closed:
+            self._strays |= left
             asyncio.get_running_loop().call_later(limits.DIRECT_ADOPT, self._end_strays, left)
 
-    def _end_strays(self, left: list[tuple[DirectKey, tuple[str, int]]]) -> None:
+    def _end_strays(self, left: Mapping[tuple[Source, str], tuple[str, int]]) -> None:
         """Ends direct connections from before a crash of the peer's agent that its next run has not taken over."""
-        if self._closed:
-            return
-        known = {(key.source, key.subscriber, route.endpoint) for key, route in self.routes.connected()}
-        for key, endpoint in left:
-            if (key.source, key.subscriber, endpoint) not in known:
-                self._moves.hang_up(key, endpoint)
+        for (source, subscriber), endpoint in left.items():
+            if not self._closed and self._strays.get((source, subscriber)) == endpoint:
+                del self._strays[source, subscriber]
+                self._start(self._end_stray(source.topic, subscriber, endpoint), f"end {subscriber}'s connection")
+
+    async def _end_stray(self, topic: str, subscriber: str, endpoint: tuple[str, int]) -> None:
+        uri = self._moves.uri(subscriber, topic)
+        links = await direct_links(uri, topic, endpoint) if uri and standing(endpoint) else None
+        await end_links(endpoint, links or ())
 
     # --- the peer ---------------------------------------------------------------------------------------------------
 
@@ -317,26 +369,32 @@ class DirectImporter:
         self._act(self.routes.retry(session.peer, requests.read_retry(args).source, self._now()))
 
     async def _ask(self, key: DirectKey, attempt: int) -> None:
-        # A peer answers a bounded number of requests at a time, and others are waiting for it too.
-        async with self._asking:
-            await self._ask_now(key, attempt)
-
-    async def _ask_now(self, key: DirectKey, attempt: int) -> None:
         session, entry = self._sessions.get(key.peer), self._imports.get(key.peer, key.source)
         found: Grant | Unmet
         if session is None or not session.linked or entry is None:
             found = Unmet(Condition.OFFERED, "its module has no link")
         else:
-            contract = self._contracts.of(entry.topic, entry.type)
-            asked = OpenDirect(key.source.topic, key.source.node, key.subscriber, contract)
-            try:
-                value = await self._rpc.request(
-                    session, requests.OPEN, requests.write(asked), limits.DIRECT_ASK_TIMEOUT
-                )
-                found = read_reply(value, key.source.node)
-            except RmpaError as error:
-                found = Unmet(Condition.RELEASE, f"{session.link.name} does not grant it: {error}")
+            limit = self._asking.setdefault(key.peer, asyncio.Semaphore(limits.DIRECT_ASKS))
+            async with limit:
+                route = self.routes.get(key)
+                if route is None or route.attempt != attempt:
+                    return  # no request has been sent for this attempt
+                found = await self._request(session, key, entry)
         self._act(self.routes.replied(key, attempt, found, self._now()))
+
+    async def _request(self, session: PeerSession, key: DirectKey, entry: RemoteTopic) -> Grant | Unmet:
+        contract = self._contracts.of(entry.topic, entry.type)
+        asked = OpenDirect(key.source.topic, key.source.node, key.subscriber, contract)
+        try:
+            value = await self._rpc.request(session, requests.OPEN, requests.write(asked), limits.DIRECT_ASK_TIMEOUT)
+            return read_reply(value, key.source.node)
+        except PeerRefused as error:
+            older = _UNKNOWN in error.reason
+            return Unmet(Condition.RELEASE if older else Condition.AGENT, str(error))
+        except RemoteProtocolError as error:
+            return Unmet(Condition.RELEASE, f"{session.link.name}: {error}")
+        except RmpaError as error:
+            return Unmet(Condition.AGENT, str(error))
 
     async def _probe(self, peer: int, grant: Grant) -> None:
         session = self._sessions.get(peer)
@@ -360,7 +418,7 @@ class DirectImporter:
                 case Probe(peer, grant):
                     self._start(self._probe(peer, grant), f"probe {grant.node}")
                 case Decided(key):
-                    self._resume(key)
+                    self._decided(key)
                 case Move(key):
                     self._moves.move(key)
                 case HangUp(key, endpoint):
@@ -368,14 +426,13 @@ class DirectImporter:
                     self._moves.hang_up(key, endpoint)
                 case Release(key, broken):
                     self._release(key, broken=broken)
-                case Fallback(key, unmet):
+                case Fallback(key, unmet) if unmet.condition is not Condition.MEASURES:
                     subject = f"{key.source} to {key.subscriber}"
                     text = f'{subject}: relayed although transport is "direct": {unmet.text}'
                     self._on_warning("direct.relayed", f"{key.peer} {subject} {unmet.condition}", text)
         self._timer.arm()
 
-    def _resume(self, key: DirectKey) -> None:
-        """Answers the requests of a subscriber that wait for its decision."""
+    def _decided(self, key: DirectKey) -> None:
         for future in self._waiting.pop(key, ()):
             if not future.done():
                 future.set_result(None)
@@ -390,11 +447,15 @@ class DirectImporter:
     def _start(self, work: Coroutine[Any, Any, None], name: str) -> asyncio.Task[None]:
         task = asyncio.create_task(work, name=name)
         self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        task.add_done_callback(self._ended)
         return task
 
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        report_failure(task, self._counters)
+
     def _watch(self) -> None:
-        """Begins to watch direct connections, if there are any."""
+        """Begins to watch direct connections."""
         if self._checking is None and self.routes.connected():
             self._checking = asyncio.get_running_loop().call_later(limits.DIRECT_CHECK, self._check)
 
@@ -422,7 +483,10 @@ class DirectImporter:
         wanted = Counter(endpoint for _, endpoint in settled)
         short = {endpoint for endpoint, count in wanted.items() if len(standing(endpoint)) < count}
         for key, endpoint in settled:
-            if endpoint in short:
+            route = self.routes.get(key)
+            if route is not None and not route.stuck and self.routes.misplaced(key):
+                self._moves.move(key)
+            elif endpoint in short:
                 self._start(self._check_one(key, endpoint), f"check {key.subscriber}")
 
     async def _check_one(self, key: DirectKey, endpoint: tuple[str, int]) -> None:

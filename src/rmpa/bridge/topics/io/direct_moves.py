@@ -10,8 +10,18 @@ import asyncio
 from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.io.nodes import direct_links, end_to, publisher_update, standing
+from rmpa.bridge.direct.io.nodes import (
+    bus_links,
+    direct_links,
+    end_links,
+    end_to,
+    publisher_update,
+    report_failure,
+    standing,
+    until,
+)
 from rmpa.bridge.direct.subscriber_side import DirectState, Path
+from rmpa.bridge.policy import is_own
 from rmpa.bridge.topics.remote_topic import RouteState
 
 if TYPE_CHECKING:
@@ -22,7 +32,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.session.peer_sessions import PeerSessions
     from rmpa.bridge.topics.imports import Imports
     from rmpa.bridge.topics.io.peer_topics import PeerTopics
-    from rmpa.bridge.topics.remote_topic import RemoteTopic
     from rmpa.core.counters import Counters
     from rmpa.ros.core.api import Core
     from rmpa.ros.node.publication import Publication
@@ -63,8 +72,13 @@ class SubscriberMoves:
         self._on_warning = on_warning
         self._counters = counters
         self._tasks: dict[DirectKey, asyncio.Task[None]] = {}
-        self._ending: dict[DirectKey, asyncio.Task[None]] = {}
+        self._hang_ups: dict[DirectKey, asyncio.Task[None]] = {}
         """Subscribers that are made to hang up; a move of one waits for it."""
+        self._again: set[DirectKey] = set()
+        """Subscribers to be judged again when their move is over."""
+        self._stuck: dict[tuple[Source, str], None] = {}
+        """Sources and subscribers whose direct connection could not be ended, the latest last."""
+        self._closed = False
 
     def __contains__(self, key: DirectKey) -> bool:
         """Whether a subscriber is being moved."""
@@ -76,74 +90,152 @@ class SubscriberMoves:
 
     async def close(self) -> None:
         """Stop all moves."""
-        tasks = [*self._tasks.values(), *self._ending.values()]
+        self._closed = True
+        tasks = [*self._tasks.values(), *self._hang_ups.values()]
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
-    def move(self, key: DirectKey) -> None:
-        """Make a subscriber leave its present connection, and call it back to get the answer that was decided."""
-        if key in self._tasks:
-            return  # the subscriber gets the latest decision when it is called back
-        task = self._tasks[key] = asyncio.create_task(self._move(key), name=f"move {key.subscriber}")
-        task.add_done_callback(lambda _: self._tasks.pop(key, None))
+    def is_stuck(self, key: DirectKey) -> bool:
+        """Whether a direct connection of a subscriber to a source could not be ended."""
+        return (key.source, key.subscriber) in self._stuck
 
-    def hang_up(self, key: DirectKey, endpoint: tuple[str, int]) -> None:
-        """Make a subscriber leave its direct connection; it is not called back."""
-        before = self._ending.get(key)
-        task = asyncio.create_task(self._hang_up(key, endpoint, before), name=f"hang up {key.subscriber}")
-        self._ending[key] = task
-        task.add_done_callback(lambda done: self._ending.pop(key) if self._ending.get(key) is done else None)
+    def stuck(self, key: DirectKey, endpoint: tuple[str, int], problem: str) -> None:
+        """Note and report a direct connection that cannot be ended.
 
-    async def _hang_up(self, key: DirectKey, endpoint: tuple[str, int], before: asyncio.Task[None] | None) -> None:
-        if before is not None:
-            await asyncio.wait([before])
-        topic, uri = key.source.topic, self._core.state().nodes.get(key.subscriber, "")
-        if not uri:
-            return
-        links = await direct_links(uri, topic, endpoint)
-        proxy = self._proxy_uri(key)
-        others = [one for one in self._core.publishers(topic).values() if one != proxy]
-        await publisher_update(uri, topic, others)
-        ports = {link.local_port for link in links or () if link.local_port is not None}
-        if ports & standing(endpoint) and (problem := end_to(endpoint, ports)):
-            self._cannot_end(key, endpoint, problem)
-        now = list(self._core.publishers(topic).values())
-        if [one for one in now if one != proxy] != others:
-            await publisher_update(uri, topic, now)  # the master's own list may have been overtaken
-
-    def _cannot_end(self, key: DirectKey, endpoint: tuple[str, int], problem: str) -> None:
+        Args:
+            key: The subscriber.
+            endpoint: The other end of its connection.
+            problem: Why.
+        """
+        self._mark_stuck(key, stuck=True)
+        route = self._routes.get(key)
+        if route is not None:
+            route.stuck = problem
         text = (
             f"{key.source}: {key.subscriber} stays connected to {endpoint[0]}:{endpoint[1]}: a rospy subscriber "
             f"leaves only when its connection is ended, and this agent may not do that ({problem}); see rmpa doctor"
         )
         self._on_warning("direct.stuck", f"{key.peer} {key.source} {key.subscriber}", text)
 
-    def _publication(self, key: DirectKey) -> Publication | None:
-        topics = self._topics.get(key.peer)
-        return topics.publication(key.source) if topics is not None else None
+    async def end_unknown(self, key: DirectKey, topic: str, address: str) -> tuple[tuple[str, int] | None, str]:
+        """End a subscriber's direct connections to a peer that no present decision knows of.
+
+        They were made under an earlier run of this agent, or could not be ended before.
+
+        Args:
+            key: The subscriber.
+            topic: The topic's local name.
+            address: The address of the peer's nodes.
+
+        Returns:
+            The other end of one that stays, and why; ``None`` if none is left.
+        """
+        uri = self.uri(key.subscriber, topic)
+        known = {route.endpoint for one, route in self._routes.connected() if one.subscriber == key.subscriber}
+        if (route := self._routes.get(key)) is not None:
+            known.discard(route.endpoint)
+        local = {one for name, one in self._core.publishers(topic).items() if not is_own(name)}
+        left: tuple[tuple[str, int] | None, str] = (None, "")
+        for link in await bus_links(uri) or () if uri else ():
+            end, port = link.remote, link.local_port
+            direct = link.inbound and link.topic == topic and link.connected and link.other not in local
+            if direct and end is not None and end[0] == address and end not in known and port in standing(end):
+                problem = end_to(end, {port})
+                left = (end, problem) if problem else left
+        self._mark_stuck(key, stuck=bool(left[1]))
+        return left
+
+    def _mark_stuck(self, key: DirectKey, *, stuck: bool) -> None:
+        if not stuck:
+            self._stuck.pop((key.source, key.subscriber), None)
+            return
+        self._stuck[key.source, key.subscriber] = None
+        if len(self._stuck) > limits.DIRECT_MAX:
+            del self._stuck[next(iter(self._stuck))]
+
+    # --- hanging up -------------------------------------------------------------------------------------------------
+
+    def hang_up(self, key: DirectKey, endpoint: tuple[str, int]) -> None:
+        """Make a subscriber leave its direct connection; it is not called back."""
+        task = asyncio.create_task(
+            self._hang_up(key, endpoint, self._hang_ups.get(key)), name=f"hang up {key.subscriber}"
+        )
+        self._hang_ups[key] = task
+        task.add_done_callback(lambda done: self._hung_up(key, done))
+
+    def _hung_up(self, key: DirectKey, task: asyncio.Task[None]) -> None:
+        if self._hang_ups.get(key) is task:
+            del self._hang_ups[key]
+        report_failure(task, self._counters)
+
+    async def _hang_up(self, key: DirectKey, endpoint: tuple[str, int], before: asyncio.Task[None] | None) -> None:
+        if before is not None:
+            await asyncio.wait([before])
+        topic, proxy = key.source.topic, self._proxy_uri(key)
+        uri = self.uri(key.subscriber, topic)
+        if not uri:
+            return
+        links = await direct_links(uri, topic, endpoint)
+        others = [one for one in self._core.publishers(topic).values() if one != proxy]
+        await publisher_update(uri, topic, others)
+        if problem := await end_links(endpoint, links or ()):
+            self.stuck(key, endpoint, problem)
+        now = list(self._core.publishers(topic).values())
+        if [one for one in now if one != proxy] != others:
+            await publisher_update(uri, topic, now)  # the master's own list may have been overtaken
 
     def _proxy_uri(self, key: DirectKey) -> str:
         session = self._sessions.get(key.peer)
         proxy = session.proxies.get(key.source.node) if session is not None else None
         return proxy.uri if proxy is not None else ""
 
+    # --- moving -----------------------------------------------------------------------------------------------------
+
+    def move(self, key: DirectKey) -> None:
+        """Make a subscriber leave its present connection, and call it back to get the answer that was decided."""
+        if key in self._tasks:
+            self._again.add(key)
+            return
+        task = self._tasks[key] = asyncio.create_task(self._move(key), name=f"move {key.subscriber}")
+        task.add_done_callback(lambda done: self._moved(key, done))
+
+    def _moved(self, key: DirectKey, task: asyncio.Task[None]) -> None:
+        """Moves a subscriber again if the decision has changed since it was called back."""
+        self._tasks.pop(key, None)
+        report_failure(task, self._counters)
+        again = key in self._again
+        self._again.discard(key)
+        if again and not self._closed and self._routes.misplaced(key):
+            self.move(key)
+
+    def _publication(self, key: DirectKey) -> Publication | None:
+        topics = self._topics.get(key.peer)
+        return topics.publication(key.source) if topics is not None else None
+
     async def _move(self, key: DirectKey) -> None:
-        if (ending := self._ending.get(key)) is not None:
-            await asyncio.wait([ending])
+        if (hanging := self._hang_ups.get(key)) is not None:
+            await asyncio.wait([hanging])
         entry, route = self._imports.get(key.peer, key.source), self._routes.get(key)
         publication = self._publication(key)
         if entry is None or route is None or publication is None:
             return
-        uri, proxy = self.uri(key.subscriber, entry.topic), self._proxy_uri(key)
-        if not uri or not proxy:
+        uri, proxy, session = (
+            self.uri(key.subscriber, entry.topic),
+            self._proxy_uri(key),
+            self._sessions.get(key.peer),
+        )
+        if not uri or not proxy or session is None:
             return
+        elsewhere = route.endpoint is not None and route.endpoint[0] != session.address
+        if not elsewhere and not self._routes.misplaced(key):
+            return  # decided otherwise meanwhile
         to_relay = route.state is DirectState.RELAYED
         held = to_relay and route.path is Path.DIRECT
         if held:
             # Make before break: the relayed route flows, and its latched message is known, before the other ends.
             self._on_demand(key.peer, key.source, True)
-            await self._opened(entry)
+            await until(lambda: entry.state is RouteState.OPEN, limits.DIRECT_MOVE_ROUTE)
         try:
             had, begin = publication.latched if held else (), publication.messages
             if not await self._leave(key, route, publication, uri, proxy):
@@ -166,37 +258,24 @@ class SubscriberMoves:
         """Ends a subscriber's present connection to a source; return whether it has none any more."""
         topic = publication.topic
         endpoint = route.endpoint if route.path is Path.DIRECT else None
-        links = await direct_links(uri, topic, endpoint) if endpoint is not None else None
-        ports = {link.local_port for link in links or () if link.local_port is not None}
+        links = await direct_links(uri, topic, endpoint) if endpoint is not None else []
+        if links is None and endpoint is not None and standing(endpoint):
+            return False  # the node is stopped: `_check` tries again
         await publisher_update(uri, topic, [one for one in self._core.publishers(topic).values() if one != proxy])
         publication.hang_up(key.subscriber)
-        if endpoint is not None and ports & standing(endpoint):
-            problem = end_to(endpoint, ports)
-            if not await self._until(lambda: not ports & standing(endpoint), limits.DIRECT_MOVE_WAIT):
-                route.stuck = problem or "the kernel does not end it"
-                self._cannot_end(key, endpoint, route.stuck)
-                return False
+        if endpoint is not None and (problem := await end_links(endpoint, links or ())):
+            self.stuck(key, endpoint, problem)
+            return False
         self._routes.hung_up(key)
         return True
-
-    async def _opened(self, entry: RemoteTopic) -> None:
-        await self._until(lambda: entry.state is RouteState.OPEN, limits.DIRECT_MOVE_ROUTE)
 
     async def _arrived(self, key: DirectKey, publication: Publication) -> bool:
         """Waits until a subscriber that was called back is connected, by either transport."""
 
         def there() -> bool:
             route = self._routes.get(key)
-            if route is None or key.subscriber in publication.listeners:
+            if route is None or key.subscriber in publication.callers:
                 return True
             return route.path is Path.DIRECT and route.endpoint is not None and bool(standing(route.endpoint))
 
-        return await self._until(there, limits.DIRECT_SETTLE)
-
-    async def _until(self, condition: Callable[[], bool], seconds: float) -> bool:
-        deadline = asyncio.get_running_loop().time() + seconds
-        while not condition():
-            if asyncio.get_running_loop().time() >= deadline:
-                return False
-            await asyncio.sleep(limits.DIRECT_LOOK)
-        return True
+        return await until(there, limits.DIRECT_SETTLE)

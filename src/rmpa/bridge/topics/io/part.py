@@ -231,6 +231,7 @@ class Topics(Part):
         self._act(self.imports.link_up(peer, identity.name, linked))
         self._act(self.exports.link_up(peer, identity.name, linked.instance))
         self.direct_imports.link_up(session)
+        self.direct_exports.link_up(session)
         self._told()
         self._driver.schedule()
 

@@ -14,7 +14,7 @@ from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, Check
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.observe.why.io.topic_evidence import name_in
-from rmpa.observe.why.services import ServiceAtClient, ServiceAtServer
+from rmpa.observe.why.services import ServiceAtClient, ServiceAtServer, ServiceTransport
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.runtime.event_loop import yielding_to_data
 
@@ -89,6 +89,7 @@ class ServiceEvidence:
             node=remote.node,
             hidden=remote.hidden,
             registered=bool(uri),
+            transport=self._transport(session.peer, service),
             answer=answer,
             refusal=refusal,
             calls=shown.stats.calls,
@@ -96,6 +97,19 @@ class ServiceEvidence:
             problem=shown.stats.problem,
             mismatch=shown.mismatch,
         )
+
+    def _transport(self, peer: int, service: str) -> ServiceTransport:
+        direct = self._services.direct_imports
+        wanted, answer, unmet = (
+            self._rules.transport(service),
+            direct.answer(peer, service),
+            direct.unmet(peer, service),
+        )
+        if answer is not None:
+            return ServiceTransport(wanted, answer.uri)
+        if unmet is None:
+            return ServiceTransport(wanted)
+        return ServiceTransport(wanted, condition=unmet.condition, problem=unmet.text)
 
     async def answer(self, session: PeerSession, args: dict[str, Any]) -> ServiceAtServer:
         """The reply to ``why.service``; the server is probed.

@@ -129,6 +129,7 @@ class TopicEvidence:
         sources: list[PublisherReport] = []
         subscribers: list[str] = []
         awaited: list[str] = []
+        await self._snapshots.sampler.settle(names.locals_of(wire))
         for topic in names.locals_of(wire):
             kind = self._core.type_of(topic)
             nodes = self._relayed(topic, instance) if instance else list(self.own(topic))
@@ -196,6 +197,7 @@ class TopicEvidence:
             oversized_bytes=flow.oversized_bytes if flow is not None else 0,
             beyond=exports.beyond.limit if exports.is_beyond(source) else 0,
             unreachable="" if flow is not None and flow.messages else self._unreachable(source.node),
+            direct=self._snapshots.direct.granted_to(session.peer, source),
         )
 
     def _unreachable(self, node: str) -> str:

@@ -14,6 +14,7 @@ from rmpa.core.names import is_global_name
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, Check
 from rmpa.observe.why.diagnosis import BothEnds, Diagnosis, TopicAtPublisher
+from rmpa.observe.why.direct_stages import connected_directly
 from rmpa.observe.why.io.service_evidence import ServiceEvidence
 from rmpa.observe.why.io.topic_evidence import TopicEvidence, name_in
 from rmpa.observe.why.services import ServiceAtServer, diagnose_service
@@ -119,10 +120,11 @@ class WhyService:
         peers = self._reachable_peers()
         own = self._topics.own(topic)
         coming = [peer.guid for peer in peers if self._offers(peer, topic)]
-        if not coming and not own:
+        if not coming and not own and not self._adrift(topic):
             # No peer offers it; one may have it, and not let it cross.
             known = await asyncio.gather(*(self._both_ends(peer, topic) for peer in peers))
             coming = [p.guid for p, e in zip(peers, known, strict=True) if e.there is not None and e.there.sources]
+        coming += self._adrift(topic)
         ways = [self._arrives(guid, topic) for guid in coming]
         ways += [self._leaves(topic, peer.guid) for peer in peers if own and peer.state == "linked"]
         found = [diagnosis for diagnoses in await asyncio.gather(*ways) for diagnosis in diagnoses]
@@ -130,6 +132,12 @@ class WhyService:
 
     def _reachable_peers(self) -> list[PeerInfo]:
         return [peer for peer in self._snapshots.build(frozenset()).peers if peer.state in ("linked", "relayed")]
+
+    def _adrift(self, topic: str) -> list[str]:
+        """The peers whose agent has died while a node of theirs is connected directly to a subscriber here."""
+        snapshot = self._snapshots.build(frozenset({topic}))
+        left = {r.peer for t in snapshot.topics for r in t.routes if r.direction == "in" and connected_directly(r)}
+        return [p.guid for p in snapshot.peers if p.name in left and p.state not in ("linked", "relayed")]
 
     def _offers(self, peer: PeerInfo, topic: str) -> bool:
         session = self._carrier(peer)
@@ -159,7 +167,8 @@ class WhyService:
         topic, wire = self._topics.there(peer.name, topic)
         ends = await self._both_ends(peer, topic)
         later = None
-        if any(r.state in _MOVING for t in ends.here.snapshot.topics for r in t.routes if r.direction == "in"):
+        routes = [r for t in ends.here.snapshot.topics for r in t.routes if r.direction == "in"]
+        if any(route.state in _MOVING or connected_directly(route) for route in routes):
             # Only a second count shows whether messages flow.
             await asyncio.sleep(observe_limits.WHY_WINDOW)
             later = await self._both_ends(peer, topic)
@@ -168,6 +177,7 @@ class WhyService:
     async def _both_ends(self, peer: PeerInfo, topic: str) -> BothEnds:
         """What both ends know now."""
         session = self._carrier(peer)
+        await self._snapshots.sampler.settle((topic,))
         if session is None:
             return BothEnds(self._topics.here(None, peer, topic), refusal="it is not linked")
         _, wire = self._topics.there(peer.name, topic)

@@ -1,0 +1,216 @@
+"""The publisher's side of direct transport, with doubles for the core, the peers and the local nodes."""
+
+from __future__ import annotations
+
+import asyncio
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from rmpa.bridge import limits
+from rmpa.bridge.direct import requests
+from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
+from rmpa.bridge.direct.requests import CloseDirect, OpenDirect
+from rmpa.bridge.messages import Source
+from rmpa.bridge.topics.io import direct_exporter
+from rmpa.bridge.topics.io.direct_exporter import DirectExporter
+from rmpa.core.contract import Contract, Contracts, Transport
+from rmpa.core.counters import Counters
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.ros.master.effects import GraphChange, RegistrationKind
+from tests.ros.node.peers import until
+
+SOURCE = Source("/chatter", "/talker")
+URI = "http://10.0.0.1:1234/"
+AUTO = Contract(transport=Transport.AUTO)
+
+
+class Module:
+    """The module of /talker, and what its agent told its peers."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.publishers = {"/chatter": {"/talker": URI}}
+        self.subscribers: dict[str, dict[str, str]] = {}
+        self.offered = {SOURCE: SimpleNamespace(type="std_msgs/String", origin=None, uri=URI)}
+        self.suspected: list[str] = []
+        self.forgotten: list[str] = []
+        self.told: list[tuple[int, str, dict[str, Any]]] = []
+        self.ended: list[tuple[int, str]] = []
+        self.asked: list[str] = []
+        self.found: Grant | Unmet = Grant(45225, "/talker")
+        self.gate = asyncio.Event()
+        self.gate.set()
+        self.handlers: dict[str, Any] = {}
+        self.sessions = {number: self._session(number) for number in (1, 2)}
+        state = SimpleNamespace(publishers=self.publishers, subscribers=self.subscribers)
+        monkeypatch.setattr(direct_exporter, "end_from", self._end_from)
+        self.sut = DirectExporter(
+            cast("Any", SimpleNamespace(state=lambda: state, suspect=self.suspected.append)),
+            cast("Any", SimpleNamespace(offered=self.offered, local=self._local)),
+            Contracts((), AUTO.transport),
+            cast("Any", SimpleNamespace(of_topic=self._of_topic, forget=self.forgotten.append)),
+            cast("Any", SimpleNamespace(get=self.sessions.get)),
+            cast(
+                "Any",
+                SimpleNamespace(
+                    on_request=self.handlers.__setitem__,
+                    on_notification=self.handlers.__setitem__,
+                    notify=lambda session, what, args: self.told.append((session.peer, what, args)),
+                ),
+            ),
+            Counters(),
+        )
+
+    @staticmethod
+    def _session(number: int) -> Any:
+        link = SimpleNamespace(name=f"peer{number}")
+        return SimpleNamespace(peer=number, link=link, linked=True, same_machine=False, address=f"10.0.0.{number}")
+
+    def _local(self, _peer: int, source: Source) -> Source | None:
+        return source if source in self.offered else None
+
+    def _end_from(self, port: int, address: str) -> str:
+        self.ended.append((port, address))
+        return ""
+
+    async def _of_topic(self, _session: object, _node: str, uri: str, _topic: str) -> Grant | Unmet:
+        self.asked.append(uri)
+        await self.gate.wait()
+        return self.found
+
+    async def open(self, peer: int = 1, subscriber: str = "/viewer", contract: Contract = AUTO) -> dict[str, Any]:
+        args = requests.write(OpenDirect("/chatter", "/talker", subscriber, contract))
+        reply: dict[str, Any] = await self.handlers[requests.OPEN](self.sessions[peer], args)
+        return reply
+
+    def close(self, peer: int = 1, subscriber: str = "/viewer", *, broken: bool = False) -> None:
+        args = requests.write(CloseDirect("/chatter", "/talker", subscriber, broken))
+        self.handlers[requests.CLOSE](self.sessions[peer], args)
+
+    def change(self, kind: RegistrationKind, node: str, uri: str, *, added: bool) -> None:
+        graph = self.publishers if kind is RegistrationKind.PUBLISHER else self.subscribers
+        nodes = graph.setdefault("/chatter", {})
+        if added:
+            nodes[node] = uri
+        else:
+            nodes.pop(node, None)
+        self.sut.graph_changed(
+            cast("GraphChange", SimpleNamespace(kind=kind, name="/chatter", node=node, api=uri, added=added))
+        )
+
+    @property
+    def granted(self) -> list[tuple[int, str]]:
+        return [(peer, name) for _, peer, name, _ in self.sut.grants]
+
+
+@pytest.fixture
+def module(monkeypatch: pytest.MonkeyPatch) -> Module:
+    return Module(monkeypatch)
+
+
+async def test_a_subscriber_is_granted_the_publishers_port(module: Module) -> None:
+    assert await module.open() == {"port": 45225, "probe": ""}
+    assert module.granted == [(1, "/viewer")]
+    assert (await module.open(2))["why"] == Condition.CALLER_ID
+    module.close()
+    assert [(peer, what) for peer, what, _ in module.told] == [(2, requests.RETRY)]
+    assert await module.open(2) == {"port": 45225, "probe": ""}
+
+
+async def test_what_is_not_offered_or_not_allowed_is_refused(module: Module) -> None:
+    assert (await module.open(contract=Contract()))["why"] == Condition.TRANSPORT
+    assert (await module.open(contract=Contract(transport=Transport.AUTO, max_rate=5.0)))["why"] == Condition.CONTRACT
+    module.offered.clear()
+    assert (await module.open())["why"] == Condition.OFFERED
+    assert module.asked == []
+    with pytest.raises(RemoteProtocolError):
+        await module.handlers[requests.OPEN](module.sessions[1], {"topic": "x"})
+
+
+async def test_a_refusal_ends_the_earlier_grant(module: Module) -> None:
+    await module.open()
+    module.found = Unmet(Condition.LISTENING, "loopback")
+    assert (await module.open())["why"] == Condition.LISTENING
+    assert module.granted == []
+
+
+async def test_a_node_that_restarts_while_it_is_asked_is_not_granted(module: Module) -> None:
+    module.gate.clear()
+    opening = asyncio.create_task(module.open())
+    await until(lambda: module.asked)
+    module.change(RegistrationKind.PUBLISHER, "/talker", "http://10.0.0.1:9/", added=True)
+    module.gate.set()
+    assert (await opening)["why"] == Condition.NODE
+    assert module.granted == []
+    # The exports learn the new address later; it counts at once.
+    await module.open()
+    assert module.asked == [URI, "http://10.0.0.1:9/"]
+
+
+async def test_a_restarted_publisher_and_a_namesake_withdraw_grants(module: Module) -> None:
+    await module.open()
+    module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=False)
+    module.change(RegistrationKind.PUBLISHER, "/talker", "http://10.0.0.1:9/", added=True)
+    assert [(what, args["why"]) for _, what, args in module.told] == [(requests.CLOSED, "node")]
+    await module.open()
+    module.change(RegistrationKind.SUBSCRIBER, "/viewer", "http://10.0.0.1:7/", added=True)
+    assert module.told[-1][2]["why"] == "caller_id"
+    assert (await module.open())["why"] == Condition.CALLER_ID
+    module.told.clear()
+    module.change(RegistrationKind.SUBSCRIBER, "/viewer", "http://10.0.0.1:7/", added=False)
+    assert [what for _, what, _ in module.told] == [requests.RETRY]
+
+
+async def test_only_a_peer_with_a_grant_may_have_a_node_examined(module: Module) -> None:
+    module.close(broken=True)
+    assert (module.suspected, module.forgotten) == ([], [])
+    await module.open()
+    module.close(2, broken=True)
+    module.close(subscriber="/other", broken=True)
+    assert module.suspected == []
+    module.close(broken=True)
+    assert (module.suspected, module.forgotten) == (["/talker"], [URI])
+
+
+@pytest.mark.parametrize(
+    ("crashed", "same", "ends"), [(False, False, True), (True, False, False), (False, True, False)]
+)
+async def test_connections_end_where_a_host_may_have_vanished(
+    module: Module, *, crashed: bool, same: bool, ends: bool
+) -> None:
+    await module.open()
+    module.sessions[1].same_machine = same
+    module.sut.link_down(module.sessions[1], crashed=crashed)
+    assert module.ended == ([(45225, "10.0.0.1")] if ends else [])
+
+
+async def test_what_a_peer_does_not_ask_for_after_a_new_link_ends(
+    module: Module, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "DIRECT_ADOPT", 0.02)
+    await module.open()
+    await module.open(subscriber="/logger")
+    module.sut.link_down(module.sessions[1], crashed=True)
+    module.sut.link_up(module.sessions[1])
+    await module.open(subscriber="/logger")
+    await until(lambda: module.granted == [(1, "/logger")])
+    # A link that ends before does not count.
+    module.sut.link_up(module.sessions[1])
+    module.sut.link_down(module.sessions[1], crashed=True)
+    assert module.sut._expiries == {}
+    module.sut.gone(module.sessions[1])
+    assert module.granted == []
+
+
+async def test_new_rules_withdraw_and_let_others_try_again(module: Module) -> None:
+    await module.open()
+    module.sut.reload(Contracts((), Transport.RELAY))
+    assert module.granted == []
+    assert module.told[-1][1:] == (
+        requests.CLOSED,
+        {**module.told[-1][2], "why": "transport", "subscriber": "/viewer"},
+    )
+    module.sut.reload(Contracts((), Transport.AUTO))
+    assert module.told[-1][:2] == (1, requests.RETRY)
+    assert await module.open() == {"port": 45225, "probe": ""}

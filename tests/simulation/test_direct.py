@@ -1,0 +1,45 @@
+"""Direct transport through lost links, crashes, restarts, collisions and reloads: each subscriber has the right path.
+
+``RMPA_SIMULATION_SEEDS=20`` runs twenty times as many;
+``python -m tests.simulation --kind direct --seed N`` one.
+"""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from tests.simulation.direct_scenario import DirectScenario
+
+FACTOR = int(os.environ.get("RMPA_SIMULATION_SEEDS", "1"))
+BLOCK = 50
+
+
+@pytest.mark.parametrize("block", range(10 * FACTOR))
+def test_each_subscriber_settles_on_the_path_that_the_conditions_ask_for(block: int) -> None:
+    for seed in range(block * BLOCK, (block + 1) * BLOCK):
+        DirectScenario(seed).play()
+
+
+def test_a_seed_replays_exactly() -> None:
+    assert DirectScenario(7).play() == DirectScenario(7).play()
+
+
+def test_without_troubles_every_subscriber_of_a_free_name_is_direct() -> None:
+    scenario = DirectScenario(1)
+    b, c = scenario.modules
+    b.subscribe("/viewer", leaves=True)
+    c.subscribe("/logger", leaves=False)
+    scenario.world.run(scenario.world.now + 1.0)
+    scenario.check()
+    assert len(list(scenario.there.grants)) == 4
+    # A second node of that name in the other module is relayed, until the first one ends.
+    c.subscribe("/viewer", leaves=True)
+    scenario.world.run(scenario.world.now + 1.0)
+    scenario.check()
+    assert len(list(scenario.there.grants)) == 4
+    b.unsubscribe("/viewer")
+    scenario.world.run(scenario.world.now + 3.0)
+    scenario.check()
+    assert len(list(scenario.there.grants)) == 3, "the latched source stays relayed until it is subscribed again"
