@@ -112,6 +112,23 @@ def test_throttled_messages_wait_in_the_queue_and_then_come() -> None:
     assert client.session.dropped == 2
 
 
+def test_the_longest_queue_is_used_and_freed_with_the_last_subscription() -> None:
+    client = Client()
+    handle = client.one(
+        Subscribe, client.send("subscribe", id="a", topic="/t", throttle_rate=1000, queue_length=1)
+    ).handle
+    client.send("subscribe", id="b", topic="/t", throttle_rate=1000, queue_length=3)
+    for number in range(5):
+        client.publish(handle, STRING, {"data": str(number)})
+    client.advance(10)
+    assert [each["msg"]["data"] for each in client.received()] == ["0", "2", "3", "4"]
+    client.publish(handle, STRING, {"data": "5"})
+    client.publish(handle, STRING, {"data": "6"})
+    client.send("unsubscribe", topic="/t")
+    assert client.session._subscriptions._queued.used == 0
+    assert client.session.next_timer() is None
+
+
 def test_long_messages_come_in_fragments_of_the_smallest_size() -> None:
     client = Client()
     handle = client.one(Subscribe, client.send("subscribe", id="a", topic="/t", fragment_size=50)).handle
@@ -365,7 +382,9 @@ def test_all_that_a_client_had_ends_with_it() -> None:
         (b"\x5b\x00\x00\x00\xff\xff\xff\xff\xff", "CBOR"),
         (b"\x81" * 100_000, "CBOR"),
         (b"\xa1\x01\x02", "no 'op'"),
-        ("[" * 1_000_000, "too deep"),
+        ("[" * 100_000, "too deep"),
+        ("[" + "{}," * limits.CONTAINERS_MAX + "{}]", "objects and lists"),
+        (bytes(limits.BINARY_FRAME_MAX + 1), "exceeds the limit"),
         ('{"op": "publish", "topic": "/t", "msg": ' + '{"a":' * 100_000, "too deep"),
         ("x" * (limits.FRAME_MAX + 1), "exceeds the limit"),
     ],
@@ -429,9 +448,9 @@ def test_a_goal_goes_to_actionlib_and_its_result_comes_back(status: int, code: i
     assert handles.keys() == {"/f/result", "/f/feedback", "/f/goal", "/f/cancel"}
     assert publish.handle == handles["/f/goal"]
     kind = MessageType(f"{TEST}ActionGoal")
-    goal = kind.to_plain(kind.deserialize(publish.payload))
+    goal: Any = kind.to_plain(kind.deserialize(publish.payload))
     assert goal["goal"] == {"goal": 5}
-    goal_id = goal["goal_id"]["id"]  # type: ignore[index,call-overload]
+    goal_id = goal["goal_id"]["id"]
     _result(client, "feedback", handles["/f/feedback"], goal_id, 1, 1)
     _result(client, "feedback", handles["/f/feedback"], "of another client", 1, 7)
     (cancel,) = client.send("cancel_action_goal", id="g", action="/f")

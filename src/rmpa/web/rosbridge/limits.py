@@ -6,8 +6,12 @@ from typing import Final
 
 from rmpa.core.sizes import KIB, MIB
 
-FRAME_MAX: Final = 16 * MIB
-"""One frame of a client, and so a message that it publishes, in JSON or CBOR; parsed, up to eight times this."""
+FRAME_MAX: Final = 10 * MIB
+"""One frame of a client, and so a message that it publishes, in JSON; rosbridge_suite's default."""
+BINARY_FRAME_MAX: Final = 2 * MIB
+"""One frame of a client in CBOR: each byte may be a value, which takes up to 64 bytes."""
+CONTAINERS_MAX: Final = 200_000
+"""Objects and lists in one frame in JSON: an empty object has two characters and takes 64 bytes."""
 ID_MAX: Final = 1 * KIB
 """Characters of an ``id``, which is sent back and kept."""
 NAME_MAX: Final = 1 * KIB

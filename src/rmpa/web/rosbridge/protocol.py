@@ -240,8 +240,9 @@ def parse_frame(data: str | Part) -> dict[str, Any]:
         OpError: The frame is neither, or no object with text keys.
         LimitExceeded: The frame is too long.
     """
-    if len(data) > limits.FRAME_MAX:
-        raise LimitExceeded("frame", len(data), limits.FRAME_MAX)
+    most = limits.FRAME_MAX if isinstance(data, str) else limits.BINARY_FRAME_MAX
+    if len(data) > most:
+        raise LimitExceeded("frame", len(data), most)
     values = _json(data) if isinstance(data, str) else _cbor(data)
     if not isinstance(values, dict):
         raise OpError(f"a frame is an object with an 'op', not a {type(values).__name__}")
@@ -329,6 +330,9 @@ def _short(text: str) -> str:
 
 
 def _json(text: str) -> object:
+    # Brackets within strings count, too: they are rare, and counting them takes no time.
+    if (count := text.count("{") + text.count("[")) > limits.CONTAINERS_MAX:
+        raise OpError(f"the message has {count} objects and lists", f"up to {limits.CONTAINERS_MAX} are read")
     try:
         return msgspec.json.decode(text)
     except RecursionError:
@@ -336,6 +340,8 @@ def _json(text: str) -> object:
     except (msgspec.DecodeError, UnicodeError) as error:
         first = error
     # Python's clients write NaN and Infinity, which are no JSON and which rosbridge_suite accepts.
+    if "NaN" not in text and "Infinity" not in text:
+        raise OpError(f"the message is not JSON: {first}"[: limits.TEXT_MAX])
     try:
         values: object = json.loads(text)
         msgspec.json.encode(values)  # Python also takes half of a surrogate pair, which cannot be sent back

@@ -5,7 +5,6 @@ Fields that are not given are zero, false or empty. A header's stamp that is not
 
 from __future__ import annotations
 
-import base64
 import binascii
 import struct
 from collections.abc import Callable, Mapping, Sequence
@@ -102,10 +101,14 @@ class _Compiler:
         )
         known = frozenset(label for label, _, _ in fields)
         is_header = name == HEADER
+        size_of_all = layout.size(name)
 
         def write(values: Any, writing: Writing) -> None:
             if not isinstance(values, Mapping):
                 raise WrongValueError(f"is a {name} (an object), not {shown(values)}")
+            if not values and not headers and not is_header:
+                _default(writing, size_of_all, [label for label, _, _ in fields] if not writing.missing else [])
+                return
             if not known.issuperset(values):
                 unknown = next(key for key in values if key not in known)
                 has = ", ".join(label for label, _, _ in fields) or "none"
@@ -174,6 +177,14 @@ def shown(value: object) -> str:
         cut = value[: limits.SHOWN].encode("utf-8", "backslashreplace").decode()
         return repr(cut) if len(value) <= limits.SHOWN else f"{cut!r}…"
     return type(value).__name__ if isinstance(value, CBORTag) else repr(value)[: limits.SHOWN]
+
+
+def _default(writing: Writing, size: int, missing: list[str]) -> None:
+    """Write a message of which no field is given."""
+    writing.out += bytes(size)
+    writing.missing += missing[: limits.MISSING_NAMED]
+    if len(writing.out) > limits.WRITTEN_MAX:
+        raise WrongValueError(f"the message is longer than {limits.WRITTEN_MAX} bytes")
 
 
 def _unsigned(now: tuple[int, int]) -> tuple[int, int]:
@@ -318,8 +329,8 @@ def _byte_array(field: Field) -> Write:
         values = _untagged(values, "B")
         if isinstance(values, str):
             try:
-                raw = base64.b64decode(values, validate=True)
-            except (binascii.Error, ValueError):
+                raw = binascii.a2b_base64(values, strict_mode=True)
+            except ValueError:
                 raise WrongValueError(f"is base64 ({field}), not {shown(values)}") from None
         elif isinstance(values, bytes | bytearray | memoryview):
             raw = bytes(values)
