@@ -56,6 +56,14 @@ DESCRIBE_AT_ONCE: Final = 4
 """Types whose definition is looked for at one time."""
 SEEN_TYPES_MAX: Final = 16
 """Types of one topic's publishers that are listed."""
+SEEN_PUBLISHERS_MAX: Final = 256
+"""Publishers of one topic whose headers are kept."""
+EARLY_MESSAGES: Final = 100
+"""Messages of one topic that wait until it is registered and its first subscriber is connected."""
+EARLY_BYTES: Final = 4 * MIB
+"""Bytes of these; the oldest is dropped, the newest always fits."""
+EARLY_WAIT: Final = 1.0
+"""Time that they wait for a subscriber, where the graph has one."""
 PACKAGES_WALKED: Final = 20_000
 """Folders that are searched for a package's assets."""
 

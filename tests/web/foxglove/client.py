@@ -9,7 +9,8 @@ import msgspec
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.types.service_types import ServiceType
 from rmpa.web.foxglove import protocol
-from rmpa.web.foxglove.session import Close, FoxgloveSession, Output, Rights
+from rmpa.web.foxglove.session import Close, FoxgloveSession, Output
+from rmpa.web.hub.rights import Rights
 from rmpa.web.hub import requests
 from rmpa.web.hub.requests import GraphService, GraphTopic
 

@@ -21,6 +21,7 @@ from rmpa.web.foxglove.connection_graph import ConnectionGraph
 from rmpa.web.foxglove.parameters import ParameterRequests
 from rmpa.web.foxglove.protocol import BinaryFrame, Capability, Frame, StatusLevel
 from rmpa.web.hub import requests
+from rmpa.web.hub.rights import Rights
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -32,17 +33,6 @@ CLOCK: Final = ("/clock", "rosgraph_msgs/Clock")
 _CLOCK: Final = struct.Struct("<II")
 _POLICY_VIOLATION: Final = 1008
 """A WebSocket's close code, RFC 6455, section 7.4.1."""
-
-
-@dataclass(frozen=True, slots=True)
-class Rights:
-    """What a client may do beyond reading topics and the graph; nothing unless it is said."""
-
-    publish: bool = False
-    call_services: bool = False
-    read_parameters: bool = False
-    set_parameters: bool = False
-    fetch_assets: bool = False
 
 
 @dataclass(frozen=True, slots=True)
