@@ -174,4 +174,3 @@ class Registration(Generic[_T]):
             for each in (unwanted, task):
                 each.cancel()
             await asyncio.wait([unwanted, task])
-

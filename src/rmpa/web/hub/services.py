@@ -193,5 +193,3 @@ class ServiceCalls:
             raise RmpaError(f"the server of {service} does not tell its type")
         found = self._found[service] = FoundService(description.type, uri)
         return found
-
-
