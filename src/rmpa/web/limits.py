@@ -11,8 +11,8 @@ from rmpa.core.sizes import KIB, MIB
 
 # --- the hub ------------------------------------------------------------------------------------------------------
 CLIENT_QUEUE_BYTES: Final = 16 * MIB
-"""Bytes that wait for one client, of all its subscriptions; beyond, the oldest messages are dropped. One message always
-fits where no other waits."""
+"""Bytes that wait for one client, of all its subscriptions; beyond, the oldest messages are dropped. One message
+always fits where no other waits."""
 SUBSCRIPTION_QUEUE_BYTES: Final = 8 * MIB
 """Bytes that wait for one subscription of one client; its newest message always fits."""
 CLIENTS_MAX: Final = 256
@@ -26,8 +26,8 @@ PUBLISHERS_MAX: Final = 2000
 NODE_RETRY: Final = 1.0
 """Pause between two attempts to reach the master, or to register."""
 LATCHED_BYTES: Final = 64 * MIB
-"""Bytes of latched messages that the hub keeps for newcomers: maps and robot descriptions have some 10 MB. Beyond, the
-oldest is forgotten, and a newcomer gets none."""
+"""Bytes of latched messages that the hub keeps for newcomers: maps and robot descriptions have some 10 MB. Beyond,
+the oldest is forgotten, and a newcomer gets none."""
 CALL_TIMEOUT: Final = 30.0
 """Time for a service call of a client that names none."""
 CALL_TIMEOUT_MAX: Final = 3600.0

@@ -21,12 +21,12 @@ from rmpa.web.foxglove.connection_graph import ConnectionGraph
 from rmpa.web.foxglove.parameters import ParameterRequests
 from rmpa.web.foxglove.protocol import BinaryFrame, Capability, Frame, StatusLevel
 from rmpa.web.hub import requests
-from rmpa.web.hub.rights import Rights
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from rmpa.web.hub.requests import Payload
+    from rmpa.web.hub.rights import Rights
 
 CLOCK: Final = ("/clock", "rosgraph_msgs/Clock")
 """The topic that gives the time where ``use_sim_time`` is set, and its type."""

@@ -2,8 +2,8 @@
 
 Higher priorities go first; the subscriptions of one priority take turns, a message each, so that a map does not hold
 up commands. Beyond a bound the oldest message of the subscription with the most bytes is dropped, of the lowest
-priority first. Handle 0 is for all that is no message of a subscription: it goes before all else and is never dropped;
-a client that lets it grow beyond the bound does not read at all, and is to be disconnected (``overflow``).
+priority first. Handle 0 is for all that is no message of a subscription: it goes before all else and is never
+dropped; a client that lets it grow beyond the bound does not read at all, and is to be disconnected (``overflow``).
 """
 
 from __future__ import annotations

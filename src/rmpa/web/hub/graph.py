@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RmpaError
@@ -16,6 +15,8 @@ from rmpa.web import limits
 from rmpa.web.hub.requests import GraphService, GraphTopic
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+
     from rmpa.ros.node.node import Node
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.web.hub.clients import Key

@@ -8,7 +8,6 @@ import itertools
 import logging
 import os
 import time
-from collections.abc import Callable, Coroutine, Mapping
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from rmpa.core.errors import PeerRefused, RmpaError
@@ -28,11 +27,13 @@ from rmpa.web.hub.topics import Topics
 from rmpa.web.hub.types import TypeLibrary
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Mapping
     from types import TracebackType
 
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.web.hub.clients import Key, Receive
     from rmpa.web.hub.node_link import MakeNode
-    from rmpa.web.hub.requests import Answer, Request
+    from rmpa.web.hub.requests import Request
     from rmpa.web.hub.rights import Rights
 
 _log = logging.getLogger(__name__)
@@ -61,7 +62,7 @@ class Hub:
         self._numbers = itertools.count(1)
         self._clients: dict[int, Client] = {}
         self._tasks: dict[Key, asyncio.Task[None]] = {}
-        self.link = NodeLink(make_node, lambda key, value: self.params.updated(key, value))
+        self.link = NodeLink(make_node, self._param_updated)
         self.params = ParamMirror(self.link)
         self.types = TypeLibrary(self.link)
         self.calls = ServiceCalls(self.link)
@@ -72,7 +73,7 @@ class Hub:
             services_changed=self._services_changed,
             master_back=self.params.reload,
         )
-        self.topics = Topics(self.link, self._learn, lambda topic: self.publishers.latched(topic), now_ns)
+        self.topics = Topics(self.link, self._learn, self._own_latched, now_ns)
         self.publishers = Publishers(
             self.link,
             self.types.find_message,
@@ -233,6 +234,9 @@ class Hub:
     def _published(self, topic: str, type_: str, payload: memoryview, latch: bool) -> None:
         self.topics.publish(topic, type_, payload, latch=latch)
 
+    def _own_latched(self, topic: str) -> tuple[str, memoryview, int] | None:
+        return self.publishers.latched(topic)
+
     def _has_subscribers(self, topic: str) -> bool:
         known = self.graph.topics.get(topic)
         own = self.link.node.name if self.link.node is not None else ""
@@ -304,6 +308,9 @@ class Hub:
             self.served.respond(key, service, request.call, ok=request.ok, response=request.response)
 
     # --- parameters -------------------------------------------------------------------------------------------
+
+    def _param_updated(self, key: str, value: XmlRpcValue) -> None:
+        self.params.updated(key, value)
 
     def _get_params(self, client: Client, request: requests.GetParams) -> None:
         _check(client.rights.read_parameters, "read parameters")
@@ -391,7 +398,7 @@ class Hub:
                 await work
             except RmpaError as error:
                 _fail(client, handle, error)
-            except Exception:
+            except Exception:  # noqa: BLE001 - a task's top
                 _log.exception("! a request of %s failed", client.name)
                 _fail(client, handle, RmpaError("the web server failed; its log says why"))
 

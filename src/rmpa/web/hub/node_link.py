@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Generic, TypeAlias, TypeVar
 
 from rmpa.core.errors import RmpaError, UnreachableError
 from rmpa.web import limits
 
 if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
     from rmpa.ros.node.node import Node
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
@@ -124,8 +125,8 @@ class Registration(Generic[_T]):
         self._unwanted = asyncio.Event()
         self.value: _T | None = None
         """What ``register`` returned, while it is registered."""
-        self._task = asyncio.get_running_loop().create_task(
-            self._run(after._task if after is not None else None), name=f"register {name}"
+        self._task: asyncio.Task[None] = asyncio.get_running_loop().create_task(
+            self._run(after), name=f"register {name}"
         )
 
     @property
@@ -141,9 +142,9 @@ class Registration(Generic[_T]):
         """Wait, after ``end``, until it is withdrawn."""
         await asyncio.wait([self._task])
 
-    async def _run(self, after: asyncio.Task[None] | None) -> None:
+    async def _run(self, after: Registration[_T] | None) -> None:
         if after is not None:
-            await asyncio.wait([after])
+            await after.closed()
         while not self._unwanted.is_set():
             node = await self._first(self._link.current())
             if node is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -153,10 +154,8 @@ class ParamMirror:
                 _log.debug("! the master tells %s for %s: %s", type(value).__name__, key, error)
 
     def _remove(self, key: str) -> None:
-        try:
+        with contextlib.suppress(KeyError):
             self._parameters.delete(key)
-        except KeyError:
-            pass
 
     def _change(self, apply: Callable[[], None]) -> None:
         before = self._parameters.tree

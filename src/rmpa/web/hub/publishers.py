@@ -6,7 +6,6 @@ import asyncio
 import functools
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -15,6 +14,8 @@ from rmpa.web import limits
 from rmpa.web.hub.node_link import Registration
 
 if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
     from rmpa.core.errors import RmpaError
     from rmpa.ros.node.node import Node, Publisher
     from rmpa.ros.types.messages import MessageType

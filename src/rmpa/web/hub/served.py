@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import functools
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -14,6 +13,8 @@ from rmpa.web import limits
 from rmpa.web.hub.node_link import Registration
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rmpa.ros.node.node import Node, Service
     from rmpa.ros.types.service_types import ServiceType
     from rmpa.web.hub.clients import Key

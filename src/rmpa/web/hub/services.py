@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -58,7 +57,7 @@ class ServiceCalls:
         """What is known of services, by name."""
         return self._found
 
-    async def call(self, service: str, md5sum: str, request: Payload, timeout: float | None) -> Payload:
+    async def call(self, service: str, md5sum: str, request: Payload, timeout: float | None) -> Payload:  # noqa: ASYNC109
         """Call a service.
 
         Args:

@@ -6,7 +6,6 @@ import asyncio
 import functools
 import time
 from collections import OrderedDict
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
@@ -16,7 +15,7 @@ from rmpa.web.hub.node_link import Registration
 from rmpa.web.hub.requests import Received
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from rmpa.core.errors import RmpaError
     from rmpa.ros.node.node import Node, Subscriber
@@ -213,21 +212,23 @@ class Topics:
     ) -> None:
         there.messages += 1
         there.bytes += len(payload)
-        had: set[_Sink] = set()
+        had: set[_Sink] | None = None
         if latch:
-            before = there.latched.get(source)
-            if before is not None and source != OWN and before.header is not header and before.payload == payload:
+            latched = there.latched.get(source)
+            if latched is not None and source != OWN and latched.header is not header and latched.payload == payload:
                 # The publisher sends its latched message at each new connection: most sinks have had it.
-                before.header = header
-                had = before.had
-                latched = before
+                latched.header = header
             else:
                 latched = self._keep(there, source, _Latched(header, type_, payload, stamp_ns))
+            had = latched.had
         for sink in [*there.sinks.values()]:
-            if sink not in had and sink.type in (None, type_):
-                if latch:
-                    latched.had.add(sink)
-                sink.deliver(Received(sink.handle, there.name, type_, payload, stamp_ns))
+            if sink.type not in (None, type_):
+                continue
+            if had is not None:
+                if sink in had:
+                    continue
+                had.add(sink)
+            sink.deliver(Received(sink.handle, there.name, type_, payload, stamp_ns))
 
     def _keep(self, there: _Topic, source: str, latched: _Latched) -> _Latched:
         self._forget_latched(there.name, source, there)

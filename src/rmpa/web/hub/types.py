@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 from rmpa.core.errors import RmpaError
@@ -19,6 +18,8 @@ from rmpa.ros.types.service_types import ServiceType, known_services
 from rmpa.web import limits
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
     from rmpa.web.hub.clients import Key
     from rmpa.web.hub.node_link import NodeLink
 
