@@ -46,8 +46,10 @@ GRAPH_PERIOD: Final = 0.08
 """Shortest time between two looks at the graph while a client follows it, so that a new topic shows within 0.1 s."""
 GRAPH_IDLE_PERIOD: Final = 1.0
 """Time between two looks while no client follows the graph."""
-GRAPH_SHARE: Final = 20.0
-"""A pause between two looks is so many times as long as a look takes: the master and this process spend 5 % on it."""
+GRAPH_GATHER: Final = 0.01
+"""Time in which changes that the hub itself makes are gathered before it looks at the graph."""
+GRAPH_SHARE: Final = 10.0
+"""A pause between two looks is so many times as long as a look takes: the master and this process spend a tenth on it."""
 PROBES_AT_ONCE: Final = 8
 """Servers that are asked for their service's type at one time."""
 PROBE_RETRY: Final = 10.0
@@ -63,7 +65,7 @@ EARLY_MESSAGES: Final = 100
 EARLY_BYTES: Final = 4 * MIB
 """Bytes of these; the oldest is dropped, the newest always fits."""
 EARLY_WAIT: Final = 1.0
-"""Time that they wait for a subscriber, where the graph has one."""
+"""Time that they wait for the first subscriber to connect."""
 PACKAGES_WALKED: Final = 20_000
 """Folders that are searched for a package's assets."""
 
@@ -75,6 +77,11 @@ SEND_TIMEOUT: Final = 30.0
 """Time in which the client's machine must acknowledge what was sent (TCP_USER_TIMEOUT)."""
 WRITE_BUFFER: Final = 64 * KIB
 """Bytes in the connection's own buffer above which nothing more is written to it."""
+UNSENT_BYTES: Final = 512 * KIB
+"""Bytes that the kernel holds beyond those on their way (TCP_NOTSENT_LOWAT): a ping behind them must pass in time,
+and commands overtake images in the queue, not there."""
+TIMER_RETRY: Final = 0.1
+"""Pause before a session's timer is looked at again while its client takes nothing."""
 JOINED_MAX: Final = 32 * KIB
 """Largest payload that is copied behind its header; a larger one is written by itself."""
 DROPS_SHOWN: Final = 1.0

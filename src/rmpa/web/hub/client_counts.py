@@ -10,6 +10,8 @@ from rmpa.core.errors import RmpaError
 from rmpa.web.values.codec import codec_for
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rmpa.web.hub.clients import Key
     from rmpa.web.hub.publishers import Publishers
     from rmpa.web.hub.types import TypeLibrary
@@ -34,18 +36,20 @@ class ClientCounts:
         publishers: The hub's.
         types: Finds the two types.
         key: For the publishers.
+        now_ns: The wall clock, in nanoseconds.
     """
 
-    def __init__(self, publishers: Publishers, types: TypeLibrary, key: Key) -> None:
+    def __init__(self, publishers: Publishers, types: TypeLibrary, key: Key, now_ns: Callable[[], int]) -> None:
+        self._now_ns = now_ns
         self._publishers = publishers
         self._types = types
         self._key = key
         self._clients: dict[int, _Connected] = {}
         self._advertised = False
 
-    def add(self, number: int, address: str, since_ns: int) -> None:
+    def add(self, number: int, address: str) -> None:
         """A client is there."""
-        self._clients[number] = _Connected(address, since_ns)
+        self._clients[number] = _Connected(address, self._now_ns())
         self._publish()
 
     def remove(self, number: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 from typing import TYPE_CHECKING, Final
 
@@ -48,6 +49,7 @@ class GraphWatch:
         master_back: Callable[[], None],
     ) -> None:
         self._link = link
+        link.on_registration.append(self.look)
         self._found = found
         self._services_changed = services_changed
         self._master_back = master_back
@@ -138,12 +140,11 @@ class GraphWatch:
                 self._rebuild()
             took = loop.time() - began
             period = limits.GRAPH_PERIOD if self.active else limits.GRAPH_IDLE_PERIOD
-            try:
+            with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(max(period, took * limits.GRAPH_SHARE)):
                     await self._look.wait()
-                await asyncio.sleep(limits.GRAPH_PERIOD)
-            except TimeoutError:
-                pass
+                # Many changes at once, as when a page subscribes to all topics, are one look.
+                await asyncio.sleep(max(limits.GRAPH_GATHER, took))
 
     async def _read(self, node: Node) -> bool:
         """Read the graph; returns whether it differs from the last one."""

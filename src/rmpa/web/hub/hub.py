@@ -79,11 +79,10 @@ class Hub:
             self.types.find_message,
             deliver=self._published,
             ended=self.topics.forget_own,
-            has_subscribers=self._has_subscribers,
             now_ns=now_ns,
         )
         self.time = RosTime(self.topics, self.params, (_OWN, 1), now_ns)
-        self.counts = ClientCounts(self.publishers, self.types, (_OWN, 2))
+        self.counts = ClientCounts(self.publishers, self.types, (_OWN, 2), now_ns)
         self._handlers: Mapping[type[Request], Callable[[Client, Any], None]] = {
             requests.Subscribe: self._subscribe,
             requests.Unsubscribe: self._unsubscribe,
@@ -181,6 +180,7 @@ class Hub:
         self.params.forget_client(client.number)
         self.graph.forget_client(client.number)
         self.types.forget_client(client.number)
+        self.counts.remove(client.number)
         self.graph.active = bool(self._clients)
 
     def ask(self, client: Client, request: Request) -> None:
@@ -236,11 +236,6 @@ class Hub:
 
     def _own_latched(self, topic: str) -> tuple[str, memoryview, int] | None:
         return self.publishers.latched(topic)
-
-    def _has_subscribers(self, topic: str) -> bool:
-        known = self.graph.topics.get(topic)
-        own = self.link.node.name if self.link.node is not None else ""
-        return known is not None and any(node != own for node in known.subscribers)
 
     def _learn(self, topic: str, header: Mapping[str, str]) -> None:
         self.types.learn(header)

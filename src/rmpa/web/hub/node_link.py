@@ -43,6 +43,13 @@ class NodeLink:
         """Why there is no node; empty while there is one."""
         self.on_node: list[Callable[[Node], None]] = []
         """Called with each new node."""
+        self.on_registration: list[Callable[[], None]] = []
+        """Called when something was registered or withdrawn."""
+
+    def registration_changed(self) -> None:
+        """Call ``on_registration``."""
+        for callback in self.on_registration:
+            callback()
 
     def start(self) -> None:
         """Begin, in a task."""
@@ -158,10 +165,12 @@ class Registration(Generic[_T]):
             except (RmpaError, ValueError) as error:  # ValueError: an illegal name
                 self._on_failed(error if isinstance(error, RmpaError) else RmpaError(str(error)))
                 return
+            self._link.registration_changed()
             await self._first(node.stopped.wait())
             value, self.value = self.value, None
             if not node.stopped.is_set():
                 await self._withdraw(value)
+                self._link.registration_changed()
 
     async def _first(self, other: Awaitable[_U]) -> _U | None:
         """Wait for it, or until it is no longer wanted: then ``None``."""

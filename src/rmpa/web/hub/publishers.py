@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
 import time
 from collections import deque
@@ -48,7 +49,6 @@ class Publishers:
         find: Finds a message type.
         deliver: ``(topic, type, payload, latch)``: hands a message to the clients of this hub.
         ended: ``(topic)``: a topic was withdrawn.
-        has_subscribers: Whether the graph shows a subscriber of a topic at another node.
         now_ns: The wall clock, in nanoseconds.
     """
 
@@ -59,14 +59,12 @@ class Publishers:
         *,
         deliver: Callable[[str, str, memoryview, bool], None],
         ended: Callable[[str], None],
-        has_subscribers: Callable[[str], bool],
         now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         self._link = link
         self._find = find
         self._deliver = deliver
         self._ended = ended
-        self._has_subscribers = has_subscribers
         self._now_ns = now_ns
         self._shared: dict[str, _Shared] = {}
         self._ending: dict[str, Registration[Publisher]] = {}
@@ -171,12 +169,11 @@ class Publishers:
     async def _register(self, shared: _Shared, node: Node) -> Publisher:
         kind = await self._find(shared.type)
         publisher = await node.advertise(shared.topic, kind, latch=shared.latch)
-        if shared.early and not shared.latch and self._has_subscribers(shared.topic):
-            try:
+        if shared.early is not None and not shared.latch:
+            # The master has just told the subscribers, which connect now: what is published meanwhile waits for them.
+            with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(limits.EARLY_WAIT):
                     await publisher.wait_for_subscriber()
-            except TimeoutError:
-                pass
         early, shared.early = shared.early, None
         for payload in early or ():
             publisher.publish_raw(payload)
