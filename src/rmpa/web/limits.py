@@ -49,7 +49,7 @@ GRAPH_IDLE_PERIOD: Final = 1.0
 GRAPH_GATHER: Final = 0.01
 """Time in which changes that the hub itself makes are gathered before it looks at the graph."""
 GRAPH_SHARE: Final = 10.0
-"""A pause between two looks is so many times as long as a look takes: the master and this process spend a tenth on it."""
+"""A pause between two looks is so many times as long as a look takes: both ends spend a tenth on it."""
 PROBES_AT_ONCE: Final = 8
 """Servers that are asked for their service's type at one time."""
 PROBE_RETRY: Final = 10.0
