@@ -178,5 +178,8 @@ ended."""
 DIRECT_MOVE_WAIT: Final = 0.5
 """Seconds that a move waits for a subscriber to hang up by itself (roscpp does at `publisherUpdate`), before its
 connection is ended."""
+DIRECT_LIST_AGAIN: Final = 3.0
+"""Seconds after which a subscriber that was made to hang up gets the list of publishers once more: a roscore's graph
+is known up to 1.3 s late, and a call to a busy node may fail."""
 DIRECT_LOOK: Final = 0.02
 """Seconds between two looks while a move waits."""
