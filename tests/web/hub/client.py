@@ -41,9 +41,15 @@ def node(core: RosCore, name: str = "") -> Node:
 @contextlib.asynccontextmanager
 async def running_hub(core: RosCore) -> AsyncIterator[Hub]:
     """A hub that has its node, and has read the graph and the parameters."""
+
+    async def where() -> str:
+        return core.uri
+
     async with Hub(
-        lambda updated: Node("rmpa_web", master_uri=core.uri, environment=RosEnvironment(), on_param_update=updated)
+        where,
+        lambda uri, updated: Node("rmpa_web", master_uri=uri, environment=RosEnvironment(), on_param_update=updated),
     ) as hub:
+        hub.start()
         await until(lambda: hub.graph.loaded.is_set() and hub.params.loaded.is_set())
         yield hub
 

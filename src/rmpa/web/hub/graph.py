@@ -131,6 +131,7 @@ class GraphWatch:
             except RmpaError as error:
                 _log.debug("! the graph cannot be read: %s", error)
                 away = True
+                await self._link.check_master()
                 await asyncio.sleep(limits.NODE_RETRY)
                 continue
             if away:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.web.hub.clients import Key, Receive
-    from rmpa.web.hub.node_link import MakeNode
+    from rmpa.web.hub.node_link import MakeNode, Where
     from rmpa.web.hub.requests import Request
     from rmpa.web.hub.rights import Rights
 
@@ -42,9 +42,10 @@ _OWN: Final = 0
 
 
 class Hub:
-    """Serves the requests of all clients; an async context manager.
+    """Serves the requests of all clients; an async context manager. The node is started with the first client.
 
     Args:
+        where: Finds the master.
         make_node: Makes the node; it is made anew when the master was away or has shut it down.
         now_ns: The wall clock, in nanoseconds.
         environ: Where packages are searched for assets.
@@ -52,6 +53,7 @@ class Hub:
 
     def __init__(
         self,
+        where: Where,
         make_node: MakeNode,
         *,
         now_ns: Callable[[], int] = time.time_ns,
@@ -60,9 +62,10 @@ class Hub:
         self._environ = os.environ if environ is None else environ
         self._now_ns = now_ns
         self._numbers = itertools.count(1)
+        self._started = False
         self._clients: dict[int, Client] = {}
         self._tasks: dict[Key, asyncio.Task[None]] = {}
-        self.link = NodeLink(make_node, self._param_updated)
+        self.link = NodeLink(where, make_node, self._param_updated)
         self.params = ParamMirror(self.link)
         self.types = TypeLibrary(self.link)
         self.calls = ServiceCalls(self.link)
@@ -107,9 +110,14 @@ class Hub:
         }
 
     async def __aenter__(self) -> Self:
-        self.link.start()
-        self.graph.start()
         return self
+
+    def start(self) -> None:
+        """Start the node, if it is not."""
+        if not self._started:
+            self._started = True
+            self.link.start()
+            self.graph.start()
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -161,6 +169,7 @@ class Hub:
             raise PeerRefused("the web server", problem, "close some pages")
         client = Client(next(self._numbers), name, rights, receive, unadvertise_delay)
         self._clients[client.number] = client
+        self.start()
         self.graph.active = True
         self.graph.look()
         return client

@@ -20,19 +20,23 @@ _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 _U = TypeVar("_U")
 
-MakeNode: TypeAlias = "Callable[[Callable[[str, XmlRpcValue], None]], Node]"
-"""Makes a node that is not started; its argument is the node's ``on_param_update``."""
+MakeNode: TypeAlias = "Callable[[str, Callable[[str, XmlRpcValue], None]], Node]"
+"""Makes a node that is not started: ``(master URI, on_param_update)``."""
+Where: TypeAlias = "Callable[[], Awaitable[str]]"
+"""Finds the master's URI; raises ``RmpaError`` while there is none."""
 
 
 class NodeLink:
     """Keeps a node running.
 
     Args:
+        where: Finds the master.
         make: Makes a node.
         on_param_update: ``(key, value)``: a parameter has changed that the node follows.
     """
 
-    def __init__(self, make: MakeNode, on_param_update: Callable[[str, XmlRpcValue], None]) -> None:
+    def __init__(self, where: Where, make: MakeNode, on_param_update: Callable[[str, XmlRpcValue], None]) -> None:
+        self._where = where
         self._make = make
         self._on_param_update = on_param_update
         self._task: asyncio.Task[None] | None = None
@@ -68,6 +72,18 @@ class NodeLink:
             await self._ready.wait()
         return self.node
 
+    async def check_master(self) -> None:
+        """The node's master does not answer: end the node where another master is the right one now."""
+        node = self.node
+        try:
+            uri = await self._where()
+        except RmpaError as error:
+            _log.debug("! %s", error)
+            return
+        if node is not None and uri != node.master_uri:
+            _log.info("= the master is at %s now", uri)
+            await node.close()
+
     def need(self) -> Node:
         """The node.
 
@@ -81,7 +97,7 @@ class NodeLink:
     async def _run(self) -> None:
         while True:
             try:
-                async with self._make(self._on_param_update) as node:
+                async with self._make(await self._where(), self._on_param_update) as node:
                     self._began(node)
                     try:
                         await node.stopped.wait()
