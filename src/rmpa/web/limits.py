@@ -82,7 +82,7 @@ UNSENT_BYTES: Final = 512 * KIB
 and commands overtake images in the queue, not there."""
 TIMER_RETRY: Final = 0.1
 """Pause before a session's timer is looked at again while its client takes nothing."""
-JOINED_MAX: Final = 32 * KIB
+JOINED_BYTES: Final = 32 * KIB
 """Largest payload that is copied behind its header; a larger one is written by itself."""
 DROPS_SHOWN: Final = 1.0
 """Shortest time between two texts to a client on the messages that it misses."""

@@ -96,7 +96,12 @@ async def test_a_message_is_converted_once_for_all_clients(core: RosCore, monkey
     from rmpa.web.rosbridge import encodings
 
     encode = encodings._encode
-    monkeypatch.setattr(encodings, "_encode", lambda *args: made.append(args[0]) or encode(*args))
+
+    def counted(topic: str, *args: Any) -> Any:
+        made.append(topic)
+        return encode(topic, *args)
+
+    monkeypatch.setattr(encodings, "_encode", counted)
     async with running_server(core) as server, node(core, "talker") as talker:
         publisher = await talker.advertise("/t", STRING)
         async with server.client() as one, server.client() as two:
@@ -185,7 +190,7 @@ async def test_a_client_that_stops_reading_costs_its_bound_and_no_other_a_messag
                 await client.send("subscribe", subscriptions=[{"id": 1, "channelId": channel["id"]}])
             await until(lambda: all(each.subscriptions for each in server.hub.clients))
             await publisher.wait_for_subscriber()
-            stuck.socket._reader._protocol.pause_reading()  # type: ignore[attr-defined]
+            stuck.socket._reader._protocol.pause_reading()
             for _ in range(45):
                 publisher.publish_raw(payload)
                 assert (await reader.next_bytes())[13:] == payload

@@ -69,9 +69,9 @@ def test_handle_0_is_never_dropped_and_its_overflow_shows() -> None:
     queue: FairQueue[str] = FairQueue(total_bytes=10, subscription_bytes=10)
     queue.push(1, "message", 8)
     queue.push(0, "one", 6)
-    assert not queue.overflow
+    before = queue.overflow
     queue.push(0, "two", 6)
-    assert queue.overflow
+    assert (before, queue.overflow) == (False, True)
     assert _all(queue) == ["one", "two"]
     assert queue.dropped == {1: 1}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rmpa.core.errors import RmpaError
 from rmpa.ros.types.messages import MessageType
@@ -64,7 +64,7 @@ async def test_all_clients_share_one_subscription_and_one_payload(core: RosCore)
         assert abs(first.stamp_ns - time.time_ns()) < DEADLINE * 1e9
 
 
-async def test_the_last_client_ends_the_subscription_after_a_while(core: RosCore, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+async def test_the_last_client_ends_the_subscription_after_a_while(core: RosCore, monkeypatch: Any) -> None:
     monkeypatch.setattr("rmpa.web.limits.SUBSCRIPTION_LINGER", 0.01)
     async with running_hub(core) as hub, node(core, "talker") as talker:
         publisher = await talker.advertise("/t", STRING)
@@ -194,7 +194,7 @@ async def test_another_type_of_a_published_topic_is_refused(core: RosCore) -> No
         assert "no_msgs/Such" in (await one.failure(2)).error
 
 
-async def test_a_node_that_was_shut_down_comes_back_with_everything(core: RosCore, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+async def test_a_node_that_was_shut_down_comes_back_with_everything(core: RosCore, monkeypatch: Any) -> None:
     monkeypatch.setattr("rmpa.web.limits.NODE_RETRY", 0.01)
     async with running_hub(core) as hub, node(core, "talker") as talker:
         publisher = await talker.advertise("/t", STRING)
@@ -343,7 +343,7 @@ async def test_clock_gives_the_time_where_the_parameter_says_so(core: RosCore) -
 async def test_a_read_only_client_changes_nothing(core: RosCore) -> None:
     async with running_hub(core) as hub:
         client = FakeClient(hub, READ_ONLY)
-        asked = [
+        asked: list[Any] = [
             Advertise(1, "/t", "std_msgs/String"),
             CallService(2, "/set", SET_BOOL, b"\x01"),
             ServeService(3, "/s", SET_BOOL),

@@ -94,9 +94,12 @@ async def test_pages_of_other_sites_connect_only_where_they_are_listed() -> None
         assert refused.value.status == 403
         async with connect(session, server, Origin=f"http://127.0.0.1:{server.port}"):
             pass
-    async with running(origins=frozenset({origin})) as (server, _), aiohttp.ClientSession() as session:
-        async with connect(session, server, Origin=origin):
-            pass
+    async with (
+        running(origins=frozenset({origin})) as (server, _),
+        aiohttp.ClientSession() as session,
+        connect(session, server, Origin=origin),
+    ):
+        pass
 
 
 async def test_the_server_ends_while_clients_are_connected() -> None:
@@ -116,7 +119,7 @@ def test_rights_need_a_token() -> None:
     assert rights_of(has_token=True, control=True) is FULL
     readers = rights_of(has_token=True, control=False)
     assert readers.read_parameters
-    assert not (readers.publish or readers.call_services or readers.set_parameters or readers.serve_services)
+    assert (readers.publish, readers.call_services, readers.set_parameters, readers.serve_services) == (False,) * 4
 
 
 async def test_contracts_give_priorities() -> None:

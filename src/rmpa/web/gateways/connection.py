@@ -10,7 +10,7 @@ import asyncio
 import logging
 import socket
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Final, TypeAlias, cast
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 from aiohttp import WSMsgType, web
 
@@ -166,8 +166,8 @@ class ClientConnection(ABC):
         writing: asyncio.Task[None] | None = None
         try:
             writer = await socket_.prepare(request)
-            self._transport = cast("asyncio.Transport", request.transport)
-            if writer is None or self._transport is None:
+            self._transport = request.transport
+            if self._transport is None:
                 return  # it went during the handshake
             _tune(self._transport)
             self.opened()
@@ -226,7 +226,7 @@ class ClientConnection(ABC):
         header = frame_header(opcode, sum(map(len, parts)))
         small: list[Payload] = [header]
         for part in parts:
-            if len(part) <= limits.JOINED_MAX:
+            if len(part) <= limits.JOINED_BYTES:
                 small.append(part)
                 continue
             transport.write(b"".join(small))
