@@ -70,7 +70,7 @@ class Server:
 
 @contextlib.asynccontextmanager
 async def running_server(
-    core: RosCore, rights: Rights = FULL, priority: Callable[[str], int] = lambda _: 0
+    core: RosCore, rights: Rights = FULL, priority: Callable[[str], int] = lambda _: 0, *, port: int = 0
 ) -> AsyncIterator[Server]:
     async with running_hub(core) as hub:
         gateways = Gateways(hub, "test", lambda _: rights, priority)
@@ -78,7 +78,7 @@ async def running_server(
         app.router.add_get("/", gateways.handle)
         runner = web.AppRunner(app, shutdown_timeout=1)
         await runner.setup()
-        site = web.TCPSite(runner, "127.0.0.1", 0)
+        site = web.TCPSite(runner, "127.0.0.1", port)
         await site.start()
         port = runner.addresses[0][1]
         try:
