@@ -1,6 +1,6 @@
 """Both gateways with a core of their own, for clients that are programs: ``python -m tests.web.gateways.serve PORT``.
 
-It ends when its standard input does.
+It prints its port (0: any), and ends when its standard input does.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from tests.web.hub.client import local_core
 
 
 async def main(port: int) -> None:
-    async with local_core() as core, running_server(core, port=port):
-        print(core.uri, flush=True)
+    async with local_core() as core, running_server(core, port=port) as server:
+        print(server.port, flush=True)
         await asyncio.to_thread(sys.stdin.read)
 
 
