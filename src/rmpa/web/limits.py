@@ -70,6 +70,10 @@ PACKAGES_WALKED: Final = 20_000
 """Folders that are searched for a package's assets."""
 
 # --- gateways -----------------------------------------------------------------------------------------------------
+SETTLE: Final = 2.0
+"""Time that the first client waits for the graph and the parameters, before it is told that there are none."""
+CLOSE_TIMEOUT: Final = 2.0
+"""Time for a client to confirm the end of its WebSocket."""
 PING_INTERVAL: Final = 20.0
 """Time between two pings of a client; one without a sign of life for half of it more is disconnected, as it may have
 left the Wi-Fi."""

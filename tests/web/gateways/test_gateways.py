@@ -198,6 +198,8 @@ async def test_a_client_that_stops_reading_costs_its_bound_and_no_other_a_messag
             assert queues[0] == (0, 0)
             assert 0 < queues[1][0] <= 16 << 20
             assert queues[1][1] > 0
+            figures = server.gateways.figures()["foxglove"]
+            assert (figures.clients, figures.queued, figures.dropped) == (2, *queues[1])
             stuck.socket._response.connection.transport.abort()  # type: ignore[union-attr]
 
 

@@ -37,8 +37,8 @@ _OVERHEAD: Final = 128
 """Bytes that an entry of the queue takes beside its payload."""
 _TURN: Final = 16
 """Entries that are written before other tasks have their turn."""
-_TRY_AGAIN_LATER: Final = 1013
-"""A WebSocket's close code (IANA's registry): the server is overloaded."""
+_INTERNAL_ERROR: Final = 1011
+"""A WebSocket's close code, RFC 6455, section 7.4.1."""
 
 
 class ClientConnection(ABC):
@@ -185,7 +185,12 @@ class ClientConnection(ABC):
     async def _read(self, socket_: web.WebSocketResponse) -> None:
         async for message in socket_:
             if message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
-                self.received_frame(message.data)
+                try:
+                    self.received_frame(message.data)
+                except Exception:  # noqa: BLE001 - a fault of one client's session must not end the server
+                    _log.exception("! a frame of %s failed", self.client.name)
+                    await socket_.close(code=_INTERNAL_ERROR, message=b"the server failed; its log says why")
+                    return
             elif message.type == WSMsgType.ERROR:
                 _log.debug("! %s: %s", self.client.name, socket_.exception())
 

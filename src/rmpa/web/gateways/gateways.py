@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import secrets
+from collections import Counter
 from typing import TYPE_CHECKING
 
 from aiohttp import web
@@ -11,6 +13,7 @@ from aiohttp import web
 from rmpa.core.errors import PeerRefused
 from rmpa.web import limits
 from rmpa.web.foxglove.protocol import SUBPROTOCOLS, choose_subprotocol
+from rmpa.web.gateways.figures import PROTOCOLS, GatewayFigures
 from rmpa.web.gateways.foxglove import FoxgloveConnection
 from rmpa.web.gateways.rosbridge import RosbridgeConnection
 from rmpa.web.rosbridge import limits as rosbridge_limits
@@ -55,11 +58,26 @@ class Gateways:
         self._session_id = secrets.token_hex(8)
         self._frames = PublishFrames()
         self._open: dict[ClientConnection, web.WebSocketResponse] = {}
+        self._sent: Counter[str] = Counter()
+        self._dropped: Counter[str] = Counter()
 
     @property
     def connections(self) -> tuple[ClientConnection, ...]:
         """All clients, with their queues."""
         return tuple(self._open)
+
+    def figures(self) -> dict[str, GatewayFigures]:
+        """What each gateway counts."""
+        found = {}
+        for kind in PROTOCOLS:
+            present = [each for each in self._open if each.kind == kind]
+            found[kind] = GatewayFigures(
+                clients=len(present),
+                queued=sum(each.queue.bytes for each in present),
+                sent=self._sent[kind] + sum(each.sent for each in present),
+                dropped=self._dropped[kind] + sum(each.queue.dropped_total for each in present),
+            )
+        return found
 
     async def handle(self, request: web.Request) -> web.StreamResponse:
         """Serve one client until it has gone."""
@@ -67,6 +85,7 @@ class Gateways:
         protocol = choose_subprotocol(offered)
         address = request.remote or "?"
         rights = self._rights_of(request)
+        await self._hub.settled(limits.SETTLE)
         connection: ClientConnection
         if protocol is not None:
             connection = FoxgloveConnection(
@@ -81,6 +100,7 @@ class Gateways:
             heartbeat=limits.PING_INTERVAL,
             compress=False,
             max_msg_size=most,
+            timeout=limits.CLOSE_TIMEOUT,
         )
         self._open[connection] = response
         try:
@@ -90,10 +110,15 @@ class Gateways:
             return web.Response(status=503, text=f"{error}\n")
         finally:
             del self._open[connection]
+            self._sent[connection.kind] += connection.sent
+            self._dropped[connection.kind] += connection.queue.dropped_total
         return response
 
     async def close(self) -> None:
         """Tell all clients that the server ends."""
-        for response in [*self._open.values()]:
-            if response.prepared:
-                await response.close(code=1001, message=b"the server ends")
+        closing = [
+            response.close(code=1001, message=b"the server ends")
+            for response in self._open.values()
+            if response.prepared
+        ]
+        await asyncio.gather(*closing, return_exceptions=True)

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from aiohttp.typedefs import Handler, Middleware
 
+    from rmpa.web.gateways.gateways import Gateways
     from rmpa.web.server.agent_watch import AgentWatch
     from rmpa.web.server.pages import Page
 
@@ -62,7 +63,7 @@ class Routes:
         pages: Files by path.
         connections: Returns how many connections are open, and how many there were.
         counters: Refusals by reason, those of the connections too.
-        websocket: Serves WebSocket upgrades of ``WEBSOCKET_PATHS``.
+        gateways: Serve WebSocket upgrades of ``WEBSOCKET_PATHS``.
     """
 
     def __init__(
@@ -72,10 +73,10 @@ class Routes:
         pages: Mapping[str, Page],
         connections: Callable[[], tuple[int, int]],
         counters: Counters,
-        websocket: Handler | None = None,
+        gateways: Gateways | None = None,
     ) -> None:
         self._watch = watch
-        self._websocket = websocket
+        self._gateways = gateways
         self._policy = policy
         self._pages = pages
         self._connections = connections
@@ -128,11 +129,11 @@ class Routes:
             return self._refused(request, "body", rest.problem(413, "a request with a body; send none with GET"))
         if isinstance(verdict, MoveToken):
             return self._move_token(request)
-        if self._websocket is not None and is_upgrade(request) and request.path in WEBSOCKET_PATHS:
+        if self._gateways is not None and is_upgrade(request) and request.path in WEBSOCKET_PATHS:
             connection = _connection(request)
             if connection is not None:
                 connection.upgrade()
-            handler = self._websocket
+            handler = self._gateways.handle
         try:
             return await handler(request)
         except web.HTTPException:  # of aiohttp's router: no such path
@@ -218,6 +219,7 @@ class Routes:
             self._counters.as_dict(),
             self._watch.reads,
             self._watch.seconds,
+            self._gateways.figures() if self._gateways is not None else {},
         )
 
     # --- what aiohttp answers by itself ---

@@ -61,7 +61,7 @@ class WebServer:
             read_pages(),
             self._connections,
             self.counters,
-            gateways.handle if gateways is not None else None,
+            gateways,
         )
         self._runner: web.AppRunner | None = None
         self._servers: list[asyncio.Server] = []
