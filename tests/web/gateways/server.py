@@ -58,13 +58,13 @@ class Server:
         self.gateways = gateways
         self.hub = hub
         self.port = port
-        self._session = session
+        self.session = session
 
     @contextlib.asynccontextmanager
     async def client(self, *protocols: str) -> AsyncIterator[Client]:
         """A client that offers subprotocols."""
         url = f"ws://127.0.0.1:{self.port}/"
-        async with self._session.ws_connect(url, protocols=protocols, max_msg_size=0) as socket:
+        async with self.session.ws_connect(url, protocols=protocols, max_msg_size=0) as socket:
             yield Client(socket)
 
 

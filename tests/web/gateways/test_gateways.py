@@ -225,6 +225,56 @@ async def test_the_hub_has_nothing_left_of_a_client_that_went(core: RosCore, mon
         assert not server.hub.topics.names
 
 
+async def test_a_client_without_a_sign_of_life_is_disconnected(core: RosCore, monkeypatch: Any) -> None:
+    monkeypatch.setattr("rmpa.web.limits.PING_INTERVAL", 0.1)
+    async with running_server(core) as server, server.client() as alive:
+        reading = asyncio.ensure_future(alive.next("service_response"))  # answers pings while it reads
+        dead = await server.session.ws_connect(f"ws://127.0.0.1:{server.port}/", autoping=False)
+        await until(lambda: len(server.gateways.connections) == 2)
+        await until(lambda: len(server.gateways.connections) == 1)
+        await alive.send("call_service", service="/rosapi/get_time", id="1")
+        assert (await reading)["result"]
+        dead._response.close()
+        await dead.close()
+
+
+async def test_a_command_overtakes_the_images_that_wait(core: RosCore) -> None:
+    payload = bytes(BYTES.serialize(BYTES.make({"data": [7] * 500_000})))
+    priorities: list[str] = []
+
+    def priority(topic: str) -> int:
+        priorities.append(topic)
+        return int(topic == "/cmd")
+
+    async with (
+        running_server(core, priority=priority) as server,
+        node(core, "camera") as camera,
+        server.client(FOXGLOVE) as client,
+    ):
+        image = await camera.advertise("/image", BYTES)
+        command = await camera.advertise("/cmd", STRING)
+        found: dict[str, int] = {}
+        while not {"/image", "/cmd"} <= found.keys():
+            found |= {each["topic"]: each["id"] for each in (await client.next("advertise"))["channels"]}
+        subscriptions = [{"id": 0, "channelId": found["/image"]}, {"id": 1, "channelId": found["/cmd"]}]
+        await client.send("subscribe", subscriptions=subscriptions)
+        await image.wait_for_subscriber()
+        await command.wait_for_subscriber()
+        client.socket._reader._protocol.pause_reading()
+        (connection,) = server.gateways.connections
+        images = 0
+        while sum(connection.queue.waiting.values()) < 5:
+            image.publish_raw(payload)
+            images += 1
+            await asyncio.sleep(0.01)
+        command.publish_raw(ONE)
+        await until(lambda: len(connection.queue.waiting) == 2)
+        client.socket._reader._protocol.resume_reading()
+        order = [struct.unpack_from("<BI", await client.next_bytes())[1] for _ in range(images + 1)]
+        assert order.index(1) <= images - 4
+        assert set(priorities) == {"/image", "/cmd"}
+
+
 async def test_frames_that_are_too_large_or_broken_end_one_client_only(core: RosCore) -> None:
     async with running_server(core) as server, server.client() as other:
         async with server.client() as client:

@@ -84,6 +84,7 @@ def test_a_javascript_client_works_unmodified(script: str, packages: list[str], 
     assert done.stdout.splitlines()[-1] == "ok"
 
 
+@pytest.mark.netns
 @pytest.mark.timeout(4 * RUN)
 @pytest.mark.parametrize("transport", ["twisted", "asyncio"])
 def test_roslibpys_own_tests_pass(transport: str, tmp_path: Path) -> None:

@@ -97,6 +97,22 @@ async def test_newcomers_get_the_latched_message_of_each_source_once(core: RosCo
         assert sorted(early.payloads(1)) == [ONE, TWO]
 
 
+async def test_a_latched_message_that_comes_again_after_a_reconnection_is_not_delivered_twice(core: RosCore) -> None:
+    async with running_hub(core) as hub, node(core, "a") as a:
+        publisher = await a.advertise("/map", LATCHED, latch=True)
+        publisher.publish_raw(ONE)
+        client = FakeClient(hub)
+        client.ask(Subscribe(1, "/map"))
+        await until(lambda: client.payloads(1))
+        assert publisher.publication.hang_up("/rmpa_web")
+        await until(lambda: publisher.subscribers == 1)
+        publisher.publish_raw(TWO)
+        await until(lambda: client.payloads(1)[-1] == TWO)
+        publisher.publish_raw(TWO)  # the same again, over the same connection, is news
+        await until(lambda: len(client.payloads(1)) == 3)
+        assert client.payloads(1) == [ONE, TWO, TWO]
+
+
 async def test_a_publisher_that_has_gone_leaves_no_latched_message(core: RosCore) -> None:
     async with running_hub(core) as hub, node(core, "a") as a:
         publisher = await a.advertise("/map", LATCHED, latch=True)

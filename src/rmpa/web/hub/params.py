@@ -179,7 +179,14 @@ class ParamMirror:
 
 
 def _same(one: object, other: object) -> bool:
-    return one is other or (type(one) is type(other) and one == other)
+    """Whether two values are equal and of the same types: 1 is not 1.0, nor True."""
+    if one is other:
+        return True
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        return one.keys() == other.keys() and all(_same(value, other[key]) for key, value in one.items())
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(_same, one, other))
+    return type(one) is type(other) and one == other
 
 
 def _get(tree: object, name: str) -> object:
@@ -200,7 +207,7 @@ def _leaves(name: str, value: object) -> Iterator[tuple[str, ParamValue]]:
 
 def _differences(name: str, before: object, after: object) -> Iterator[tuple[str, ParamValue]]:
     """The leaves that differ, each with its new value; ``None`` for those that are gone."""
-    if _same(before, after):
+    if before is after or (not isinstance(after, Mapping) and _same(before, after)):
         return
     old = before if isinstance(before, Mapping) else {}
     new = after if isinstance(after, Mapping) else {}
