@@ -43,13 +43,16 @@ SERVED_CALLS_MAX: Final = 1000
 SERVED_TIMEOUT: Final = 60.0
 """Time for a client's answer to a call of its service."""
 GRAPH_PERIOD: Final = 0.08
-"""Shortest time between two looks at the graph while a client follows it, so that a new topic shows within 0.1 s."""
+"""Shortest time from one look at the graph to the next while there are clients, so that a new topic shows within
+0.1 s."""
 GRAPH_IDLE_PERIOD: Final = 1.0
 """Time between two looks while no client follows the graph."""
 GRAPH_GATHER: Final = 0.01
 """Time in which changes that the hub itself makes are gathered before it looks at the graph."""
 GRAPH_SHARE: Final = 10.0
 """A pause between two looks is so many times as long as a look takes: both ends spend a tenth on it."""
+GRAPH_CHANGED_SHARE: Final = 1.0
+"""The same after a look that found a change, which is parsed: that takes ten times as long as to compare."""
 PROBES_AT_ONCE: Final = 8
 """Servers that are asked for their service's type at one time."""
 PROBE_RETRY: Final = 10.0

@@ -141,8 +141,9 @@ class GraphWatch:
                 self._rebuild()
             took = loop.time() - began
             period = limits.GRAPH_PERIOD if self.active else limits.GRAPH_IDLE_PERIOD
+            share = limits.GRAPH_CHANGED_SHARE if changed else limits.GRAPH_SHARE
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(max(period, took * limits.GRAPH_SHARE)):
+                async with asyncio.timeout(max(period - took, took * share)):
                     await self._look.wait()
                 # Many changes at once, as when a page subscribes to all topics, are one look.
                 await asyncio.sleep(max(limits.GRAPH_GATHER, took))
