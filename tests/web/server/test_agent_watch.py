@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import socket
 import threading
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import pytest
 
@@ -21,6 +21,12 @@ if TYPE_CHECKING:
 from rmpa.observe.control import ControlReply
 
 
+class Closing(Protocol):
+    """Anything that can be closed."""
+
+    def close(self) -> None: ...
+
+
 class ControlSocket:
     """A control socket that answers the first ``answers`` requests and then hangs."""
 
@@ -34,7 +40,7 @@ class ControlSocket:
         self._thread.start()
 
     def _serve(self) -> None:
-        held = []
+        held: list[Closing] = []
         while True:
             connection, _ = self._listener.accept()
             held.append(connection)

@@ -1,4 +1,4 @@
-"""Calls to local nodes that direct transport needs: their connections, and whom they shall be connected to."""
+"""Calls to local nodes that direct transport needs: their connections, and lists of publishers sent to them."""
 
 from __future__ import annotations
 
