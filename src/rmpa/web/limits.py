@@ -78,8 +78,8 @@ SETTLE: Final = 2.0
 CLOSE_TIMEOUT: Final = 2.0
 """Time for a client to confirm the end of its WebSocket."""
 PING_INTERVAL: Final = 20.0
-"""Time between two pings of a client; one without a sign of life for half of it more is disconnected, as it may have
-left the Wi-Fi."""
+"""Time without a sign of life of a client, half of it after a ping; after half of it more it is disconnected, as it
+may have left the Wi-Fi."""
 SEND_TIMEOUT: Final = 30.0
 """Time in which the client's machine must acknowledge what was sent (TCP_USER_TIMEOUT)."""
 WRITE_BUFFER: Final = 64 * KIB

@@ -37,6 +37,8 @@ _OVERHEAD: Final = 128
 """Bytes that an entry of the queue takes beside its payload."""
 _TURN: Final = 16
 """Entries that are written before other tasks have their turn."""
+_SILENT_LOOKS: Final = 3
+"""Looks without a sign of life, each after half of ``limits.PING_INTERVAL``."""
 _INTERNAL_ERROR: Final = 1011
 """A WebSocket's close code, RFC 6455, section 7.4.1."""
 
@@ -70,6 +72,7 @@ class ClientConnection(ABC):
         self.queue: FairQueue[Received | OutFrame] = FairQueue()
         self.sent = 0
         """Messages and answers that were written."""
+        self._heard = 0
         self._priority = priority
         self._unadvertise_delay = unadvertise_delay
         self._wake = asyncio.Event()
@@ -163,7 +166,7 @@ class ClientConnection(ABC):
         self._client = self.hub.connect(
             f"{self.kind} {self.address}", self.rights, self.receive, unadvertise_delay=self._unadvertise_delay
         )
-        writing: asyncio.Task[None] | None = None
+        tasks: list[asyncio.Task[None]] = []
         try:
             writer = await socket_.prepare(request)
             self._transport = request.transport
@@ -171,20 +174,25 @@ class ClientConnection(ABC):
                 return  # it went during the handshake
             _tune(self._transport)
             self.opened()
-            writing = self._loop.create_task(self._write(socket_, writer), name=f"write to {self.client.name}")
+            for name, work in (("write to", self._write(socket_, writer)), ("watch", self._watch())):
+                tasks.append(self._loop.create_task(work, name=f"{name} {self.client.name}"))
             await self._read(socket_)
         finally:
             if self._timer is not None:
                 self._timer.cancel()
             self.hub.disconnect(self._client)
             self.queue.clear()
-            if writing is not None:
-                writing.cancel()
-                await asyncio.wait([writing])
+            for task in tasks:
+                task.cancel()
+            if tasks:
+                await asyncio.wait(tasks)
 
     async def _read(self, socket_: web.WebSocketResponse) -> None:
         async for message in socket_:
-            if message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
+            self._heard += 1
+            if message.type == WSMsgType.PING:
+                self._send(Opcode.PONG, (message.data,))
+            elif message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
                 try:
                     self.received_frame(message.data)
                 except Exception:  # noqa: BLE001 - a fault of one client's session must not end the server
@@ -193,6 +201,23 @@ class ClientConnection(ABC):
                     return
             elif message.type == WSMsgType.ERROR:
                 _log.debug("! %s: %s", self.client.name, socket_.exception())
+
+    async def _watch(self) -> None:
+        """Disconnect a client without a sign of life: it sends nothing, answers no ping, and takes nothing.
+
+        A large message on a slow link holds up the ping behind it; that it goes on is a sign of life, too.
+        """
+        silent, heard, waiting = 0, -1, 0
+        while silent < _SILENT_LOOKS:
+            await asyncio.sleep(limits.PING_INTERVAL / 2)
+            now = self._transport.get_write_buffer_size() if self._transport is not None else 0
+            alive = self._heard != heard or (waiting and now != waiting)
+            silent = 0 if alive else silent + 1
+            heard, waiting = self._heard, now
+            if not waiting:
+                self._send(Opcode.PING, ())
+        _log.info("= %s gave no sign of life, and is disconnected", self.client.name)
+        self._abort()
 
     async def _write(self, socket_: web.WebSocketResponse, writer: AbstractStreamWriter) -> None:
         try:
@@ -227,7 +252,7 @@ class ClientConnection(ABC):
         transport = self._transport
         if transport is None or transport.is_closing():
             return
-        self.sent += 1
+        self.sent += opcode in (Opcode.TEXT, Opcode.BINARY)
         header = frame_header(opcode, sum(map(len, parts)))
         small: list[Payload] = [header]
         for part in parts:

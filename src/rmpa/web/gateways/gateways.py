@@ -97,7 +97,7 @@ class Gateways:
             most = rosbridge_limits.FRAME_MAX
         response = web.WebSocketResponse(
             protocols=SUBPROTOCOLS,
-            heartbeat=limits.PING_INTERVAL,
+            autoping=False,
             compress=False,
             max_msg_size=most,
             timeout=limits.CLOSE_TIMEOUT,

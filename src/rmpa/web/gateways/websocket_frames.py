@@ -17,10 +17,12 @@ _LONG: Final = struct.Struct("!BBQ")
 
 
 class Opcode(IntEnum):
-    """The kind of a data frame."""
+    """The kind of a frame."""
 
     TEXT = 1
     BINARY = 2
+    PING = 9
+    PONG = 10
 
 
 def frame_header(opcode: Opcode, size: int) -> bytes:
