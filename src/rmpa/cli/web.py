@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rmpa.web.server.process import Address
 
 _log = logging.getLogger("rmpa.web")
-_LIBRARIES = ("aiohttp", "prometheus_client")
+_LIBRARIES = ("aiohttp", "cbor2", "prometheus_client")
 _DEFAULTS = WebSettings()
 EPILOG = """\
 \b
@@ -54,6 +54,11 @@ Examples:
 @click.option(
     "--host", "hosts", metavar="NAME", multiple=True, help="A further name of this server in URLs; repeatable."
 )
+@click.option(
+    "--control",
+    is_flag=True,
+    help="Let clients publish, call and offer services, and set parameters; they then need the token.",
+)
 @click.option("--config", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]")
 @click.option("--with-agent", is_flag=True, hidden=True, help="End when standard input ends.")
 @agent_option
@@ -63,12 +68,13 @@ def web(
     listen: str | None,
     token_file: str | None,
     hosts: tuple[str, ...],
+    control: bool,
     config: str | None,
     with_agent: bool,
     agent: str | None,
     as_json: bool,
 ) -> int:
-    """Serve this module's state over HTTP: /metrics for Prometheus, /api/v1 as JSON.
+    """Serve this module's state: /metrics for Prometheus, /api/v1 as JSON, rosbridge and Foxglove clients.
 
     It is a process of its own: the agent does not depend on it. It starts without an agent too, and finds it later.
     """
@@ -83,6 +89,7 @@ def web(
         port=given.port if port is None else port,
         listen=given.listen if listen is None else _host("--listen", listen),
         token_file=given.token_file if token_file is None else token_file,
+        control=given.control or control,
         hosts=(*given.hosts, *(_host("--host", name) for name in hosts)),
     )
     from rmpa.web.server.process import access_of, serve
@@ -93,7 +100,8 @@ def web(
     def announce(address: Address) -> None:
         _announce(address, as_json=as_json)
 
-    asyncio.run(serve(settings, access, agent, announce, with_agent=with_agent))
+    contracts = loaded.settings.make_contracts()
+    asyncio.run(serve(settings, access, agent, announce, with_agent=with_agent, contracts=contracts))
     return 0
 
 

@@ -249,6 +249,24 @@ class WebSettings:
         "Names of this server in URLs, besides its addresses, localhost and the host's name.",
         env="RMPA_WEB_HOSTS",
     )
+    ports: tuple[int, ...] = setting(
+        (),
+        list_of(PORT),
+        "Further ports, for clients that expect 9090 (rosbridge) or 8765 (Foxglove).",
+        env="RMPA_WEB_PORTS",
+    )
+    origins: tuple[str, ...] = setting(
+        (),
+        list_of(TEXT),
+        "Pages of other sites that may connect, such as https://app.foxglove.dev.",
+        env="RMPA_WEB_ORIGINS",
+    )
+    control: bool = setting(
+        False,
+        BOOL,
+        "Let clients publish, call and offer services, and set parameters; they then need the token.",
+        env="RMPA_WEB_CONTROL",
+    )
 
 
 @dataclass(frozen=True, slots=True)

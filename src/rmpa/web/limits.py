@@ -9,6 +9,91 @@ from typing import Final
 
 from rmpa.core.sizes import KIB, MIB
 
+# --- the hub ------------------------------------------------------------------------------------------------------
+CLIENT_QUEUE_BYTES: Final = 16 * MIB
+"""Bytes that wait for one client, of all its subscriptions; beyond, the oldest messages are dropped. One message
+always fits where no other waits."""
+SUBSCRIPTION_QUEUE_BYTES: Final = 8 * MIB
+"""Bytes that wait for one subscription of one client; its newest message always fits."""
+CLIENTS_MAX: Final = 256
+"""Clients of both gateways together."""
+SUBSCRIPTION_LINGER: Final = 2.0
+"""Time that the hub stays subscribed to a topic without a client: pages reload, and panels move."""
+UNADVERTISE_DELAY: Final = 10.0
+"""Time until a topic is withdrawn that no client advertises any more, as rosbridge_suite does."""
+PUBLISHERS_MAX: Final = 2000
+"""Topics that the hub publishes, those included that wait for their withdrawal."""
+NODE_RETRY: Final = 1.0
+"""Pause between two attempts to reach the master, or to register."""
+LATCHED_BYTES: Final = 64 * MIB
+"""Bytes of latched messages that the hub keeps for newcomers: maps and robot descriptions have some 10 MB. Beyond,
+the oldest is forgotten, and a newcomer gets none."""
+CALL_TIMEOUT: Final = 30.0
+"""Time for a service call of a client that names none."""
+CALL_TIMEOUT_MAX: Final = 3600.0
+"""The longest time that a client may give a call."""
+CALLS_AT_ONCE: Final = 8
+"""Connections to one service's server; further calls wait. rospy serves each connection by a thread."""
+CALLS_WAITING: Final = 1000
+"""Calls that wait for a free connection to one service's server."""
+CALL_IDLE: Final = 10.0
+"""Time that an unused connection to a service's server stays open."""
+SERVED_CALLS_MAX: Final = 1000
+"""Calls of one service that a client serves and that wait for its answer."""
+SERVED_TIMEOUT: Final = 60.0
+"""Time for a client's answer to a call of its service."""
+GRAPH_PERIOD: Final = 0.08
+"""Shortest time from one look at the graph to the next while there are clients, so that a new topic shows within
+0.1 s."""
+GRAPH_IDLE_PERIOD: Final = 1.0
+"""Time between two looks while no client follows the graph."""
+GRAPH_GATHER: Final = 0.01
+"""Time in which changes that the hub itself makes are gathered before it looks at the graph."""
+GRAPH_SHARE: Final = 10.0
+"""A pause between two looks is so many times as long as a look takes: both ends spend a tenth on it."""
+GRAPH_CHANGED_SHARE: Final = 1.0
+"""The same after a look that found a change, which is parsed: that takes ten times as long as to compare."""
+PROBES_AT_ONCE: Final = 8
+"""Servers that are asked for their service's type at one time."""
+PROBE_RETRY: Final = 10.0
+"""Time before a server that did not tell its service's type, or a type that was not found, is asked for again."""
+DESCRIBE_AT_ONCE: Final = 4
+"""Types whose definition is looked for at one time."""
+SEEN_TYPES_MAX: Final = 16
+"""Types of one topic's publishers that are listed."""
+SEEN_PUBLISHERS_MAX: Final = 256
+"""Publishers of one topic whose headers are kept."""
+EARLY_MESSAGES: Final = 100
+"""Messages of one topic that wait until it is registered and its first subscriber is connected."""
+EARLY_BYTES: Final = 4 * MIB
+"""Bytes of these; the oldest is dropped, the newest always fits."""
+EARLY_WAIT: Final = 1.0
+"""Time that they wait for the first subscriber to connect."""
+PACKAGES_WALKED: Final = 20_000
+"""Folders that are searched for a package's assets."""
+
+# --- gateways -----------------------------------------------------------------------------------------------------
+SETTLE: Final = 2.0
+"""Time that the first client waits for the graph and the parameters, before it is told that there are none."""
+CLOSE_TIMEOUT: Final = 2.0
+"""Time for a client to confirm the end of its WebSocket."""
+PING_INTERVAL: Final = 20.0
+"""Time without a sign of life of a client, half of it after a ping; after half of it more it is disconnected, as it
+may have left the Wi-Fi."""
+SEND_TIMEOUT: Final = 30.0
+"""Time in which the client's machine must acknowledge what was sent (TCP_USER_TIMEOUT)."""
+WRITE_BUFFER: Final = 64 * KIB
+"""Bytes in the connection's own buffer above which nothing more is written to it."""
+UNSENT_BYTES: Final = 512 * KIB
+"""Bytes that the kernel holds beyond those on their way (TCP_NOTSENT_LOWAT): a ping behind them must pass in time,
+and commands overtake images in the queue, not there."""
+TIMER_RETRY: Final = 0.1
+"""Pause before a session's timer is looked at again while its client takes nothing."""
+JOINED_BYTES: Final = 32 * KIB
+"""Largest payload that is copied behind its header; a larger one is written by itself."""
+DROPS_SHOWN: Final = 1.0
+"""Shortest time between two texts to a client on the messages that it misses."""
+
 # --- Foxglove WebSocket -----------------------------------------------------------------------------------------
 FOXGLOVE_TEXT_MAX: Final = 1 * MIB
 """Bytes of one JSON message of a client; the longest name the parameters that it wants."""

@@ -9,9 +9,10 @@ import msgspec
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.types.service_types import ServiceType
 from rmpa.web.foxglove import protocol
-from rmpa.web.foxglove.session import Close, FoxgloveSession, Output, Rights
+from rmpa.web.foxglove.session import Close, FoxgloveSession, Output
 from rmpa.web.hub import requests
 from rmpa.web.hub.requests import GraphService, GraphTopic
+from rmpa.web.hub.rights import Rights
 
 ALL = Rights(publish=True, call_services=True, read_parameters=True, set_parameters=True, fetch_assets=True)
 CHATTER = GraphTopic("/chatter", ("std_msgs/String",), ("/talker",), ("/listener",))

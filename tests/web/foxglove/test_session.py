@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from rmpa.core.errors import LocalProtocolError
 from rmpa.web import limits
 from rmpa.web.foxglove import protocol
-from rmpa.web.foxglove.session import Rights
 from rmpa.web.hub import requests
 from rmpa.web.hub.requests import GraphService, GraphTopic
+from rmpa.web.hub.rights import Rights
 from tests.web.foxglove.client import CHATTER, SET_BOOL, Client, described, message
 
 # --- opening, channels ---

@@ -90,6 +90,17 @@ def test_incomplete_messages_are_bounded_in_number_and_bytes() -> None:
     assert assembler._bytes == sum(each.size for each in assembler._messages.values())
 
 
+def test_the_message_that_waited_longest_is_dropped_first() -> None:
+    assembler = Assembler()
+    for number in range(limits.FRAGMENTED_MESSAGES_MAX):
+        assembler.add("fragment", number, 0, 3, "a", 0)
+    assembler.add("fragment", 0, 1, 3, "b", 1)
+    assembler.add("fragment", "new", 0, 3, "a", 2)
+    assert assembler.add("fragment", 0, 2, 3, "c", 3) == "abc"
+    assembler.add("fragment", 1, 1, 3, "b", 4)
+    assert assembler.add("fragment", 1, 2, 3, "c", 4) is None
+
+
 def test_a_message_whose_next_fragment_is_overdue_is_dropped() -> None:
     assembler = Assembler()
     assembler.add("fragment", "a", 0, 3, "x", 0)

@@ -112,6 +112,23 @@ def test_throttled_messages_wait_in_the_queue_and_then_come() -> None:
     assert client.session.dropped == 2
 
 
+def test_the_longest_queue_is_used_and_freed_with_the_last_subscription() -> None:
+    client = Client()
+    handle = client.one(
+        Subscribe, client.send("subscribe", id="a", topic="/t", throttle_rate=1000, queue_length=1)
+    ).handle
+    client.send("subscribe", id="b", topic="/t", throttle_rate=1000, queue_length=3)
+    for number in range(5):
+        client.publish(handle, STRING, {"data": str(number)})
+    client.advance(10)
+    assert [each["msg"]["data"] for each in client.received()] == ["0", "2", "3", "4"]
+    client.publish(handle, STRING, {"data": "5"})
+    client.publish(handle, STRING, {"data": "6"})
+    client.send("unsubscribe", topic="/t")
+    assert client.session._subscriptions._queued.used == 0
+    assert client.session.next_timer() is None
+
+
 def test_long_messages_come_in_fragments_of_the_smallest_size() -> None:
     client = Client()
     handle = client.one(Subscribe, client.send("subscribe", id="a", topic="/t", fragment_size=50)).handle

@@ -252,6 +252,7 @@ class Node:
         handler: Handler,
         *,
         timeout: float = config_limits.SERVICE_TIMEOUT,  # noqa: ASYNC109 - of each call; the client gets an error
+        raw: bool = False,
     ) -> Service:
         """Serve a service.
 
@@ -261,6 +262,7 @@ class Node:
             handler: Called in the loop with each request's object; returns the response, as an object or plain
                 values, at once or as an awaitable. An exception becomes the client's error.
             timeout: Seconds for a call before the client gets an error.
+            raw: Whether the handler gets the request's bytes, and returns the response's.
 
         Raises:
             DefinitionError: The type is not known.
@@ -270,7 +272,7 @@ class Node:
         """
         resolved = self._resolve(name)
         kind = await asyncio.to_thread(find_service_type, kind) if isinstance(kind, str) else kind
-        service = Service(resolved, self.name, kind, handler, timeout, self._unadvertise_service)
+        service = Service(resolved, self.name, kind, handler, timeout, self._unadvertise_service, raw=raw)
         self._slave.add_service(service.endpoint)
         self._services[resolved] = service
         try:
@@ -504,7 +506,7 @@ class Node:
     def _param_update(self, key: str, value: XmlRpcValue) -> bool:
         # An update of a namespace concerns subscriptions below it, and the other way round.
         if not any(
-            key == f or key.startswith(f + "/") or f.startswith(key.rstrip("/") + "/")
+            key == f or key.startswith(f.rstrip("/") + "/") or f.startswith(key.rstrip("/") + "/")
             for f in self._param_subscriptions
         ):
             return False

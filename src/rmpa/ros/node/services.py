@@ -36,6 +36,7 @@ class Service:
             awaitable. An exception becomes the client's error.
         timeout: Seconds for a call.
         on_close: Unregisters the service.
+        raw: Whether the handler gets the request's bytes, and returns the response's.
     """
 
     def __init__(
@@ -46,9 +47,12 @@ class Service:
         handler: Handler,
         timeout: float,
         on_close: Callable[[str], Awaitable[None]],
+        *,
+        raw: bool = False,
     ) -> None:
         self.name = name
         self.kind = kind
+        self._raw = raw
         self._handler = handler
         self._on_close = on_close
         self._tasks: set[asyncio.Task[None]] = set()
@@ -60,7 +64,7 @@ class Service:
 
     def _serve(self, call: ServiceCall) -> None:
         try:
-            result = self._handler(self.kind.request.deserialize(call.request))
+            result = self._handler(bytes(call.request) if self._raw else self.kind.request.deserialize(call.request))
         except Exception as error:  # noqa: BLE001 - the top of the user's code
             self._failed(call, error)
             return
@@ -84,7 +88,7 @@ class Service:
 
     def _reply(self, call: ServiceCall, result: Any) -> None:
         try:
-            call.reply(True, _serialize(self.kind.response, result))
+            call.reply(True, result if self._raw else _serialize(self.kind.response, result))
         except MessageError as error:
             self._failed(call, error)
 

@@ -26,23 +26,13 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from rmpa.web.hub.requests import Payload
+    from rmpa.web.hub.rights import Rights
 
 CLOCK: Final = ("/clock", "rosgraph_msgs/Clock")
 """The topic that gives the time where ``use_sim_time`` is set, and its type."""
 _CLOCK: Final = struct.Struct("<II")
 _POLICY_VIOLATION: Final = 1008
 """A WebSocket's close code, RFC 6455, section 7.4.1."""
-
-
-@dataclass(frozen=True, slots=True)
-class Rights:
-    """What a client may do beyond reading topics and the graph; nothing unless it is said."""
-
-    publish: bool = False
-    call_services: bool = False
-    read_parameters: bool = False
-    set_parameters: bool = False
-    fetch_assets: bool = False
 
 
 @dataclass(frozen=True, slots=True)

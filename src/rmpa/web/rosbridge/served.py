@@ -109,7 +109,8 @@ class ServedServices:
         call = served.calls.pop(op.id, None) if isinstance(op.id, str) else None
         if call is None:
             raise OpError(f"service {name} has no open call of this id", "answer with the id of the call_service")
-        if not op.result:
+        # rosbridge_suite does not look at ``result``, and clients send false with a response that counts.
+        if not op.result and not (isinstance(op.values, dict) and op.values):
             text = op.values if isinstance(op.values, str) else "the service failed"
             self._refuse(served.handle, call, text)
             return

@@ -141,6 +141,10 @@ class RosbridgeSession:
         self.refused = True
         self._context.status("error", "the client must authenticate first, by the op 'auth'", op.id)
 
+    def warn(self, text: str) -> None:
+        """Send a status of the level ``warning``, if the client wants those."""
+        self._context.status("warning", text)
+
     def _set_level(self, op: protocol.SetLevel) -> None:
         if op.level not in LEVELS:
             raise OpError(f"unknown level {op.level[:40]!r}", f"it is one of {', '.join(LEVELS)}")

@@ -16,6 +16,7 @@ from aiohttp.abc import AbstractAccessLogger
 
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.web import limits, rest
+from rmpa.web.gateways.gateways import is_upgrade
 from rmpa.web.metrics import exposition
 from rmpa.web.server.auth import TOKEN_PARAMETER, AccessPolicy, MoveToken, Refused, RequestFacts
 from rmpa.web.server.connections import GuardedConnection
@@ -26,12 +27,15 @@ if TYPE_CHECKING:
 
     from aiohttp.typedefs import Handler, Middleware
 
+    from rmpa.web.gateways.gateways import Gateways
     from rmpa.web.server.agent_watch import AgentWatch
     from rmpa.web.server.pages import Page
 
 _log = logging.getLogger(__name__)
 _OPEN: Final = ("/healthz",)
 """Paths without a token: they tell only whether the agent answers."""
+WEBSOCKET_PATHS: Final = ("/", "/rosbridge", "/foxglove")
+"""Where WebSocket clients connect; the subprotocol that they offer chooses the gateway."""
 _METHODS: Final = ("GET", "HEAD")
 _JUDGED: Final = web.RequestKey("rmpa.judged", bool)
 """Marks requests that reached the middleware; aiohttp answers malformed ones before."""
@@ -59,6 +63,7 @@ class Routes:
         pages: Files by path.
         connections: Returns how many connections are open, and how many there were.
         counters: Refusals by reason, those of the connections too.
+        gateways: Serve WebSocket upgrades of ``WEBSOCKET_PATHS``.
     """
 
     def __init__(
@@ -68,8 +73,10 @@ class Routes:
         pages: Mapping[str, Page],
         connections: Callable[[], tuple[int, int]],
         counters: Counters,
+        gateways: Gateways | None = None,
     ) -> None:
         self._watch = watch
+        self._gateways = gateways
         self._policy = policy
         self._pages = pages
         self._connections = connections
@@ -122,6 +129,11 @@ class Routes:
             return self._refused(request, "body", rest.problem(413, "a request with a body; send none with GET"))
         if isinstance(verdict, MoveToken):
             return self._move_token(request)
+        if self._gateways is not None and is_upgrade(request) and request.path in WEBSOCKET_PATHS:
+            connection = _connection(request)
+            if connection is not None:
+                connection.upgrade()
+            handler = self._gateways.handle
         try:
             return await handler(request)
         except web.HTTPException:  # of aiohttp's router: no such path
@@ -132,7 +144,7 @@ class Routes:
 
     def _facts(self, request: web.Request) -> RequestFacts:
         headers = request.headers
-        page = self._pages.get(request.path)
+        page = None if is_upgrade(request) else self._pages.get(request.path)
         return RequestFacts(
             host=tuple(headers.getall("Host", ())),
             origin=headers.get("Origin"),
@@ -207,6 +219,7 @@ class Routes:
             self._counters.as_dict(),
             self._watch.reads,
             self._watch.seconds,
+            self._gateways.figures() if self._gateways is not None else {},
         )
 
     # --- what aiohttp answers by itself ---

@@ -88,11 +88,13 @@ class AccessPolicy:
         port: The server's port.
         hosts: The names under which it may be asked, in lower case; addresses are always accepted.
         token: Empty: none is needed.
+        origins: Other sites whose pages may connect, as ``Origin`` headers name them, in lower case.
     """
 
     port: int
     hosts: frozenset[str]
     token: str = ""
+    origins: frozenset[str] = frozenset()
 
     @property
     def cookie(self) -> str:
@@ -117,6 +119,8 @@ class AccessPolicy:
         if request.origin is not None:
             scheme, _, rest = request.origin.partition("://")
             if scheme in ("http", "https") and rest.lower() == request.host[0].lower():
+                return None
+            if request.origin.lower() in self.origins:
                 return None
             return _foreign(_short(request.origin))
         elsewhere = request.fetch_site in ("cross-site", "same-site")
@@ -145,7 +149,11 @@ class AccessPolicy:
 
 
 def _foreign(whose: str) -> Refused:
-    return Refused("origin", 403, f"pages of {whose} may not read from this server; open its own pages instead")
+    return Refused(
+        "origin",
+        403,
+        f"pages of {whose} may not read from this server; open its own pages instead, or list it as origins of [web]",
+    )
 
 
 def bearer(authorization: str | None) -> str | None:

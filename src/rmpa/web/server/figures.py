@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, SummaryMetricFamily
 
+from rmpa.web.gateways.figures import PROTOCOLS, GatewayFigures
 from rmpa.web.server import auth
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ class Figures:
         refused: Refusals so far, by the words of ``REASONS``.
         reads: Questions to the agent so far.
         read_seconds: Seconds that they took.
+        gateways: What each gateway counts, by its protocol.
     """
 
     connections: int
@@ -46,6 +48,7 @@ class Figures:
     refused: Mapping[str, int]
     reads: int
     read_seconds: float
+    gateways: Mapping[str, GatewayFigures] = field(default_factory=dict)
 
 
 def web_metrics(figures: Figures) -> Iterator[Metric]:
@@ -65,3 +68,21 @@ def web_metrics(figures: Figures) -> Iterator[Metric]:
     yield SummaryMetricFamily(
         "rmpa_web_agent_read_seconds", "Time to read the agent's snapshot.", figures.reads, figures.read_seconds
     )
+    yield from _gateway_metrics(figures)
+
+
+def _gateway_metrics(figures: Figures) -> Iterator[Metric]:
+    labels = ("protocol",)
+    clients = GaugeMetricFamily("rmpa_web_clients", "WebSocket clients of the gateways.", labels=labels)
+    queued = GaugeMetricFamily("rmpa_web_client_queue_bytes", "Bytes that wait for these.", labels=labels)
+    sent = CounterMetricFamily("rmpa_web_client_frames", "Messages and answers sent to these.", labels=labels)
+    dropped = CounterMetricFamily(
+        "rmpa_web_client_dropped_messages", "Messages dropped because one of these was slow.", labels=labels
+    )
+    for protocol in PROTOCOLS:
+        gateway = figures.gateways.get(protocol, GatewayFigures())
+        clients.add_metric((protocol,), gateway.clients)
+        queued.add_metric((protocol,), gateway.queued)
+        sent.add_metric((protocol,), gateway.sent)
+        dropped.add_metric((protocol,), gateway.dropped)
+    yield from (clients, queued, sent, dropped)

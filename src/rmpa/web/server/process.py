@@ -12,10 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rmpa.core.contract import Contracts
 from rmpa.core.errors import StartError
 from rmpa.runtime.state_dir import module_dir, state_dir
+from rmpa.web.gateways.gateways import Gateways
 from rmpa.web.server import auth
 from rmpa.web.server.agent_watch import AgentWatch, ControlReader
+from rmpa.web.server.hub_setup import make_hub, priority_of, rights_of
 from rmpa.web.server.server import WebServer
 from rmpa.web.server.token_file import token_from
 
@@ -52,7 +55,7 @@ class Access:
 
 
 def access_of(web: WebSettings, module: str, environ: Mapping[str, str], state: str = "") -> Access:
-    """The token that the settings ask for: one beyond loopback, or where a file is given.
+    """The token that the settings ask for: one beyond loopback, for control, or where a file is given.
 
     Args:
         web: The settings.
@@ -63,7 +66,7 @@ def access_of(web: WebSettings, module: str, environ: Mapping[str, str], state: 
     Raises:
         StartError: The file cannot be used, or there is no place for one.
     """
-    if auth.is_loopback(web.listen) and not web.token_file:
+    if auth.is_loopback(web.listen) and not web.token_file and not web.control:
         return Access()
     if web.token_file:
         file = Path(web.token_file)
@@ -84,7 +87,13 @@ def address_of(web: WebSettings, access: Access, port: int) -> Address:
 
 
 async def serve(
-    web: WebSettings, access: Access, agent: str | None, announce: Callable[[Address], None], *, with_agent: bool
+    web: WebSettings,
+    access: Access,
+    agent: str | None,
+    announce: Callable[[Address], None],
+    *,
+    with_agent: bool,
+    contracts: Contracts | None = None,
 ) -> None:
     """Serve until SIGINT or SIGTERM.
 
@@ -94,6 +103,7 @@ async def serve(
         agent: The agent's name; ``None``: the one that runs.
         announce: Called when the server listens.
         with_agent: Whether to end when standard input ends: it is a pipe that the agent holds open.
+        contracts: Their priorities say whose messages go first to a slow client.
 
     Raises:
         StartError: The address cannot be used.
@@ -104,14 +114,24 @@ async def serve(
         loop.add_signal_handler(number, stop.set)
     reader = ControlReader(os.environ, agent)
     hosts = auth.own_names((socket.gethostname(), *web.hosts)) | {web.listen.lower()}
-    server = WebServer(AgentWatch(reader), auth.AccessPolicy(web.port, hosts, access.token), web.listen)
+    origins = frozenset(origin.lower().rstrip("/") for origin in web.origins)
+    policy = auth.AccessPolicy(web.port, hosts, access.token, origins)
+    watch = AgentWatch(reader)
+    hub = make_hub(watch, web.port)
+    rights = rights_of(has_token=bool(access.token), control=web.control)
+    gateways = Gateways(
+        hub, f"RMPA {agent or socket.gethostname()}", lambda _: rights, priority_of(hub, contracts or Contracts())
+    )
+    server = WebServer(watch, policy, web.listen, gateways, web.ports)
     try:
-        await server.start()
-        if with_agent:
-            _stop_at_end_of_input(loop, stop)
-        announce(address_of(web, access, server.port))
-        await stop.wait()
-        _log.info("= ending")
+        async with hub:
+            await server.start()
+            if with_agent:
+                _stop_at_end_of_input(loop, stop)
+            announce(address_of(web, access, server.port))
+            await stop.wait()
+            _log.info("= ending")
+            await gateways.close()
     finally:
         await server.close()
         reader.close()

@@ -16,6 +16,9 @@ from rmpa.web.server.connections import ConnectionTable
 from rmpa.web.server.pages import read_pages
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rmpa.web.gateways.gateways import Gateways
     from rmpa.web.server.agent_watch import AgentWatch
     from rmpa.web.server.auth import AccessPolicy
 
@@ -32,18 +35,36 @@ class WebServer:
         watch: Gives the agent's snapshot; closed with the server.
         policy: Which requests are served.
         host: The address to listen at.
+        gateways: Serve WebSocket clients.
+        ports: Further ports to listen at.
     """
 
-    def __init__(self, watch: AgentWatch, policy: AccessPolicy, host: str) -> None:
+    def __init__(
+        self,
+        watch: AgentWatch,
+        policy: AccessPolicy,
+        host: str,
+        gateways: Gateways | None = None,
+        ports: Sequence[int] = (),
+    ) -> None:
+        self._gateways = gateways
+        self._ports = ports
         self._watch = watch
         self._host = host
         self._policy = policy
         self.counters = Counters()
         """Refusals, by reason."""
         self._table: ConnectionTable | None = None
-        self._routes = Routes(watch, policy, read_pages(), self._connections, self.counters)
+        self._routes = Routes(
+            watch,
+            policy,
+            read_pages(),
+            self._connections,
+            self.counters,
+            gateways,
+        )
         self._runner: web.AppRunner | None = None
-        self._server: asyncio.Server | None = None
+        self._servers: list[asyncio.Server] = []
 
     async def start(self) -> None:
         """Listen.
@@ -68,23 +89,28 @@ class WebServer:
         assert make is not None, "setup() makes it"  # noqa: S101 - for the type checker
         self._table = ConnectionTable(make, self.counters)
         loop = asyncio.get_running_loop()
-        port = self._policy.port
-        try:
-            self._server = await loop.create_server(
-                self._table.make, self._host, port, backlog=limits.WEB_BACKLOG, reuse_address=True
-            )
-        except OSError as error:
-            await runner.cleanup()
-            problem = f"cannot be listened at: {error.strerror or error}"
-            raise StartError(f"{self._host}:{port}", problem, "choose another --port or --listen") from None
+        for port in dict.fromkeys((self._policy.port, *self._ports)):
+            try:
+                server = await loop.create_server(
+                    self._table.make, self._host, port, backlog=limits.WEB_BACKLOG, reuse_address=True
+                )
+            except OSError as error:
+                for server in self._servers:
+                    server.close()
+                self._servers.clear()
+                await runner.cleanup()
+                problem = f"cannot be listened at: {error.strerror or error}"
+                remedy = "choose another --port or --listen" if port == self._policy.port else "see ports of [web]"
+                raise StartError(f"{self._host}:{port}", problem, remedy) from None
+            self._servers.append(server)
         self._runner = runner
 
     @property
     def port(self) -> int:
         """The port that it listens at."""
-        if self._server is None:
+        if not self._servers:
             return self._policy.port
-        port: int = self._server.sockets[0].getsockname()[1]
+        port: int = self._servers[0].sockets[0].getsockname()[1]
         return port
 
     def _connections(self) -> tuple[int, int]:
@@ -92,8 +118,10 @@ class WebServer:
 
     async def close(self) -> None:
         """End: responses under way have ``limits.WEB_SHUTDOWN_TIMEOUT``, then every connection is closed."""
-        if self._server is not None:
-            self._server.close()
+        for server in self._servers:
+            server.close()
+        if self._gateways is not None:
+            await self._gateways.close()
         if self._runner is not None:
             await self._runner.cleanup()
         if self._table is not None:

@@ -1,0 +1,316 @@
+"""One WebSocket client: its queue, and the task that writes.
+
+Messages wait in the queue as the hub delivers them, and are encoded when the connection can take them: what a slow
+client does not get costs no encoding, and payloads are shared by all clients.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+from aiohttp import WSMsgType, web
+
+from rmpa.core.errors import RmpaError
+from rmpa.web import limits
+from rmpa.web.gateways.websocket_frames import Opcode, frame_header
+from rmpa.web.hub.fair_queue import FairQueue
+from rmpa.web.hub.requests import Received, Unsubscribe
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from aiohttp.abc import AbstractStreamWriter
+
+    from rmpa.web.hub.clients import Client
+    from rmpa.web.hub.hub import Hub
+    from rmpa.web.hub.requests import Answer, Payload, Request
+    from rmpa.web.hub.rights import Rights
+
+_log = logging.getLogger(__name__)
+OutFrame: TypeAlias = "tuple[Opcode, Sequence[Payload]]"
+"""A frame for the client: its kind, and its payload in pieces."""
+_OVERHEAD: Final = 128
+"""Bytes that an entry of the queue takes beside its payload."""
+_TURN: Final = 16
+"""Entries that are written before other tasks have their turn."""
+_SILENT_LOOKS: Final = 3
+"""Looks without a sign of life, each after half of ``limits.PING_INTERVAL``."""
+_INTERNAL_ERROR: Final = 1011
+"""A WebSocket's close code, RFC 6455, section 7.4.1."""
+
+
+class ClientConnection(ABC):
+    """One client of a gateway.
+
+    Args:
+        hub: The hub.
+        rights: What the client may do.
+        priority: The priority of a topic's messages: higher ones go first.
+        address: The client's, for logs.
+        unadvertise_delay: As ``Hub.connect`` has it.
+    """
+
+    kind = ""
+    """The protocol's name, for logs and lists."""
+
+    def __init__(
+        self,
+        hub: Hub,
+        rights: Rights,
+        priority: Callable[[str], int],
+        address: str,
+        *,
+        unadvertise_delay: float,
+    ) -> None:
+        self.hub = hub
+        self.rights = rights
+        self.address = address
+        self.queue: FairQueue[Received | OutFrame] = FairQueue()
+        self.sent = 0
+        """Messages and answers that were written."""
+        self._heard = 0
+        self._priority = priority
+        self._unadvertise_delay = unadvertise_delay
+        self._wake = asyncio.Event()
+        self._loop = asyncio.get_running_loop()
+        self._timer: asyncio.TimerHandle | None = None
+        self._transport: asyncio.Transport | None = None
+        self._close: tuple[int, str] | None = None
+        self._client: Client | None = None
+        self._drops_shown = 0
+        self._drops_at = 0.0
+
+    @property
+    def client(self) -> Client:
+        """The client as the hub knows it."""
+        assert self._client is not None, "run() connects it"  # noqa: S101
+        return self._client
+
+    # --- the protocol -----------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def opened(self) -> None:
+        """The WebSocket is open."""
+
+    @abstractmethod
+    def received_frame(self, data: str | bytes) -> None:
+        """A frame of the client."""
+
+    @abstractmethod
+    def answered(self, answer: Answer) -> None:
+        """An answer of the hub that is no message of a subscription."""
+
+    @abstractmethod
+    def encode(self, message: Received) -> Iterable[OutFrame]:
+        """The frames of a message; called when the connection can take them."""
+
+    @abstractmethod
+    def show_drops(self, dropped: dict[str, int]) -> None:
+        """Tell the client how many messages of which topics it has missed so far."""
+
+    def next_timer(self) -> float | None:
+        """When ``handle_timer`` is to be called; ``None`` for never."""
+        return None
+
+    def handle_timer(self) -> None:  # noqa: B027 - not each protocol has timers
+        """Do what is due."""
+
+    # --- for the protocol -------------------------------------------------------------------------------------
+
+    def push(self, frame: OutFrame, handle: int = 0) -> None:
+        """Queue a frame: of the subscription ``handle``, or one that is not dropped."""
+        size = sum(map(len, frame[1])) + _OVERHEAD
+        self._queue(handle, frame, size, self.client.subscriptions.get(handle, ""))
+
+    def ask(self, request: Request) -> None:
+        """Pass a request on to the hub; what waits for an ended subscription is dropped."""
+        if isinstance(request, Unsubscribe):
+            self.queue.end(request.handle)
+        self.hub.ask(self.client, request)
+
+    def end(self, code: int, reason: str) -> None:
+        """Close the WebSocket."""
+        self._close = (code, reason)
+        self._wake.set()
+
+    def arm(self) -> None:
+        """Set the timer anew, after each call of the session."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        at = self.next_timer()
+        if at is not None:
+            self._timer = self._loop.call_at(at, self._due)
+
+    # --- the hub ----------------------------------------------------------------------------------------------
+
+    def receive(self, answer: Answer) -> None:
+        """Take an answer of the hub."""
+        if isinstance(answer, Received):
+            self._queue(answer.handle, answer, len(answer.payload) + _OVERHEAD, answer.topic)
+        else:
+            self.answered(answer)
+
+    # --- the WebSocket ----------------------------------------------------------------------------------------
+
+    async def run(self, request: web.Request, socket_: web.WebSocketResponse) -> None:
+        """Serve the client until it has gone.
+
+        Raises:
+            PeerRefused: There are too many clients.
+        """
+        self._client = self.hub.connect(
+            f"{self.kind} {self.address}", self.rights, self.receive, unadvertise_delay=self._unadvertise_delay
+        )
+        tasks: list[asyncio.Task[None]] = []
+        try:
+            writer = await socket_.prepare(request)
+            self._transport = request.transport
+            if self._transport is None:
+                return  # it went during the handshake
+            _tune(self._transport)
+            self.opened()
+            for name, work in (("write to", self._write(socket_, writer)), ("watch", self._watch())):
+                tasks.append(self._loop.create_task(work, name=f"{name} {self.client.name}"))
+            await self._read(socket_)
+        finally:
+            if self._timer is not None:
+                self._timer.cancel()
+            self.hub.disconnect(self._client)
+            self.queue.clear()
+            for task in tasks:
+                task.cancel()
+            if tasks:
+                await asyncio.wait(tasks)
+
+    async def _read(self, socket_: web.WebSocketResponse) -> None:
+        async for message in socket_:
+            self._heard += 1
+            if message.type == WSMsgType.PING:
+                self._send(Opcode.PONG, (message.data,))
+            elif message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
+                try:
+                    self.received_frame(message.data)
+                except Exception:  # noqa: BLE001 - a fault of one client's session must not end the server
+                    _log.exception("! a frame of %s failed", self.client.name)
+                    await socket_.close(code=_INTERNAL_ERROR, message=b"the server failed; its log says why")
+                    return
+            elif message.type == WSMsgType.ERROR:
+                _log.debug("! %s: %s", self.client.name, socket_.exception())
+
+    async def _watch(self) -> None:
+        """Disconnect a client without a sign of life: it sends nothing, answers no ping, and takes nothing.
+
+        A large message on a slow link holds up the ping behind it; that it goes on is a sign of life, too.
+        """
+        silent, heard, waiting = 0, -1, 0
+        while silent < _SILENT_LOOKS:
+            await asyncio.sleep(limits.PING_INTERVAL / 2)
+            now = self._transport.get_write_buffer_size() if self._transport is not None else 0
+            alive = self._heard != heard or (waiting and now != waiting)
+            silent = 0 if alive else silent + 1
+            heard, waiting = self._heard, now
+            if not waiting:
+                self._send(Opcode.PING, ())
+        _log.info("= %s gave no sign of life, and is disconnected", self.client.name)
+        self._abort()
+
+    async def _write(self, socket_: web.WebSocketResponse, writer: AbstractStreamWriter) -> None:
+        try:
+            turn = 0
+            while not socket_.closed and not self._gone:
+                if self._close is not None:
+                    await socket_.close(code=self._close[0], message=self._close[1].encode()[:120])
+                    return
+                entry = self.queue.pop()
+                if entry is None:
+                    self._wake.clear()
+                    await self._wake.wait()
+                    continue
+                for frame in self.encode(entry) if isinstance(entry, Received) else (entry,):
+                    self._send(*frame)
+                self._tell_drops()
+                await writer.drain()
+                turn += 1
+                if turn % _TURN == 0:
+                    await asyncio.sleep(0)
+        except ConnectionError as error:
+            _log.debug("= %s: %s", self.client.name, error)
+        except Exception:  # noqa: BLE001 - a task's top
+            _log.exception("! writing to %s failed", self.client.name)
+            self._abort()
+
+    @property
+    def _gone(self) -> bool:
+        return self._transport is None or self._transport.is_closing()
+
+    def _send(self, opcode: Opcode, parts: Sequence[Payload]) -> None:
+        transport = self._transport
+        if transport is None or transport.is_closing():
+            return
+        self.sent += opcode in (Opcode.TEXT, Opcode.BINARY)
+        header = frame_header(opcode, sum(map(len, parts)))
+        small: list[Payload] = [header]
+        for part in parts:
+            if len(part) <= limits.JOINED_BYTES:
+                small.append(part)
+                continue
+            transport.write(b"".join(small))
+            transport.write(part)
+            small.clear()
+        if small:
+            transport.write(b"".join(small))
+
+    def _queue(self, handle: int, entry: Received | OutFrame, size: int, topic: str) -> None:
+        priority = self._priority(topic) if handle else 0
+        self.queue.push(handle, entry, size, priority)
+        if self.queue.overflow:
+            _log.warning("! %s does not read its answers, and is disconnected", self.client.name)
+            self._abort()
+        self._wake.set()
+
+    def _tell_drops(self) -> None:
+        if self.queue.dropped_total == self._drops_shown or self._loop.time() < self._drops_at:
+            return
+        self._drops_shown = self.queue.dropped_total
+        self._drops_at = self._loop.time() + limits.DROPS_SHOWN
+        topics = self.client.subscriptions
+        self.show_drops({topics[handle]: count for handle, count in self.queue.dropped.items() if handle in topics})
+
+    def _due(self) -> None:
+        self._timer = None
+        if self._transport is not None and self._transport.get_write_buffer_size() > limits.WRITE_BUFFER:
+            # The client cannot take what the session holds back: it stays there, within its bounds.
+            self._timer = self._loop.call_later(limits.TIMER_RETRY, self._due)
+            return
+        try:
+            self.handle_timer()
+        except RmpaError:
+            _log.exception("! a timer of %s failed", self.client.name)
+        self.arm()
+
+    def _abort(self) -> None:
+        if self._transport is not None:
+            self._transport.abort()
+
+
+def _tune(transport: asyncio.Transport) -> None:
+    """Set the options of a client's connection; those that a kernel lacks are left out."""
+    transport.set_write_buffer_limits(high=limits.WRITE_BUFFER)
+    sock = transport.get_extra_info("socket")
+    options = (
+        ("TCP_NODELAY", 1),
+        ("TCP_USER_TIMEOUT", int(limits.SEND_TIMEOUT * 1000)),
+        ("TCP_NOTSENT_LOWAT", limits.UNSENT_BYTES),
+    )
+    for name, value in options:
+        option = getattr(socket, name, None)
+        if sock is not None and option is not None:
+            try:
+                sock.setsockopt(socket.IPPROTO_TCP, option, value)
+            except OSError as error:
+                _log.debug("! %s: %s", name, error)

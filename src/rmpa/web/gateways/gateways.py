@@ -1,0 +1,124 @@
+"""Both gateways at one path: the subprotocol that a client offers chooses."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from aiohttp import web
+
+from rmpa.core.errors import PeerRefused
+from rmpa.web import limits
+from rmpa.web.foxglove.protocol import SUBPROTOCOLS, choose_subprotocol
+from rmpa.web.gateways.figures import PROTOCOLS, GatewayFigures
+from rmpa.web.gateways.foxglove import FoxgloveConnection
+from rmpa.web.gateways.rosbridge import RosbridgeConnection
+from rmpa.web.rosbridge import limits as rosbridge_limits
+from rmpa.web.rosbridge.encodings import PublishFrames
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.web.gateways.connection import ClientConnection
+    from rmpa.web.hub.hub import Hub
+    from rmpa.web.hub.rights import Rights
+
+_log = logging.getLogger(__name__)
+
+
+def is_upgrade(request: web.BaseRequest) -> bool:
+    """Whether a request asks for a WebSocket."""
+    return request.headers.get("Upgrade", "").lower() == "websocket"
+
+
+class Gateways:
+    """Serves WebSocket clients; its ``handle`` is the handler of one or more paths.
+
+    Args:
+        hub: The hub.
+        name: The server's name, for users.
+        rights_of: What the sender of a request may do.
+        priority: The priority of a topic's messages: higher ones go first.
+    """
+
+    def __init__(
+        self,
+        hub: Hub,
+        name: str,
+        rights_of: Callable[[web.Request], Rights],
+        priority: Callable[[str], int] = lambda _: 0,
+    ) -> None:
+        self._hub = hub
+        self._name = name
+        self._rights_of = rights_of
+        self._priority = priority
+        self._session_id = secrets.token_hex(8)
+        self._frames = PublishFrames()
+        self._open: dict[ClientConnection, web.WebSocketResponse] = {}
+        self._sent: Counter[str] = Counter()
+        self._dropped: Counter[str] = Counter()
+
+    @property
+    def connections(self) -> tuple[ClientConnection, ...]:
+        """All clients, with their queues."""
+        return tuple(self._open)
+
+    def figures(self) -> dict[str, GatewayFigures]:
+        """What each gateway counts."""
+        found = {}
+        for kind in PROTOCOLS:
+            present = [each for each in self._open if each.kind == kind]
+            found[kind] = GatewayFigures(
+                clients=len(present),
+                queued=sum(each.queue.bytes for each in present),
+                sent=self._sent[kind] + sum(each.sent for each in present),
+                dropped=self._dropped[kind] + sum(each.queue.dropped_total for each in present),
+            )
+        return found
+
+    async def handle(self, request: web.Request) -> web.StreamResponse:
+        """Serve one client until it has gone."""
+        offered = [name.strip() for name in request.headers.get("Sec-WebSocket-Protocol", "").split(",")]
+        protocol = choose_subprotocol(offered)
+        address = request.remote or "?"
+        rights = self._rights_of(request)
+        await self._hub.settled(limits.SETTLE)
+        connection: ClientConnection
+        if protocol is not None:
+            connection = FoxgloveConnection(
+                self._hub, rights, self._priority, address, name=self._name, session_id=self._session_id
+            )
+            most = limits.FOXGLOVE_BINARY_MAX
+        else:
+            connection = RosbridgeConnection(self._hub, rights, self._priority, address, frames=self._frames)
+            most = rosbridge_limits.FRAME_MAX
+        response = web.WebSocketResponse(
+            protocols=SUBPROTOCOLS,
+            autoping=False,
+            compress=False,
+            max_msg_size=most,
+            timeout=limits.CLOSE_TIMEOUT,
+        )
+        self._open[connection] = response
+        try:
+            await connection.run(request, response)
+        except PeerRefused as error:
+            _log.warning("! %s: %s", address, error)
+            return web.Response(status=503, text=f"{error}\n")
+        finally:
+            del self._open[connection]
+            self._sent[connection.kind] += connection.sent
+            self._dropped[connection.kind] += connection.queue.dropped_total
+        return response
+
+    async def close(self) -> None:
+        """Tell all clients that the server ends."""
+        closing = [
+            response.close(code=1001, message=b"the server ends")
+            for response in self._open.values()
+            if response.prepared
+        ]
+        await asyncio.gather(*closing, return_exceptions=True)

@@ -1,0 +1,124 @@
+"""rosbridge v2 over a WebSocket."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from rmpa.web.gateways.connection import ClientConnection, OutFrame
+from rmpa.web.gateways.websocket_frames import Opcode
+from rmpa.web.rosbridge.session import RosbridgeSession
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+
+    from rmpa.web.hub.hub import Hub
+    from rmpa.web.hub.requests import Answer, GraphService, GraphTopic, ParamValue, Received
+    from rmpa.web.hub.rights import Rights
+    from rmpa.web.rosbridge.encodings import PublishFrames
+    from rmpa.web.rosbridge.protocol import Frame
+
+
+@dataclass(frozen=True, slots=True)
+class HubGraph:
+    """The graph as one client may see it: without parameters where it may not read them."""
+
+    hub: Hub
+    with_params: bool
+
+    @property
+    def topics(self) -> Mapping[str, GraphTopic]:
+        """By name, in order of names."""
+        return self.hub.graph.topics
+
+    @property
+    def services(self) -> Mapping[str, GraphService]:
+        """By name, in order of names."""
+        return self.hub.graph.services
+
+    @property
+    def nodes(self) -> Sequence[str]:
+        """In order of names."""
+        return self.hub.graph.nodes
+
+    @property
+    def params(self) -> Mapping[str, ParamValue]:
+        """The tree of parameters."""
+        return self.hub.params.tree if self.with_params else {}
+
+
+class RosbridgeConnection(ClientConnection):
+    """One rosbridge client; the arguments are those of ``ClientConnection``.
+
+    Args:
+        frames: Encodes messages, once for all clients.
+    """
+
+    kind = "rosbridge"
+
+    def __init__(
+        self,
+        hub: Hub,
+        rights: Rights,
+        priority: Callable[[str], int],
+        address: str,
+        *,
+        frames: PublishFrames,
+    ) -> None:
+        # The session itself delays the end of a publisher.
+        super().__init__(hub, rights, priority, address, unadvertise_delay=0.0)
+        graph = HubGraph(hub, rights.read_parameters)
+        self._session = RosbridgeSession(
+            hub.types, graph, hub.time.now_ns, frames=frames, client=f"rosbridge_{id(self):x}"
+        )
+
+    def opened(self) -> None:
+        """Count the client; nothing is sent first."""
+        self.hub.counts.add(self.client.number, self.address)
+
+    def received_frame(self, data: str | bytes) -> None:
+        """A frame of the client."""
+        self._session.receive_frame(data, self._loop.time())
+        self._flush()
+        if self._session.refused:
+            self.end(1008, "not authenticated")
+
+    def answered(self, answer: Answer) -> None:
+        """An answer of the hub."""
+        self._session.receive_answer(answer, self._loop.time())
+        self._flush()
+
+    def encode(self, message: Received) -> Iterable[OutFrame]:
+        """The frames of a message; none where it is throttled."""
+        self._session.receive_answer(message, self._loop.time())
+        frames = self._session.frames_to_send()
+        # A message that is held back needs the timer; to ask for it at each message would take time.
+        self._flush(arm=not frames)
+        return (_out(frame) for frame in frames)
+
+    def show_drops(self, dropped: dict[str, int]) -> None:
+        """A status of the level ``warning``."""
+        listed = ", ".join(f"{count} of {topic}" for topic, count in dropped.items())
+        self._session.warn(f"this client is too slow; messages dropped so far: {listed}")
+        self._flush()
+
+    def next_timer(self) -> float | None:
+        """The session's."""
+        return self._session.next_timer()
+
+    def handle_timer(self) -> None:
+        """Do what is due."""
+        self._session.handle_timer(self._loop.time())
+        self._flush()
+
+    def _flush(self, *, arm: bool = True) -> None:
+        for frame in self._session.frames_to_send():
+            self.push(_out(frame), frame.handle)
+        for request in self._session.requests_to_send():
+            self.ask(request)
+        if arm:
+            self.arm()
+
+
+def _out(frame: Frame) -> OutFrame:
+    return (Opcode.BINARY if frame.binary else Opcode.TEXT, frame.parts)

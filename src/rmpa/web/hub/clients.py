@@ -1,0 +1,42 @@
+"""A client as the hub knows it, and the key of what it has asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, TypeAlias
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.web.hub.requests import Answer
+    from rmpa.web.hub.rights import Rights
+
+Key: TypeAlias = "tuple[int, int]"
+"""The number of a client and one of its handles: unique in the hub."""
+Receive: TypeAlias = "Callable[[Answer], None]"
+
+
+@dataclass(slots=True, eq=False)
+class Client:
+    """One client.
+
+    Args:
+        number: Never used again.
+        name: For logs and lists.
+        rights: What it may do.
+        receive: Takes answers; it must not raise.
+        unadvertise_delay: Seconds until a topic is withdrawn that it no longer advertises; its protocol may have a
+            delay of its own.
+    """
+
+    number: int
+    name: str
+    rights: Rights
+    receive: Receive
+    unadvertise_delay: float
+    subscriptions: dict[int, str] = field(default_factory=dict)
+    """The topics by handle."""
+    publishers: dict[int, str] = field(default_factory=dict)
+    """The published topics by handle."""
+    services: dict[int, str] = field(default_factory=dict)
+    """The served services by handle."""

@@ -1,0 +1,221 @@
+"""The parameters of the local core: a copy that follows its changes."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, cast
+
+from rmpa.core.errors import RmpaError
+from rmpa.ros.master.parameters import Parameters
+from rmpa.web import limits
+
+if TYPE_CHECKING:
+    from rmpa.ros.node.node import Node
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
+    from rmpa.web.hub.clients import Key
+    from rmpa.web.hub.node_link import NodeLink
+    from rmpa.web.hub.requests import ParamValue
+
+_log = logging.getLogger(__name__)
+_MISSING = object()
+
+
+@dataclass(frozen=True, slots=True)
+class _Follower:
+    names: tuple[str, ...]
+    changed: Callable[[Mapping[str, ParamValue]], None]
+
+
+class ParamMirror:
+    """The copy, and the clients that follow it.
+
+    Args:
+        link: Has the node.
+    """
+
+    def __init__(self, link: NodeLink) -> None:
+        self._link = link
+        self._parameters = Parameters()
+        self._followers: dict[Key, _Follower] = {}
+        self._loading: asyncio.Task[None] | None = None
+        self._meanwhile: list[tuple[str, XmlRpcValue]] | None = None
+        self.loaded = asyncio.Event()
+        """Set once the parameters are known."""
+        link.on_node.append(self._load_from)
+
+    @property
+    def tree(self) -> Mapping[str, ParamValue]:
+        """All parameters; never changed afterwards."""
+        return cast("Mapping[str, ParamValue]", self._parameters.tree)
+
+    def value(self, name: str) -> ParamValue:
+        """The value at a global name; ``None`` where there is none."""
+        try:
+            return cast("ParamValue", self._parameters.get(name))
+        except KeyError:
+            return None
+
+    def values(self, names: tuple[str, ...], prefix: str) -> dict[str, ParamValue]:
+        """The values of ``names`` that exist; without names those of all parameters below ``prefix``."""
+        if names:
+            return {name: value for name in names if (value := self.value(name)) is not None}
+        value = self.value(prefix)
+        return dict(_leaves(prefix.rstrip("/"), value)) if value is not None else {}
+
+    def updated(self, key: str, value: XmlRpcValue) -> None:
+        """The master tells a change; ``{}`` for a parameter that was deleted."""
+        if self._meanwhile is not None:
+            self._meanwhile.append((key, value))
+            return
+        self._change(lambda: self._apply(key, value))
+
+    async def set(self, name: str, value: ParamValue) -> None:
+        """Set a parameter.
+
+        Raises:
+            RmpaError: The master does not answer, or refuses.
+        """
+        await self._link.need().set_param(name, cast("XmlRpcValue", value))
+        # The master does not tell the node that set it.
+        self._change(lambda: self._parameters.set(name, cast("XmlRpcValue", value)))
+
+    async def delete(self, name: str) -> None:
+        """Delete a parameter.
+
+        Raises:
+            RmpaError: The master does not answer, or the parameter does not exist.
+        """
+        await self._link.need().delete_param(name)
+        self._change(lambda: self._remove(name))
+
+    def follow(self, key: Key, names: tuple[str, ...], changed: Callable[[Mapping[str, ParamValue]], None]) -> None:
+        """Call ``changed`` with each change of ``names``, or of all; ``None`` is a parameter that was deleted."""
+        self._followers[key] = _Follower(names, changed)
+
+    def unfollow(self, key: Key) -> None:
+        """End a ``follow``."""
+        self._followers.pop(key, None)
+
+    def forget_client(self, number: int) -> None:
+        """End all that a client follows."""
+        for key in [key for key in self._followers if key[0] == number]:
+            del self._followers[key]
+
+    def reload(self) -> None:
+        """Read everything anew: the master was away."""
+        if self._link.node is not None:
+            self._load_from(self._link.node)
+
+    async def close(self) -> None:
+        """End the reading."""
+        if self._loading is not None:
+            self._loading.cancel()
+            await asyncio.wait([self._loading])
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    def _load_from(self, node: Node) -> None:
+        if self._loading is not None:
+            self._loading.cancel()
+        self._loading = asyncio.get_running_loop().create_task(self._load(node), name="read the parameters")
+
+    async def _load(self, node: Node) -> None:
+        while True:
+            self._meanwhile = []
+            try:
+                tree = await node.follow_param("/")
+            except RmpaError as error:
+                _log.debug("! the parameters cannot be read: %s", error)
+                await asyncio.sleep(limits.NODE_RETRY)
+                continue
+            # Changes that the master told before its answer arrived are newer than the answer.
+            meanwhile, self._meanwhile = self._meanwhile, None
+
+            def apply(tree: XmlRpcValue = tree, meanwhile: list[tuple[str, XmlRpcValue]] = meanwhile) -> None:
+                self._parameters.set("/", tree if isinstance(tree, dict) else {})
+                for key, value in meanwhile:
+                    self._apply(key, value)
+
+            self._change(apply)
+            self.loaded.set()
+            return
+
+    def _apply(self, key: str, value: XmlRpcValue) -> None:
+        if value == {} and key.strip("/"):
+            self._remove(key)
+        else:
+            try:
+                self._parameters.set(key, value)
+            except TypeError as error:
+                _log.debug("! the master tells %s for %s: %s", type(value).__name__, key, error)
+
+    def _remove(self, key: str) -> None:
+        with contextlib.suppress(KeyError):
+            self._parameters.delete(key)
+
+    def _change(self, apply: Callable[[], None]) -> None:
+        before = self._parameters.tree
+        apply()
+        after = self._parameters.tree
+        if before is after or not self._followers:
+            return
+        leaves: dict[str, ParamValue] | None = None
+        for follower in [*self._followers.values()]:
+            if follower.names:
+                changed = {
+                    name: new for name in follower.names if not _same(_get(before, name), new := _get(after, name))
+                }
+                told = {name: None if new is _MISSING else cast("ParamValue", new) for name, new in changed.items()}
+            else:
+                if leaves is None:
+                    leaves = dict(_differences("", before, after))
+                told = leaves
+            if told:
+                follower.changed(told)
+
+
+def _same(one: object, other: object) -> bool:
+    """Whether two values are equal and of the same types: 1 is not 1.0, nor True."""
+    if one is other:
+        return True
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        return one.keys() == other.keys() and all(_same(value, other[key]) for key, value in one.items())
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(_same, one, other))
+    return type(one) is type(other) and one == other
+
+
+def _get(tree: object, name: str) -> object:
+    for part in filter(None, name.split("/")):
+        if not isinstance(tree, Mapping) or part not in tree:
+            return _MISSING
+        tree = tree[part]
+    return tree
+
+
+def _leaves(name: str, value: object) -> Iterator[tuple[str, ParamValue]]:
+    if isinstance(value, Mapping):
+        for key, each in value.items():
+            yield from _leaves(f"{name}/{key}", each)
+    else:
+        yield name, cast("ParamValue", value)
+
+
+def _differences(name: str, before: object, after: object) -> Iterator[tuple[str, ParamValue]]:
+    """The leaves that differ, each with its new value; ``None`` for those that are gone."""
+    if before is after or (not isinstance(after, Mapping) and _same(before, after)):
+        return
+    old = before if isinstance(before, Mapping) else {}
+    new = after if isinstance(after, Mapping) else {}
+    for key in old.keys() - new.keys():
+        yield from ((leaf, None) for leaf, _ in _leaves(f"{name}/{key}", old[key]))
+    for key, value in new.items():
+        yield from _differences(f"{name}/{key}", old.get(key, _MISSING), value)
+    if not isinstance(before, Mapping) and before is not _MISSING and isinstance(after, Mapping):
+        yield name, None
+    if not isinstance(after, Mapping):
+        yield name, cast("ParamValue", after)

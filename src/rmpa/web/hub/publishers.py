@@ -1,0 +1,204 @@
+"""What clients publish: one publisher of the node for each topic, which all clients share."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from rmpa.core.errors import PeerRefused
+from rmpa.web import limits
+from rmpa.web.hub.node_link import Registration
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from rmpa.core.errors import RmpaError
+    from rmpa.ros.node.node import Node, Publisher
+    from rmpa.ros.types.messages import MessageType
+    from rmpa.web.hub.clients import Key
+    from rmpa.web.hub.node_link import NodeLink
+    from rmpa.web.hub.requests import Payload
+
+
+@dataclass(slots=True, eq=False)
+class _Shared:
+    """One published topic."""
+
+    topic: str
+    type: str
+    latch: bool
+    users: dict[Key, Callable[[RmpaError], None]] = field(default_factory=dict)
+    registration: Registration[Publisher] | None = None
+    linger: asyncio.TimerHandle | None = None
+    early: deque[Payload] | None = field(default_factory=deque)
+    """What was published before subscribers were connected; ``None`` from then on."""
+    early_bytes: int = 0
+    latched: tuple[memoryview, int] | None = None
+
+
+class Publishers:
+    """All published topics of the hub.
+
+    Args:
+        link: Has the node.
+        find: Finds a message type.
+        deliver: ``(topic, type, payload, latch)``: hands a message to the clients of this hub.
+        ended: ``(topic)``: a topic was withdrawn.
+        now_ns: The wall clock, in nanoseconds.
+    """
+
+    def __init__(
+        self,
+        link: NodeLink,
+        find: Callable[[str], Awaitable[MessageType]],
+        *,
+        deliver: Callable[[str, str, memoryview, bool], None],
+        ended: Callable[[str], None],
+        now_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self._link = link
+        self._find = find
+        self._deliver = deliver
+        self._ended = ended
+        self._now_ns = now_ns
+        self._shared: dict[str, _Shared] = {}
+        self._ending: dict[str, Registration[Publisher]] = {}
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """The types of the published topics by name, those included that wait for their withdrawal."""
+        return {each.topic: each.type for each in self._shared.values()}
+
+    def latched(self, topic: str) -> tuple[str, memoryview, int] | None:
+        """The type, payload and time of the last message of a latching topic."""
+        shared = self._shared.get(topic)
+        return (shared.type, *shared.latched) if shared is not None and shared.latched is not None else None
+
+    def advertise(
+        self, key: Key, topic: str, type_: str, failed: Callable[[RmpaError], None], *, latch: bool
+    ) -> None:
+        """Publish a topic, or join its publisher.
+
+        Raises:
+            PeerRefused: Other clients publish it with another type, or there are too many topics.
+        """
+        shared = self._shared.get(topic)
+        if shared is not None and shared.type != type_:
+            if shared.users:
+                problem = f"other clients publish {topic} as {shared.type}, not {type_}"
+                raise PeerRefused("the web server", problem, "publish it with that type, or under another name")
+            self._end(shared)
+            shared = None
+        if shared is not None and latch and not shared.latch:
+            users = shared.users
+            self._end(shared)  # TCPROS says at the connection whether a publisher latches
+            shared = self._begin(topic, type_, latch=True)
+            shared.users |= users
+        if shared is None:
+            shared = self._begin(topic, type_, latch=latch)
+        if shared.linger is not None:
+            shared.linger.cancel()
+            shared.linger = None
+        shared.users[key] = failed
+
+    def unadvertise(self, key: Key, topic: str, delay: float) -> None:
+        """Leave a topic's publisher; the last one's is withdrawn after ``delay`` seconds."""
+        shared = self._shared.get(topic)
+        if shared is None or shared.users.pop(key, None) is None or shared.users:
+            return
+        if delay <= 0:
+            self._end(shared)
+        else:
+            shared.linger = asyncio.get_running_loop().call_later(delay, self._end, shared)
+
+    def publish(self, topic: str, payload: Payload) -> None:
+        """Publish a message of an advertised topic. The payload must not change afterwards."""
+        shared = self._shared.get(topic)
+        if shared is None:
+            return
+        view = memoryview(payload)
+        if shared.latch:
+            shared.latched = (view, self._now_ns())
+        if shared.early is not None:
+            shared.early.append(payload)
+            shared.early_bytes += len(payload)
+            while len(shared.early) > limits.EARLY_MESSAGES or (
+                len(shared.early) > 1 and shared.early_bytes > limits.EARLY_BYTES
+            ):
+                shared.early_bytes -= len(shared.early.popleft())
+        elif shared.registration is not None and shared.registration.value is not None:
+            shared.registration.value.publish_raw(payload)
+        self._deliver(topic, shared.type, view, shared.latch)
+
+    async def close(self) -> None:
+        """End all, after the node was closed."""
+        ending = [*self._ending.values()]
+        for shared in [*self._shared.values()]:
+            if shared.registration is not None:
+                ending.append(shared.registration)
+            self._end(shared)
+        for registration in ending:
+            await registration.closed()
+        self._ending.clear()
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    def _begin(self, topic: str, type_: str, *, latch: bool) -> _Shared:
+        if len(self._shared) >= limits.PUBLISHERS_MAX:
+            waiting = next((each for each in self._shared.values() if not each.users), None)
+            if waiting is None:
+                problem = f"its clients publish {len(self._shared)} topics, which is the limit"
+                raise PeerRefused("the web server", problem, "publish fewer topics")
+            self._end(waiting)
+        shared = self._shared[topic] = _Shared(topic, type_, latch)
+        shared.registration = Registration(
+            self._link,
+            topic,
+            functools.partial(self._register, shared),
+            _withdraw,
+            functools.partial(self._refused, shared),
+            after=self._ending.pop(topic, None),
+        )
+        return shared
+
+    async def _register(self, shared: _Shared, node: Node) -> Publisher:
+        kind = await self._find(shared.type)
+        publisher = await node.advertise(shared.topic, kind, latch=shared.latch)
+        if shared.early is not None and not shared.latch:
+            # The master has just told the subscribers, which connect now: what is published meanwhile waits for them.
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(limits.EARLY_WAIT):
+                    await publisher.wait_for_subscriber()
+        early, shared.early = shared.early, None
+        for payload in early or ():
+            publisher.publish_raw(payload)
+        if early is None and shared.latched is not None:
+            publisher.publish_raw(shared.latched[0])  # a new node: its subscribers have had it, newcomers have not
+        return publisher
+
+    def _refused(self, shared: _Shared, error: RmpaError) -> None:
+        if self._shared.get(shared.topic) is shared:
+            users = [*shared.users.values()]
+            shared.users.clear()
+            self._end(shared)
+            for failed in users:
+                failed(error)
+
+    def _end(self, shared: _Shared) -> None:
+        if shared.linger is not None:
+            shared.linger.cancel()
+        del self._shared[shared.topic]
+        self._ended(shared.topic)
+        if shared.registration is not None:
+            shared.registration.end()
+            self._ending = {name: each for name, each in self._ending.items() if not each.ended}
+            self._ending[shared.topic] = shared.registration
+
+
+async def _withdraw(publisher: Publisher) -> None:
+    await publisher.close()

@@ -1,0 +1,147 @@
+"""Services that clients offer: the node serves them, and hands each call to its client."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import itertools
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from rmpa.core.errors import PeerRefused, RmpaError
+from rmpa.web import limits
+from rmpa.web.hub.node_link import Registration
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.ros.node.node import Node, Service
+    from rmpa.ros.types.service_types import ServiceType
+    from rmpa.web.hub.clients import Key
+    from rmpa.web.hub.node_link import NodeLink
+    from rmpa.web.hub.requests import Payload
+
+
+@dataclass(slots=True, eq=False)
+class _Served:
+    name: str
+    key: Key
+    kind: ServiceType
+    request: Callable[[int, bytes], None]
+    failed: Callable[[RmpaError], None]
+    registration: Registration[Service] | None = None
+    calls: dict[int, asyncio.Future[Payload]] = field(default_factory=dict)
+
+
+class ServedServices:
+    """All services that clients offer.
+
+    Args:
+        link: Has the node.
+    """
+
+    def __init__(self, link: NodeLink) -> None:
+        self._link = link
+        self._served: dict[str, _Served] = {}
+        self._ending: dict[str, Registration[Service]] = {}
+        self._numbers = itertools.count(1)
+
+    def serve(
+        self,
+        key: Key,
+        name: str,
+        kind: ServiceType,
+        request: Callable[[int, bytes], None],
+        failed: Callable[[RmpaError], None],
+    ) -> None:
+        """Offer a service.
+
+        Args:
+            key: The client and its handle.
+            name: The global name.
+            kind: Its type.
+            request: ``(call, payload)``: hands a call to the client, which answers by ``respond``.
+            failed: Called where the service cannot be registered; it has then ended.
+
+        Raises:
+            PeerRefused: A client offers it already.
+        """
+        if name in self._served:
+            problem = f"a client offers {name} already"
+            raise PeerRefused("the web server", problem, "end that one first, or choose another name")
+        served = self._served[name] = _Served(name, key, kind, request, failed)
+        served.registration = Registration(
+            self._link,
+            name,
+            functools.partial(self._register, served),
+            _withdraw,
+            functools.partial(self._refused, served),
+            after=self._ending.pop(name, None),
+        )
+
+    def respond(self, key: Key, name: str, call: int, *, ok: bool, response: Payload | str) -> None:
+        """Answer a call; one that has ended is ignored."""
+        served = self._served.get(name)
+        future = served.calls.get(call) if served is not None and served.key == key else None
+        if future is None or future.done():
+            return
+        if ok and not isinstance(response, str):
+            future.set_result(response)
+        else:
+            future.set_exception(RmpaError(str(response)))
+
+    def end(self, key: Key, name: str) -> None:
+        """End a service; its open calls fail."""
+        served = self._served.get(name)
+        if served is not None and served.key == key:
+            self._end(served)
+
+    async def close(self) -> None:
+        """End all, after the node was closed."""
+        ending = [*self._ending.values()]
+        for served in [*self._served.values()]:
+            if served.registration is not None:
+                ending.append(served.registration)
+            self._end(served)
+        for registration in ending:
+            await registration.closed()
+        self._ending.clear()
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    async def _register(self, served: _Served, node: Node) -> Service:
+        handler = functools.partial(self._call, served)
+        return await node.advertise_service(
+            served.name, served.kind, handler, timeout=limits.SERVED_TIMEOUT, raw=True
+        )
+
+    async def _call(self, served: _Served, request: bytes) -> Payload:
+        if len(served.calls) >= limits.SERVED_CALLS_MAX:
+            raise RmpaError(f"{len(served.calls)} calls of {served.name} wait for its client, which is the limit")
+        number = next(self._numbers)
+        future: asyncio.Future[Payload] = asyncio.get_running_loop().create_future()
+        served.calls[number] = future
+        try:
+            served.request(number, request)
+            return await future
+        finally:
+            del served.calls[number]
+
+    def _refused(self, served: _Served, error: RmpaError) -> None:
+        if self._served.get(served.name) is served:
+            self._end(served)
+            served.failed(error)
+
+    def _end(self, served: _Served) -> None:
+        del self._served[served.name]
+        for future in served.calls.values():
+            if not future.done():
+                future.set_exception(RmpaError(f"the client that offers {served.name} has ended it"))
+        if served.registration is not None:
+            served.registration.end()
+            self._ending = {name: each for name, each in self._ending.items() if not each.ended}
+            self._ending[served.name] = served.registration
+
+
+async def _withdraw(service: Service) -> None:
+    await service.close()

@@ -1,0 +1,261 @@
+"""The hub's subscriptions: one ROS subscription a topic for all clients, and the latched messages for newcomers."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import time
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from rmpa.ros.wire.tcpros import ANY
+from rmpa.web import limits
+from rmpa.web.hub.node_link import Registration
+from rmpa.web.hub.requests import Received
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from rmpa.core.errors import RmpaError
+    from rmpa.ros.node.node import Node, Subscriber
+    from rmpa.ros.node.topics import Received as RosReceived
+    from rmpa.web.hub.clients import Key
+    from rmpa.web.hub.node_link import NodeLink
+
+OWN: Final = ""
+"""The source of what clients of this hub publish: the node has no connection to itself."""
+
+
+@dataclass(slots=True, eq=False)
+class _Sink:
+    """One subscription of one client."""
+
+    handle: int
+    type: str | None
+    deliver: Callable[[Received], None]
+    failed: Callable[[RmpaError], None]
+
+
+@dataclass(slots=True, eq=False)
+class _Latched:
+    """The last message of a latching source, and which sinks have had it."""
+
+    header: Mapping[str, str]
+    type: str
+    payload: memoryview
+    stamp_ns: int
+    had: set[_Sink] = field(default_factory=set)
+
+
+@dataclass(slots=True, eq=False)
+class _Topic:
+    name: str
+    sinks: dict[Key, _Sink] = field(default_factory=dict)
+    registration: Registration[Subscriber] | None = None
+    linger: asyncio.TimerHandle | None = None
+    latched: dict[str, _Latched] = field(default_factory=dict)
+    headers: dict[str, Mapping[str, str]] = field(default_factory=dict)
+    """The last header of each publisher, by its name."""
+    messages: int = 0
+    bytes: int = 0
+
+
+class Topics:
+    """All subscriptions.
+
+    Args:
+        link: Has the node.
+        learn: ``(topic, header)``: a publisher's header, at each new connection, before its first message.
+        own_latched: The type, payload and time of the latched message that a client of this hub publishes on a topic.
+        now_ns: The wall clock, in nanoseconds.
+    """
+
+    def __init__(
+        self,
+        link: NodeLink,
+        learn: Callable[[str, Mapping[str, str]], None],
+        own_latched: Callable[[str], tuple[str, memoryview, int] | None],
+        now_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self._link = link
+        self._learn = learn
+        self._own_latched = own_latched
+        self._now_ns = now_ns
+        self._topics: dict[str, _Topic] = {}
+        self._ending: dict[str, Registration[Subscriber]] = {}
+        self._latched_bytes = 0
+        self._latched_order: OrderedDict[tuple[str, str], None] = OrderedDict()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The topics that are subscribed to, those included that linger."""
+        return tuple(self._topics)
+
+    def subscribe(
+        self,
+        key: Key,
+        topic: str,
+        type_: str | None,
+        deliver: Callable[[Received], None],
+        failed: Callable[[RmpaError], None],
+    ) -> None:
+        """Begin a subscription; latched messages that are there are delivered before this returns.
+
+        Args:
+            key: The client and its handle.
+            topic: The global name.
+            type_: The only type that is wanted; ``None`` for any.
+            deliver: Takes each message.
+            failed: Called where the master refuses the subscription, which has then ended.
+        """
+        sink = _Sink(key[1], None if type_ == ANY else type_, deliver, failed)
+        there = self._topics.get(topic)
+        if there is None:
+            there = self._topics[topic] = _Topic(topic)
+            there.registration = Registration(
+                self._link,
+                topic,
+                functools.partial(self._register, there),
+                _withdraw,
+                functools.partial(self._refused, there),
+                after=self._ending.pop(topic, None),
+            )
+            own = self._own_latched(topic)
+            if own is not None:
+                self._keep(there, OWN, _Latched({}, *own))
+        if there.linger is not None:
+            there.linger.cancel()
+            there.linger = None
+        there.sinks[key] = sink
+        self._replay(there, sink)
+
+    def unsubscribe(self, key: Key, topic: str) -> None:
+        """End a subscription; the last one's topic lingers for ``limits.SUBSCRIPTION_LINGER``."""
+        there = self._topics.get(topic)
+        sink = there.sinks.pop(key, None) if there is not None else None
+        if there is None or sink is None:
+            return
+        for latched in there.latched.values():
+            latched.had.discard(sink)
+        if not there.sinks:
+            loop = asyncio.get_running_loop()
+            there.linger = loop.call_later(limits.SUBSCRIPTION_LINGER, self._end, there)
+
+    def publish(self, topic: str, type_: str, payload: memoryview, *, latch: bool) -> None:
+        """Deliver what a client of this hub publishes, to which the node itself does not subscribe."""
+        there = self._topics.get(topic)
+        if there is not None:
+            self._deliver(there, OWN, {"type": type_}, type_, payload, self._now_ns(), latch=latch)
+
+    def forget_own(self, topic: str) -> None:
+        """Forget the latched message of the hub's own publisher, which has ended."""
+        self._forget_latched(topic, OWN)
+
+    async def close(self) -> None:
+        """End all, after the node was closed."""
+        ending = [*self._ending.values()]
+        for there in [*self._topics.values()]:
+            if there.registration is not None:
+                ending.append(there.registration)
+            self._end(there)
+        for registration in ending:
+            await registration.closed()
+        self._ending.clear()
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    async def _register(self, there: _Topic, node: Node) -> Subscriber:
+        return await node.subscribe(there.name, None, functools.partial(self._take, there))
+
+    def _refused(self, there: _Topic, error: RmpaError) -> None:
+        if self._topics.get(there.name) is there:
+            sinks = [*there.sinks.values()]
+            there.sinks.clear()
+            self._end(there)
+            for sink in sinks:
+                sink.failed(error)
+
+    def _end(self, there: _Topic) -> None:
+        if there.linger is not None:
+            there.linger.cancel()
+        del self._topics[there.name]
+        for source in [*there.latched]:
+            self._forget_latched(there.name, source, there)
+        if there.registration is not None:
+            there.registration.end()
+            self._ending = {name: each for name, each in self._ending.items() if not each.ended}
+            self._ending[there.name] = there.registration
+
+    def _take(self, there: _Topic, message: RosReceived) -> None:
+        header = message.header
+        source = header.get("callerid", "?")
+        if there.headers.get(source) is not header:
+            there.headers[source] = header
+            if len(there.headers) > limits.SEEN_PUBLISHERS_MAX:
+                del there.headers[next(iter(there.headers))]
+            self._learn(there.name, header)
+        latch = header.get("latching") == "1"
+        payload = memoryview(message.raw)
+        self._deliver(there, source, header, header.get("type", ""), payload, message.stamp_ns, latch=latch)
+
+    def _deliver(
+        self,
+        there: _Topic,
+        source: str,
+        header: Mapping[str, str],
+        type_: str,
+        payload: memoryview,
+        stamp_ns: int,
+        *,
+        latch: bool,
+    ) -> None:
+        there.messages += 1
+        there.bytes += len(payload)
+        had: set[_Sink] | None = None
+        if latch:
+            latched = there.latched.get(source)
+            if latched is not None and source != OWN and latched.header is not header and latched.payload == payload:
+                # The publisher sends its latched message at each new connection: most sinks have had it.
+                latched.header = header
+            else:
+                latched = self._keep(there, source, _Latched(header, type_, payload, stamp_ns))
+            had = latched.had
+        for sink in [*there.sinks.values()]:
+            if sink.type not in (None, type_):
+                continue
+            if had is not None:
+                if sink in had:
+                    continue
+                had.add(sink)
+            sink.deliver(Received(sink.handle, there.name, type_, payload, stamp_ns))
+
+    def _keep(self, there: _Topic, source: str, latched: _Latched) -> _Latched:
+        self._forget_latched(there.name, source, there)
+        there.latched[source] = latched
+        self._latched_order[there.name, source] = None
+        self._latched_bytes += len(latched.payload)
+        while self._latched_bytes > limits.LATCHED_BYTES and len(self._latched_order) > 1:
+            self._forget_latched(*next(iter(self._latched_order)))
+        return latched
+
+    def _forget_latched(self, topic: str, source: str, there: _Topic | None = None) -> None:
+        there = there or self._topics.get(topic)
+        latched = there.latched.pop(source, None) if there is not None else None
+        if latched is not None:
+            self._latched_order.pop((topic, source), None)
+            self._latched_bytes -= len(latched.payload)
+
+    def _replay(self, there: _Topic, sink: _Sink) -> None:
+        subscriber = there.registration.value if there.registration is not None else None
+        connected = subscriber.callers if subscriber is not None else set()
+        for source, latched in there.latched.items():
+            if (source == OWN or source in connected) and sink.type in (None, latched.type):
+                latched.had.add(sink)
+                sink.deliver(
+                    Received(sink.handle, there.name, latched.type, latched.payload, latched.stamp_ns, latched=True)
+                )
+
+
+async def _withdraw(subscriber: Subscriber) -> None:
+    await subscriber.close()

@@ -1,0 +1,89 @@
+"""Both gateways at a port of this machine, and WebSocket clients of another library's making."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from typing import TYPE_CHECKING, Any
+
+import aiohttp
+from aiohttp import web
+
+from rmpa.web.gateways.gateways import Gateways
+from rmpa.web.hub.rights import FULL, Rights
+from tests.ros.node.peers import DEADLINE
+from tests.web.hub.client import running_hub
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    from rmpa.ros.core.embedded import RosCore
+
+
+class Client:
+    """A WebSocket client of aiohttp."""
+
+    def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
+        self.socket = socket
+
+    async def send(self, op: str, **values: Any) -> None:
+        await self.socket.send_str(json.dumps({"op": op, **values}))
+
+    async def next(self, op: str) -> dict[str, Any]:
+        """The next text frame of this op; others are skipped."""
+        async with asyncio.timeout(DEADLINE):
+            while True:
+                message = await self.socket.receive()
+                assert message.type not in (aiohttp.WSMsgType.CLOSED, aiohttp.WSMsgType.CLOSE), message
+                if message.type == aiohttp.WSMsgType.TEXT:
+                    values: dict[str, Any] = json.loads(message.data)
+                    if values["op"] == op:
+                        return values
+
+    async def next_bytes(self) -> bytes:
+        """The next binary frame."""
+        async with asyncio.timeout(DEADLINE):
+            while True:
+                message = await self.socket.receive()
+                assert message.type not in (aiohttp.WSMsgType.CLOSED, aiohttp.WSMsgType.CLOSE), message
+                if message.type == aiohttp.WSMsgType.BINARY:
+                    return bytes(message.data)
+
+
+class Server:
+    """The gateways, and their port."""
+
+    def __init__(self, gateways: Gateways, hub: Any, port: int, session: aiohttp.ClientSession) -> None:
+        self.gateways = gateways
+        self.hub = hub
+        self.port = port
+        self.session = session
+
+    @contextlib.asynccontextmanager
+    async def client(self, *protocols: str) -> AsyncIterator[Client]:
+        """A client that offers subprotocols."""
+        url = f"ws://127.0.0.1:{self.port}/"
+        async with self.session.ws_connect(url, protocols=protocols, max_msg_size=0) as socket:
+            yield Client(socket)
+
+
+@contextlib.asynccontextmanager
+async def running_server(
+    core: RosCore, rights: Rights = FULL, priority: Callable[[str], int] = lambda _: 0, *, port: int = 0
+) -> AsyncIterator[Server]:
+    async with running_hub(core) as hub:
+        gateways = Gateways(hub, "test", lambda _: rights, priority)
+        app = web.Application()
+        app.router.add_get("/", gateways.handle)
+        runner = web.AppRunner(app, shutdown_timeout=1)
+        await runner.setup()
+        site = web.TCPSite(runner, "127.0.0.1", port)
+        await site.start()
+        port = runner.addresses[0][1]
+        try:
+            async with aiohttp.ClientSession() as session:
+                yield Server(gateways, hub, port, session)
+        finally:
+            await gateways.close()
+            await runner.cleanup()

@@ -1,0 +1,83 @@
+"""The sign of life of a client, with a transport that the test plays."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+from rmpa.web.gateways.connection import ClientConnection, OutFrame
+from rmpa.web.hub.clients import Client
+from rmpa.web.hub.rights import READ_ONLY
+from tests.ros.node.peers import DEADLINE
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    import pytest
+
+    from rmpa.web.hub.requests import Answer, Received
+
+
+class Silent(ClientConnection):
+    """A protocol without messages."""
+
+    def opened(self) -> None: ...
+
+    def received_frame(self, data: str | bytes) -> None: ...
+
+    def answered(self, answer: Answer) -> None: ...
+
+    def encode(self, message: Received) -> Iterable[OutFrame]:
+        return ()
+
+    def show_drops(self, dropped: dict[str, int]) -> None: ...
+
+
+class Transport:
+    """A transport with so many bytes waiting, look by look; the last number stays."""
+
+    def __init__(self, *waiting: int) -> None:
+        self.waiting = list(waiting)
+        self.looks = 0
+        self.written = b""
+        self.aborted = False
+
+    def get_write_buffer_size(self) -> int:
+        self.looks += 1
+        return self.waiting.pop(0) if len(self.waiting) > 1 else self.waiting[0]
+
+    def is_closing(self) -> bool:
+        return self.aborted
+
+    def write(self, data: bytes) -> None:
+        self.written += data
+
+    def abort(self) -> None:
+        self.aborted = True
+
+
+async def watched(transport: Transport) -> None:
+    hub: Any = None
+    connection = Silent(hub, READ_ONLY, lambda _: 0, "here", unadvertise_delay=0.0)
+    played: Any = transport
+    connection._transport = played
+    connection._client = Client(1, "test", READ_ONLY, lambda _: None, 0.0)
+    await asyncio.wait_for(connection._watch(), DEADLINE)
+
+
+async def test_a_client_that_answers_no_ping_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rmpa.web.limits.PING_INTERVAL", 0.002)
+    transport = Transport(0)
+    await watched(transport)
+    assert transport.aborted
+    assert transport.written.startswith(b"\x89\x00")
+    assert transport.looks == 4
+
+
+async def test_a_large_message_that_goes_on_is_a_sign_of_life(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rmpa.web.limits.PING_INTERVAL", 0.002)
+    transport = Transport(*range(1000, 100, -100))
+    await watched(transport)
+    assert transport.aborted
+    assert transport.looks == 9 + 3
+    assert transport.written == b""

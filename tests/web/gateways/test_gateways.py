@@ -1,0 +1,291 @@
+"""WebSocket clients at both gateways, with nodes of a core."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import socket
+import struct
+from typing import TYPE_CHECKING, Any
+
+from rmpa.ros.types.messages import MessageType
+from rmpa.web.hub.rights import READ_ONLY
+from tests.ros.node.peers import DEADLINE, LATCHED, STRING, until
+from tests.web.gateways.server import Client, running_server
+from tests.web.hub.client import node
+
+if TYPE_CHECKING:
+    from rmpa.ros.core.embedded import RosCore
+
+ONE, TWO = b"\x03\0\0\0one", b"\x03\0\0\0two"
+FOXGLOVE = "foxglove.websocket.v1"
+BYTES = MessageType("std_msgs/UInt8MultiArray")
+
+
+async def channel_of(client: Client, topic: str) -> dict[str, Any]:
+    while True:
+        for channel in (await client.next("advertise"))["channels"]:
+            if channel["topic"] == topic:
+                found: dict[str, Any] = channel
+                return found
+
+
+# --- rosbridge ---
+
+
+async def test_rosbridge_publishes_subscribes_and_calls(core: RosCore) -> None:
+    async with running_server(core) as server, node(core, "server") as other, server.client() as client:
+        await other.advertise_service("/set", "std_srvs/SetBool", lambda r: {"success": r.data, "message": "done"})
+        heard: list[bytes] = []
+        await other.subscribe("/out", callback=lambda message: heard.append(message.raw))
+        await client.send("advertise", topic="/out", type="std_msgs/String")
+        await client.send("publish", topic="/out", msg={"data": "one"})
+        await until(lambda: heard == [ONE])
+        publisher = await other.advertise("/in", STRING)
+        await client.send("subscribe", topic="/in", type="std_msgs/String")
+        await publisher.wait_for_subscriber()
+        publisher.publish_raw(TWO)
+        assert (await client.next("publish"))["msg"] == {"data": "two"}
+        await client.send("call_service", service="/set", id="7", args={"data": True})
+        answer = await client.next("service_response")
+        assert answer == {
+            "op": "service_response",
+            "service": "/set",
+            "id": "7",
+            "values": {"success": True, "message": "done"},
+            "result": True,
+        }
+        await until(lambda: {"/in", "/out"} <= server.hub.graph.topics.keys())
+        await client.send("call_service", service="/rosapi/topics", id="8")
+        topics = (await client.next("service_response"))["values"]["topics"]
+        assert {"/in", "/out"} <= set(topics)
+
+
+async def test_rosbridge_parameters_and_served_services(core: RosCore) -> None:
+    async with running_server(core) as server, node(core, "caller") as caller, server.client() as client:
+        await client.send("call_service", service="/rosapi/set_param", id="1", args={"name": "/p", "value": "[1, 2]"})
+        await client.next("service_response")
+        assert await caller.get_param("/p") == [1, 2]
+        await client.send("call_service", service="/rosapi/get_param", id="2", args={"name": "/p"})
+        assert json.loads((await client.next("service_response"))["values"]["value"]) == [1, 2]
+        await client.send("advertise_service", service="/served", type="std_srvs/SetBool")
+        await until(lambda: "/served" in server.hub.graph.services)
+        calling = asyncio.ensure_future(caller.call_service("/served", "std_srvs/SetBool", {"data": True}))
+        call = await client.next("call_service")
+        assert call["args"] == {"data": True}
+        values = {"success": True, "message": "ok"}
+        await client.send("service_response", service="/served", id=call["id"], values=values, result=True)
+        assert (await calling).message == "ok"
+
+
+async def test_rosbridge_counts_its_clients(core: RosCore) -> None:
+    async with running_server(core) as server, server.client() as client:
+        await client.send("subscribe", topic="/client_count", type="std_msgs/Int32")
+        assert (await client.next("publish"))["msg"] == {"data": 1}
+        async with server.client():
+            assert (await client.next("publish"))["msg"] == {"data": 2}
+        assert (await client.next("publish"))["msg"] == {"data": 1}
+        await client.send("subscribe", topic="/connected_clients")
+        (connected,) = (await client.next("publish"))["msg"]["clients"]
+        assert connected["ip_address"] == "127.0.0.1"
+
+
+async def test_a_message_is_converted_once_for_all_clients(core: RosCore, monkeypatch: Any) -> None:
+    made: list[str] = []
+    from rmpa.web.rosbridge import encodings
+
+    encode = encodings._encode
+
+    def counted(topic: str, *args: Any) -> Any:
+        made.append(topic)
+        return encode(topic, *args)
+
+    monkeypatch.setattr(encodings, "_encode", counted)
+    async with running_server(core) as server, node(core, "talker") as talker:
+        publisher = await talker.advertise("/t", STRING)
+        async with server.client() as one, server.client() as two:
+            for client in (one, two):
+                await client.send("subscribe", topic="/t", type="std_msgs/String")
+            await until(lambda: len(server.hub.topics.names) and len(server.hub.clients) == 2)
+            await publisher.wait_for_subscriber()
+            await until(lambda: all(each.subscriptions for each in server.hub.clients))
+            publisher.publish_raw(ONE)
+            for client in (one, two):
+                assert (await client.next("publish"))["msg"] == {"data": "one"}
+    assert made.count("/t") == 1
+
+
+async def test_a_read_only_rosbridge_client_sees_topics_but_no_parameters(core: RosCore) -> None:
+    async with (
+        running_server(core, READ_ONLY) as server,
+        node(core, "talker") as talker,
+        server.client() as client,
+    ):
+        await talker.set_param("/secret", 5)
+        (await talker.advertise("/t", LATCHED, latch=True)).publish_raw(ONE)
+        await client.send("subscribe", topic="/t", type="std_msgs/String")
+        assert (await client.next("publish"))["msg"] == {"data": "one"}
+        await until(lambda: server.hub.params.value("/secret") == 5)
+        await client.send("call_service", service="/rosapi/get_param", id="1", args={"name": "/secret"})
+        assert (await client.next("service_response"))["values"]["value"] == "null"
+        await client.send("advertise", topic="/cmd_vel", type="geometry_msgs/Twist")
+        assert "may not publish" in (await client.next("status"))["msg"]
+        assert not core.publishers("/cmd_vel")
+
+
+# --- Foxglove ---
+
+
+async def test_foxglove_gets_channels_bytes_and_answers(core: RosCore) -> None:
+    async with (
+        running_server(core) as server,
+        node(core, "talker") as talker,
+        server.client("other", FOXGLOVE) as client,
+    ):
+        assert client.socket.protocol == FOXGLOVE
+        info = await client.next("serverInfo")
+        assert info["metadata"] == {"ROS_DISTRO": "noetic"}
+        publisher = await talker.advertise("/t", LATCHED, latch=True)
+        publisher.publish_raw(ONE)
+        channel = await channel_of(client, "/t")
+        assert (channel["schemaName"], channel["schema"].strip()) == ("std_msgs/String", "string data")
+        await client.send("subscribe", subscriptions=[{"id": 9, "channelId": channel["id"]}])
+        data = await client.next_bytes()
+        opcode, subscription, _ = struct.unpack_from("<BIQ", data)
+        assert (opcode, subscription, data[13:]) == (1, 9, ONE)
+        heard: list[bytes] = []
+        await talker.subscribe("/out", callback=lambda message: heard.append(message.raw))
+        advertised = {"id": 3, "topic": "/out", "encoding": "ros1", "schemaName": "std_msgs/String"}
+        await client.send("advertise", channels=[advertised])
+        await client.socket.send_bytes(b"\x01\x03\0\0\0" + TWO)
+        await until(lambda: heard == [TWO])
+        await client.send("setParameters", parameters=[{"name": "/p", "value": 5}], id="set")
+        assert (await client.next("parameterValues"))["id"] == "set"
+        assert await talker.get_param("/p") == 5
+
+
+async def test_large_messages_arrive_whole_at_every_client(core: RosCore) -> None:
+    payload = BYTES.serialize(BYTES.make({"data": [7] * 200_000}))
+    async with running_server(core) as server, node(core, "camera") as camera:
+        publisher = await camera.advertise("/image", BYTES, latch=True)
+        publisher.publish_raw(payload)
+        async with server.client(FOXGLOVE) as fox, server.client() as bridge:
+            channel = await channel_of(fox, "/image")
+            await fox.send("subscribe", subscriptions=[{"id": 1, "channelId": channel["id"]}])
+            await bridge.send("subscribe", topic="/image", compression="cbor-raw")
+            assert (await fox.next_bytes())[13:] == bytes(payload)
+            assert bytes(payload) in await bridge.next_bytes()
+
+
+async def test_a_client_that_stops_reading_costs_its_bound_and_no_other_a_message(core: RosCore) -> None:
+    payload = bytes(BYTES.serialize(BYTES.make({"data": [7] * 500_000})))
+    async with running_server(core) as server, node(core, "camera") as camera:
+        publisher = await camera.advertise("/image", BYTES)
+        async with server.client(FOXGLOVE) as stuck, server.client(FOXGLOVE) as reader:
+            sock = stuck.socket.get_extra_info("socket")
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            for client in (stuck, reader):
+                channel = await channel_of(client, "/image")
+                await client.send("subscribe", subscriptions=[{"id": 1, "channelId": channel["id"]}])
+            await until(lambda: all(each.subscriptions for each in server.hub.clients))
+            await publisher.wait_for_subscriber()
+            stuck.socket._reader._protocol.pause_reading()
+            for _ in range(45):
+                publisher.publish_raw(payload)
+                assert (await reader.next_bytes())[13:] == payload
+            queues = sorted((each.queue.bytes, each.queue.dropped_total) for each in server.gateways.connections)
+            assert queues[0] == (0, 0)
+            assert 0 < queues[1][0] <= 16 << 20
+            assert queues[1][1] > 0
+            figures = server.gateways.figures()["foxglove"]
+            assert (figures.clients, figures.queued, figures.dropped) == (2, *queues[1])
+            stuck.socket._response.connection.transport.abort()  # type: ignore[union-attr]
+
+
+async def test_the_hub_has_nothing_left_of_a_client_that_went(core: RosCore, monkeypatch: Any) -> None:
+    monkeypatch.setattr("rmpa.web.limits.SUBSCRIPTION_LINGER", 0.01)
+    monkeypatch.setattr("rmpa.web.limits.UNADVERTISE_DELAY", 0.01)
+    async with running_server(core) as server, node(core, "talker") as talker:
+        publisher = await talker.advertise("/t", STRING)
+        for protocols in ((), (FOXGLOVE,)):
+            async with server.client(*protocols) as client:
+                if protocols:
+                    channel = await channel_of(client, "/t")
+                    await client.send("subscribe", subscriptions=[{"id": 1, "channelId": channel["id"]}])
+                else:
+                    await client.send("subscribe", topic="/t")
+                    await client.send("advertise", topic="/u", type="std_msgs/String")
+                    await until(lambda: core.publishers("/u"))
+                await publisher.wait_for_subscriber()
+                client.socket._response.connection.transport.abort()  # type: ignore[union-attr]
+                await until(lambda: not server.hub.clients)
+            await until(lambda: publisher.subscribers == 0 and not core.publishers("/u"))
+        assert not server.gateways.connections
+        assert not server.hub.topics.names
+
+
+async def test_a_client_without_a_sign_of_life_is_disconnected(core: RosCore, monkeypatch: Any) -> None:
+    monkeypatch.setattr("rmpa.web.limits.PING_INTERVAL", 0.1)
+    async with running_server(core) as server, server.client() as alive:
+        reading = asyncio.ensure_future(alive.next("service_response"))  # answers pings while it reads
+        dead = await server.session.ws_connect(f"ws://127.0.0.1:{server.port}/", autoping=False)
+        await until(lambda: len(server.gateways.connections) == 2)
+        await until(lambda: len(server.gateways.connections) == 1)
+        await alive.send("call_service", service="/rosapi/get_time", id="1")
+        assert (await reading)["result"]
+        dead._response.close()
+        await dead.close()
+
+
+async def test_a_command_overtakes_the_images_that_wait(core: RosCore) -> None:
+    payload = bytes(BYTES.serialize(BYTES.make({"data": [7] * 500_000})))
+    priorities: list[str] = []
+
+    def priority(topic: str) -> int:
+        priorities.append(topic)
+        return int(topic == "/cmd")
+
+    async with (
+        running_server(core, priority=priority) as server,
+        node(core, "camera") as camera,
+        server.client(FOXGLOVE) as client,
+    ):
+        image = await camera.advertise("/image", BYTES)
+        command = await camera.advertise("/cmd", STRING)
+        found: dict[str, int] = {}
+        while not {"/image", "/cmd"} <= found.keys():
+            found |= {each["topic"]: each["id"] for each in (await client.next("advertise"))["channels"]}
+        subscriptions = [{"id": 0, "channelId": found["/image"]}, {"id": 1, "channelId": found["/cmd"]}]
+        await client.send("subscribe", subscriptions=subscriptions)
+        await image.wait_for_subscriber()
+        await command.wait_for_subscriber()
+        client.socket._reader._protocol.pause_reading()
+        (connection,) = server.gateways.connections
+        images = 0
+        while sum(connection.queue.waiting.values()) < 5:
+            image.publish_raw(payload)
+            images += 1
+            await asyncio.sleep(0.01)
+        command.publish_raw(ONE)
+        await until(lambda: len(connection.queue.waiting) == 2)
+        client.socket._reader._protocol.resume_reading()
+        order = [struct.unpack_from("<BI", await client.next_bytes())[1] for _ in range(images + 1)]
+        assert order.index(1) <= images - 4
+        assert set(priorities) == {"/image", "/cmd"}
+
+
+async def test_frames_that_are_too_large_or_broken_end_one_client_only(core: RosCore) -> None:
+    async with running_server(core) as server, server.client() as other:
+        async with server.client() as client:
+            with contextlib.suppress(ConnectionError):  # it may be closed before all is sent
+                await client.socket.send_str("x" * (11 << 20))
+            async with asyncio.timeout(DEADLINE):
+                while not client.socket.closed:
+                    await client.socket.receive()
+            await until(lambda: len(server.gateways.connections) == 1)
+        async with server.client() as client:
+            await client.socket.send_str("[[[")
+            assert "level" in await client.next("status")
+        await other.send("call_service", service="/rosapi/get_time", id="1")
+        assert (await other.next("service_response"))["result"]

@@ -1,0 +1,25 @@
+"""docs/rosbridge.md: its figures are the code's."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from rmpa.core.sizes import MIB
+from rmpa.web.rosbridge import limits
+
+PAGE = Path(__file__).parents[3] / "docs" / "rosbridge.md"
+
+
+def test_the_page_says_the_bounds_of_the_code() -> None:
+    rows = re.findall(r"\| ([\d,]+)( MiB| s)? \| `([A-Z_]+)` \|", PAGE.read_text())
+    assert len(rows) > 15
+    for figure, unit, name in rows:
+        assert getattr(limits, name) == int(figure.replace(",", "")) * (MIB if unit == " MiB" else 1), name
+    told = {name for _, _, name in rows}
+    assert {name for name in vars(limits) if name.endswith("_MAX")} - told == {
+        "FRAGMENTED_MESSAGES_MAX",
+        "ID_MAX",
+        "NAME_MAX",
+        "TEXT_MAX",
+    }

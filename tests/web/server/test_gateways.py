@@ -1,0 +1,132 @@
+"""WebSocket clients at the whole server: who may connect, and what for."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+import aiohttp
+import msgspec
+import pytest
+
+from rmpa.core.contract import ContractRule, Contracts, Priority
+from rmpa.web.gateways.gateways import Gateways
+from rmpa.web.hub.rights import FULL, READ_ONLY
+from rmpa.web.server.agent_watch import AgentWatch
+from rmpa.web.server.auth import AccessPolicy, own_names
+from rmpa.web.server.hub_setup import make_hub, priority_of, rights_of
+from rmpa.web.server.server import WebServer
+from tests.ros.node.peers import DEADLINE, LATCHED, until
+from tests.web.hub.client import local_core, node
+from tests.web.snapshots import FULL as SNAPSHOT
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+TOKEN = "secret-" * 6
+ONE = b"\x03\0\0\0one"
+
+
+@asynccontextmanager
+async def running(token: str = "", **policy: Any) -> AsyncIterator[tuple[WebServer, Any]]:
+    async with local_core() as core:
+        agent = msgspec.structs.replace(SNAPSHOT.agent, core_uri=core.uri)
+        watch = AgentWatch(lambda: msgspec.structs.replace(SNAPSHOT, agent=agent))
+        hub = make_hub(watch, 8480)
+        rights = rights_of(has_token=bool(token), control=bool(token))
+        gateways = Gateways(hub, "test", lambda _: rights)
+        access = AccessPolicy(0, own_names(("base",)), token, **policy)
+        server = WebServer(watch, access, "127.0.0.1", gateways, (0,))
+        try:
+            async with hub:
+                await server.start()
+                yield server, core
+                await gateways.close()
+        finally:
+            await server.close()
+
+
+def connect(session: aiohttp.ClientSession, server: WebServer, path: str = "/", **headers: str) -> Any:
+    return session.ws_connect(f"ws://127.0.0.1:{server.port}{path}", headers=headers)
+
+
+async def published(socket: Any) -> Any:
+    async with asyncio.timeout(DEADLINE):
+        while True:
+            values = json.loads((await socket.receive()).data)
+            if values["op"] == "publish":
+                return values["msg"]
+
+
+async def test_a_client_without_a_token_reads_topics_on_this_machine() -> None:
+    async with (
+        running() as (server, core),
+        node(core, "talker") as talker,
+        aiohttp.ClientSession() as session,
+        connect(session, server) as socket,
+    ):
+        (await talker.advertise("/t", LATCHED, latch=True)).publish_raw(ONE)
+        await socket.send_json({"op": "subscribe", "topic": "/t", "type": "std_msgs/String"})
+        assert await published(socket) == {"data": "one"}
+        await socket.send_json({"op": "advertise", "topic": "/cmd_vel", "type": "geometry_msgs/Twist"})
+        async with asyncio.timeout(DEADLINE):
+            assert "may not publish" in (await socket.receive()).data
+
+
+@pytest.mark.parametrize("path", ["/", "/rosbridge", "/foxglove"])
+async def test_a_token_in_the_url_opens_a_websocket(path: str) -> None:
+    async with running(TOKEN) as (server, core), aiohttp.ClientSession() as session:
+        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+            await connect(session, server, path)
+        assert refused.value.status == 401
+        async with connect(session, server, f"{path}?token={TOKEN}") as socket:
+            await socket.send_json({"op": "advertise", "topic": "/cmd_vel", "type": "geometry_msgs/Twist"})
+            await until(lambda: core.publishers("/cmd_vel"))
+
+
+async def test_pages_of_other_sites_connect_only_where_they_are_listed() -> None:
+    origin = "https://app.foxglove.dev"
+    async with running() as (server, _), aiohttp.ClientSession() as session:
+        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+            await connect(session, server, Origin=origin)
+        assert refused.value.status == 403
+        async with connect(session, server, Origin=f"http://127.0.0.1:{server.port}"):
+            pass
+    async with (
+        running(origins=frozenset({origin})) as (server, _),
+        aiohttp.ClientSession() as session,
+        connect(session, server, Origin=origin),
+    ):
+        pass
+
+
+async def test_the_server_ends_while_clients_are_connected() -> None:
+    async with running() as (server, _), aiohttp.ClientSession() as session:
+        socket = await connect(session, server)
+        receiving = asyncio.ensure_future(socket.receive())
+        await asyncio.sleep(0)
+    assert (await asyncio.wait_for(receiving, DEADLINE)).type in (
+        aiohttp.WSMsgType.CLOSE,
+        aiohttp.WSMsgType.CLOSED,
+        aiohttp.WSMsgType.CLOSING,
+    )
+
+
+def test_rights_need_a_token() -> None:
+    assert rights_of(has_token=False, control=True) is READ_ONLY
+    assert rights_of(has_token=True, control=True) is FULL
+    readers = rights_of(has_token=True, control=False)
+    assert readers.read_parameters
+    assert (readers.publish, readers.call_services, readers.set_parameters, readers.serve_services) == (False,) * 4
+
+
+async def test_contracts_give_priorities() -> None:
+    rules = (
+        ContractRule(("/cmd_vel",), (), {"priority": Priority.HIGH}),
+        ContractRule(("/image",), (), {"priority": Priority.LOW}),
+    )
+    hub = make_hub(AgentWatch(lambda: SNAPSHOT), 8480)
+    priority = priority_of(hub, Contracts(rules))
+    assert [priority(topic) for topic in ("/cmd_vel", "/odom", "/image")] == [1, 0, -1]
