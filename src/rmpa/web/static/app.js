@@ -124,7 +124,7 @@ class App extends Component {
         <div class="tools">
           <button type="button" class="icon" aria-label="Search (/)" title="Search (/)" onClick=${() => this.setState({ overlay: "search" })}><svg viewBox="0 0 20 20" aria-hidden="true"><circle cx="8.5" cy="8.5" r="5.5" /><path d="m12.5 12.5 5 5" /></svg></button>
           <button type="button" class="icon" aria-label=${dark ? "Light colours (c)" : "Dark colours (c)"} title="Colours (c)" onClick=${() => this.turn()}><svg viewBox="0 0 20 20" aria-hidden="true"><circle cx="10" cy="10" r="7" /><path class="fill" d="M10 3a7 7 0 0 1 0 14Z" /></svg></button>
-          <button type="button" class="icon keys" aria-label="Keys (?)" title="Keys (?)" onClick=${() => this.setState({ overlay: "keys" })}><svg viewBox="0 0 20 20" aria-hidden="true"><path d="M7 7.5a3 3 0 1 1 4.5 2.6c-1 .6-1.5 1.1-1.5 2.4M10 15.5v.5" /></svg></button>
+          <button type="button" class="icon help" aria-label="Keys (?)" title="Keys (?)" onClick=${() => this.setState({ overlay: "keys" })}><svg viewBox="0 0 20 20" aria-hidden="true"><path d="M7 7.5a3 3 0 1 1 4.5 2.6c-1 .6-1.5 1.1-1.5 2.4M10 15.5v.5" /></svg></button>
         </div>
       </header>
       ${this.banner()}

@@ -43,13 +43,13 @@ const width = (bytes) => Math.min(9, 2 + Math.max(0, Math.log10((bytes || 0) / 1
 
 const Flow = memo(({ flow, from, to, a, b, geo, both, labelled, compact }) => {
   const line = chord(a, b, geo.node, both ? 9 : 0);
-  const label = line.at(geo.slots > 8 ? 0.66 : both ? 0.6 : 0.5);
+  const label = line.at(geo.slots > 8 ? 0.16 : 0.33); // near its source, where chords are apart
   const text = flow.rate === undefined ? "" : hertz(flow.rate);
   return html`<g class="flow ${flow.by === "resource" ? "declared" : ""}">
     <title>${from} to ${to}: ${text || "rate not known"}, ${flow.topics.join(", ")}</title>
     <path class="pipe" d=${line.d} stroke-width=${width(flow.bandwidth) + 4} />
     <path class="stream ${speed(flow.rate || 0)}" d=${line.d} stroke-width=${width(flow.bandwidth)} marker-end="url(#arrow)" />
-    ${labelled && text && html`<text class="rate" x=${label.x} y=${label.y + (both ? (label.y < CENTRE ? -6 : 16) : 6)}>${text}</text>`}
+    ${labelled && text && html`<text class="rate" x=${label.x} y=${label.y + 6}>${text}</text>`}
     ${labelled && !compact && text && geo.slots <= 8 && flow.bandwidth && html`<text class="minor" x=${label.x} y=${label.y + 30}>${bandwidth(flow.bandwidth)}</text>`}
   </g>`;
 });
@@ -72,7 +72,7 @@ function arc(x, y, radius, from, to) {
 // One arc around its module for each Smart Resource; its colour is the quality's level, its pattern too.
 const Arcs = ({ at, geo, resources }) => {
   const part = (2 * Math.PI) / resources.length;
-  const gap = resources.length > 1 ? 0.09 : 0.0001;
+  const gap = 0.09;
   return resources.map(([key, one], index) => html`<path key=${key} class="quality ${known(one.level).tone} level-${(one.level || "none").toLowerCase()}"
     d=${arc(at.x, at.y, geo.node + 8, -Math.PI / 2 + index * part + gap, -Math.PI / 2 + (index + 1) * part - gap)}><title>${one.name}: ${known(one.level).word}, profile ${one.profile || "none"}</title></path>`);
 };
