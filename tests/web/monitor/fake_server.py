@@ -1,10 +1,10 @@
-"""A server of the monitor that replays recorded snapshots of the demo; for the tests of the pages, and to work on them.
+"""A server of the monitor that replays recorded snapshots of the demo: for tests, and to work on the pages.
 
     python tests/web/monitor/fake_server.py --port 8480 [--scene demo]
 
-It has the real pages and the real ``MonitorSession``; the agent, the hub and all answers are made up here. Scenes:
-``demo`` (all is well), ``killed`` (the module base was killed), ``sick`` (one of each state, and alarms), ``large`` (16
-modules, 300 topics), ``mute`` (the agent does not answer).
+It has the real pages and the real ``MonitorSession``; the agent, the hub and all answers are made up here.
+Scenes: ``demo`` (all is well), ``killed`` (the module base was killed), ``sick`` (one of each state, and alarms),
+``large`` (16 modules, 300 topics), ``mute`` (the agent does not answer), ``sensors`` (a laser and a camera).
 """
 
 from __future__ import annotations
@@ -37,9 +37,10 @@ if TYPE_CHECKING:
 
 FIXTURES = Path(__file__).with_name("fixtures")
 STATIC = Path(__file__).parents[3] / "src/rmpa/web/static"
-CSP = "default-src 'self'; img-src 'self' blob:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+CSP = "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; object-src 'none'"
 TICK = 0.1
-SCENES = ("demo", "killed", "sick", "large", "mute")
+SCENES = ("demo", "killed", "sick", "large", "mute", "sensors")
+_SENSORS = {"/scan": "sensor_msgs/LaserScan", "/camera/image": "sensor_msgs/CompressedImage"}
 
 
 def snapshots() -> list[Snapshot]:
@@ -70,7 +71,7 @@ class FakeAgent:
         if self.scene == "killed":
             since = self._since.setdefault("killed", now)
             base = self._recorded[2 if now - since < 7 else 3]
-        elif self.scene in ("sick", "large"):
+        elif self.scene in ("sick", "large", "sensors"):
             base = getattr(self, f"_{self.scene}")(base)
         age = now - self._started
         wobble = 1 + 0.004 * math.sin(now * 3)
@@ -143,20 +144,33 @@ class FakeAgent:
         some, link = linked["base"], linked["velocity"].link
         assert link is not None
         peers = (
-            replace(some, name="arm", state="linking", link=None, beacon_ago=2.0, last_error="10.0.0.7:40001: timed out"),
-            replace(some, name="camera", state="refused", link=None, last_error="is of version 0.0.9, this one of 0.1.0"),
+            replace(
+                some, name="arm", state="linking", link=None, beacon_ago=2.0, last_error="10.0.0.7:40001: timed out"
+            ),
+            replace(
+                some, name="camera", state="refused", link=None, last_error="is of version 0.0.9, this one of 0.1.0"
+            ),
             replace(some, name="gripper", state="linking", link=None, beacon_ago=60.0, last_error="No route to host"),
             linked["joystick"],
             replace(linked["velocity"], link=replace(link, heard_ago=1.8)),
             some,
         )
         topics = tuple(
-            replace(topic, mismatches=("/pc expects geometry_msgs/TwistStamped, /velocity publishes geometry_msgs/Twist",))
+            replace(
+                topic, mismatches=("/pc expects geometry_msgs/TwistStamped, /velocity publishes geometry_msgs/Twist",)
+            )
             if topic.name == "/velocity_order"
             else topic
             for topic in base.topics
         )
-        return replace(base, peers=peers, topics=topics, notes=("multicast does not leave eth0: is there a firewall?",))
+        return replace(
+            base, peers=peers, topics=topics, notes=("multicast does not leave eth0: is there a firewall?",)
+        )
+
+    def _sensors(self, base: Snapshot) -> Snapshot:
+        odom = next(topic for topic in base.topics if topic.name == "/odom")
+        more = tuple(msgspec.structs.replace(odom, name=name, type=kind) for name, kind in _SENSORS.items())
+        return msgspec.structs.replace(base, topics=(*base.topics, *more))
 
     def _large(self, base: Snapshot) -> Snapshot:
         replace = msgspec.structs.replace
@@ -212,7 +226,7 @@ class FakeServer:
         app.router.add_get("/monitor", self._socket)
         app.router.add_get("/", self._index)
         app.router.add_post("/csp", self._report)
-        app.router.add_static("/", STATIC)
+        app.router.add_static("/static", STATIC)
         app.on_response_prepare.append(self._headers)
         return app
 
@@ -235,7 +249,9 @@ class FakeServer:
     def _next_state(self) -> Tree:
         if self.agent.scene == "mute":
             self._mute_since = self._mute_since or time.time()
-            return self._builder.unreachable(self._mute_since, "no agent at /run/rmpa/pc.sock", "Start one with `rmpa up`.")
+            return self._builder.unreachable(
+                self._mute_since, "no agent at /run/rmpa/pc.sock", "Start one with `rmpa up`."
+            )
         self._mute_since = 0.0
         self._snapshot = self.agent.snapshot()
         return self._builder.build(self._snapshot, self.agent.facts(), self.agent.alarms())
@@ -266,8 +282,12 @@ class FakeServer:
         return {
             "header": {"seq": int(at), "stamp": {"secs": int(time.time()), "nsecs": 0}, "frame_id": "odom"},
             "child_frame_id": "base_link",
-            "pose": {"pose": {"position": {"x": x, "y": y, "z": 0.0}, "orientation": {"x": 0.0, "y": 0.0, "z": z, "w": w}}},
-            "twist": {"twist": {"linear": {"x": forward, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": turn}}},
+            "pose": {
+                "pose": {"position": {"x": x, "y": y, "z": 0.0}, "orientation": {"x": 0.0, "y": 0.0, "z": z, "w": w}}
+            },
+            "twist": {
+                "twist": {"linear": {"x": forward, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": turn}}
+            },
         }
 
     def answer(self, question: monitor.Question) -> Any:
@@ -277,30 +297,50 @@ class FakeServer:
             LookupError: There is none.
         """
         self.asked.append(question)
-        what, args = question.what, question.args
-        if what == "why":
-            return self._why if self.agent.scene == "demo" else [{**self._why[0], "flows": False, "stages": [
-                *self._why[0]["stages"][:2],
-                {"name": "publisher", "verdict": "fail", "text": "no linked peer publishes it", "remedy": "start the module base"},
-            ]}]  # fmt: skip
-        if what == "params":
-            return {"values": self.params}
-        if what == "set_param":
-            self.params[str(args["name"])] = args["value"]
-            return {"values": self.params}
-        if what == "delete_param":
-            self.params.pop(str(args["name"]), None)
-            return {"values": self.params}
-        if what == "describe":
-            return {"type": "std_srvs/SetBool", "request": {"data": False}, "text": "bool data\n---\nbool success\nstring message"}
-        if what == "call":
-            return {"response": {"success": True, "message": "as asked"}, "seconds": 0.0031}
-        if what in ("profile", "context"):
-            return {"text": "chosen"}
-        if what == "history":
-            return [{"at": time.time() - 300, "level": "WARN", "resource": "velocity:/velocity", "text": "adapting"},
-                    {"at": time.time() - 200, "level": "OK", "resource": "velocity:/velocity", "text": "well again"}]  # fmt: skip
-        raise LookupError(what)
+        answer = getattr(self, f"_answer_{question.what}", None)
+        if answer is None:
+            raise LookupError(question.what)
+        return answer(question.args)
+
+    def _answer_why(self, _args: dict[str, Any]) -> Any:
+        flows = self._why[0]
+        if self.agent.scene == "demo":
+            return [flows]
+        text = "no linked peer publishes it"
+        failed = {"name": "publisher", "verdict": "fail", "text": text, "remedy": "start the module base"}
+        return [{**flows, "flows": False, "stages": [*flows["stages"][:2], failed]}]
+
+    def _answer_params(self, _args: dict[str, Any]) -> Any:
+        return {"values": self.params}
+
+    def _answer_set_param(self, args: dict[str, Any]) -> Any:
+        self.params[str(args["name"])] = args["value"]
+        return {"values": self.params}
+
+    def _answer_delete_param(self, args: dict[str, Any]) -> Any:
+        self.params.pop(str(args["name"]), None)
+        return {"values": self.params}
+
+    def _answer_describe(self, _args: dict[str, Any]) -> Any:
+        text = "bool data\n---\nbool success\nstring message"
+        return {"type": "std_srvs/SetBool", "request": {"data": False}, "text": text}
+
+    def _answer_call(self, args: dict[str, Any]) -> Any:
+        return {"response": {"success": True, "message": f"as asked: {args['request']}"}, "seconds": 0.0031}
+
+    def _answer_profile(self, _args: dict[str, Any]) -> Any:
+        return {"text": "chosen"}
+
+    def _answer_context(self, _args: dict[str, Any]) -> Any:
+        return {"text": "chosen"}
+
+    def _answer_history(self, _args: dict[str, Any]) -> Any:
+        lines = ((300, "WARN", "adapting: acceleration"), (200, "OK", "well again"))
+        now = time.time()
+        return [
+            {"at": now - ago, "level": level, "resource": "velocity:/velocity", "text": text}
+            for ago, level, text in lines
+        ]
 
 
 class _Client:
@@ -309,15 +349,19 @@ class _Client:
         self._socket = socket
         self._watched: dict[int, str] = {}
         self._log = False
-        self.session = monitor.MonitorSession(
-            server._details, self._decode, server.rights, time.monotonic()
-        )
+        self.session = monitor.MonitorSession(server._details, self._decode, server.rights, time.monotonic())
 
     def _decode(self, message: requests.Received) -> Any:
         topic = message.topic
         if "scan" in topic:
-            return {"angle_min": -math.pi, "angle_increment": math.pi / 180, "range_min": 0.1, "range_max": 8.0,
-                    "ranges": [2.0 + math.sin(n / 20 + time.time() / 5) + (n % 90 == 0) * 9 for n in range(360)]}  # fmt: skip
+            ranges = [_room(number * math.pi / 180) for number in range(360)]
+            return {
+                "angle_min": 0.0,
+                "angle_increment": math.pi / 180,
+                "range_min": 0.1,
+                "range_max": 8.0,
+                "ranges": ranges,
+            }
         if "image" in topic:
             return {"format": "png", "data": _png(160, 120, time.time())}
         if topic == "/odom":
@@ -331,11 +375,19 @@ class _Client:
             if tick % 2 == 0:
                 await self.act(self.session.update(self._server._next_state(), now))
             for handle, topic in list(self._watched.items()):
-                kind = "sensor_msgs/LaserScan" if "scan" in topic else "sensor_msgs/CompressedImage" if "image" in topic else "nav_msgs/Odometry"
+                kind = (
+                    "sensor_msgs/LaserScan"
+                    if "scan" in topic
+                    else "sensor_msgs/CompressedImage"
+                    if "image" in topic
+                    else "nav_msgs/Odometry"
+                )
                 received = requests.Received(handle, topic, kind, memoryview(b"\0" * 712), time.time_ns())
                 await self.act(self.session.receive_message(received, now))
             if self._log and tick % 10 == 0:
-                await self.act(self.session.log([{"at": time.time(), "level": "INFO", "node": "/base", "text": f"turn {tick}"}]))
+                await self.act(
+                    self.session.log([{"at": time.time(), "level": "INFO", "node": "/base", "text": f"turn {tick}"}])
+                )
             await self.act(self.session.handle_timer(now))
             await asyncio.sleep(TICK)
 
@@ -343,7 +395,9 @@ class _Client:
         for output in list(outputs):
             if isinstance(output, str | bytes):
                 if not self._socket.closed:
-                    await (self._socket.send_str(output) if isinstance(output, str) else self._socket.send_bytes(output))
+                    await (
+                        self._socket.send_str(output) if isinstance(output, str) else self._socket.send_bytes(output)
+                    )
             elif isinstance(output, requests.Subscribe):
                 self._watched[output.handle] = output.topic
             elif isinstance(output, requests.Unsubscribe):
@@ -359,6 +413,12 @@ class _Client:
                 self._log = output.on
             elif isinstance(output, monitor.Close):
                 await self._socket.close(code=output.code, message=output.reason.encode())
+
+
+def _room(angle: float) -> float:
+    """Metres to the walls of a room of 6 m by 4 m, with a pillar."""
+    walls = min(3 / max(abs(math.cos(angle)), 1e-6), 2 / max(abs(math.sin(angle)), 1e-6))
+    return 1.4 if abs(angle - 0.8) < 0.12 else walls
 
 
 def _png(width: int, height: int, at: float) -> bytes:

@@ -119,7 +119,7 @@ class App extends Component {
     return html`
       <a class="skip" href="#main" onClick=${(event) => { event.preventDefault(); document.querySelector("h1")?.focus(); }}>To the content</a>
       <header class="top">
-        <a class="brand" href="#/"><img src="icon.svg" alt="" width="28" height="28" /><span>RMPA<small>${agent || "…"}</small></span></a>
+        <a class="brand" href="#/"><img src="static/icon.svg" alt="" width="28" height="28" /><span>RMPA<small>${agent || "…"}</small></span></a>
         <nav aria-label="Pages">${PAGES.filter(([each]) => each !== "drive" || connection.may("drive") || page === "drive").map(([each, title]) => html`<a key=${each} href=${`#/${each}`} aria-current=${each === current ? "page" : undefined}>${title}${each === "alarms" && alarms > 0 ? html`<b class="badge">${alarms}<span class="unseen"> alarms stand</span></b>` : ""}</a>`)}</nav>
         <div class="tools">
           <button type="button" class="icon" aria-label="Search (/)" title="Search (/)" onClick=${() => this.setState({ overlay: "search" })}><svg viewBox="0 0 20 20" aria-hidden="true"><circle cx="8.5" cy="8.5" r="5.5" /><path d="m12.5 12.5 5 5" /></svg></button>

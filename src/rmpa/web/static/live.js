@@ -8,6 +8,7 @@ import { Plot, append } from "./plot.js";
 const IMAGES = ["sensor_msgs/Image", "sensor_msgs/CompressedImage"];
 const POSES = { "nav_msgs/Odometry": "pose.pose", "geometry_msgs/PoseStamped": "pose", "geometry_msgs/PoseWithCovarianceStamped": "pose.pose", "geometry_msgs/Pose": "" };
 const MOST_LINES = 8;
+const JUMP = 0.5; // metres between two poses, beyond which the trail begins anew
 
 export function Live({ connection, topic, type }) {
   const [on, setOn] = useState(false);
@@ -140,7 +141,7 @@ function Scan({ connection, topic }) {
     });
     robot(context, to(0, 0), 0);
   };
-  return html`<div class="wide"><${Failure} failure=${failure} /><${Canvas} draw=${draw} version=${message} label=${`Laser scan: ${seen.length} of ${scan?.ranges.length || 0} ranges, the nearest ${Math.min(...seen).toFixed(2)} m`} /></div>`;
+  return html`<div><${Failure} failure=${failure} /><${Canvas} draw=${draw} version=${message} label=${`Laser scan: ${seen.length} of ${scan?.ranges.length || 0} ranges, the nearest ${Math.min(...seen).toFixed(2)} m`} /></div>`;
 }
 
 function Pose({ connection, topic, path }) {
@@ -150,6 +151,8 @@ function Pose({ connection, topic, path }) {
     const pose = path.split(".").filter(Boolean).reduce((value, key) => value?.[key], next.value);
     if (!Number.isFinite(pose?.position?.x)) return;
     const { x, y, z, w } = pose.orientation;
+    const last = trail.current[trail.current.length - 1];
+    if (last && Math.hypot(pose.position.x - last.x, pose.position.y - last.y) > JUMP) trail.current = []; // it was put elsewhere
     trail.current.push({ x: pose.position.x, y: pose.position.y, yaw: Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) });
     if (trail.current.length > 900) trail.current.shift();
     set(next);
@@ -166,5 +169,5 @@ function Pose({ connection, topic, path }) {
     robot(context, to(here.x, here.y), here.yaw);
   };
   const said = here ? `x ${here.x.toFixed(2)} m, y ${here.y.toFixed(2)} m, yaw ${((here.yaw * 180) / Math.PI).toFixed(0)}°` : "waiting for a pose";
-  return html`<figure class="wide"><${Failure} failure=${failure} /><${Canvas} draw=${draw} version=${message} label=${`Pose: ${said}`} /><figcaption class="muted mono">${said}</figcaption></figure>`;
+  return html`<figure><${Failure} failure=${failure} /><${Canvas} draw=${draw} version=${message} label=${`Pose: ${said}`} /><figcaption class="muted mono">${said}</figcaption></figure>`;
 }

@@ -77,7 +77,7 @@ const Arcs = ({ at, geo, resources }) => {
     d=${arc(at.x, at.y, geo.node + 8, -Math.PI / 2 + index * part + gap, -Math.PI / 2 + (index + 1) * part - gap)}><title>${one.name}: ${known(one.level).word}, profile ${one.profile || "none"}</title></path>`);
 };
 
-const LEVELS = ["ERROR", "STALE", "WARN", "OK"];
+const LEVELS = ["ERROR", "STALE", "WARN", "OK"]; // the worst first
 const worst = (resources) => LEVELS.find((level) => resources.some(([, one]) => one.level === level)) || "";
 
 const Module = memo(({ name, module, at, geo, resources, alarms, compact }) => {
@@ -177,7 +177,7 @@ function concerns(state) {
   }
   for (const [name, topic] of entries(state, "topics")) if (topic.problem) found.push({ id: `t${name}`, level: "WARN", text: topic.problem, who: name, to: href("topic", name) });
   for (const note of state.notes || []) found.push({ id: `n${note}`, level: "WARN", text: note, who: "the agent", to: href("module", section(state, "agent").name) });
-  return found;
+  return found.sort((a, b) => LEVELS.indexOf(a.level) - LEVELS.indexOf(b.level));
 }
 
 export function Concerns({ state }) {

@@ -23,19 +23,22 @@ function library() {
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 const COLOURS = ["--accent", "--good", "--warn", "--bad", "--idle", "--text"];
 
-function options(labels, format, width) {
+const time = (value) => new Date(value * 1000).toLocaleTimeString("en-GB");
+
+function options(labels, format, width, zero) {
   const axis = { stroke: colour("--muted"), grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line"), width: 1 }, font: "12px system-ui" };
   return {
     width, height: 240, legend: { live: true },
-    axes: [axis, { ...axis, size: 76, values: (_, values) => values.map((value) => format(value)) }],
-    series: [{ value: (_, value) => (value ? new Date(value * 1000).toLocaleTimeString("en-GB") : "–") }, ...labels.map((label, at) => ({
+    scales: zero ? { y: { range: (_, low, high) => [Math.min(0, low ?? 0), Math.max((high ?? 0) * 1.15, 1e-6)] } } : {},
+    axes: [{ ...axis, space: 90, incrs: [1, 2, 5, 10, 30, 60, 120, 300], values: (_, values) => values.map(time) }, { ...axis, size: 76, values: (_, values) => values.map((value) => format(value)) }],
+    series: [{ value: (_, value) => (value ? time(value) : "–") }, ...labels.map((label, at) => ({
       label, stroke: colour(COLOURS[at % COLOURS.length]), width: 1.6, dash: DASHES[Math.floor(at / COLOURS.length) % DASHES.length], points: { show: false }, value: (_, value) => (value === null || value === undefined ? "–" : format(value)),
     }))],
   };
 }
 
-// `data` is a list of columns that grows in place; `version` says when it did.
-export function Plot({ labels, data, version, format, label }) {
+// `data` is a list of columns that grows in place; `version` says when it did. `zero`: whether the scale begins at 0.
+export function Plot({ labels, data, version, format, label, zero }) {
   const box = useRef(), plot = useRef();
   const [failure, setFailure] = useState("");
   useEffect(() => {
@@ -44,7 +47,7 @@ export function Plot({ labels, data, version, format, label }) {
       if (ended) return;
       const make = () => {
         plot.current?.destroy();
-        plot.current = new uPlot(options(labels, format, box.current.clientWidth), data, box.current);
+        plot.current = new uPlot(options(labels, format, box.current.clientWidth, zero), data, box.current);
       };
       make();
       observer = new ResizeObserver(() => plot.current.setSize({ width: box.current.clientWidth, height: 240 }));
@@ -86,5 +89,5 @@ export function Lines({ series, format, label }) {
     return () => clearInterval(timer);
   }, [labels.join("\n")]);
   if (data.current.length !== labels.length + 1) data.current = [[], ...labels.map(() => [])];
-  return html`<${Plot} labels=${labels} data=${data.current} version=${version} format=${format} label=${label} />`;
+  return html`<${Plot} labels=${labels} data=${data.current} version=${version} format=${format} label=${label} zero=${true} />`;
 }
