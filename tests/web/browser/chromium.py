@@ -19,6 +19,15 @@ if TYPE_CHECKING:
 
 BINARY = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 """The program, or ``None``: then the tests of the pages are skipped."""
+FLAGS = (
+    "--headless=new",
+    "--disable-gpu",
+    "--no-first-run",
+    "--disable-extensions",
+    "--disable-background-networking",
+    "--hide-scrollbars",
+    "--remote-debugging-port=0",
+)
 DEADLINE = 30.0
 KEYS = {"Enter": 13, "Escape": 27, "ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40, "Tab": 9}
 
@@ -43,8 +52,7 @@ class Chromium:
         assert BINARY is not None
         self._stack = contextlib.AsyncExitStack()
         self._profile = Path(self._stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True)))
-        flags = ["--headless=new", "--disable-gpu", "--no-first-run", "--disable-extensions", "--hide-scrollbars",
-                 "--disable-background-networking", "--remote-debugging-port=0", f"--user-data-dir={self._profile}"]  # fmt: skip
+        flags = [*FLAGS, f"--user-data-dir={self._profile}"]
         if os.geteuid() == 0:
             flags.append("--no-sandbox")
         self._process = await asyncio.create_subprocess_exec(
@@ -136,7 +144,7 @@ class Chromium:
             raise PageError(f"{script}: {details.get('exception', {}).get('description', details['text'])}")
         return result["result"].get("value")
 
-    async def wait(self, script: str) -> Any:
+    async def wait(self, script: str) -> None:
         """Wait until a JavaScript expression is true.
 
         Raises:
@@ -146,8 +154,8 @@ class Chromium:
             async with asyncio.timeout(DEADLINE):
                 while True:
                     with contextlib.suppress(PageError):
-                        if value := await self.run(script):
-                            return value
+                        if await self.run(f"Boolean({script})"):
+                            return
                     await asyncio.sleep(0.05)
         except TimeoutError:
             text = await self.run("document.body.innerText")

@@ -71,7 +71,8 @@ async def test_a_phone_shows_a_page_without_sideways_scrolling_and_with_large_ta
     await page.wait_text(PAGES[address])
     assert await page.run("document.documentElement.scrollWidth - innerWidth") == 0
     small = await page.run(
-        "[...document.querySelectorAll('.top a, .top button, main button:not(.field), input:not([type=checkbox]), select, .module, .concerns a')]"
+        "[...document.querySelectorAll('.top a, .top button, main button:not(.field), .module, .concerns a,"
+        " input:not([type=checkbox]), select')]"
         ".map((each) => [each.outerHTML.slice(0, 80), each.getBoundingClientRect()])"
         ".filter(([, box]) => box.width && (box.height < 43.5 || box.width < 43.5)).map(([text]) => text)"
     )
@@ -151,7 +152,10 @@ async def test_the_colours_can_be_chosen_and_stay(site: Site) -> None:
 
 async def test_only_what_flows_moves_and_nothing_where_motion_is_to_be_reduced(site: Site) -> None:
     page = await site.open()
-    moving = "document.getAnimations().filter((each) => each.playState === 'running').map((each) => each.effect.target.classList[0])"
+    moving = (
+        "document.getAnimations().filter((each) => each.playState === 'running')"
+        ".map((each) => each.effect.target.classList[0])"
+    )
     assert await page.run(moving) == []
     await page.look(still=False)
     await page.wait(f"{moving}.length === 5")
@@ -160,8 +164,10 @@ async def test_only_what_flows_moves_and_nothing_where_motion_is_to_be_reduced(s
 
 async def test_what_did_not_change_is_not_drawn_again(site: Site) -> None:
     page = await site.open()
-    await page.run("window.drawn = 0; new MutationObserver((all) => window.drawn += all.length)"
-                   ".observe(document.querySelector('.mandala'), {attributes: true, childList: true, subtree: true, characterData: true}); true")  # fmt: skip
+    await page.run(
+        "window.drawn = 0; new MutationObserver((all) => window.drawn += all.length).observe(document.querySelector("
+        "'.mandala'), {attributes: true, childList: true, subtree: true, characterData: true}); true"
+    )
     await page.run("window.before = window.rmpa.frames.patches; true")
     await page.wait("window.rmpa.frames.patches > window.before + 8")
     assert await page.run("window.drawn") < 10
@@ -170,7 +176,7 @@ async def test_what_did_not_change_is_not_drawn_again(site: Site) -> None:
 async def test_the_first_page_is_small(site: Site) -> None:
     page = await site.open()
     sizes: dict[str, int] = await page.run(
-        "Object.fromEntries([...performance.getEntriesByType('navigation'), ...performance.getEntriesByType('resource')]"
+        "Object.fromEntries(['navigation', 'resource'].flatMap((kind) => performance.getEntriesByType(kind))"
         ".map((each) => [each.name, each.transferSize]))"
     )
     assert len(sizes) > 5
@@ -183,16 +189,20 @@ async def test_names_and_values_of_others_are_text(site: Site) -> None:
     page = await site.open("topic/%2Fjoystick%2Fprofile")
     await click(page, "On")
     await page.wait_text("<script>alert(1)</script>")
-    await page.run("window.rmpa.receive(JSON.stringify({op: 'patch', n: 0, patch: {"
-                   " modules: {'<img src=x onerror=\"window.owned=1\">': {state: 'up'}, __proto__x: {state: 'up'}},"
-                   " ring: {places: {'<img src=x onerror=\"window.owned=1\">': 1}}, notes: ['<b id=owned>note</b>']}})); location.hash = '#/'; true")  # fmt: skip
+    evil = "<img src=x onerror='window.owned=1'>"
+    patch = {"modules": {evil: {"state": "up"}}, "ring": {"places": {evil: 1}}, "notes": ["<b id=owned>note</b>"]}
+    await receive(page, patch)
+    await page.run("location.hash = '#/'")
     await page.wait_text("<b id=owned>note</b>")
     assert await page.run("window.owned === undefined && !document.getElementById('owned')") is True
-    polluted = (
-        '{"op": "patch", "n": 0, "patch": {"__proto__": {"polluted": 1}, "topics": {"__proto__": {"polluted": 1}}}}'
-    )
-    await page.run(f"window.rmpa.receive({json.dumps(polluted)})")
+    await receive(page, {"__proto__": {"polluted": 1}, "topics": {"__proto__": {"polluted": 1}}})
     assert await page.run("({}).polluted === undefined") is True
+
+
+async def receive(page: Chromium, patch: dict[str, Any]) -> None:
+    """Let the page take a patch as if the server had sent it."""
+    message = json.dumps({"op": "patch", "n": 0, "patch": patch})
+    await page.run(f"window.rmpa.receive({json.dumps(message)}); true")
 
 
 async def click(page: Chromium, text: str) -> None:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rmpa.web.monitor.patch import Tree, Value
     from rmpa.web.monitor.watches import Decode
 
-READ_ONLY = frozenset({"why", "explain", "history", "params", "describe", "fields"})
+READ_ONLY = frozenset({"why", "history", "params", "describe"})
 """Questions that change nothing; every client may ask them."""
 ORDERS = {"call": "call", "set_param": "param", "delete_param": "param", "profile": "resource", "context": "resource"}
 """Questions that change something, and the right that each needs."""

@@ -43,8 +43,10 @@ const width = (bytes) => Math.min(9, 2 + Math.max(0, Math.log10((bytes || 0) / 1
 
 const Flow = memo(({ flow, from, to, a, b, geo, both, labelled, compact }) => {
   const line = chord(a, b, geo.node, both ? 9 : 0);
-  const label = line.at(geo.slots > 8 ? 0.16 : 0.33); // near its source, where chords are apart
+  const far = Math.hypot(a.x - b.x, a.y - b.y) > geo.ring * 0.9;
+  const label = line.at(geo.slots > 8 ? 0.16 : far ? 0.33 : 0.5); // near its source, where chords are apart
   const text = flow.rate === undefined ? "" : hertz(flow.rate);
+  labelled = labelled && !(compact && geo.slots > 6 && flow.by === "resource");
   return html`<g class="flow ${flow.by === "resource" ? "declared" : ""}">
     <title>${from} to ${to}: ${text || "rate not known"}, ${flow.topics.join(", ")}</title>
     <path class="pipe" d=${line.d} stroke-width=${width(flow.bandwidth) + 4} />
@@ -96,7 +98,7 @@ const Module = memo(({ name, module, at, geo, resources, alarms, compact }) => {
     ${resources.length > 0 && html`<${Arcs} at=${at} geo=${geo} resources=${resources} />`}
     <text class="name" x=${at.x} y=${at.y + out - (small ? 0 : compact ? 22 : 16)}>${short}</text>
     ${!small && html`<g class="state" transform="translate(${at.x} ${at.y + (compact ? 18 : 14)})"><svg x=${compact ? -16 : -10} y=${compact ? -16 : -11} width=${compact ? 32 : 20} height=${compact ? 32 : 20} viewBox="0 0 16 16">${shape(module.state)}</svg></g>`}
-    ${!small && html`<text class="word" x=${at.x} y=${at.y + (compact ? 66 : 46)}>${profile && module.state !== "away" && module.state !== "linking" ? profile.slice(0, limit) : about.word}</text>`}
+    ${!small && html`<text class="word" x=${at.x} y=${at.y + (compact ? 66 : 46)}>${profile && module.state !== "away" && module.state !== "linking" ? profile.slice(0, limit) : compact && module.state === "here" ? "here" : about.word}</text>`}
     ${alarms > 0 && html`<g class="bell" transform="translate(${at.x + geo.node * 0.72} ${at.y - geo.node * 0.72})"><circle r="20" /><text y="8">${alarms}</text></g>`}
   </a>`;
 });
@@ -160,7 +162,7 @@ export function Ring({ state }) {
     <defs><marker id="arrow" viewBox="0 0 8 8" refX="6.5" refY="4" markerWidth="14" markerHeight="14" markerUnits="userSpaceOnUse" orient="auto"><path class="head" d="M.8.8 7 4 .8 7.2 2.6 4Z" /></marker></defs>
     <circle class="dial" cx=${CENTRE} cy=${CENTRE} r=${geo.ring} />
     ${Array.from({ length: geo.slots }, (_, slot) => slot).filter((slot) => !taken.has(slot)).map((slot) => html`<circle key=${slot} class="vacant" cx=${point(slot, geo).x} cy=${point(slot, geo).y} r="5" />`)}
-    <g>${names.filter((name) => name !== own).map((name) => html`<${Wire} key=${name} name=${name} module=${modules[name]} a=${at(own)} b=${at(name)} geo=${geo} labelled=${labelled} />`)}</g>
+    <g>${names.filter((name) => name !== own).map((name) => html`<${Wire} key=${name} name=${name} module=${modules[name]} a=${at(own)} b=${at(name)} geo=${geo} labelled=${labelled && !compact} />`)}</g>
     <g>${flows.map(([from, to, flow]) => html`<${Flow} key=${`${from}>${to}`} from=${from} to=${to} flow=${flow} a=${at(from)} b=${at(to)} geo=${geo} labelled=${labelled} compact=${compact} both=${`${to}>${from}` in section(state, "flows")} />`)}</g>
     <g>${names.map((name) => html`<${Module} key=${name} name=${name} module=${modules[name]} at=${at(name)} geo=${geo} compact=${compact}
       resources=${same(name, resources.filter(([, one]) => one.module === name))} alarms=${alarms.filter(([, one]) => one.module === name).length} />`)}</g>
