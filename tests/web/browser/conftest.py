@@ -32,7 +32,7 @@ class Site:
         """Open a page, as ``topic/%2Fodom``, in a scene, and wait until it is live."""
         self.server.agent.scene = scene
         await self.page.goto(f"http://127.0.0.1:{self.port}/?{address}#/{address}")
-        await self.page.wait("document.querySelector('h1') && window.rmpa.frames.patches > 1")
+        await self.page.wait("document.querySelector('h1') && window.rmpa.state")
         return self.page
 
 

@@ -11,7 +11,14 @@ const SPEEDS = [[0, ""], [0.5, "slow"], [5, "medium"], [30, "fast"]];
 
 function geometry(slots, compact) {
   const node = compact ? (slots <= 8 ? 104 : 62) : slots <= 8 ? 78 : slots <= 16 ? 62 : slots <= 32 ? 40 : 22;
-  return { node, ring: CENTRE - node - 26, slots };
+  const small = node < 45; // then names stand outside of the ring
+  return { node, ring: CENTRE - node - (small ? 130 : 26), slots, small };
+}
+
+// Where a name stands outside of a small node, and how it is aligned.
+function outside(at, { node, ring }) {
+  const x = (at.x - CENTRE) / ring, y = (at.y - CENTRE) / ring;
+  return { x: at.x + x * (node + 18), y: at.y + y * (node + 22) + 7, anchor: x > 0.25 ? "start" : x < -0.25 ? "end" : "middle" };
 }
 
 const angle = (slot, slots) => (slot / slots) * 2 * Math.PI - Math.PI / 2;
@@ -85,10 +92,11 @@ const worst = (resources) => LEVELS.find((level) => resources.some(([, one]) => 
 const Module = memo(({ name, module, at, geo, resources, alarms, compact }) => {
   const about = known(module.state);
   const profile = resources.length === 1 ? resources[0][1].profile : resources.length ? `${resources.length} resources` : "";
-  const small = geo.node < 45;
+  const { small } = geo;
   const level = worst(resources);
   const said = [name, about.word, profile && `profile ${profile}`, level && `quality ${known(level).word}`, alarms && `${alarms} alarm${alarms > 1 ? "s" : ""}`].filter(Boolean).join(", ");
-  const out = small ? geo.node + 26 : 0;
+  const label = small ? outside(at, geo) : { x: at.x, y: at.y - (compact ? 22 : 16), anchor: "middle" };
+  const mark = small ? (geo.node > 30 ? 24 : 18) : compact ? 32 : 20;
   const limit = compact ? 9 : small ? 12 : geo.slots > 8 ? 9 : 11;
   const short = name.length > limit ? `${name.slice(0, limit - 1)}…` : name;
   return html`<a class="module ${module.state} ${about.tone}" href=${href("module", name)} aria-label=${said} data-module=${name}>
@@ -96,8 +104,8 @@ const Module = memo(({ name, module, at, geo, resources, alarms, compact }) => {
     <circle class="halo" cx=${at.x} cy=${at.y} r=${geo.node + 16} />
     <circle class="body" cx=${at.x} cy=${at.y} r=${geo.node} />
     ${resources.length > 0 && html`<${Arcs} at=${at} geo=${geo} resources=${resources} />`}
-    <text class="name" x=${at.x} y=${at.y + out - (small ? 0 : compact ? 22 : 16)}>${short}</text>
-    ${!small && html`<g class="state" transform="translate(${at.x} ${at.y + (compact ? 18 : 14)})"><svg x=${compact ? -16 : -10} y=${compact ? -16 : -11} width=${compact ? 32 : 20} height=${compact ? 32 : 20} viewBox="0 0 16 16">${shape(module.state)}</svg></g>`}
+    <text class="name" x=${label.x} y=${label.y} text-anchor=${label.anchor}>${short}</text>
+    <g class="state"><svg x=${at.x - mark / 2} y=${at.y - mark / 2 + (small ? 0 : compact ? 18 : 13)} width=${mark} height=${mark} viewBox="0 0 16 16">${shape(module.state)}</svg></g>
     ${!small && html`<text class="word" x=${at.x} y=${at.y + (compact ? 66 : 46)}>${profile && module.state !== "away" && module.state !== "linking" ? profile.slice(0, limit) : compact && module.state === "here" ? "here" : about.word}</text>`}
     ${alarms > 0 && html`<g class="bell" transform="translate(${at.x + geo.node * 0.72} ${at.y - geo.node * 0.72})"><circle r="20" /><text y="8">${alarms}</text></g>`}
   </a>`;

@@ -58,7 +58,11 @@ export function Plot({ labels, data, version, format, label, zero }) {
     }, (error) => setFailure(String(error.message)));
     return () => { ended = true; observer?.disconnect(); observer?.themes.disconnect(); plot.current?.destroy(); plot.current = undefined; };
   }, [labels.join("\n")]);
-  useEffect(() => { plot.current?.setData(data); }, [version]);
+  useEffect(() => {
+    if (!plot.current) return;
+    plot.current.setData(data);
+    if (!(plot.current.cursor.left >= 0)) plot.current.setLegend({ idx: data[0].length - 1 }); // the newest, unless someone points
+  }, [version]);
   const newest = labels.map((name, at) => `${name} ${format(data[at + 1]?.[data[at + 1].length - 1])}`).join(", ");
   return html`<div><div class="plot" ref=${box} role="img" aria-label=${`${label}: ${newest}`}></div>${failure && html`<p class="empty">${failure}. ${newest}</p>`}</div>`;
 }

@@ -26,13 +26,19 @@ export function ResourcePage({ name, state, connection }) {
     <${Panel} title="Distance of each profile to what is asked"><${Distances} scores=${decision.scores || []} profile=${one.profile} /><//>
     <${Panel} title="Profiles" wide><${Profiles} descriptor=${descriptor} decision=${decision} one=${one} choose=${connection.may("resource") ? (choice) => choose("profile", choice) : null} /><//>
     <${Panel} title="Why: each term of the decision" wide><${Terms} scores=${decision.scores || []} /><//>
-    <${Panel} title="Quality"><${Table} caption="Quality" columns=${["Attribute", "#Now", "Better", "Class"]} empty="It has measured nothing yet.">${(descriptor.attributes || []).filter((each) => each.name in values).map((each) => html`<tr key=${each.name}><th scope="row">${each.name}</th><td class="number">${values[each.name]}</td><td>${each.better === "max" ? "more" : each.better === "min" ? "less" : each.better}</td><td>${each.category}</td></tr>`)}<//><//>
+    <${Panel} title="Quality"><${Table} caption="Quality" columns=${["Attribute", "#Now", "Better", "Class"]} empty="It has measured nothing yet.">${(descriptor.attributes || []).filter((each) => each.name in values).map((each) => html`<tr key=${each.name}><th scope="row">${each.name}</th><td class="number">${quantity(values[each.name])}</td><td>${each.better === "max" ? "more" : each.better === "min" ? "less" : each.better}</td><td>${each.category}</td></tr>`)}<//><//>
     <${Panel} title="Who asked what"><${Table} caption="Clients" columns=${["Client", "Is told", "Asks"]} empty="No client asks for anything.">${(detail.clients || []).map((client) => html`<tr key=${client.name}><th scope="row">${client.name}</th><td><${Mark} state=${client.level} word=${client.message} /></td><td>${Object.entries(client.values || {}).map(([key, value]) => html`<div key=${key}>${key} ${value}</div>`)}</td></tr>`)}<//><//>
     <${Panel} title="Contexts"><${Table} caption="Contexts" columns=${["Context", "When", "Requires", "Profiles", ""]} empty="It has no contexts.">${(detail.contexts || descriptor.contexts || []).map((each) => html`<tr key=${each.name}><th scope="row">${each.name === one.context ? html`<${Mark} state="up" word=${each.name} />` : each.name}</th><td>${each.when || "by hand"}</td><td>${Object.entries(each.requires || {}).map(([key, value]) => `${key} ${value}`).join(", ") || "–"}</td><td>${(each.profiles || []).join(", ") || "all"}</td>
       <td class="number">${connection.may("resource") && html`<button type="button" onClick=${() => choose("context", each.name === one.context ? "" : each.name)}>${each.name === one.context ? "Leave" : "Enter"}</button>`}</td></tr>`)}<//><//>
     <${Panel} title="Configuration"><${Table} caption="Parameters" columns=${["Parameter", "#Value", "Range", "Description"]} empty="It has no parameters.">${(descriptor.parameters || []).map((each) => html`<tr key=${each.name}><th scope="row">${each.name}</th><td class="number">${JSON.stringify(section(detail, "parameters")[each.name] ?? each.default)} ${each.unit}</td><td>${each.choices?.length ? each.choices.join(" | ") : each.low !== undefined || each.high !== undefined ? `${each.low ?? ""} … ${each.high ?? ""}` : each.type}</td><td>${each.description}</td></tr>`)}<//><//>
     <${Panel} title="Topics"><${Table} caption="Topics" columns=${["Topic", "Way", "Type", "Contract"]}>${[["outputs", "out"], ["inputs", "in"]].flatMap(([list, way]) => (descriptor[list] || []).map((each) => html`<tr key=${way + each.topic}><th scope="row"><${Link} page="topic" name=${each.topic} /></th><td>${way}</td><td>${each.type}</td><td>${Object.entries(each.contract || {}).map(([key, value]) => `${key} ${value}`).join(", ") || "–"}</td></tr>`))}<//><//>
   </div><//>`;
+}
+
+// "0.000797688 m/s²" with four digits.
+function quantity(text) {
+  const [number, ...unit] = text.split(" ");
+  return Number.isFinite(Number(number)) && number !== "" ? [Number(Number(number).toPrecision(4)), ...unit].join("\u2009") : text;
 }
 
 const offers = (profile, units) => Object.entries(profile.offers || {}).map(([key, value]) => `${key} ${value}${units[key] ? `\u2009${units[key]}` : ""}`).join(", ") || "–";
