@@ -83,7 +83,7 @@ const Arcs = ({ at, geo, resources }) => {
   const part = (2 * Math.PI) / resources.length;
   const gap = 0.09;
   return resources.map(([key, one], index) => html`<path key=${key} class="quality ${known(one.level).tone} level-${(one.level || "none").toLowerCase()}"
-    d=${arc(at.x, at.y, geo.node + 8, -Math.PI / 2 + index * part + gap, -Math.PI / 2 + (index + 1) * part - gap)}><title>${one.name}: ${known(one.level).word}, profile ${one.profile || "none"}</title></path>`);
+    d=${arc(at.x, at.y, geo.node + 8, -Math.PI / 2 + index * part + gap, -Math.PI / 2 + (index + 1) * part - gap)} />`);
 };
 
 const LEVELS = ["ERROR", "STALE", "WARN", "OK"]; // the worst first
@@ -94,20 +94,21 @@ const Module = memo(({ name, module, at, geo, resources, alarms, compact }) => {
   const profile = resources.length === 1 ? resources[0][1].profile : resources.length ? `${resources.length} resources` : "";
   const { small } = geo;
   const level = worst(resources);
-  const said = [name, about.word, profile && `profile ${profile}`, level && `quality ${known(level).word}`, alarms && `${alarms} alarm${alarms > 1 ? "s" : ""}`].filter(Boolean).join(", ");
   const label = small ? outside(at, geo) : { x: at.x, y: at.y - (compact ? 22 : 16), anchor: "middle" };
   const mark = small ? (geo.node > 30 ? 24 : 18) : compact ? 32 : 20;
   const limit = compact ? 9 : small ? 12 : geo.slots > 8 ? 9 : 11;
   const short = name.length > limit ? `${name.slice(0, limit - 1)}…` : name;
+  const word = small ? "" : profile && module.state !== "away" && module.state !== "linking" ? profile.slice(0, limit) : compact && module.state === "here" ? "here" : about.word;
+  // The name begins with the text that is seen, so that a user can say what they see.
+  const said = [short, word, alarms && `${alarms} alarm${alarms > 1 ? "s" : ""}`, short !== name && name, `link ${about.word}`, profile && `profile ${profile}`, level && `quality ${known(level).word}`].filter(Boolean).join(", ");
   return html`<a class="module ${module.state} ${about.tone}" href=${href("module", name)} aria-label=${said} data-module=${name}>
-    <title>${said}</title>
     <circle class="halo" cx=${at.x} cy=${at.y} r=${geo.node + 16} />
     <circle class="body" cx=${at.x} cy=${at.y} r=${geo.node} />
     ${resources.length > 0 && html`<${Arcs} at=${at} geo=${geo} resources=${resources} />`}
     <text class="name" x=${label.x} y=${label.y} text-anchor=${label.anchor}>${short}</text>
     <g class="state"><svg x=${at.x - mark / 2} y=${at.y - mark / 2 + (small ? 0 : compact ? 18 : 13)} width=${mark} height=${mark} viewBox="0 0 16 16">${shape(module.state)}</svg></g>
-    ${!small && html`<text class="word" x=${at.x} y=${at.y + (compact ? 66 : 46)}>${profile && module.state !== "away" && module.state !== "linking" ? profile.slice(0, limit) : compact && module.state === "here" ? "here" : about.word}</text>`}
-    ${alarms > 0 && html`<g class="bell" transform="translate(${at.x + geo.node * 0.72} ${at.y - geo.node * 0.72})"><circle r="20" /><text y="8">${alarms}</text></g>`}
+    ${" "}${!small && html`<text class="word" x=${at.x} y=${at.y + (compact ? 66 : 46)}>${word}</text>`}
+    ${" "}${alarms > 0 && html`<g class="bell" transform="translate(${at.x + geo.node * 0.72} ${at.y - geo.node * 0.72})"><circle r="20" /><text y="8">${alarms}</text></g>`}
   </a>`;
 });
 

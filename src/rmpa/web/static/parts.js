@@ -67,7 +67,7 @@ export function Table({ caption, columns, children, empty }) {
   if (!rows.filter(Boolean).length) return html`<p class="empty">${empty || "Nothing here."}</p>`;
   return html`<div class="scroll" tabindex="0" role="region" aria-label=${caption}><table>
     <caption class="unseen">${caption}</caption>
-    <thead><tr>${columns.map((column) => html`<th key=${column} scope="col" class=${column.startsWith("#") ? "number" : ""}>${column.replace("#", "")}</th>`)}</tr></thead>
+    <thead><tr>${columns.map((column) => html`<th key=${column} scope="col" class=${column.startsWith("#") ? "number" : ""}>${column.replace("#", "") || html`<span class="unseen">Action</span>`}</th>`)}</tr></thead>
     <tbody>${rows}</tbody></table></div>`;
 }
 
