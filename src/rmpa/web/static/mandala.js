@@ -178,17 +178,19 @@ export function Ring({ state }) {
   </svg>`;
 }
 
+const URGENT = ["ERROR", "WARN", "STALE"];
+
 function concerns(state) {
   const found = [];
   for (const [id, alarm] of entries(state, "alarms")) found.push({ id, level: alarm.level, text: alarm.text, who: alarm.resource || alarm.module, to: alarm.resource ? href("resource", alarm.resource) : href("alarms"), since: alarm.at });
   for (const [name, module] of entries(state, "modules")) {
     if (module.state !== "up" && module.state !== "here" && module.state !== "relayed")
-      found.push({ id: `m${name}`, level: module.state === "refused" ? "ERROR" : "WARN", text: `${known(module.state).word}${module.error ? `: ${module.error}` : ""}`, who: name, to: href("module", name), since: module.since });
+      found.push({ id: `m${name}`, level: { refused: "ERROR", away: "STALE" }[module.state] || "WARN", text: `${known(module.state).word}${module.error ? `: ${module.error}` : ""}`, who: name, to: href("module", name), since: module.since });
     else if (module.error) found.push({ id: `m${name}`, level: "WARN", text: module.error, who: name, to: href("module", name) });
   }
   for (const [name, topic] of entries(state, "topics")) if (topic.problem) found.push({ id: `t${name}`, level: "WARN", text: topic.problem, who: name, to: href("topic", name) });
   for (const note of state.notes || []) found.push({ id: `n${note}`, level: "WARN", text: note, who: "the agent", to: href("module", section(state, "agent").name) });
-  return found.sort((a, b) => LEVELS.indexOf(a.level) - LEVELS.indexOf(b.level));
+  return found.sort((a, b) => URGENT.indexOf(a.level) - URGENT.indexOf(b.level));
 }
 
 export function Concerns({ state }) {
