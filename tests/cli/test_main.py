@@ -51,7 +51,7 @@ def test_each_command_but_those_without_an_answer_has_json(path: str, command: c
 
 
 WORDS = {"values": "{}", "value": "1"}
-QUIET = {"rmpa doctor", "rmpa multicast send", "rmpa multicast receive"}
+QUIET = {"rmpa doctor", "rmpa multicast send", "rmpa multicast receive", "rmpa web"}
 """These need neither an agent nor a master."""
 
 
@@ -132,7 +132,7 @@ def test_completion_scripts(shell: str) -> None:
 @pytest.mark.parametrize("module", ["rmpa.cli.main", "rmpa.cli.up", "rmpa.cli.peer", "rmpa.cli.topic_graph"])
 def test_heavy_packages_wait_until_they_are_needed(module: str) -> None:
     importlib.import_module(module)
-    heavy = "{'rich', 'numpy', 'rosbags', 'ruamel', 'yaml', 'matplotlib'}"
+    heavy = "{'aiohttp', 'prometheus_client', 'rich', 'numpy', 'rosbags', 'ruamel', 'yaml', 'matplotlib'}"
     code = f"import sys, {module}; sys.exit(' '.join({heavy} & set(sys.modules)) or 0)"
     assert subprocess.run([sys.executable, "-c", code], check=False, capture_output=True).stderr == b""
 

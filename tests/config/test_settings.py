@@ -22,6 +22,7 @@ from rmpa.config.settings import (
     PolicySettings,
     RealtimeSettings,
     Settings,
+    WebSettings,
 )
 from rmpa.config.sources import Loaded, find_config_file, load_settings
 from rmpa.config.toml_lines import line_of
@@ -186,6 +187,7 @@ def test_every_flag(load: Load) -> None:
         "log_level": "error",
         "log_json": True,
         "realtime": True,
+        "web": True,
     }
     assert set(options) == {setting.option_name for setting in SETTINGS if setting.option}
     settings = load(options=options).settings
@@ -204,6 +206,7 @@ def test_every_flag(load: Load) -> None:
         log_level="error",
         log_json=True,
         realtime=RealtimeSettings(True),
+        web=WebSettings(True),
     )
 
 

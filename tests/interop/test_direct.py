@@ -11,6 +11,7 @@ from tests.interop.modules import Module, flows
 from tests.interop.ros import NODES, lacks
 from tests.interop.transports import (
     AUTO,
+    conditions,
     direct_topics,
     heard,
     in_order,
@@ -19,6 +20,7 @@ from tests.interop.transports import (
     reload,
     steady,
     unbroken,
+    wait_condition,
     wait_direct,
     wait_direct_topics,
     wait_relayed,
@@ -70,16 +72,11 @@ name = "b"
 remap_out = { "/out_there" = "/out_here" }
 """
 RELAYS: Final = "[relay]\nenabled = true\n"
-BY_TERMS: Final = (
-    "/relayed_here",
-    "/relayed_there",
-    "/reliable",
-    "/kept",
-    "/limited",
-    "/urgent",
-    "/watched",
-    "/fresh",
-)
+BY_TERMS: Final = {
+    "/relayed_here": "transport",
+    "/relayed_there": "transport",
+    **dict.fromkeys(("/reliable", "/kept", "/limited", "/urgent", "/watched", "/fresh"), "contract"),
+}
 FREE: Final = ("/free", "/free_too")
 
 
@@ -111,6 +108,8 @@ def test_what_needs_the_agents_is_relayed_until_its_rules_change(modules: Module
         heard(listener, here)
         wait_direct_topics(b, f"/{name}", a, FREE)
         steady(listener, here)
+    shown = {topic: condition for topic, condition in conditions(b).items() if topic in here}
+    assert shown == BY_TERMS | dict.fromkeys(("/in_here", "/out_here"), "name") | dict.fromkeys(FREE, "")
     before = [heard(listener, FREE) for listener in ears]
     reload(tmp_path, a, AUTO)
     reload(tmp_path, b, AUTO)
@@ -144,6 +143,8 @@ def test_nodes_that_are_bound_to_loopback_are_relayed(modules: ModuleFactory) ->
     for client in ("roscpp", "rospy"):
         wait_direct_topics(b, f"/free_{client}", a, ("/free_roscpp", "/free_rospy"))
         assert direct_topics(b, f"/bound_{client}", a) == set()
+    assert {conditions(b)[f"/bound_{client}"] for client in ("roscpp", "rospy")} <= {"listening", "subscriber"}
+    assert {conditions(b)[f"/free_{client}"] for client in ("roscpp", "rospy")} == {"subscriber"}
 
 
 def test_a_firewall_between_the_nodes_makes_them_fall_back(modules: ModuleFactory) -> None:
@@ -157,6 +158,7 @@ def test_a_firewall_between_the_nodes_makes_them_fall_back(modules: ModuleFactor
     _nft(a, "add table ip filter", "add chain ip filter input { type filter hook input priority 0 ; }")
     _nft(a, f"add rule ip filter input iifname eth0 tcp dport {{ {ports} }} reject with tcp reset")
     in_order(wait_relayed(listener, talker))
+    wait_condition(b, "/chatter", "reachable")
     _nft(a, "flush chain ip filter input", f"add rule ip filter input iifname eth0 tcp dport {{ {ports} }} drop")
     late = b.ros.roscpp("listener", topic="/chatter")
     flows(late)
@@ -193,6 +195,7 @@ def test_one_caller_id_is_direct_once(modules: ModuleFactory, client: str) -> No
     flows(second)
     wait_direct(other, talker)
     assert (links(first, talker), links(second, talker)) == (1, 0)
+    assert (conditions(b)["/chatter"], conditions(c)["/chatter"]) == ("", "caller_id")
     unbroken(flows(first, 50))
     first.terminate()
     in_order(wait_direct(second, talker))
@@ -214,6 +217,7 @@ def test_what_comes_by_a_relay_is_relayed(lab: Lab, agent: AgentFactory, shell: 
     wait_direct(near, talker)
     unbroken(flows(far, 100))
     assert links(far, talker) == 0
+    assert conditions(c)["/chatter"] == "own_source"
 
 
 @pytest.mark.skipif(bool(lacks("actionlib")), reason=lacks("actionlib"))
@@ -229,6 +233,7 @@ def test_actions_work_because_their_topics_are_relayed(modules: ModuleFactory, c
     assert asking.wait_event("server")["found"]
     assert asking.wait_event("done")["result"] == 20
     assert direct_topics(a, "/counter", b) | direct_topics(b, "/asking", a) == set()
+    assert conditions(a)["/count/goal"] == conditions(b)["/count/status"] == "action"
 
 
 @pytest.mark.parametrize("older", ["a", "b"])
@@ -246,6 +251,7 @@ def test_with_an_agent_of_an_earlier_release_all_is_relayed(
     listener = b.ros.rospy("listener", topic="/chatter")
     unbroken(flows(listener, 200))
     assert links(listener, talker) == 0
+    assert older == "b" or conditions(b)["/chatter"] == "release"
 
 
 def test_measuring_tools_are_relayed_and_disturb_nothing(modules: ModuleFactory) -> None:

@@ -17,6 +17,7 @@ from tests.interop.transports import (
     links,
     on_the_network,
     reload,
+    shown,
     unbroken,
     wait_direct,
     wait_relayed,
@@ -96,6 +97,7 @@ def test_direct_messages_go_on_while_an_agent_is_dead(
 ) -> None:
     a, b, talker, listener = pair(modules, subscriber, publisher)
     one, other = (b, a) if side == "subscriber" else (a, b)
+    flows(listener, 200)  # a new run knows the nodes that were registered for more than a second
     one.agent.kill()
     unbroken(flows(listener, 50))
     other.agent.wait_no_peer(one.name)
@@ -104,6 +106,9 @@ def test_direct_messages_go_on_while_an_agent_is_dead(
     one.agent.wait_peer(other.name)
     in_order(flows(listener, 300))
     in_order(wait_direct(listener, talker))
+    taken_over = shown(b, "/chatter", "/hearer")
+    assert taken_over is not None
+    assert (taken_over.transport, taken_over.condition) == ("direct", "")
 
 
 @pytest.mark.parametrize("side", ["subscriber", "publisher"])
@@ -152,19 +157,23 @@ def test_without_the_right_to_end_connections_only_rospy_subscribers_stay(
     a, b = modules("a", "b", config=AUTO, prefix=UNPRIVILEGED)
     on_the_network(a, b)
     talker = a.ros.roscpp("talker", topic="/chatter", rate=RATE)
-    cpp, py = (b.ros.node(client, "listener", topic="/chatter") for client in ("roscpp", "rospy"))
+    cpp, py = (b.ros.node(client, "listener", topic="/chatter", name=client) for client in ("roscpp", "rospy"))
     for listener in (cpp, py):
         wait_direct(listener, talker)
     for changed in (b, a):
         reload(tmp_path, changed, AUTO + RELAY)
         in_order(wait_relayed(cpp, talker))
-        b.agent.process.wait_for("/listener_\\d.* stays connected .*see rmpa doctor")
+        b.agent.process.wait_for("/rospy stays connected .*see rmpa doctor")
         assert links(py, talker) == 1
+        eventually(lambda: (row := shown(b, "/chatter", "/rospy")) and row.stuck, what="shown as stuck")
         unbroken(flows(py, 100))
         reload(tmp_path, changed, AUTO)
         in_order(wait_direct(cpp, talker))
         unbroken(flows(py, 100))
         assert links(py, talker) == 1
+        free = shown(b, "/chatter", "/rospy")
+        assert free is not None
+        assert (free.transport, free.stuck) == ("direct", "")
     # The cable is out for longer than a lease: neither hears anything twice when it is back.
     b.host.cut()
     b.agent.wait_no_peer("a")
@@ -174,6 +183,9 @@ def test_without_the_right_to_end_connections_only_rospy_subscribers_stay(
     eventually(lambda: links(py, talker) == 1, what="one connection")
     in_order(flows(py, 300))
     in_order(flows(cpp))
+    back = shown(b, "/chatter", "/rospy")
+    assert back is not None
+    assert (back.transport, back.stuck) == ("direct", "")
     # A contract that forbids it leaves the connection, and does not add a second path.
     reload(tmp_path, b, AUTO + RELAY)
     in_order(wait_relayed(cpp, talker))

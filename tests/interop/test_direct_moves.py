@@ -152,7 +152,8 @@ def test_a_restarted_publisher_is_direct_again(modules: ModuleFactory, subscribe
         wait_direct(listener, talker)
         report = listener.wait_event("report", where=lambda event, n=str(source): n in event["sources"])  # type: ignore[misc]
         in_order(report)
-    unbroken(flows(listener))
+    settled = gaps(flows(listener))
+    assert gaps(flows(listener, 50)) == settled
 
 
 @pytest.mark.parametrize("client", ["roscpp", "rospy"])

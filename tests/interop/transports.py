@@ -7,6 +7,7 @@ import subprocess
 from typing import TYPE_CHECKING, Final
 
 from lab.bed.processes import DEADLINE, Deadline, eventually
+from rmpa.observe.io.control_client import ControlClient
 from tests.interop.modules import Module, flows
 from tests.interop.ros import PYTHON
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from lab.bed.processes import Event, Process
+    from rmpa.observe.snapshot import SubscriberTransport
 
 AUTO: Final = '[bridge]\ntransport = "auto"\n'
 _BUS_INFO: Final = """
@@ -65,6 +67,31 @@ def direct_topics(module: Module, node: str, other: Module) -> set[str]:
     inbound = [row for row in rows if row[2] == "i" and f"[{other.host.address}:" in str(row[6:])]
     assert len(inbound) == len({row[4] for row in inbound}), inbound
     return {row[4] for row in inbound}
+
+
+def conditions(module: Module) -> dict[str, str]:
+    """Why subscribers of the topics that come from peers are relayed, by topic; empty where none is."""
+    with ControlClient(module.agent.sockets()[0]) as client:
+        topics = client.snapshot().topics
+    return {
+        topic.name: route.condition
+        for topic in topics
+        for route in topic.routes
+        if route.direction == "in" and (route.transport or route.condition)
+    }
+
+
+def shown(module: Module, topic: str, node: str) -> SubscriberTransport | None:
+    """What a module says of one subscriber of a topic that comes from one peer; ``None`` if it does not name it."""
+    with ControlClient(module.agent.sockets()[0]) as client:
+        topics = client.snapshot().topics
+    rows = [one for info in topics if info.name == topic for route in info.routes for one in route.subscribers]
+    return next((one for one in rows if one.node == node), None)
+
+
+def wait_condition(module: Module, topic: str, condition: str) -> None:
+    """Wait until a module says that a topic is relayed because of one condition of docs/contracts.md."""
+    eventually(lambda: conditions(module).get(topic) == condition, what=f"{topic} relayed by {condition}")
 
 
 def wait_direct_topics(module: Module, node: str, other: Module, topics: Collection[str]) -> None:

@@ -80,6 +80,9 @@ class SimSocket:
     def fileno(self) -> int:
         return self._fd
 
+    def getsockname(self) -> tuple[str, int]:
+        return self.host, 0
+
     def setblocking(self, _flag: bool) -> None:
         pass
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.agent.core_choice import make_core
 from rmpa.agent.network import Network
 from rmpa.agent.reload import Reloader, SighupHandler
+from rmpa.agent.web_process import WebProcess, web_command, web_environment
 from rmpa.bridge.io.bridge import Bridge
 from rmpa.bridge.io.limit_reports import LimitReports
 from rmpa.bridge.io.node_requests import NodeRequests
@@ -42,7 +43,7 @@ from rmpa.runtime.garbage_collector import GarbageCollector
 from rmpa.runtime.service_manager import notify_service_manager
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Collection, Iterator
 
     from rmpa.config.settings import Settings
     from rmpa.config.sources import Loaded
@@ -187,7 +188,10 @@ class Agent:
 
 
 async def _serve(
-    settings: Settings, requests: tuple[realtime.SchedulingRequest, ...], load: Callable[[], Loaded] | None = None
+    settings: Settings,
+    requests: tuple[realtime.SchedulingRequest, ...],
+    load: Callable[[], Loaded] | None = None,
+    cpus: Collection[int] = (),
 ) -> None:
     agent = Agent(settings, requests, load)
     stop = asyncio.Event()
@@ -196,8 +200,11 @@ async def _serve(
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stop.set)
     sighup = SighupHandler(agent.reloader, stop.set)
+    web = WebProcess(web_command(settings), random.random, environ=web_environment(settings, os.environ), cpus=cpus)
     await agent.start()
     sighup.start()
+    if settings.web.enabled:
+        web.start()
     try:
         notify_service_manager("READY=1")
         await stop.wait()
@@ -205,6 +212,7 @@ async def _serve(
         _log.info("= ending")
     finally:
         await sighup.close()
+        await web.close()
         await agent.close()
 
 
@@ -220,10 +228,11 @@ def run(settings: Settings, load: Callable[[], Loaded] | None = None) -> int:
     """
     raise_file_limit()
     sys.setswitchinterval(runtime_limits.THREAD_SWITCH)
+    cpus = os.sched_getaffinity(0)  # before the agent takes some for itself
     requests = realtime.apply(settings.realtime)
     try:
         with asyncio.Runner(loop_factory=AgentLoop) as runner:
-            runner.run(_serve(settings, requests, load))
+            runner.run(_serve(settings, requests, load, cpus))
     except OSError as error:
         if is_shortage(error):
             raise StartError(f"agent {settings.name}", "no file descriptors left", remedy()) from error

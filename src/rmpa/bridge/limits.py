@@ -176,7 +176,10 @@ DIRECT_MOVE_ROUTE: Final = 1.0
 """Seconds that a move to the relayed transport waits for the relayed route to open before the direct connection is
 ended."""
 DIRECT_MOVE_WAIT: Final = 0.5
-"""Seconds that a move waits for a subscriber to hang up by itself (roscpp does at `publisherUpdate`), before its
-connection is ended."""
+"""Seconds that a move waits until an ended connection is gone. Without CAP_NET_ADMIN a roscpp subscriber closes it by
+itself in this time."""
+DIRECT_LIST_AGAIN: Final = 3.0
+"""Seconds after which a subscriber that was made to hang up gets the list of publishers once more: a roscore's graph
+is known up to 1.3 s late, and a call to a busy node may fail."""
 DIRECT_LOOK: Final = 0.02
 """Seconds between two looks while a move waits."""

@@ -39,6 +39,7 @@ COMMANDS = {
     "alarm": (_GROUPS, "See the alarms of resources."),
     "why": ("rmpa.cli.why", "Say why a topic of a peer does not arrive, and what to do."),
     "doctor": ("rmpa.cli.doctor", "Check this machine: network, clock, rights, ROS environment."),
+    "web": ("rmpa.cli.web", "Serve this module's state over HTTP: metrics, REST."),
     "multicast": (_GROUPS, "Send and receive multicast packets by hand."),
     "config": ("rmpa.cli.config", "Show the settings and where each comes from; print their JSON Schema."),
     "reload": ("rmpa.cli.reload", "Let the agent read its settings again."),

@@ -70,6 +70,7 @@ __all__ = [
     "ServiceSettings",
     "Settings",
     "TimeSettings",
+    "WebSettings",
 ]
 
 
@@ -218,6 +219,39 @@ class RealtimeSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class WebSettings:
+    """Where ``rmpa web`` serves, and whether the agent starts it."""
+
+    enabled: bool = setting(
+        False,
+        BOOL,
+        "Start rmpa web with the agent, and again whenever it ends.",
+        env="RMPA_WEB",
+        option="--web/--no-web",
+    )
+    port: int = setting(8480, PORT, "The port of rmpa web.", env="RMPA_WEB_PORT")
+    listen: str = setting(
+        "127.0.0.1",
+        HOST,
+        "The address that rmpa web listens at; beyond this machine clients need a token.",
+        env="RMPA_WEB_LISTEN",
+    )
+    token_file: str = setting(
+        "",
+        TEXT,
+        "The file of the token, made if it is not there; with it clients on this machine need the token too.",
+        env="RMPA_WEB_TOKEN_FILE",
+        shown_default="in the state directory",
+    )
+    hosts: tuple[str, ...] = setting(
+        (),
+        list_of(HOST),
+        "Names of this server in URLs, besides its addresses, localhost and the host's name.",
+        env="RMPA_WEB_HOSTS",
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class Settings:
     """All settings of one agent.
 
@@ -330,6 +364,7 @@ class Settings:
     limits: LimitSettings = table(LimitSettings, "limits", live=True)
     lanes: LaneSettings = table(LaneSettings, "lanes")
     realtime: RealtimeSettings = table(RealtimeSettings, "realtime")
+    web: WebSettings = table(WebSettings, "web")
     relay: bool = setting(
         False,
         BOOL,
@@ -397,6 +432,7 @@ TABLES: Final = {
     "limits": "How much is accepted from one peer.",
     "lanes": "How the packets of each lane are marked.",
     "realtime": "What the agent asks the kernel for.",
+    "web": "Where the module's state is served over HTTP (docs/web.md).",
     "relay": "Whether this module joins networks that are not routed to each other.",
     "log": "What the log says, and how.",
 }

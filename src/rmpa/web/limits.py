@@ -49,6 +49,8 @@ METRIC_SERVICES: Final = 1000
 """Services in /metrics, each with some six time series."""
 METRIC_REASONS: Final = 256
 """Counters of what was refused or dropped in /metrics; there are some hundred."""
+METRIC_FORMATS: Final = 4
+"""Formats of /metrics that are kept for the scrapes of one snapshot; clients ask for two."""
 METRIC_LABEL_CHARACTERS: Final = 256
 """Characters of a label's value in /metrics, which Prometheus keeps with each time series."""
 
@@ -57,3 +59,37 @@ REST_PATH_MAX: Final = 2048
 """Characters of a path: a name of 512 characters, percent-encoded."""
 REST_NAMES_COMPARED: Final = 1000
 """Names that a wrong one is compared with for a hint, which takes some microseconds each."""
+
+# --- HTTP server --------------------------------------------------------------------------------------------------
+WEB_CONNECTIONS_MAX: Final = 256
+"""Connections at one time: a browser has six, Prometheus one. Each takes some 10 KiB and a file descriptor."""
+WEB_LINE_MAX: Final = 4096
+"""Bytes of a request line: twice the longest path of the API, for a token behind it."""
+WEB_FIELD_MAX: Final = 8 * KIB
+"""Bytes of one header: a browser sends the cookies of all servers of one host."""
+WEB_HEADERS_MAX: Final = 64
+"""Headers of a request; browsers send some 20."""
+WEB_REQUEST_MAX: Final = 32 * KIB
+"""Bytes that one connection may send until a response begins: a request, or several in a row."""
+WEB_REQUEST_TIMEOUT: Final = 10.0
+"""Seconds for a request to arrive, from its first byte or, for the first one, from the connection on."""
+WEB_RESPONSE_TIMEOUT: Final = 30.0
+"""Seconds from a request to the end of its response; a client that does not read is disconnected then."""
+WEB_IDLE_TIMEOUT: Final = 75.0
+"""Seconds that a connection is kept without a request; Prometheus asks every 15 to 60 s."""
+WEB_LINGER: Final = 1.0
+"""Seconds in which the rest of a refused body is read, so that the client sees the refusal and no reset."""
+WEB_BACKLOG: Final = 128
+"""Connections that wait to be accepted."""
+WEB_SHUTDOWN_TIMEOUT: Final = 2.0
+"""Seconds for responses under way when the server ends."""
+WEB_SNAPSHOT_AGE: Final = 0.2
+"""Seconds that a snapshot is shared before the agent is asked again: the monitor shows 5 changes a second."""
+WEB_AGENT_TIMEOUT: Final = 2.0
+"""Seconds for the agent to answer; it takes milliseconds, and Prometheus waits for 10 s."""
+WEB_TOKEN_BYTES: Final = 32
+"""Random bytes of a token that is made: 256 bits cannot be guessed."""
+WEB_TOKEN_LENGTH_MIN: Final = 16
+"""Characters of a token that the user chose."""
+WEB_TOKEN_FILE_MAX: Final = 4096
+"""Bytes of a token's file; a larger one is no token."""

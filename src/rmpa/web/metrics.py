@@ -70,10 +70,12 @@ class SnapshotCollector(Collector):
 
     Args:
         read: Returns the snapshot; ``None`` while the agent does not answer, which ``rmpa_up`` then says.
+        further: Metrics that follow those of the snapshot.
     """
 
-    def __init__(self, read: Callable[[], Snapshot | None]) -> None:
+    def __init__(self, read: Callable[[], Snapshot | None], further: Iterable[Metric] = ()) -> None:
         self._read = read
+        self._further = further
 
     def describe(self) -> Iterator[Metric]:
         """Nothing: a registration needs no snapshot."""
@@ -81,18 +83,20 @@ class SnapshotCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """All metrics."""
-        return metrics(self._read())
+        yield from metrics(self._read())
+        yield from self._further
 
 
-def exposition(snapshot: Snapshot | None, accept: str = "") -> tuple[bytes, str]:
+def exposition(snapshot: Snapshot | None, accept: str = "", further: Iterable[Metric] = ()) -> tuple[bytes, str]:
     """The body of ``/metrics`` and its content type.
 
     Args:
         snapshot: ``None`` while the agent does not answer.
         accept: The request's ``Accept`` header: it chooses between Prometheus's text format and OpenMetrics.
+        further: Metrics that follow those of the snapshot: the web server's own.
     """
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(SnapshotCollector(lambda: snapshot))
+    registry.register(SnapshotCollector(lambda: snapshot, further))
     encode, content_type = choose_encoder(accept)
     return encode(registry), content_type
 

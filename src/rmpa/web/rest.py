@@ -129,27 +129,28 @@ RESOURCES: Final = (
 _BY_PATH: Final = {resource.path: resource for resource in RESOURCES}
 
 
-def respond(method: str, path: str, snapshot: Snapshot | None) -> Response:
+def respond(method: str, path: str, snapshot: Snapshot | None, why: str = "") -> Response:
     """The response to a request.
 
     Args:
         method: As in the request: ``GET``, or ``HEAD``, of which the server sends no body.
         path: Percent-encoded, without the query. Slashes of a topic's or a service's name need no encoding.
         snapshot: The newest; ``None`` while the agent does not answer.
+        why: Why it does not, and what to do, where that is known.
     """
     if method not in _METHODS:
         allowed = ", ".join(_METHODS)
-        return _problem(405, f"{method[:20]} is not supported; this API is read with GET", (("Allow", allowed),))
+        return problem(405, f"{method[:20]} is not supported; this API is read with GET", (("Allow", allowed),))
     if path == OPENAPI_PATH:
         return Response(200, openapi_json())
     resource, name = _find(path)
     if resource is None:
-        return _problem(404, f"there is no {_short(path)}; {OPENAPI_PATH} lists all paths")
+        return problem(404, f"there is no {_short(path)}; {OPENAPI_PATH} lists all paths")
     if snapshot is None:
-        return _problem(503, "the agent does not answer; start it with rmpa up, or look at its log")
+        return problem(503, why or "the agent does not answer; start it with rmpa up, or look at its log")
     result = resource.read(snapshot, name)
     if isinstance(result, _Missing):
-        return _problem(404, _missing(result))
+        return problem(404, _missing(result))
     return Response(200, msgspec.json.encode(result))
 
 
@@ -178,10 +179,25 @@ def _short(text: str) -> str:
     return ascii(text if len(text) <= 80 else f"{text[:80]}…")
 
 
-_TITLES: Final = {404: "Not found", 405: "Method not allowed", 503: "The agent does not answer"}
+_TITLES: Final = {
+    400: "Bad request",
+    401: "A token is needed",
+    403: "Refused",
+    404: "Not found",
+    405: "Method not allowed",
+    413: "Too large",
+    500: "Internal error",
+    503: "The agent does not answer",
+}
 
 
-def _problem(status: int, detail: str, headers: tuple[tuple[str, str], ...] = ()) -> Response:
+def detail_of(response: Response) -> str:
+    """The text of a response that ``problem`` made."""
+    return msgspec.json.decode(response.body, type=Problem).detail
+
+
+def problem(status: int, detail: str, headers: tuple[tuple[str, str], ...] = ()) -> Response:
+    """The problem details of a status, as a response."""
     body = msgspec.json.encode(Problem(title=_TITLES[status], status=status, detail=detail))
     return Response(status, body, _PROBLEM_JSON, headers)
 

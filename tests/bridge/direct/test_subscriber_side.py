@@ -144,11 +144,26 @@ def test_the_response_to_an_earlier_request_is_not_taken_for_the_present_one() -
     assert sut.decision(KEY) == NAMESAKE
 
 
-def test_a_withdrawal_that_crosses_a_request_does_not_count() -> None:
+def test_a_notification_that_comes_while_the_peer_is_asked_makes_it_be_asked_once_more() -> None:
     sut = Sut()
     attempt = sut.ask()
     assert sut.closed(1, SOURCE, "", NAMESAKE, 0.1) == []
-    assert sut.replied(KEY, attempt, GRANT, 0.2) == [Probe(1, GRANT)]
+    assert Decided(KEY) in sut.replied(KEY, attempt, GRANT, 0.2)
+    assert sut.state() == (DirectState.RELAYED, Path.NONE)
+    again = sut.next_timer()
+    assert again is not None
+    attempt = asked(sut.handle_timer(again)).attempt
+    assert sut.replied(KEY, attempt, GRANT, again) == [Probe(1, GRANT)]
+
+
+def test_a_retry_that_comes_while_the_peer_is_asked_is_not_lost() -> None:
+    sut = Sut()
+    attempt = sut.ask()
+    assert sut.retry(1, SOURCE, 0.1) == []
+    sut.replied(KEY, attempt, NAMESAKE, 0.2)
+    again = sut.next_timer()
+    assert again is not None
+    assert asked(sut.handle_timer(again)).key == KEY
 
 
 def test_a_peer_that_does_not_answer_is_asked_again_and_may_hold_a_grant() -> None:
@@ -334,3 +349,14 @@ def test_a_port_that_was_not_reached_delays_no_further_subscriber_until_it_is_tr
     later = 1.0 + limits.DIRECT_RETRY
     attempt = asked(sut.handle_timer(later)).attempt
     assert Probe(1, GRANT) in sut.replied(KEY, attempt, GRANT, later)
+
+
+def test_a_stuck_subscriber_that_may_be_direct_again_is_stuck_no_more() -> None:
+    sut = Sut()
+    sut.connected_directly()
+    sut.consider(KEY, Transport.RELAY, RULE, 1.0)
+    route = sut.get(KEY)
+    assert route is not None
+    route.stuck = "it cannot be ended"
+    sut.direct(now=2.0)
+    assert (sut.state(), route.stuck) == ((DirectState.DIRECT, Path.DIRECT), "")

@@ -170,7 +170,9 @@ async def test_only_what_changed_is_drawn_again(site: Site) -> None:
         " characterData: true}); true"
     )
     for number in range(10):
-        await receive(page, {"modules": {"base": {"rtt": 0.01 + number}}, "topics": {f"/new{number}": {"type": "a/B"}}})
+        await receive(
+            page, {"modules": {"base": {"rtt": 0.01 + number}}, "topics": {f"/new{number}": {"type": "a/B"}}}
+        )
     await receive(page, {"flows": {"joystick>pc": {"rate": 12.0}}})
     await page.wait("window.drawn.length > 0")
     assert set(await page.run("window.drawn")) == {"12\u2009Hz"}

@@ -90,6 +90,7 @@ class DirectRoute:
         missed: Messages that passed while it was moved, as far as they were seen.
         held: Whether the peer may hold a grant for it.
         asked_at: When the peer was last asked, monotonic seconds.
+        doubtful: Whether a notification of the peer came while it was asked, so that its response may be outdated.
         stuck: Why its direct connection cannot be ended although it has to be relayed; empty: it can.
     """
 
@@ -108,6 +109,7 @@ class DirectRoute:
     missed: int = 0
     held: bool = False
     asked_at: float = -math.inf
+    doubtful: bool = False
     stuck: str = ""
 
 
@@ -227,6 +229,14 @@ class DirectSubscriptions:
     def connected(self) -> list[tuple[DirectKey, DirectRoute]]:
         """The subscribers whose last answer was the publisher's address."""
         return [(key, route) for key, route in self._routes.items() if route.path is Path.DIRECT]
+
+    def waiting(self, now: float) -> list[DirectKey]:
+        """The subscribers that were made to hang up, are decided, and have not been called back for a while."""
+        return [
+            key
+            for key, route in self._routes.items()
+            if route.stranded and self.misplaced(key) and now - route.since > limits.DIRECT_SETTLE
+        ]
 
     # --- the local graph --------------------------------------------------------------------------------------------
 
@@ -354,6 +364,16 @@ class DirectSubscriptions:
                 return []
             route.held = False
             return [Release(key)]
+        if route.doubtful:
+            # A notification may be handled before the response that was sent first: the peer is asked once more.
+            why = Unmet(Condition.AGENT, "something changed there while it was asked")
+            if isinstance(found, Unmet):
+                why, route.held = found, found.condition is Condition.AGENT
+            else:
+                route.grant = found  # released by what follows
+            actions = self._relay(key, route, why, now)
+            self._timers.set(key, route.asked_at + limits.DIRECT_RETRY_PAUSE)
+            return actions
         if isinstance(found, Unmet):
             route.held = found.condition is Condition.AGENT
             return self._relay(key, route, found, now)
@@ -413,8 +433,10 @@ class DirectSubscriptions:
         actions: list[DirectAction] = []
         for name, route in self.of(peer, source):
             key = DirectKey(peer, source, name)
+            if subscriber in {"", name} and route.state is DirectState.ASKING:
+                route.doubtful = True
             if subscriber not in {"", name} or route.grant is None:
-                continue  # without a grant: the response to the last request comes later, and counts
+                continue
             self._reached.discard((peer, route.grant.port))
             route.grant, route.held = None, False
             route.breaks.append(now)
@@ -434,6 +456,8 @@ class DirectSubscriptions:
         """
         actions: list[DirectAction] = []
         for name, route in self.of(peer, source):
+            if route.state is DirectState.ASKING:
+                route.doubtful = True
             if route.state is not DirectState.RELAYED or route.local or _waits(route):
                 continue
             key, due = DirectKey(peer, source, name), route.asked_at + limits.DIRECT_RETRY_PAUSE
@@ -537,7 +561,7 @@ class DirectSubscriptions:
         self._timers.set(key, None)
         self._enter(route, DirectState.ASKING, now)
         self._attempts += 1
-        route.attempt, route.asked_at = self._attempts, now
+        route.attempt, route.asked_at, route.doubtful = self._attempts, now, False
         route.grant, route.held = None, True
         return [Ask(key, route.attempt)]
 
@@ -555,6 +579,7 @@ class DirectSubscriptions:
         self._enter(route, DirectState.DIRECT, now)
         if route.path is Path.DIRECT and route.grant is not None and route.endpoint is not None:
             same = route.endpoint[1] == route.grant.port
+            route.stuck = "" if same else route.stuck  # it may stay now
         else:
             same = route.path is Path.NONE and not route.stranded
         return [Decided(key)] if same else [Decided(key), Move(key)]

@@ -253,7 +253,11 @@ class SlaveNode:
 
     @staticmethod
     async def _answer_other(other: Awaitable[RosReply | None], own: RosReply) -> XmlRpcValue:
-        return list(await other or own)
+        try:
+            return list(await other or own)
+        except Exception:  # noqa: BLE001 - the subscriber would not ask again
+            _log.exception("! a requestTopic was not decided; answered with the own address")
+            return list(own)
 
     @staticmethod
     async def _answer(reply: Awaitable[RosReply]) -> XmlRpcValue:

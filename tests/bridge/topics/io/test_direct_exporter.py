@@ -50,7 +50,7 @@ class Module:
             cast("Any", SimpleNamespace(offered=self.offered, local=self._local)),
             Contracts((), AUTO.transport),
             cast("Any", SimpleNamespace(of_topic=self._of_topic, forget=self.forgotten.append)),
-            cast("Any", SimpleNamespace(get=self.sessions.get)),
+            cast("Any", SimpleNamespace(get=self.sessions.get, linked=self.sessions.values)),
             cast(
                 "Any",
                 SimpleNamespace(
@@ -64,7 +64,7 @@ class Module:
 
     @staticmethod
     def _session(number: int) -> Any:
-        link = SimpleNamespace(name=f"peer{number}")
+        link = SimpleNamespace(name=f"peer{number}", silent=True)
         return SimpleNamespace(peer=number, link=link, linked=True, same_machine=False, address=f"10.0.0.{number}")
 
     def _local(self, _peer: int, source: Source) -> Source | None:
@@ -174,13 +174,23 @@ async def test_only_a_peer_with_a_grant_may_have_a_node_examined(module: Module)
 
 
 @pytest.mark.parametrize(
-    ("crashed", "same", "ends"), [(False, False, True), (True, False, False), (False, True, False)]
+    ("silent", "crashed", "same", "shared", "ends"),
+    [
+        (True, False, False, False, True),
+        (True, True, False, False, False),
+        (True, False, True, False, False),
+        (False, False, False, False, False),
+        (True, False, False, True, False),
+    ],
 )
 async def test_connections_end_where_a_host_may_have_vanished(
-    module: Module, *, crashed: bool, same: bool, ends: bool
+    module: Module, *, silent: bool, crashed: bool, same: bool, shared: bool, ends: bool
 ) -> None:
     await module.open()
     module.sessions[1].same_machine = same
+    module.sessions[1].link.silent = silent
+    if shared:
+        module.sessions[2].address = module.sessions[1].address
     module.sut.link_down(module.sessions[1], crashed=crashed)
     assert module.ended == ([(45225, "10.0.0.1")] if ends else [])
 

@@ -58,7 +58,12 @@ class Module:
         self.imports = SimpleNamespace(get=lambda *_: self.entry, at=lambda _: [(1, SOURCE)])
         state = SimpleNamespace(subscribers=self.subscribers, publishers={}, nodes={})
         self.sut = DirectImporter(
-            cast("Any", SimpleNamespace(state=lambda: state, publishers=lambda _: {}, suspect=lambda _: None)),
+            cast(
+                "Any",
+                SimpleNamespace(
+                    state=lambda: state, publishers=lambda _: {}, suspect=lambda _: None, node_host="127.0.0.1"
+                ),
+            ),
             cast("Any", self.imports),
             cast("Any", {1: SimpleNamespace(publication=lambda _: publication)}),
             Contracts((), Transport.AUTO),

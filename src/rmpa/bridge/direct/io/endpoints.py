@@ -1,4 +1,4 @@
-"""The TCPROS endpoints of this module's nodes: at which port a node listens, and for whom."""
+"""The TCPROS endpoints of this module's nodes: at which port a node listens, and which peers reach it."""
 
 from __future__ import annotations
 

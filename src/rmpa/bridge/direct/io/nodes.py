@@ -1,4 +1,4 @@
-"""Calls to local nodes that direct transport needs: their connections, and whom they shall be connected to."""
+"""Calls to local nodes that direct transport needs: their connections, and lists of publishers sent to them."""
 
 from __future__ import annotations
 
@@ -72,6 +72,23 @@ async def direct_links(uri: str, topic: str, endpoint: tuple[str, int]) -> list[
     if links is None:
         return None
     return [one for one in links if one.inbound and one.topic == topic and one.connected and one.remote == endpoint]
+
+
+def standing_at(address: str) -> dict[int, set[int]]:
+    """The connections from this machine to one address: their local ports, by the remote port.
+
+    One question to the kernel, whatever the number of connections.
+    """
+    found: dict[int, set[int]] = {}
+    for one in connections(remote=(address, None)) or []:
+        if one.state in _STANDING:
+            found.setdefault(one.remote[1], set()).add(one.local[1])
+    return found
+
+
+def kernel_tells() -> bool:
+    """Whether the kernel lists the connections of this machine; without that, two paths cannot be ruled out."""
+    return connections(remote=("127.0.0.1", 1)) is not None
 
 
 def standing(endpoint: tuple[str, int]) -> set[int]:

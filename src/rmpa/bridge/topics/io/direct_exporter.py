@@ -103,13 +103,16 @@ class DirectExporter:
         self._expiries[session.peer] = expire
 
     def link_down(self, session: PeerSession, *, crashed: bool) -> None:
-        """End the publishers' connections to a peer that cannot be reached; unless only its agent has died.
+        """End the publishers' connections to a peer that cannot be reached.
 
+        A peer that left in order, or whose agent alone has died, has nodes that go on. So do the nodes of another
+        module on that host.
         On this machine no connection outlives its process, and the nodes of all modules have the same address.
         """
         if (expiry := self._expiries.pop(session.peer, None)) is not None:
             expiry.cancel()
-        if not crashed and not session.same_machine:
+        shared = any(other.address == session.address for other in self._sessions.linked() if other is not session)
+        if session.link.silent and not crashed and not session.same_machine and not shared:
             self._act(self.grants.unreachable(session.peer))
 
     def gone(self, session: PeerSession) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.bridge import limits
 from rmpa.bridge.direct import requests
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, read_unmet, unmet_by_contract
-from rmpa.bridge.direct.io.nodes import direct_links, end_links, report_failure, standing
+from rmpa.bridge.direct.io.nodes import direct_links, end_links, kernel_tells, report_failure, standing, standing_at
 from rmpa.bridge.direct.requests import CloseDirect, OpenDirect
 from rmpa.bridge.direct.subscriber_side import (
     Ask,
@@ -30,7 +30,9 @@ from rmpa.bridge.topics.io.direct_moves import SubscriberMoves
 from rmpa.core.contract import Transport
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.ros.environment import host_of, is_loopback
+from rmpa.ros.http.client import is_own_name
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
+from rmpa.ros.node.local_addresses import local_addresses
 from rmpa.ros.node.probe import probe
 from rmpa.ros.wire.slave_api import TCPROS
 from rmpa.ros.wire.xmlrpc import RosReply
@@ -117,6 +119,7 @@ class DirectImporter:
         self._asking: dict[int, asyncio.Semaphore] = {}
         self._checking: asyncio.TimerHandle | None = None
         self._closed = False
+        self._kernel_tells = kernel_tells()
         self._started = self._now()
         """Subscribers may have direct connections from before this moment, of an earlier run of this agent."""
         rpc.on_notification(requests.CLOSED, self._closed_there)
@@ -194,7 +197,12 @@ class DirectImporter:
             return Unmet(Condition.ACTION, f"actions compare the names of the nodes at {entry.type}")
         if node.startswith(MEASURING):
             return Unmet(Condition.MEASURES, "rmpa's own tools measure by the agents")
-        if is_loopback(host_of(uri)) and not session.same_machine:
+        host = host_of(uri)
+        if not is_loopback(self._core.node_host) and not (is_own_name(host) or host in local_addresses()):
+            return Unmet(Condition.SUBSCRIBER, f"{node} runs at {host}, not on its agent's machine")
+        if not self._kernel_tells:
+            return Unmet(Condition.SUBSCRIBER, "the kernel does not list the connections of this machine (sock_diag)")
+        if is_loopback(host) and not session.same_machine:
             text = f"{node} connects within its machine only (ROS_IP or ROS_HOSTNAME is {host_of(uri)})"
             return Unmet(Condition.SUBSCRIBER, text)
         return None
@@ -369,6 +377,13 @@ class DirectImporter:
         self._act(self.routes.retry(session.peer, requests.read_retry(args).source, self._now()))
 
     async def _ask(self, key: DirectKey, attempt: int) -> None:
+        try:
+            await self._ask_peer(key, attempt)
+        except Exception:
+            self._act(self.routes.replied(key, attempt, Unmet(Condition.AGENT, "this agent failed"), self._now()))
+            raise
+
+    async def _ask_peer(self, key: DirectKey, attempt: int) -> None:
         session, entry = self._sessions.get(key.peer), self._imports.get(key.peer, key.source)
         found: Grant | Unmet
         if session is None or not session.linked or entry is None:
@@ -401,7 +416,12 @@ class DirectImporter:
         if session is None:
             return
         address = session.address
-        problem = await probe(address, grant.port, grant.probe, node=grant.node, timeout=limits.DIRECT_PROBE_TIMEOUT)
+        try:
+            timeout = limits.DIRECT_PROBE_TIMEOUT
+            problem = await probe(address, grant.port, grant.probe, node=grant.node, timeout=timeout)
+        except Exception:
+            self._act(self.routes.probed(peer, grant.port, "this agent failed", self._now()))
+            raise
         if problem:
             problem = f"no connection to {address}:{grant.port}: {problem}"
         self._act(self.routes.probed(peer, grant.port, problem, self._now()))
@@ -456,7 +476,7 @@ class DirectImporter:
 
     def _watch(self) -> None:
         """Begins to watch direct connections."""
-        if self._checking is None and self.routes.connected():
+        if self._checking is None and (self.routes.connected() or any(route.stranded for _, route in self.routes)):
             self._checking = asyncio.get_running_loop().call_later(limits.DIRECT_CHECK, self._check)
 
     def _publication(self, peer: int, source: Source) -> Publication | None:
@@ -468,11 +488,13 @@ class DirectImporter:
     def _check(self) -> None:
         """Compares the direct connections with the kernel's table; asks the nodes only where some are missing."""
         self._checking = None
-        connected = self.routes.connected()
-        if self._closed or not connected:
+        now, connected = self._now(), self.routes.connected()
+        stranded = self.routes.waiting(now)
+        if self._closed or not (connected or stranded):
             return
         self._checking = asyncio.get_running_loop().call_later(limits.DIRECT_CHECK, self._check)
-        now = self._now()
+        for key in stranded:
+            self._moves.move(key)  # its call-back was lost
         settled = [
             (key, route.endpoint)
             for key, route in connected
@@ -481,7 +503,8 @@ class DirectImporter:
             and key not in self._moves
         ]
         wanted = Counter(endpoint for _, endpoint in settled)
-        short = {endpoint for endpoint, count in wanted.items() if len(standing(endpoint)) < count}
+        there = {address: standing_at(address) for address in {endpoint[0] for endpoint in wanted}}
+        short = {end for end, count in wanted.items() if len(there[end[0]].get(end[1], ())) < count}
         for key, endpoint in settled:
             route = self.routes.get(key)
             if route is not None and not route.stuck and self.routes.misplaced(key):

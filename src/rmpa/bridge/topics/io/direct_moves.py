@@ -7,6 +7,7 @@ proxy, rospy by ending its connection. Then it is called back by a list with the
 from __future__ import annotations
 
 import asyncio
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
@@ -25,13 +26,14 @@ from rmpa.bridge.policy import is_own
 from rmpa.bridge.topics.remote_topic import RouteState
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import AsyncIterator, Callable, Mapping
 
     from rmpa.bridge.direct.subscriber_side import DirectKey, DirectRoute, DirectSubscriptions
     from rmpa.bridge.messages import Source
     from rmpa.bridge.session.peer_sessions import PeerSessions
     from rmpa.bridge.topics.imports import Imports
     from rmpa.bridge.topics.io.peer_topics import PeerTopics
+    from rmpa.bridge.topics.remote_topic import RemoteTopic
     from rmpa.core.counters import Counters
     from rmpa.ros.core.api import Core
     from rmpa.ros.node.publication import Publication
@@ -72,8 +74,11 @@ class SubscriberMoves:
         self._on_warning = on_warning
         self._counters = counters
         self._tasks: dict[DirectKey, asyncio.Task[None]] = {}
-        self._hang_ups: dict[DirectKey, asyncio.Task[None]] = {}
-        """Subscribers that are made to hang up; a move of one waits for it."""
+        self._hang_ups: set[asyncio.Task[None]] = set()
+        """The calls that make subscribers hang up."""
+        self._locks: dict[DirectKey, tuple[asyncio.Lock, int]] = {}
+        """A lock for each subscriber that is being called, and how many hold it or wait for it."""
+        self._repeats: dict[DirectKey, asyncio.TimerHandle] = {}
         self._again: set[DirectKey] = set()
         """Subscribers to be judged again when their move is over."""
         self._stuck: dict[tuple[Source, str], None] = {}
@@ -91,7 +96,10 @@ class SubscriberMoves:
     async def close(self) -> None:
         """Stop all moves."""
         self._closed = True
-        tasks = [*self._tasks.values(), *self._hang_ups.values()]
+        for handle in self._repeats.values():
+            handle.cancel()
+        self._repeats.clear()
+        tasks = [*self._tasks.values(), *self._hang_ups]
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -158,20 +166,34 @@ class SubscriberMoves:
 
     def hang_up(self, key: DirectKey, endpoint: tuple[str, int]) -> None:
         """Make a subscriber leave its direct connection; it is not called back."""
-        task = asyncio.create_task(
-            self._hang_up(key, endpoint, self._hang_ups.get(key)), name=f"hang up {key.subscriber}"
-        )
-        self._hang_ups[key] = task
-        task.add_done_callback(lambda done: self._hung_up(key, done))
+        task = asyncio.create_task(self._hang_up_alone(key, endpoint), name=f"hang up {key.subscriber}")
+        self._hang_ups.add(task)
+        task.add_done_callback(self._hung_up)
 
-    def _hung_up(self, key: DirectKey, task: asyncio.Task[None]) -> None:
-        if self._hang_ups.get(key) is task:
-            del self._hang_ups[key]
+    def _hung_up(self, task: asyncio.Task[None]) -> None:
+        self._hang_ups.discard(task)
         report_failure(task, self._counters)
 
-    async def _hang_up(self, key: DirectKey, endpoint: tuple[str, int], before: asyncio.Task[None] | None) -> None:
-        if before is not None:
-            await asyncio.wait([before])
+    @asynccontextmanager
+    async def _alone(self, key: DirectKey) -> AsyncIterator[None]:
+        """Excludes other calls to the same subscriber: their lists of publishers must not overtake each other."""
+        lock, count = self._locks.get(key, (asyncio.Lock(), 0))
+        self._locks[key] = (lock, count + 1)
+        try:
+            async with lock:
+                yield
+        finally:
+            lock, count = self._locks[key]
+            if count == 1:
+                del self._locks[key]
+            else:
+                self._locks[key] = (lock, count - 1)
+
+    async def _hang_up_alone(self, key: DirectKey, endpoint: tuple[str, int]) -> None:
+        async with self._alone(key):
+            await self._hang_up(key, endpoint)
+
+    async def _hang_up(self, key: DirectKey, endpoint: tuple[str, int]) -> None:
         topic, proxy = key.source.topic, self._proxy_uri(key)
         uri = self.uri(key.subscriber, topic)
         if not uri:
@@ -181,9 +203,29 @@ class SubscriberMoves:
         await publisher_update(uri, topic, others)
         if problem := await end_links(endpoint, links or ()):
             self.stuck(key, endpoint, problem)
-        now = list(self._core.publishers(topic).values())
-        if [one for one in now if one != proxy] != others:
+        route, now = self._routes.get(key), list(self._core.publishers(topic).values())
+        called_back = route is not None and not route.stranded
+        if called_back or [one for one in now if one != proxy] != others:
             await publisher_update(uri, topic, now)  # the master's own list may have been overtaken
+        self._repeat_later(key, topic)
+
+    def _repeat_later(self, key: DirectKey, topic: str) -> None:
+        """Repeats the list of publishers: a roscore's list is known here with a delay, and calls may be lost."""
+        if not self._closed:
+            later = asyncio.get_running_loop().call_later
+            self._repeats[key] = later(limits.DIRECT_LIST_AGAIN, self._repeat, key, topic)
+
+    def _repeat(self, key: DirectKey, topic: str) -> None:
+        self._repeats.pop(key, None)
+        uri, route = self.uri(key.subscriber, topic), self._routes.get(key)
+        if uri and not self._closed and not (route is not None and route.stranded):
+            task = asyncio.create_task(self._call_back(key, uri, topic), name=f"call back {key.subscriber}")
+            self._hang_ups.add(task)
+            task.add_done_callback(self._hung_up)
+
+    async def _call_back(self, key: DirectKey, uri: str, topic: str) -> None:
+        async with self._alone(key):
+            await publisher_update(uri, topic, list(self._core.publishers(topic).values()))
 
     def _proxy_uri(self, key: DirectKey) -> str:
         session = self._sessions.get(key.peer)
@@ -214,8 +256,10 @@ class SubscriberMoves:
         return topics.publication(key.source) if topics is not None else None
 
     async def _move(self, key: DirectKey) -> None:
-        if (hanging := self._hang_ups.get(key)) is not None:
-            await asyncio.wait([hanging])
+        async with self._alone(key):
+            await self._move_alone(key)
+
+    async def _move_alone(self, key: DirectKey) -> None:
         entry, route = self._imports.get(key.peer, key.source), self._routes.get(key)
         publication = self._publication(key)
         if entry is None or route is None or publication is None:
@@ -235,7 +279,10 @@ class SubscriberMoves:
         if held:
             # Make before break: the relayed route flows, and its latched message is known, before the other ends.
             self._on_demand(key.peer, key.source, True)
-            await until(lambda: entry.state is RouteState.OPEN, limits.DIRECT_MOVE_ROUTE)
+            await until(lambda: _is_relayed(entry, publication), limits.DIRECT_MOVE_ROUTE)
+            if not self._routes.misplaced(key):
+                self._let_go(key, publication)
+                return  # decided otherwise meanwhile
         try:
             had, begin = publication.latched if held else (), publication.messages
             if not await self._leave(key, route, publication, uri, proxy):
@@ -248,9 +295,15 @@ class SubscriberMoves:
             elif self._routes.get(key) is route and route.path is Path.NONE:
                 # A list of publishers that the master sent at the same time may have overtaken this one.
                 await publisher_update(uri, entry.topic, list(self._core.publishers(entry.topic).values()))
+            self._repeat_later(key, entry.topic)
         finally:
-            if held and not publication.subscribers:
-                self._on_demand(key.peer, key.source, False)
+            if held:
+                self._let_go(key, publication)
+
+    def _let_go(self, key: DirectKey, publication: Publication) -> None:
+        """Lets the relayed route close again if nothing subscribes to it."""
+        if not publication.subscribers:
+            self._on_demand(key.peer, key.source, False)
 
     async def _leave(
         self, key: DirectKey, route: DirectRoute, publication: Publication, uri: str, proxy: str
@@ -279,3 +332,11 @@ class SubscriberMoves:
             return route.path is Path.DIRECT and route.endpoint is not None and bool(standing(route.endpoint))
 
         return await until(there, limits.DIRECT_SETTLE)
+
+
+def _is_relayed(entry: RemoteTopic, publication: Publication) -> bool:
+    """Whether messages flow through the agents, and the last one of a latched source has come."""
+    if entry.state is not RouteState.OPEN:
+        return False
+    latching = entry.description is not None and entry.description.latching
+    return bool(publication.latched) or not latching

@@ -1,0 +1,131 @@
+"""``rmpa web``: this module's state for browsers and programs, over HTTP."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.util
+import logging
+import os
+import socket
+import sys
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import click
+
+from rmpa.cli.options import agent_option, json_option
+from rmpa.config.settings import WebSettings
+from rmpa.config.sources import load_settings
+from rmpa.config.values import HOST, BadValue
+from rmpa.core.errors import ConfigError
+from rmpa.core.log import configure_logging
+
+if TYPE_CHECKING:
+    from rmpa.web.server.process import Address
+
+_log = logging.getLogger("rmpa.web")
+_LIBRARIES = ("aiohttp", "prometheus_client")
+_DEFAULTS = WebSettings()
+EPILOG = """\
+\b
+[web] of rmpa.toml and the variables RMPA_WEB_* give the same; options are stronger.
+
+\b
+Examples:
+  rmpa web                        for this machine: http://127.0.0.1:8480/
+  rmpa web --listen 0.0.0.0       for the network; prints the URL with its token once
+  rmpa up --web                   the agent starts it, and again if it ends
+  curl -s localhost:8480/api/v1/peers | jq '.[].name'
+"""
+
+
+@click.command(epilog=EPILOG)
+@click.option("--port", type=click.IntRange(1, 65535), help=f"Port to listen at. [default: {_DEFAULTS.port}]")
+@click.option(
+    "--listen",
+    metavar="ADDRESS",
+    help=f"Address to listen at; beyond this machine a token is needed. [default: {_DEFAULTS.listen}]",
+)
+@click.option(
+    "--token-file",
+    metavar="FILE",
+    help="Ask clients for the token of this file; made if it is not there. [default: in the state directory]",
+)
+@click.option(
+    "--host", "hosts", metavar="NAME", multiple=True, help="A further name of this server in URLs; repeatable."
+)
+@click.option("--config", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]")
+@click.option("--with-agent", is_flag=True, hidden=True, help="End when standard input ends.")
+@agent_option
+@json_option
+def web(
+    port: int | None,
+    listen: str | None,
+    token_file: str | None,
+    hosts: tuple[str, ...],
+    config: str | None,
+    with_agent: bool,
+    agent: str | None,
+    as_json: bool,
+) -> int:
+    """Serve this module's state over HTTP: /metrics for Prometheus, /api/v1 as JSON.
+
+    It is a process of its own: the agent does not depend on it. It starts without an agent too, and finds it later.
+    """
+    _check_libraries()
+    loaded = load_settings({"config": config}, dict(os.environ), host_name=socket.gethostname())
+    configure_logging(loaded.settings.log_level, sys.stderr, as_json=loaded.settings.log_json)
+    for note in loaded.notes:
+        _log.warning("%s", note)
+    given = loaded.settings.web
+    settings = replace(
+        given,
+        port=given.port if port is None else port,
+        listen=given.listen if listen is None else _host("--listen", listen),
+        token_file=given.token_file if token_file is None else token_file,
+        hosts=(*given.hosts, *(_host("--host", name) for name in hosts)),
+    )
+    from rmpa.web.server.process import access_of, serve
+
+    module = agent or os.environ.get("RMPA_AGENT") or loaded.settings.name
+    access = access_of(settings, module, os.environ, loaded.settings.state_dir)
+
+    def announce(address: Address) -> None:
+        _announce(address, as_json=as_json)
+
+    asyncio.run(serve(settings, access, agent, announce, with_agent=with_agent))
+    return 0
+
+
+def _check_libraries() -> None:
+    missing = [name for name in _LIBRARIES if not _is_there(name)]
+    if missing:
+        raise ConfigError("rmpa web", f"{' and '.join(missing)} not installed", "run pip install 'rmpa[web]'")
+
+
+def _is_there(name: str) -> bool:
+    try:
+        return importlib.util.find_spec(name) is not None
+    except ValueError:  # it was taken out of sys.modules
+        return False
+
+
+def _host(option: str, text: str) -> str:
+    try:
+        return HOST.read(text)
+    except BadValue as error:
+        raise ConfigError(option, error.problem, error.remedy) from None
+
+
+def _announce(address: Address, *, as_json: bool) -> None:
+    if as_json:
+        from rmpa.cli.output import print_json
+
+        print_json({"url": address.url, "token_file": address.token_file})
+    else:
+        click.echo(address.url)
+        if address.is_new:
+            click.echo(f"the token is kept in {address.token_file}; it is not printed again")
+        elif address.token_file:
+            click.echo(f"clients need the token of {address.token_file}")
+    sys.stdout.flush()

@@ -1,0 +1,241 @@
+"""The routes of ``rmpa web``, and what holds for all of them: access, read-only, headers, counts.
+
+A gateway or a page is added as one more route (``Routes.application``): the middleware judges its requests, WebSocket
+upgrades included, before its handler runs.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from typing import TYPE_CHECKING, Final
+
+from aiohttp import web
+from aiohttp.abc import AbstractAccessLogger
+
+from rmpa.core.counters import Counters, RefusalLog
+from rmpa.web import limits, rest
+from rmpa.web.metrics import exposition
+from rmpa.web.server.auth import TOKEN_PARAMETER, AccessPolicy, MoveToken, Refused, RequestFacts
+from rmpa.web.server.connections import GuardedConnection
+from rmpa.web.server.figures import Figures, web_metrics
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from aiohttp.typedefs import Handler, Middleware
+
+    from rmpa.web.server.agent_watch import AgentWatch
+    from rmpa.web.server.pages import Page
+
+_log = logging.getLogger(__name__)
+_OPEN: Final = ("/healthz",)
+"""Paths without a token: they tell only whether the agent answers."""
+_METHODS: Final = ("GET", "HEAD")
+_JUDGED: Final = web.RequestKey("rmpa.judged", bool)
+"""Marks requests that reached the middleware; aiohttp answers malformed ones before."""
+HEADERS: Final = {
+    "Content-Security-Policy": "default-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'; object-src 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
+    "Cache-Control": "no-store",
+    "Server": "rmpa",
+}
+"""Of every response."""
+
+
+class Routes:
+    """The handlers of all paths.
+
+    Args:
+        watch: Gives the agent's snapshot.
+        policy: Says which requests are served.
+        pages: Files by path.
+        connections: Returns how many connections are open, and how many there were.
+        counters: Refusals by reason, those of the connections too.
+    """
+
+    def __init__(
+        self,
+        watch: AgentWatch,
+        policy: AccessPolicy,
+        pages: Mapping[str, Page],
+        connections: Callable[[], tuple[int, int]],
+        counters: Counters,
+    ) -> None:
+        self._watch = watch
+        self._policy = policy
+        self._pages = pages
+        self._connections = connections
+        self._counters = counters
+        self._refusals = RefusalLog(_log, counters)
+        self.responses = Counters()
+        """Responses by status."""
+        self._encoding = asyncio.Lock()
+        self._encoded: dict[str, tuple[int, bytes, str]] = {}
+
+    def application(self) -> web.Application:
+        """The application, to be run once."""
+        app = web.Application(middlewares=[self._middleware()])
+        for path in self._pages:
+            app.router.add_get(path, self._page)
+        app.router.add_get("/metrics", self._metrics)
+        app.router.add_get("/healthz", self._health)
+        app.router.add_get("/openapi.json", self._openapi)
+        app.router.add_get(rest.PREFIX + "/{below:.*}", self._api)
+        return app
+
+    # --- what holds for all paths ---
+
+    def _middleware(self) -> Middleware:
+        @web.middleware
+        async def middleware(request: web.Request, handler: Handler) -> web.StreamResponse:
+            request[_JUDGED] = True
+            connection = _connection(request)
+            if connection is not None:
+                connection.request_begins()
+            try:
+                response = await self._respond(request, handler)
+            finally:
+                if connection is not None:
+                    connection.request_ends()
+            if not response.prepared:
+                response.headers.update(HEADERS)
+            return response
+
+        return middleware
+
+    async def _respond(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        verdict = self._policy.judge(self._facts(request))
+        if isinstance(verdict, Refused):
+            return self._refused(request, verdict.reason, rest.problem(verdict.status, verdict.detail))
+        if request.method not in _METHODS:
+            text = f"{request.method[:20]} is not supported; this server only shows, and is read with GET"
+            return self._refused(request, "method", rest.problem(405, text, (("Allow", ", ".join(_METHODS)),)))
+        if request.body_exists:
+            return self._refused(request, "body", rest.problem(413, "a request with a body; send none with GET"))
+        if isinstance(verdict, MoveToken):
+            return self._move_token(request)
+        try:
+            return await handler(request)
+        except web.HTTPException:  # of aiohttp's router: no such path
+            return _response(rest.problem(404, f"there is no {request.path[:80]!a}; / lists what there is"))
+        except Exception:  # noqa: BLE001 - the top of the request: a fault in one path must not end the connection's task
+            _log.exception("! %s failed", request.path)
+            return _response(rest.problem(500, "the server failed; its log says why"))
+
+    def _facts(self, request: web.Request) -> RequestFacts:
+        headers = request.headers
+        page = self._pages.get(request.path)
+        return RequestFacts(
+            host=tuple(headers.getall("Host", ())),
+            origin=headers.get("Origin"),
+            fetch_site=headers.get("Sec-Fetch-Site"),
+            fetch_mode=headers.get("Sec-Fetch-Mode"),
+            authorization=headers.get("Authorization"),
+            cookie=request.cookies.get(self._policy.cookie),
+            token=request.query.get(TOKEN_PARAMETER),
+            is_page=page is not None and page.is_html,
+            is_open=request.path in _OPEN,
+        )
+
+    def _refused(self, request: web.Request, reason: str, problem: rest.Response) -> web.Response:
+        address = request.remote or "?"
+        self._refusals.refuse(time.monotonic(), reason, address, f"{address}: {rest.detail_of(problem)}")
+        response = _response(problem)
+        if problem.status == 401:
+            response.headers["WWW-Authenticate"] = 'Bearer realm="rmpa"'
+        if request.body_exists:
+            response.force_close()
+        return response
+
+    def _move_token(self, request: web.Request) -> web.Response:
+        query = {name: value for name, value in request.query.items() if name != TOKEN_PARAMETER}
+        response = web.Response(status=303, headers={"Location": str(request.rel_url.with_query(query))})
+        token = request.query[TOKEN_PARAMETER]
+        response.set_cookie(self._policy.cookie, token, httponly=True, samesite="Strict", path="/")
+        return response
+
+    # --- the paths ---
+
+    async def _page(self, request: web.Request) -> web.Response:
+        page = self._pages[request.path]
+        return web.Response(body=page.body, headers={"Content-Type": page.content_type})
+
+    async def _health(self, _request: web.Request) -> web.Response:
+        reading = await self._watch.reading()
+        if reading.snapshot is None:
+            return _response(rest.problem(503, "the agent does not answer"))
+        return web.Response(text="ok\n")
+
+    async def _openapi(self, _request: web.Request) -> web.Response:
+        return _response(rest.respond("GET", rest.OPENAPI_PATH, None))
+
+    async def _api(self, request: web.Request) -> web.Response:
+        path = request.rel_url.raw_path
+        if path == rest.OPENAPI_PATH:
+            return await self._openapi(request)
+        reading = await self._watch.reading()
+        return _response(rest.respond("GET", path, reading.snapshot, reading.problem))
+
+    async def _metrics(self, request: web.Request) -> web.Response:
+        accept = request.headers.get("Accept", "")
+        reading = await self._watch.reading()
+        async with self._encoding:  # thousands of time series take a tenth of a second: once for all, in a thread
+            made = self._encoded.get(accept)
+            if made is None or made[0] != reading.number:
+                figures = tuple(web_metrics(self._figures()))
+                body, kind = await asyncio.to_thread(exposition, reading.snapshot, accept, figures)
+                made = (reading.number, body, kind)
+                self._encoded = {key: each for key, each in self._encoded.items() if each[0] == reading.number}
+                if len(self._encoded) < limits.METRIC_FORMATS:
+                    self._encoded[accept] = made
+        return web.Response(body=made[1], headers={"Content-Type": made[2]})
+
+    def _figures(self) -> Figures:
+        connections, accepted = self._connections()
+        return Figures(
+            connections,
+            accepted,
+            self.responses.as_dict(),
+            self._counters.as_dict(),
+            self._watch.reads,
+            self._watch.seconds,
+        )
+
+    # --- what aiohttp answers by itself ---
+
+    def access_logger(self) -> type[AbstractAccessLogger]:
+        """The class that is told of every response, also of those to bytes that are no HTTP."""
+        routes = self
+
+        class CountingAccessLogger(AbstractAccessLogger):
+            def log(self, request: web.BaseRequest, response: web.StreamResponse, time: float) -> None:  # noqa: ARG002
+                routes.count(request, response.status)
+
+        return CountingAccessLogger
+
+    def count(self, request: web.BaseRequest, status: int) -> None:
+        """Count a response."""
+        self.responses.add(str(status))
+        if _JUDGED not in request:
+            address = request.remote or "?"
+            text = f"{address}: a request that is no HTTP/1.1, or with a header beyond the limits (docs/limits.md)"
+            self._refusals.refuse(time.monotonic(), "malformed", address, text)
+
+
+def _connection(request: web.Request) -> GuardedConnection | None:
+    transport = request.transport
+    protocol = transport.get_protocol() if transport is not None else None
+    return protocol if isinstance(protocol, GuardedConnection) else None
+
+
+def _response(made: rest.Response) -> web.Response:
+    headers = {"Content-Type": made.content_type, **dict(made.headers)}
+    return web.Response(status=made.status, body=made.body, headers=headers)

@@ -1,0 +1,158 @@
+"""``rmpa web`` as a user runs it, with a real agent beside it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rmpa.agent.agent import Agent
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from tests.cli.conftest import Place
+
+DEADLINE = 60.0
+WEB = ("aiohttp", "prometheus_client", "rmpa.web")
+
+
+def free_port() -> int:
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        port: int = sock.getsockname()[1]
+        return port
+
+
+def get(port: int, path: str, token: str = "") -> tuple[int, str]:
+    request = urllib.request.Request(f"http://127.0.0.1:{port}{path}")
+    if token:
+        request.add_header("Authorization", f"Bearer {token}")
+    try:
+        with urllib.request.urlopen(request, timeout=DEADLINE) as response:
+            return response.status, response.read().decode()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read().decode()
+    except OSError:
+        return 0, ""
+
+
+def until(condition: Callable[[], object]) -> None:
+    deadline = time.monotonic() + DEADLINE
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+@contextmanager
+def running(place: Place, *arguments: str, end: signal.Signals = signal.SIGTERM) -> Iterator[subprocess.Popen[str]]:
+    with place.start(*arguments) as process:
+        try:
+            yield process
+        finally:
+            if process.poll() is None:
+                process.send_signal(end)
+            process.communicate(timeout=DEADLINE)
+
+
+def agent_options(*more: str) -> tuple[str, ...]:
+    return ("up", "--name", "base", "--core-port", str(free_port()), "--multicast", "off", *more)
+
+
+def test_it_waits_for_an_agent_and_survives_its_end(place: Place) -> None:
+    port = free_port()
+    with running(place, "web", "--port", str(port)) as web:
+        assert web.stdout is not None
+        assert web.stdout.readline() == f"http://127.0.0.1:{port}/\n"
+        assert get(port, "/healthz")[0] == 503
+        assert "rmpa up" in get(port, "/api/v1/agent")[1]
+        with running(place, *agent_options(), end=signal.SIGKILL):
+            until(lambda: get(port, "/healthz")[0] == 200)
+            assert json.loads(get(port, "/api/v1/agent")[1])["name"] == "base"
+            assert "\nrmpa_up 1.0\n" in get(port, "/metrics")[1]
+        until(lambda: get(port, "/healthz")[0] == 503)
+        assert "\nrmpa_up 0.0\n" in get(port, "/metrics")[1]
+        with running(place, *agent_options()):
+            until(lambda: get(port, "/healthz")[0] == 200)
+    assert web.returncode == 0
+
+
+def test_up_web_starts_it_again_and_ends_it(place: Place) -> None:
+    port = free_port()
+    place.environ["RMPA_WEB_PORT"] = str(port)
+    with running(place, *agent_options("--web"), end=signal.SIGKILL) as agent:
+        until(lambda: get(port, "/healthz")[0] == 200)
+        first = child_of(agent.pid)
+        os.kill(first, signal.SIGKILL)
+        until(lambda: get(port, "/healthz")[0] == 200)
+        second = child_of(agent.pid)
+        assert first != second
+    until(lambda: get(port, "/healthz")[0] == 0)  # the agent was killed, and it ended by itself
+    with running(place, *agent_options("--web")) as agent:
+        until(lambda: get(port, "/healthz")[0] == 200)
+    assert agent.returncode == 0
+    assert get(port, "/healthz")[0] == 0
+
+
+def child_of(pid: int) -> int:
+    """The child of an agent; a thread of the agent started it."""
+    children = " ".join(task.read_text() for task in Path(f"/proc/{pid}/task").glob("*/children"))
+    return int(children.split()[0])
+
+
+def test_beyond_this_machine_a_token_is_made_and_told_once(place: Place) -> None:
+    port = free_port()
+    arguments = ("web", "--port", str(port), "--listen", "0.0.0.0", "--agent", "base", "--json")
+    file = place.path / ".local" / "state" / "rmpa" / "base" / "web-token"
+    told = []
+    for _ in range(2):
+        with running(place, *arguments) as web:
+            assert web.stdout is not None
+            told.append(json.loads(web.stdout.readline()))
+            token = file.read_text().strip()
+            assert file.stat().st_mode & 0o777 == 0o600
+            assert get(port, "/metrics")[0] == 401
+            assert get(port, "/metrics", token)[0] == 200
+            assert get(port, f"/metrics?token={token}")[0] == 200
+    token = file.read_text().strip()
+    assert told[0]["url"].endswith(f":{port}/?token={token}")
+    assert token not in told[1]["url"]
+    assert told[0]["token_file"] == told[1]["token_file"] == str(file)
+
+
+def test_without_the_extra_it_says_what_to_install(place: Place) -> None:
+    block = "import sys; sys.modules['aiohttp'] = None; from rmpa.cli.main import main; sys.exit(main(['web']))"
+    done = subprocess.run(
+        [sys.executable, "-c", block], capture_output=True, text=True, env=place.environ, cwd=place.path, check=False
+    )
+    assert done.returncode == 2
+    assert done.stderr == "rmpa: rmpa web: aiohttp not installed; run pip install 'rmpa[web]'\n"
+
+
+def test_mistakes_are_told_with_their_option(place: Place) -> None:
+    code, _, err = place.run("web", "--listen", "::1")
+    assert (code, err.startswith("rmpa: --listen: ")) == (2, True)
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        sock.listen()
+        code, _, err = place.run("web", "--port", str(sock.getsockname()[1]))
+        assert code == 1
+        assert "choose another --port" in err
+        code, out, _ = place.run("web", "--port", str(sock.getsockname()[1]), "--json")
+        assert "choose another --port" in json.loads(out)["error"]
+
+
+def test_the_agent_does_not_import_the_web(place: Place) -> None:
+    code = f"import sys, {Agent.__module__}, rmpa.cli.up; print([n for n in sys.modules if n.startswith({WEB})])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=place.environ, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,132 @@
+"""Which requests are served, as a table of headers."""
+
+from __future__ import annotations
+
+import pytest
+
+from rmpa.web.server.auth import AccessPolicy, Granted, MoveToken, Refused, RequestFacts, is_loopback, own_names
+
+TOKEN = "t" * 43
+HOSTS = own_names(("base",))
+OPEN = AccessPolicy(8480, HOSTS)
+CLOSED = AccessPolicy(8480, HOSTS, TOKEN)
+HERE = ("base.local:8480",)
+
+
+def reason(verdict: Granted | MoveToken | Refused) -> str:
+    return verdict.reason if isinstance(verdict, Refused) else type(verdict).__name__
+
+
+@pytest.mark.parametrize(
+    ("host", "expected"),
+    [
+        (("localhost:8480",), "Granted"),
+        (("LOCALHOST",), "Granted"),
+        (("localhost.:8480",), "Granted"),
+        (("127.0.0.1:8480",), "Granted"),
+        (("192.168.1.7:8480",), "Granted"),  # an address cannot be rebound
+        (("[::1]:8480",), "Granted"),
+        (("base",), "Granted"),
+        (("base.local:8480",), "Granted"),
+        (("evil.example:8480",), "host"),
+        (("localhost.evil.example",), "host"),
+        (("127.0.0.1.evil.example:8480",), "host"),
+        (("0x7f.1",), "host"),
+        (("localhost:8480@evil.example",), "host"),
+        (("localhost, evil.example",), "host"),
+        (("",), "host"),
+        ((), "host"),
+        (("localhost", "evil.example"), "host"),
+    ],
+)
+def test_a_name_that_is_not_ours_is_a_rebound_one(host: tuple[str, ...], expected: str) -> None:
+    assert reason(OPEN.judge(RequestFacts(host))) == expected
+    # The right token does not help: a rebound page would have the browser send the cookie.
+    with_token = reason(CLOSED.judge(RequestFacts(host, authorization=f"Bearer {TOKEN}")))
+    assert with_token == expected
+
+
+@pytest.mark.parametrize(
+    ("origin", "expected"),
+    [
+        ("http://base.local:8480", "Granted"),
+        ("https://BASE.local:8480", "Granted"),
+        ("http://base.local:8481", "origin"),
+        ("http://base.local", "origin"),
+        ("http://evil.example", "origin"),
+        ("http://evil.example/base.local:8480", "origin"),
+        ("null", "origin"),
+        ("", "origin"),
+        ("ftp://base.local:8480", "origin"),
+        ("chrome-extension://abc", "origin"),
+    ],
+)
+def test_only_our_own_pages_may_read(origin: str, expected: str) -> None:
+    assert reason(OPEN.judge(RequestFacts(HERE, origin=origin))) == expected
+    assert reason(CLOSED.judge(RequestFacts(HERE, origin=origin, cookie=TOKEN))) == expected
+
+
+@pytest.mark.parametrize(
+    ("site", "mode", "is_page", "expected"),
+    [
+        ("same-origin", "cors", False, "Granted"),
+        ("none", "navigate", True, "Granted"),
+        ("cross-site", "navigate", True, "Granted"),  # a link in a wiki
+        ("cross-site", "navigate", False, "origin"),
+        ("cross-site", "no-cors", False, "origin"),  # <script src>, <img src>
+        ("cross-site", "websocket", False, "origin"),
+        ("same-site", "no-cors", True, "origin"),  # another port of this host
+    ],
+)
+def test_what_other_sites_load_is_refused_without_an_origin_too(
+    site: str, mode: str, is_page: bool, expected: str
+) -> None:
+    facts = RequestFacts(HERE, fetch_site=site, fetch_mode=mode, is_page=is_page)
+    assert reason(OPEN.judge(facts)) == expected
+
+
+@pytest.mark.parametrize(
+    ("facts", "expected"),
+    [
+        ({}, "token"),
+        ({"authorization": f"Bearer {TOKEN}"}, "Granted"),
+        ({"authorization": f"bearer  {TOKEN} "}, "Granted"),
+        ({"authorization": f"Basic {TOKEN}"}, "token"),
+        ({"authorization": "Bearer "}, "token"),
+        ({"authorization": f"Bearer {TOKEN}x"}, "token"),
+        ({"authorization": f"Bearer {TOKEN[:-1]}"}, "token"),
+        ({"authorization": "Bearer \udcff\u00e4"}, "token"),
+        ({"cookie": TOKEN}, "Granted"),
+        ({"cookie": "old"}, "token"),
+        ({"cookie": ""}, "token"),
+        ({"token": TOKEN}, "Granted"),
+        ({"token": TOKEN, "is_page": True}, "MoveToken"),
+        ({"token": TOKEN, "is_page": True, "cookie": "old"}, "MoveToken"),
+        ({"token": "wrong", "is_page": True}, "token"),
+        ({"token": "wrong", "cookie": TOKEN}, "Granted"),
+        ({"is_open": True}, "Granted"),
+    ],
+)
+def test_the_token_comes_as_bearer_cookie_or_query(facts: dict[str, object], expected: str) -> None:
+    assert reason(CLOSED.judge(RequestFacts(HERE, **facts))) == expected  # type: ignore[arg-type]
+
+
+def test_a_refusal_says_what_to_do() -> None:
+    for facts, remedy in (
+        (RequestFacts(("base.lan",)), "--host"),
+        (RequestFacts(HERE, origin="http://evil.example"), "open its own pages"),
+        (RequestFacts(HERE), "Authorization: Bearer TOKEN"),
+        (RequestFacts(HERE, cookie="old"), "the token is wrong"),
+    ):
+        verdict = CLOSED.judge(facts)
+        assert isinstance(verdict, Refused)
+        assert remedy in verdict.detail
+
+
+def test_only_loopback_needs_no_token() -> None:
+    assert all(map(is_loopback, ("127.0.0.1", "127.3.4.5", "localhost")))
+    assert not any(map(is_loopback, ("0.0.0.0", "192.168.1.7", "base", "")))
+
+
+def test_two_servers_of_one_host_have_cookies_of_their_own() -> None:
+    assert AccessPolicy(8480, HOSTS).cookie != AccessPolicy(8481, HOSTS).cookie
