@@ -30,9 +30,9 @@ def test_the_buffer_is_bounded_and_keeps_the_extremes(rows: list[tuple[float | N
     assert len(moments) <= 16
     assert moments == sorted(moments, key=lambda moment: moment or 0.0)
     for number, line in enumerate(lines):
-        given = [row[number] for row in rows if row[number] is not None]
-        kept = [value for value in line if value is not None]
-        assert (min(kept, default=None), max(kept, default=None)) == (
-            min(given, default=None),
-            max(given, default=None),
-        )
+        given = [value for row in rows if (value := row[number]) is not None]
+        assert _extremes([value for value in line if value is not None]) == _extremes(given)
+
+
+def _extremes(values: list[float]) -> tuple[float, float] | None:
+    return (min(values), max(values)) if values else None

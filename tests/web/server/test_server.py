@@ -102,7 +102,7 @@ def detail(body: bytes) -> str:
 async def test_each_path_gives_what_it_says() -> None:
     async with running() as site:
         for path, kind, part in (
-            ("/", "text/html; charset=utf-8", b"/metrics"),
+            ("/", "text/html; charset=utf-8", b'href="metrics"'),
             ("/static/style.css", "text/css; charset=utf-8", b"color-scheme"),
             ("/static/app.js", "text/javascript; charset=utf-8", b"import"),
             ("/static/pages/topics.js", "text/javascript; charset=utf-8", b"import"),
