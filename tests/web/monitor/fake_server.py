@@ -175,16 +175,18 @@ class FakeAgent:
     def _large(self, base: Snapshot) -> Snapshot:
         replace = msgspec.structs.replace
         some = next(peer for peer in base.peers if peer.name == "base")
-        odom = next(topic for topic in base.topics if topic.name == "/odom")
+        odom, idle = (
+            next(topic for topic in base.topics if topic.name == name) for name in ("/odom", "/base/context")
+        )
         names = [f"module_{number:02d}" for number in range(1, 16)]
         peers = tuple(replace(some, name=name) for name in names)
         topics = tuple(
             replace(
-                odom,
+                odom if number < 6 else idle,
                 name=f"/{name}/topic_{number:02d}",
                 routes=tuple(
-                    replace(route, peer=name, rate=1.0 + (at * 7 + number * 13) % 60 if number < 6 else None)
-                    for route in odom.routes
+                    replace(route, peer=name, rate=route.rate and 1.0 + (at * 7 + number * 13) % 60)
+                    for route in (odom if number < 6 else idle).routes
                 ),
             )
             for at, name in enumerate(names)

@@ -8,7 +8,7 @@ costs little.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import msgspec
 
@@ -85,7 +85,7 @@ class StateBuilder:
         self._places = Places(own)
         self._steady = Steady()
         self._bytes = _ByteRates()
-        self._entries: dict[str, Tree] = {}
+        self._idle: dict[str, tuple[TopicInfo, Tree]] = {}
         self._sections: Tree = {}
 
     def build(self, snapshot: Snapshot, resources: Sequence[ResourceFacts] = (), alarms: Sequence[Tree] = ()) -> Tree:
@@ -96,7 +96,6 @@ class StateBuilder:
             resources: The Smart Resources of all modules.
             alarms: The alarms that stand, each with ``id``, ``module``, ``resource``, ``level``, ``text`` and ``at``.
         """
-        self._entries = {}
         taken = snapshot.taken
         peers = snapshot.peers[: limits.MODULES_SHOWN]
         self._bytes.keep(peer.name for peer in peers)
@@ -107,7 +106,7 @@ class StateBuilder:
             "ring": {"slots": self._places.slots, "places": dict(self._places.places)},
             "modules": dict(self._modules(snapshot, peers)),
             "flows": {**self._flows(snapshot.topics), **resource_flows(resources, self._own, self._steady)},
-            "topics": {t.name: self._topic(t) for t in snapshot.topics[: limits.TOPICS_SHOWN]},
+            "topics": self._topics(snapshot.topics[: limits.TOPICS_SHOWN]),
             "services": {service_key(s): _service(s) for s in snapshot.services[: limits.SERVICES_SHOWN]},
             "resources": {one.key: resource_entry(one, self._own) for one in resources},
             "alarms": {str(alarm.get("id", index)): alarm for index, alarm in enumerate(alarms)},
@@ -223,16 +222,28 @@ class StateBuilder:
             })  # fmt: skip
         return found
 
+    def _topics(self, topics: Sequence[TopicInfo]) -> Tree:
+        """By name. Most topics of a large mesh are idle: their entries are kept until they change."""
+        found: Tree = {}
+        idle: dict[str, tuple[TopicInfo, Tree]] = {}
+        for topic in topics:
+            before = self._idle.get(topic.name)
+            entry = before[1] if before is not None and before[0] == topic else self._topic(topic)
+            found[topic.name] = entry
+            if "rate" not in entry:
+                idle[topic.name] = (topic, entry)
+        self._idle = idle
+        return found
+
     def _topic(self, topic: TopicInfo) -> Tree:
         incoming = [route for route in topic.routes if route.direction == "in"]
         active = [route for route in topic.routes if route.rate]
+        sources = {route.peer for route in incoming}
+        targets = {route.peer for route in topic.routes if route.direction == "out" and route.state == "open"}
         entry = {
             "type": topic.type,
-            "from": sorted({r.peer for r in incoming} | ({self._own} if topic.publishers else set())),
-            "to": sorted(
-                {r.peer for r in topic.routes if r.direction == "out" and r.state == "open"}
-                | ({self._own} if topic.subscribers else set())
-            ),
+            "from": sorted(sources | {self._own} if topic.publishers else sources),
+            "to": sorted(targets | {self._own} if topic.subscribers else targets),
             "rate": self._steady.figure(f"{topic.name} rate", max((r.rate or 0.0 for r in active), default=None)),
             "bandwidth": self._steady.figure(
                 f"{topic.name} bandwidth", sum(r.bandwidth or 0.0 for r in active) or None, share=0.1
@@ -248,7 +259,12 @@ class StateBuilder:
             "problem": _problem(topic),
             "crosses": topic.crosses,
         }
-        return _tree({key: value for key, value in entry.items() if value not in ("", 0, [])})
+        return _said(entry)
+
+
+def _said(entry: Mapping[str, object]) -> Tree:
+    """Without what says nothing: no, none, nothing, not known. A page takes a missing member as that."""
+    return cast("Tree", {key: value for key, value in entry.items() if value not in ("", 0, [], None)})
 
 
 def _problem(topic: TopicInfo) -> str:
