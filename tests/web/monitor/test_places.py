@@ -63,3 +63,11 @@ def test_the_order_around_the_ring_stays_and_no_two_share_a_place(steps: list[se
         assert present <= taken.keys()
         after = [name for name in sorted(taken, key=taken.__getitem__) if name in before]
         assert after == before
+
+
+def test_free_slots_are_spread_around_the_ring() -> None:
+    places = Places("pc")
+    places.update(NAMES[:12], 0.0)
+    free = set(range(places.slots)) - set(places.places.values())
+    assert (places.slots, len(free)) == (16, 3)
+    assert not [slot for slot in free if (slot + 1) % places.slots in free]
