@@ -96,6 +96,7 @@ async def test_without_an_agent_the_page_says_so_and_comes_back_by_itself(site: 
     site.server.agent.scene = "mute"
     await page.wait_text("The agent does not answer")
     await page.wait_text("Start one with `rmpa up`.")
+    assert "Nothing is wrong" not in await page.run("document.body.innerText")
     assert await page.run("document.querySelectorAll('[data-module]').length") == 4
     site.server.agent.scene = "demo"
     await page.wait("!document.querySelector('.banner')")

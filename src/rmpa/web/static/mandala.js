@@ -193,8 +193,11 @@ function concerns(state) {
   return found.sort((a, b) => URGENT.indexOf(a.level) - URGENT.indexOf(b.level));
 }
 
-export function Concerns({ state }) {
+export function Concerns({ state, connection }) {
   const found = concerns(state);
+  const reach = section(state, "reach");
+  if (connection.phase === "lost") found.unshift({ id: "lost", level: "ERROR", who: "rmpa web", text: "no connection: what is shown is as it was last known", to: location.hash || "#/", since: connection.lostAt / 1000 });
+  else if (reach.ok === false) found.unshift({ id: "mute", level: "ERROR", who: "the agent", text: `does not answer: ${reach.error}`, to: location.hash || "#/", since: reach.since });
   if (!found.length) return html`<p class="well"><${Mark} state="OK" word="Nothing is wrong." /></p>`;
   return html`<ul class="concerns">${found.slice(0, 50).map((one) => html`<li key=${one.id}><a href=${one.to}><${Mark} state=${one.level} word="" /><span><strong>${one.who}</strong><span>${one.text}</span></span>${one.since && html`<span class="muted"><${Since} moment=${one.since} /></span>`}</a></li>`)}</ul>`;
 }
@@ -210,16 +213,17 @@ const Row = memo(({ name, module, resources }) => html`<tr>
 const FlowRow = memo(({ from, to, flow }) => html`<tr><th scope="row">${from} → ${to}</th><td class="number">${hertz(flow.rate)}</td><td class="number">${bandwidth(flow.bandwidth)}</td>
   <td>${flow.topics.map((topic, at) => html`${at > 0 && ", "}<a href=${href("topic", topic)}>${topic}</a>`)}</td></tr>`);
 
-export function Mandala({ state }) {
+export function Mandala({ state, connection }) {
+  const current = connection.phase !== "lost" && section(state, "reach").ok !== false;
   const modules = entries(state, "modules"), resources = entries(state, "resources");
   const up = modules.filter(([, one]) => one.state === "up" || one.state === "here").length;
   const places = section(section(state, "ring"), "places");
   const ordered = modules.sort(([a], [b]) => (places[a] ?? 1e9) - (places[b] ?? 1e9));
-  return html`<${Page} title="Mesh" kind=${`Domain ${section(state, "agent").domain ?? "–"} · ${up} of ${modules.length} modules up`}>
+  return html`<${Page} title="Mesh" kind=${`Domain ${section(state, "agent").domain ?? "–"} · ${up} of ${modules.length} modules up${current ? "" : " when last heard of"}`}>
     <div class="overview"><div class="stage-area"><${Ring} state=${state} />
       <p class="legend" aria-hidden="true">${["up", "silent", "linking", "refused", "away"].map((each) => html`<${Mark} key=${each} state=${each} />`)}<span class="mark flowkey"><svg viewBox="0 0 26 16"><path d="M1 8h22" /></svg>messages</span></p></div>
     <div class="beside">
-      <${Panel} title="What is wrong"><${Concerns} state=${state} /><//>
+      <${Panel} title="What is wrong"><${Concerns} state=${state} connection=${connection} /><//>
       <${Panel} title="Modules"><${Table} caption="Modules" columns=${["Module", "Link", "#Round trip", "#In", "#Out", "Profile"]}>${ordered.map(([name, module]) => html`<${Row} key=${name} name=${name} module=${module} resources=${same(`row ${name}`, resources.filter(([, one]) => one.module === name))} />`)}<//><//>
       <${Panel} title="Flows"><${Table} caption="Flows between modules" columns=${["From → to", "#Messages", "#Bytes", "Topics"]} empty="No messages cross at present.">${entries(state, "flows").map(([key, flow]) => { const [from, to] = key.split(">"); return html`<${FlowRow} key=${key} from=${from} to=${to} flow=${flow} />`; })}<//><//>
     </div></div><//>`;
