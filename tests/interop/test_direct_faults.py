@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
-CLIENTS: Final = [(s, p) for s in ("roscpp", "rospy") for p in ("roscpp", "rospy")]
+CLIENTS: Final = [("roscpp", "rospy"), ("rospy", "roscpp")]
+"""Subscriber and publisher. What each library does at a fault depends on its own side alone."""
 RATE: Final = 100
 UNPRIVILEGED: Final = ("setpriv", "--bounding-set=-net_admin", "--inh-caps=-net_admin", "--")
 """Runs an agent as root without the capability that ending connections of others takes."""
@@ -48,7 +49,7 @@ def pair(modules: ModuleFactory, subscriber: str, publisher: str) -> tuple[Modul
     return a, b, talker, listener
 
 
-@pytest.mark.parametrize(("subscriber", "publisher"), [("roscpp", "rospy"), ("rospy", "roscpp")])
+@pytest.mark.parametrize(("subscriber", "publisher"), CLIENTS)
 def test_a_network_that_drops_all_for_a_moment_costs_nothing(
     modules: ModuleFactory, subscriber: str, publisher: str
 ) -> None:
