@@ -71,7 +71,9 @@ class FakeAgent:
         if self.scene == "killed":
             since = self._since.setdefault("killed", now)
             base = self._recorded[2 if now - since < 7 else 3]
-        elif self.scene in ("sick", "large", "sensors"):
+        else:
+            self._since.clear()
+        if self.scene in ("sick", "large", "sensors"):
             base = getattr(self, f"_{self.scene}")(base)
         age = now - self._started
         wobble = 1 + 0.004 * math.sin(now * 3)

@@ -59,7 +59,7 @@ function Distances({ scores, profile }) {
     ${scores.map((each, at) => { const y = at * tall + 4; const length = Math.max(2, (Math.min(each.distance ?? most, most) / most) * 200); return html`<g key=${each.profile}>
       <text x="0" y=${y + 17}>${each.profile === profile ? "● " : ""}${each.profile}</text><rect class="track" x="130" y=${y + 4} width="200" height="16" rx="3" />
       <rect class=${each.excluded || !each.feasible ? "hard" : each.profile === profile ? "soft" : "none"} x="130" y=${y + 4} width=${length} height="16" rx="3" />
-      <text x="338" y=${y + 17}>${each.excluded ? "excluded" : !each.feasible ? "infeasible" : Number(each.distance.toPrecision(3))}</text></g>`; })}</svg>
+      <text x="338" y=${y + 17}>${each.excluded ? "excluded" : !each.feasible ? "infeasible" : cell(each.distance)}</text></g>`; })}</svg>
     <p class="muted">Shorter is nearer to what is asked. Red: it cannot be chosen.</p>`;
 }
 
