@@ -1,0 +1,75 @@
+"""Limits of the monitor's clients.
+
+Each has its reason beside it. Seconds and bytes, unless the name says otherwise.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from rmpa.core.sizes import KIB
+
+PATCH_PERIOD: Final = 0.15
+"""Between two patches of one client: some 7 a second, which looks live and is read at leisure."""
+UNACKNOWLEDGED_MAX: Final = 2
+"""States and patches that a client has not acknowledged yet. A slow browser gets fewer patches, never a queue."""
+REQUEST_MAX: Final = 64 * KIB
+"""Bytes of one message of a client: a parameter's value, or the arguments of a call."""
+REQUEST_RATE: Final = 50.0
+"""Messages of one client a second, in the long run: a joystick sends 10, acknowledgements 7."""
+REQUEST_BURST: Final = 200.0
+"""Messages of one client at once: a page that reconnects and asks for all that it shows."""
+LOOKS_MAX: Final = 4
+"""Things whose details one client is shown at one time; a page shows one or two."""
+WATCHES_MAX: Final = 16
+"""Topics whose messages one client is shown at one time."""
+WATCH_RATE_MAX: Final = 10.0
+"""Values, images and scans a second of one watch."""
+FIELDS_MAX: Final = 8
+"""Numeric fields of one plot: as many lines as can be told apart."""
+FIELD_CHARACTERS: Final = 256
+"""Characters of a field's path, as ``pose.pose.position.x``."""
+ASKS_MAX: Final = 16
+"""Questions of one client (why, calls, parameters) that wait for their answer."""
+POINTS_MAX: Final = 64
+"""Samples of a plot in one message. Of more, the least and the greatest of each part are kept."""
+VALUE_CHARACTERS: Final = 512
+"""Characters of a string in a live value; the rest is cut."""
+VALUE_ITEMS: Final = 64
+"""Elements of an array in a live value; the rest is counted."""
+VALUE_NODES: Final = 2000
+"""Values in one live value, all levels together."""
+SCAN_POINTS: Final = 720
+"""Ranges of a laser scan that are sent: two a degree. Of more, the nearest of each part is kept."""
+IMAGE_PIXELS: Final = 320 * 240
+"""Pixels of an uncompressed image that are sent; of more, every n-th row and column."""
+TOPICS_SHOWN: Final = 2000
+"""Topics in a state; further ones are counted."""
+SERVICES_SHOWN: Final = 2000
+"""Services in a state; further ones are counted."""
+MODULES_SHOWN: Final = 256
+"""Modules in a state; further ones are counted. A ring of more could not be read."""
+FLOW_TOPICS: Final = 8
+"""Topics that a flow names; the busiest first."""
+ALARMS_KEPT: Final = 200
+"""Alarms in the history."""
+LOG_LINES: Final = 500
+"""Lines of the log that are kept for a page that opens it."""
+LOG_CHARACTERS: Final = 1024
+"""Characters of one line of the log; the rest is cut."""
+SILENT_AFTER: Final = 1.0
+"""Time without a word on a link after which its module is shown as silent. Keepalives come more often."""
+AWAY_AFTER: Final = 7.0
+"""Time without a beacon after which a module without a link is shown as away. Heartbeats come every 5 s."""
+FORGET_AFTER: Final = 600.0
+"""Time for which a module that has left the roster keeps its place in the ring."""
+STEADY: Final = 0.03
+"""Share by which a figure must change before it is shown anew, so that noise moves nothing."""
+RATE_SMOOTHING: Final = 1.0
+"""Time constant of a link's byte rates."""
+DRIVE_TIMEOUT: Final = 0.3
+"""Time after the last command of a joystick after which the robot is stopped; a joystick sends every 0.1 s."""
+DRIVE_SPEED: Final = 2.0
+"""Magnitude of a linear speed that a joystick may command, m/s."""
+DRIVE_TURN: Final = 4.0
+"""Magnitude of an angular speed that a joystick may command, rad/s."""

@@ -1,0 +1,110 @@
+"""The messages of a monitor's client (docs/design/monitor-protocol.md): parsed and checked once, here."""
+
+from __future__ import annotations
+
+from typing import Any, Final, Literal, TypeAlias
+
+import msgspec
+
+from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+from rmpa.core.names import is_global_name
+from rmpa.web.monitor import limits
+
+VERSION: Final = 1
+SUBPROTOCOL: Final = "rmpa.monitor.v1"
+"""The WebSocket subprotocol; a version that older pages cannot read has another one."""
+
+Id: TypeAlias = int
+Kind: TypeAlias = Literal["module", "topic", "service", "resource", "counters"]
+How: TypeAlias = Literal["value", "plot", "image", "scan"]
+
+
+class Ack(msgspec.Struct, frozen=True, tag_field="op", tag="ack", forbid_unknown_fields=False):
+    """The state or patch number ``n`` is shown, and all before it."""
+
+    n: int
+
+
+class Look(msgspec.Struct, frozen=True, tag_field="op", tag="look"):
+    """The page shows these things and wants their details; none of others. Each is ``[kind, name]``."""
+
+    at: tuple[tuple[Kind, str], ...] = ()
+
+
+class Watch(msgspec.Struct, frozen=True, tag_field="op", tag="watch"):
+    """Messages of a topic: its newest values, lines of a plot, images, or laser scans."""
+
+    id: Id
+    topic: str
+    how: How
+    fields: tuple[str, ...] = ()
+    rate: float = 5.0
+
+
+class Unwatch(msgspec.Struct, frozen=True, tag_field="op", tag="unwatch"):
+    """No more messages of that watch."""
+
+    id: Id
+
+
+class Ask(msgspec.Struct, frozen=True, tag_field="op", tag="ask"):
+    """A question or an order that has one answer: ``why``, ``call``, ``params``, ``set_param`` and so on."""
+
+    id: Id
+    what: str
+    args: dict[str, Any] = {}  # the edge: each question has its own
+
+
+class Log(msgspec.Struct, frozen=True, tag_field="op", tag="log"):
+    """Whether lines of the log are wanted."""
+
+    on: bool
+
+
+class Drive(msgspec.Struct, frozen=True, tag_field="op", tag="drive"):
+    """A joystick: speeds in m/s and rad/s, from -1 to 1 of what is allowed; repeated every 0.1 s while it is held."""
+
+    topic: str
+    linear: float
+    angular: float
+
+
+class Release(msgspec.Struct, frozen=True, tag_field="op", tag="release"):
+    """The joystick is let go: the robot is stopped at once."""
+
+
+ClientMessage: TypeAlias = Ack | Look | Watch | Unwatch | Ask | Log | Drive | Release
+_decoder: Final = msgspec.json.Decoder(ClientMessage)
+
+
+def parse(text: str | bytes) -> ClientMessage:
+    """A message of a client.
+
+    Raises:
+        LimitExceeded: It is too long.
+        RemoteProtocolError: It is not one, or says what cannot be.
+    """
+    if len(text) > limits.REQUEST_MAX:
+        raise LimitExceeded("a monitor's request", len(text), limits.REQUEST_MAX)
+    try:
+        message: ClientMessage = _decoder.decode(text)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise RemoteProtocolError(f"not a monitor's request: {error}") from None
+    _check(message)
+    return message
+
+
+def _check(message: ClientMessage) -> None:
+    if isinstance(message, Look) and len(message.at) > limits.LOOKS_MAX:
+        raise RemoteProtocolError(f"a page looks at {len(message.at)} things; {limits.LOOKS_MAX} is the most")
+    if isinstance(message, Watch | Drive) and not is_global_name(message.topic):
+        raise RemoteProtocolError(f"{message.topic[:80]!a} is not a topic's name")
+    if isinstance(message, Watch):
+        if not 0 < message.rate <= limits.WATCH_RATE_MAX:
+            raise RemoteProtocolError(
+                f"rate {message.rate:g} is not above 0 and at most {limits.WATCH_RATE_MAX:g} Hz"
+            )
+        if len(message.fields) > limits.FIELDS_MAX or (message.how == "plot") != bool(message.fields):
+            raise RemoteProtocolError(f"a plot has 1 to {limits.FIELDS_MAX} fields, everything else none")
+    if isinstance(message, Drive) and not (abs(message.linear) <= 1 and abs(message.angular) <= 1):
+        raise RemoteProtocolError("a joystick's values are from -1 to 1")

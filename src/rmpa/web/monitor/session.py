@@ -1,0 +1,296 @@
+"""One client of the monitor: its messages and the agent's states in; frames and requests out; no I/O.
+
+The client gets a state, then patches, at most one in ``limits.PATCH_PERIOD`` and only while it acknowledges them: a
+slow browser gets fewer. The session keeps no queue, just the last state that it sent, which clients share.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import msgspec
+
+from rmpa.core.errors import RemoteProtocolError, RmpaError
+from rmpa.core.token_bucket import TokenBucket
+from rmpa.web.hub import requests
+from rmpa.web.monitor import limits
+from rmpa.web.monitor.messages import VERSION, Ack, Ask, Drive, Log, Look, Release, Unwatch, Watch, parse
+from rmpa.web.monitor.patch import difference
+from rmpa.web.monitor.watches import WatchState
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from rmpa.web.hub.requests import Received
+    from rmpa.web.monitor.patch import Tree, Value
+    from rmpa.web.monitor.watches import Decode
+
+READ_ONLY = frozenset({"why", "history", "params", "describe"})
+"""Questions that change nothing; every client may ask them."""
+ORDERS = {"call": "call", "set_param": "param", "delete_param": "param", "profile": "resource", "context": "resource"}
+"""Questions that change something, and the right that each needs."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rights:
+    """What a client may do beyond looking; nothing unless it is said."""
+
+    call: bool = False
+    param: bool = False
+    resource: bool = False
+    drive: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """The server finds the answer and gives it to ``MonitorSession.answer`` or ``refuse``."""
+
+    id: int
+    what: str
+    args: dict[str, Any]  # the edge: each question has its own
+
+
+@dataclass(frozen=True, slots=True)
+class Speed:
+    """A geometry_msgs/Twist for ``topic``: m/s and rad/s."""
+
+    topic: str
+    linear: float
+    angular: float
+
+
+@dataclass(frozen=True, slots=True)
+class FollowLog:
+    """Whether the server is to pass lines of the log to ``MonitorSession.log``."""
+
+    on: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Close:
+    """The client is to be disconnected, with this close code of RFC 6455 and reason."""
+
+    code: int
+    reason: str
+
+
+Output: TypeAlias = str | bytes | requests.Request | Question | Speed | FollowLog | Close
+
+
+class MonitorSession:
+    """One client.
+
+    Args:
+        details: Gives all that is known of one thing, by kind and name (``view.details``).
+        decode: Gives a message's values.
+        rights: What the client may do.
+        now: Seconds of the clock of all further calls.
+        unsent: Bytes that the client's connection has not taken; above zero no live frame is sent.
+    """
+
+    def __init__(
+        self,
+        details: Callable[[str, str], Tree | None],
+        decode: Decode,
+        rights: Rights,
+        now: float,
+        unsent: Callable[[], int] = lambda: 0,
+    ) -> None:
+        self._details = details
+        self._decode = decode
+        self._rights = rights
+        self._unsent = unsent
+        self._bucket = TokenBucket(limits.REQUEST_RATE, limits.REQUEST_BURST)
+        self._state: Tree | None = None
+        self._shown: Tree | None = None
+        self._looks: tuple[tuple[str, str], ...] = ()
+        self._number = self._acknowledged = 0
+        self._patched = now - limits.PATCH_PERIOD
+        self._stale = False
+        self._watches: dict[int, WatchState] = {}
+        self._questions: set[int] = set()
+        self._driven: str = ""
+        self._drive_until = 0.0
+        self.skipped = 0
+
+    # --- the client ---
+
+    def open(self, agent: str) -> Iterator[Output]:
+        """The first message, before any state; ``agent`` is the name of the agent's module."""
+        may = sorted(name for name in Rights.__slots__ if getattr(self._rights, name))
+        yield _text({"op": "hello", "version": VERSION, "agent": agent, "may": may, "period": limits.PATCH_PERIOD})
+
+    def receive(self, text: str | bytes, now: float) -> Iterator[Output]:
+        """A message of the client."""
+        if not self._bucket.take(now):
+            yield Close(1008, f"more than {limits.REQUEST_RATE:g} messages a second")
+            return
+        try:
+            message = parse(text)
+        except RmpaError as error:
+            yield Close(1008, ascii(str(error))[1:-1][:100])
+            return
+        try:
+            yield from self._act(message, now)
+        except RmpaError as error:
+            yield self._failed(getattr(message, "id", 0), str(error))
+
+    def _act(self, message: object, now: float) -> Iterator[Output]:
+        if isinstance(message, Ack):
+            self._acknowledged = max(self._acknowledged, min(message.n, self._number))
+        elif isinstance(message, Look):
+            self._looks, self._stale = message.at, True
+        elif isinstance(message, Watch):
+            yield from self._watch(message)
+        elif isinstance(message, Unwatch):
+            if self._watches.pop(message.id, None):
+                yield requests.Unsubscribe(message.id)
+        elif isinstance(message, Ask):
+            yield from self._ask(message)
+        elif isinstance(message, Log):
+            yield FollowLog(message.on)
+        elif isinstance(message, Drive):
+            yield from self._drive(message, now)
+        elif isinstance(message, Release):
+            yield from self._stop()
+        yield from self.handle_timer(now)
+
+    def _watch(self, message: Watch) -> Iterator[Output]:
+        if message.id in self._watches:
+            raise RemoteProtocolError(f"watch {message.id} is in use")
+        if len(self._watches) >= limits.WATCHES_MAX:
+            raise RemoteProtocolError(f"{limits.WATCHES_MAX} topics are watched already; close one first")
+        self._watches[message.id] = WatchState(message, self._decode)
+        yield requests.Subscribe(message.id, message.topic)
+
+    def _ask(self, message: Ask) -> Iterator[Output]:
+        right = ORDERS.get(message.what)
+        if right is None and message.what not in READ_ONLY:
+            raise RemoteProtocolError(f"there is no question {message.what[:40]!a}")
+        if right and not getattr(self._rights, right):
+            yield self._failed(message.id, "this page may only look", "open it with a token whose role may do more")
+        elif message.id in self._questions or len(self._questions) >= limits.ASKS_MAX:
+            yield self._failed(message.id, f"{len(self._questions)} questions wait for an answer already")
+        else:
+            self._questions.add(message.id)
+            yield Question(message.id, message.what, message.args)
+
+    def _drive(self, message: Drive, now: float) -> Iterator[Output]:
+        if not self._rights.drive:
+            yield self._failed(0, "this page may not drive", "open it with a token whose role may")
+            return
+        if self._driven and self._driven != message.topic:
+            yield from self._stop()
+        self._driven, self._drive_until = message.topic, now + limits.DRIVE_TIMEOUT
+        yield Speed(message.topic, message.linear * limits.DRIVE_SPEED, message.angular * limits.DRIVE_TURN)
+
+    def _stop(self) -> Iterator[Output]:
+        if self._driven:
+            yield Speed(self._driven, 0.0, 0.0)
+        self._driven = ""
+
+    def close(self) -> Iterator[Output]:
+        """The connection has ended: the robot is stopped, and what was open is closed."""
+        yield from self._stop()
+        yield from map(requests.Unsubscribe, self._watches)
+        self._watches.clear()
+        self._questions.clear()
+
+    # --- the server ---
+
+    def update(self, state: Tree, now: float) -> Iterator[Output]:
+        """The newest state, which is never changed after that."""
+        self._state, self._stale = state, True
+        yield from self.handle_timer(now)
+
+    def receive_message(self, message: Received, now: float) -> Iterator[Output]:
+        """A message for one of the watches."""
+        watch = self._watches.get(message.handle)
+        if watch is None:
+            return
+        try:
+            watch.receive(message)
+        except RmpaError as error:
+            yield from self.end_watch(message.handle, str(error))
+            yield requests.Unsubscribe(message.handle)
+        yield from self._flush(now)
+
+    def end_watch(self, handle: int, error: str, remedy: str = "") -> Iterator[Output]:
+        """The hub cannot subscribe, or the subscription has ended."""
+        if self._watches.pop(handle, None):
+            yield self._failed(handle, error, remedy)
+
+    def answer(self, question: int, value: Value | Any) -> Iterator[Output]:
+        """The answer to a question."""
+        if question in self._questions:
+            self._questions.discard(question)
+            yield _text({"op": "answer", "id": question, "value": value})
+
+    def refuse(self, question: int, error: str, remedy: str = "") -> Iterator[Output]:
+        """A question has no answer."""
+        if question in self._questions:
+            self._questions.discard(question)
+            yield self._failed(question, error, remedy)
+
+    def log(self, lines: list[dict[str, Any]]) -> Iterator[Output]:
+        """Lines of the log, oldest first; left out while the client does not take what was sent."""
+        if self._unsent() == 0:
+            yield _text({"op": "log", "lines": lines[-limits.LOG_LINES :]})
+        else:
+            self.skipped += len(lines)
+
+    def next_timer(self) -> float | None:
+        """When ``handle_timer`` is to be called; ``None`` for not before something else happens."""
+        dues = [watch.due(0.0) for watch in self._watches.values()]
+        if self._driven:
+            dues.append(self._drive_until)
+        if self._stale and self._number - self._acknowledged < limits.UNACKNOWLEDGED_MAX:
+            dues.append(self._patched + limits.PATCH_PERIOD)
+        return min((due for due in dues if due is not None), default=None)
+
+    def handle_timer(self, now: float) -> Iterator[Output]:
+        """Send what is due, and stop a robot that nobody commands any more."""
+        if self._driven and now >= self._drive_until:
+            yield from self._stop()
+        if (
+            self._stale
+            and now >= self._patched + limits.PATCH_PERIOD
+            and self._number - self._acknowledged < limits.UNACKNOWLEDGED_MAX
+        ):
+            yield from self._send_state(now)
+        yield from self._flush(now)
+
+    def _send_state(self, now: float) -> Iterator[Output]:
+        if self._state is None:
+            return
+        self._stale, self._patched = False, now
+        found = {f"{kind}:{name}": self._details(kind, name) for kind, name in self._looks}
+        wanted: Tree = {**self._state, "detail": {key: tree for key, tree in found.items() if tree is not None}}
+        shown, self._shown = self._shown, wanted
+        if shown is None:
+            self._number += 1
+            yield _text({"op": "state", "n": self._number, "state": wanted})
+        elif patch := difference(shown, wanted):
+            self._number += 1
+            yield _text({"op": "patch", "n": self._number, "patch": patch})
+
+    def _flush(self, now: float) -> Iterator[Output]:
+        if self._unsent() > 0:
+            return
+        for handle, watch in list(self._watches.items()):
+            due = watch.due(now)
+            if due is None or due > now:
+                continue
+            try:
+                yield from watch.frames(now)
+            except RmpaError as error:
+                yield from self.end_watch(handle, str(error))
+                yield requests.Unsubscribe(handle)
+
+    def _failed(self, id_: int, error: str, remedy: str = "") -> str:
+        return _text({"op": "failed", "id": id_, "error": error, "remedy": remedy})
+
+
+def _text(message: dict[str, Any]) -> str:
+    return msgspec.json.encode(message).decode()

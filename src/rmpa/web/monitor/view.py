@@ -1,0 +1,338 @@
+"""The state that all pages show, made of the agent's snapshots: small, steady, and the same for all clients.
+
+Figures change only when there is something to see (``steady``); counters and distributions are in the details, which
+a client gets of what it looks at alone. Entries that did not change are the same objects as before, so a difference
+costs little.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, cast
+
+import msgspec
+
+from rmpa.web.monitor import limits
+from rmpa.web.monitor.patch import Tree, Value, without_nulls
+from rmpa.web.monitor.places import Places
+from rmpa.web.monitor.resources import resource_detail, resource_entry, resource_flows
+from rmpa.web.monitor.steady import Steady
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from rmpa.observe.snapshot import LinkInfo, PeerInfo, RouteInfo, ServiceInfo, Snapshot, TopicInfo
+    from rmpa.web.monitor.resources import ResourceFacts
+
+_STATES = {"refused": "refused", "conflict": "refused", "relayed": "relayed"}
+
+
+def module_state(peer: PeerInfo) -> str:
+    """The word for a peer: ``up``, ``silent``, ``linking``, ``refused``, ``relayed`` or ``away``."""
+    if peer.state == "linked":
+        heard = peer.link.heard_ago if peer.link else None
+        return "silent" if heard is not None and heard > limits.SILENT_AFTER else "up"
+    if peer.state in _STATES:
+        return _STATES[peer.state]
+    return "away" if peer.beacon_ago is None or peer.beacon_ago > limits.AWAY_AFTER else "linking"
+
+
+class _ByteRates:
+    """Bytes a second of a link each way, from its counters, smoothed."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, tuple[float, int, int]] = {}
+        self._rates: dict[str, tuple[float, float]] = {}
+
+    def update(self, name: str, now: float, link: LinkInfo | None) -> tuple[float, float] | None:
+        """In and out; ``None`` before there are two counts of one link."""
+        if link is None:
+            self._last.pop(name, None)
+            self._rates.pop(name, None)
+            return None
+        before = self._last.get(name)
+        self._last[name] = (now, link.bytes_in, link.bytes_out)
+        if before is None or link.bytes_in < before[1] or link.bytes_out < before[2]:
+            self._rates.pop(name, None)
+            return None
+        span = now - before[0]
+        if span <= 0:
+            return self._rates.get(name)
+        fresh = ((link.bytes_in - before[1]) / span, (link.bytes_out - before[2]) / span)
+        old = self._rates.get(name, fresh)
+        share = 1 - math.exp(-span / limits.RATE_SMOOTHING)
+        self._rates[name] = made = (old[0] + share * (fresh[0] - old[0]), old[1] + share * (fresh[1] - old[1]))
+        return made
+
+    def keep(self, names: Iterable[str]) -> None:
+        """Forget all others."""
+        wanted = set(names)
+        for name in list(self._last):
+            if name not in wanted:
+                self._last.pop(name, None)
+                self._rates.pop(name, None)
+
+
+class StateBuilder:
+    """Makes the state of each snapshot.
+
+    Args:
+        own: The name of the agent's module.
+    """
+
+    def __init__(self, own: str) -> None:
+        self._own = own
+        self._places = Places(own)
+        self._steady = Steady()
+        self._bytes = _ByteRates()
+        self._idle: dict[str, tuple[TopicInfo, Tree]] = {}
+        self._sections: Tree = {}
+
+    def build(self, snapshot: Snapshot, resources: Sequence[ResourceFacts] = (), alarms: Sequence[Tree] = ()) -> Tree:
+        """The state of ``snapshot``.
+
+        Args:
+            snapshot: The newest.
+            resources: The Smart Resources of all modules.
+            alarms: The alarms that stand, each with ``id``, ``module``, ``resource``, ``level``, ``text`` and ``at``.
+        """
+        taken = snapshot.taken
+        peers = snapshot.peers[: limits.MODULES_SHOWN]
+        self._bytes.keep(peer.name for peer in peers)
+        self._places.update((peer.name for peer in peers), taken)
+        state: Tree = {
+            "reach": {"ok": True},
+            "agent": self._agent(snapshot),
+            "ring": {"slots": self._places.slots, "places": dict(self._places.places)},
+            "modules": dict(self._modules(snapshot, peers)),
+            "flows": {**self._flows(snapshot.topics), **resource_flows(resources, self._own, self._steady)},
+            "topics": self._topics(snapshot.topics[: limits.TOPICS_SHOWN]),
+            "services": {service_key(s): _service(s) for s in snapshot.services[: limits.SERVICES_SHOWN]},
+            "resources": {one.key: resource_entry(one, self._own) for one in resources},
+            "alarms": {str(alarm.get("id", index)): alarm for index, alarm in enumerate(alarms)},
+            "notes": list(snapshot.notes[:100]),
+            "unreachable": [str(each) for each in snapshot.unreachable[:100]],
+        }
+        hidden = {
+            "topics": len(snapshot.topics) - limits.TOPICS_SHOWN,
+            "services": len(snapshot.services) - limits.SERVICES_SHOWN,
+            "modules": len(snapshot.peers) - limits.MODULES_SHOWN,
+        }
+        state["hidden"] = {kind: count for kind, count in hidden.items() if count > 0}
+        self._steady.sweep()
+        return self._shared(state)
+
+    def unreachable(self, since: float, error: str, remedy: str) -> Tree:
+        """The state while the agent does not answer: what was last known, marked as such."""
+        known: Tree = dict(self._sections) or {"agent": {"name": self._own}, "modules": {}, "topics": {}}
+        return known | {"reach": {"ok": False, "since": round(since, 1), "error": error, "remedy": remedy}}
+
+    def _shared(self, state: Tree) -> Tree:
+        """``state`` with the objects of the last one wherever these are equal."""
+        for name, section in state.items():
+            before = self._sections.get(name)
+            if not isinstance(section, dict) or not isinstance(before, dict):
+                continue
+            for key, value in section.items():
+                old = before.get(key)
+                if old is not value and type(old) is type(value) and old == value:
+                    section[key] = old
+            if before == section:
+                state[name] = before
+        self._sections = dict(state)
+        return state
+
+    def _agent(self, snapshot: Snapshot) -> Tree:
+        agent, steady = snapshot.agent, self._steady
+        files = agent.files
+        return _tree({
+            "name": agent.name,
+            "guid": agent.guid,
+            "version": agent.version,
+            "domain": agent.domain,
+            "core_uri": agent.core_uri,
+            "pid": agent.pid,
+            "started": agent.started,
+            "cpu": steady.figure("cpu", agent.cpu, share=0.15, least=1.0),
+            "rss": steady.figure("rss", agent.rss),
+            "addresses": agent.addresses,
+            "config_file": agent.config_file,
+            "realtime": agent.realtime,
+            "files_open": steady.figure("files", files.open, least=2.0) if files else None,
+            "files_limit": files.limit if files else None,
+            "files_problem": files.problem if files else None,
+            "proxies": agent.proxies,
+            "core_memory": agent.core_memory,
+        })  # fmt: skip
+
+    def _modules(self, snapshot: Snapshot, peers: Sequence[PeerInfo]) -> Iterable[tuple[str, Tree]]:
+        yield self._own, {"state": "here", "since": round(snapshot.agent.started, 1)}
+        for peer in peers:
+            yield peer.name, self._module(peer, snapshot.taken)
+        for name in self._places.absent(peer.name for peer in peers):
+            yield name, {"state": "away", "error": "has left the roster: no beacon and no link"}
+
+    def _module(self, peer: PeerInfo, taken: float) -> Tree:
+        link, steady, name = peer.link, self._steady, peer.name
+        rates = self._bytes.update(name, taken, link)
+        entry = {
+            "state": module_state(peer),
+            "since": steady.moment(f"{name} since", taken - peer.since_ago),
+            "error": peer.last_error or "; ".join(peer.conflicts) if not link else link.path_problem,
+            "remedy": link.path_remedy if link else "",
+            "guid": peer.guid,
+            "source": peer.source,
+            "via": peer.via,
+            "topics_in": peer.topics_in,
+            "topics_out": peer.topics_out,
+            "hidden": [bound.text for bound in peer.beyond],
+            "direct_in": peer.direct_in,
+            "direct_out": peer.direct_out,
+        }
+        if link is not None:
+            entry |= {
+                "remote": link.remote,
+                "rtt": steady.figure(f"{name} rtt", link.rtt, share=0.25, least=5e-5),
+                "offset": steady.figure(f"{name} offset", link.clock_offset, share=0.1, least=2e-5),
+                "offset_error": steady.figure(f"{name} error", link.clock_error, share=0.25, least=2e-5),
+                "queued": steady.figure(f"{name} queued", link.queued, share=0.25),
+                "dropped": link.dropped,
+                "bytes_in": steady.figure(f"{name} in", rates[0] if rates else None, share=0.1, least=20.0),
+                "bytes_out": steady.figure(f"{name} out", rates[1] if rates else None, share=0.1, least=20.0),
+            }
+        return _tree({key: value for key, value in entry.items() if value not in ("", [], ())})
+
+    def _flows(self, topics: Iterable[TopicInfo]) -> dict[str, Tree]:
+        """What flows on the own links, ``from>to``: messages and bytes a second, and the busiest topics."""
+        sums: dict[str, list[tuple[float, float, str]]] = {}
+        for topic in topics:
+            for route in topic.routes:
+                if route.rate:
+                    ends = (route.peer, self._own) if route.direction == "in" else (self._own, route.peer)
+                    sums.setdefault(">".join(ends), []).append((route.rate, route.bandwidth or 0.0, topic.name))
+        found: dict[str, Tree] = {}
+        for key, parts in sums.items():
+            parts.sort(key=lambda part: (-part[0], part[2]))
+            names: list[Value] = list(dict.fromkeys(part[2] for part in parts))[: limits.FLOW_TOPICS]  # type: ignore[assignment]
+            names.sort(key=str)
+            found[key] = _tree({
+                "rate": self._steady.figure(f"{key} rate", sum(part[0] for part in parts)),
+                "bandwidth": self._steady.figure(f"{key} bandwidth", sum(part[1] for part in parts), share=0.1),
+                "topics": names,
+            })  # fmt: skip
+        return found
+
+    def _topics(self, topics: Sequence[TopicInfo]) -> Tree:
+        """By name. Most topics of a large mesh are idle: their entries are kept until they change."""
+        found: Tree = {}
+        idle: dict[str, tuple[TopicInfo, Tree]] = {}
+        for topic in topics:
+            before = self._idle.get(topic.name)
+            entry = before[1] if before is not None and before[0] == topic else self._topic(topic)
+            found[topic.name] = entry
+            if "rate" not in entry:
+                idle[topic.name] = (topic, entry)
+        self._idle = idle
+        return found
+
+    def _topic(self, topic: TopicInfo) -> Tree:
+        incoming = [route for route in topic.routes if route.direction == "in"]
+        active = [route for route in topic.routes if route.rate]
+        sources = {route.peer for route in incoming}
+        targets = {route.peer for route in topic.routes if route.direction == "out" and route.state == "open"}
+        entry = {
+            "type": topic.type,
+            "from": sorted(sources | {self._own} if topic.publishers else sources),
+            "to": sorted(targets | {self._own} if topic.subscribers else targets),
+            "rate": self._steady.figure(f"{topic.name} rate", max((r.rate or 0.0 for r in active), default=None)),
+            "bandwidth": self._steady.figure(
+                f"{topic.name} bandwidth", sum(r.bandwidth or 0.0 for r in active) or None, share=0.1
+            ),
+            "latency": self._steady.figure(
+                f"{topic.name} latency",
+                max((r.latency.p50 for r in incoming if r.latency), default=None),
+                share=0.25,
+                least=1e-4,
+            ),
+            "lost": sum(r.lost + r.expired for r in topic.routes),
+            "dropped": sum(r.dropped + r.oversized for r in topic.routes),
+            "problem": _problem(topic),
+            "crosses": topic.crosses,
+        }
+        return _said(entry)
+
+
+def _said(entry: Mapping[str, object]) -> Tree:
+    """Without what says nothing: no, none, nothing, not known. A page takes a missing member as that."""
+    return cast("Tree", {key: value for key, value in entry.items() if value not in ("", 0, [], None)})
+
+
+def _problem(topic: TopicInfo) -> str:
+    said = (*topic.mismatches, *topic.unreachable, *(route.problem for route in topic.routes if route.problem))
+    return next(iter(said), "")
+
+
+def service_key(service: ServiceInfo) -> str:
+    """``module:/name`` for a peer's service, ``/name`` for one of this module."""
+    return f"{service.peer}:{service.name}" if service.peer else service.name
+
+
+def _service(service: ServiceInfo) -> Tree:
+    entry = {
+        "name": service.name,
+        "module": service.peer,
+        "node": service.node,
+        "type": service.type,
+        "state": service.state,
+        "calls": service.calls,
+        "failed": service.failed,
+        "transport": service.transport,
+        "problem": service.problem or service.hidden,
+    }
+    return _tree({key: value for key, value in entry.items() if value not in ("", 0)})
+
+
+def details(snapshot: Snapshot, resources: Mapping[str, ResourceFacts], kind: str, name: str) -> Tree | None:
+    """All that is known of one thing, for its page; ``None`` where there is no such thing.
+
+    Args:
+        snapshot: The newest.
+        resources: By ``ResourceFacts.key``.
+        kind: ``module``, ``topic``, ``service`` or ``resource``; or ``counters``, without a name.
+        name: A module's or topic's name; ``service_key`` of a service; ``key`` of a resource.
+    """
+    own = snapshot.agent.name
+    if kind == "counters":
+        return dict(sorted(snapshot.counters.items()))
+    if kind == "resource":
+        return resource_detail(resources[name], own) if name in resources else None
+    if kind == "module" and name == own:
+        return _tree(msgspec.to_builtins(snapshot.agent))
+    found: object = None
+    if kind == "module":
+        found = next((peer for peer in snapshot.peers if peer.name == name), None)
+    elif kind == "service":
+        found = next((each for each in snapshot.services if service_key(each) == name), None)
+    elif kind == "topic":
+        found = next((topic for topic in snapshot.topics if topic.name == name), None)
+    if found is None:
+        return None
+    made = _tree(msgspec.to_builtins(found))
+    if kind == "topic":
+        routes = made.get("routes")
+        made["routes"] = (
+            {_route_key(route): route for route in routes if isinstance(route, dict)}
+            if isinstance(routes, list)
+            else {}
+        )
+    return made
+
+
+def _route_key(route: Mapping[str, Value] | RouteInfo) -> str:
+    values = route if isinstance(route, dict) else {}
+    return f"{values.get('direction')} {values.get('peer')} {values.get('node')}"
+
+
+def _tree(value: Mapping[str, object]) -> Tree:
+    made = without_nulls(dict(value))
+    return made if isinstance(made, dict) else {}

@@ -1,0 +1,140 @@
+// The frame around all pages: address, navigation, search, keys, colours, and what to say when the agent is gone.
+
+import { html, render, Component } from "./vendor/htm-preact.js";
+import { Connection } from "./connection.js";
+import { section } from "./state.js";
+import { Mark, Since } from "./parts.js";
+import { Mandala } from "./mandala.js";
+import { Search, Shortcuts } from "./search.js";
+import { applyTheme, nextTheme, theme } from "./theme.js";
+
+const PAGES = [["", "Mesh", "m"], ["topics", "Topics", "t"], ["services", "Services", "s"], ["params", "Parameters", "p"], ["resources", "Resources", "r"], ["alarms", "Alarms", "a"], ["log", "Log", "l"], ["drive", "Drive", "d"]];
+const DETAILED = ["module", "topic", "service", "resource"];
+// All pages but the first one are loaded when they are first opened.
+const LAZY = {
+  module: ["module.js", "ModulePage"], topics: ["topics.js", "Topics"], topic: ["topics.js", "TopicPage"],
+  services: ["services.js", "Services"], service: ["services.js", "ServicePage"], params: ["params.js", "Params"],
+  resources: ["resources.js", "Resources"], resource: ["resources.js", "ResourcePage"], alarms: ["alarms.js", "Alarms"],
+  log: ["log.js", "Log"], drive: ["drive.js", "DrivePage"],
+};
+
+function address() {
+  const [page = "", name] = location.hash.replace(/^#\/?/, "").split("/");
+  try { return { page, name: name === undefined ? undefined : decodeURIComponent(name) }; } catch { return { page, name }; }
+}
+
+class App extends Component {
+  constructor() {
+    super();
+    this.state = { ...address(), overlay: "" };
+    this.drawn = [];
+    this.connection = new Connection((done) => this.draw(done));
+    this.look();
+  }
+
+  componentDidMount() {
+    addEventListener("hashchange", () => {
+      this.setState({ ...address(), overlay: "", nav: false }, () => { this.look(); document.querySelector("h1")?.focus({ preventScroll: true }); scrollTo(0, 0); });
+    });
+    addEventListener("keydown", (event) => this.key(event));
+    window.rmpa = this.connection; // for the console and for tests
+  }
+
+  // Many messages, one drawing: in the next frame, or soon in a hidden tab, which has none.
+  draw(done) {
+    if (done) this.drawn.push(done);
+    if (this.waits) return;
+    this.waits = true;
+    const now = () => {
+      this.waits = false;
+      this.setState({}, () => { for (const each of this.drawn.splice(0)) each(); });
+    };
+    if (document.hidden) setTimeout(now, 200); else requestAnimationFrame(now);
+  }
+
+  look() {
+    const { page, name } = address();
+    this.connection.look(DETAILED.includes(page) && name !== undefined ? [[page, name]] : []);
+  }
+
+  key(event) {
+    if (event.key === "Escape" && this.state.overlay) return this.setState({ overlay: "" });
+    const field = event.target.closest?.("input, textarea, select, [contenteditable]");
+    if (field || event.ctrlKey || event.metaKey || event.altKey || this.state.overlay) {
+      if (!(event.key === "k" && (event.ctrlKey || event.metaKey))) return;
+    }
+    if (event.key === "/" || event.key === "k") { event.preventDefault(); return this.setState({ overlay: "search" }); }
+    if (event.key === "?") return this.setState({ overlay: "keys" });
+    if (event.key === "c") return this.turn();
+    if (event.key === "w") { [...document.querySelectorAll(".question button")].find((each) => each.textContent === "Why?")?.click(); return; }
+    if (this.prefix) {
+      this.prefix = false;
+      const found = PAGES.find(([, , key]) => key === event.key);
+      if (found) location.hash = `#/${found[0]}`;
+    } else if (event.key === "g") {
+      this.prefix = true;
+      setTimeout(() => (this.prefix = false), 1500);
+    }
+  }
+
+  turn() { nextTheme(); this.setState({}); }
+
+  page() {
+    const { page, name } = this.state;
+    const { connection } = this;
+    if (!page) return html`<${Mandala} state=${connection.state} connection=${connection} />`;
+    const lazy = LAZY[page];
+    if (!lazy) return html`<p class="empty">There is no page <code>${page}</code>. <a href="#/">The mesh</a></p>`;
+    const loaded = this.loaded?.[lazy[0]];
+    if (!loaded) {
+      import(`./pages/${lazy[0]}`).then((module) => { this.loaded = { ...this.loaded, [lazy[0]]: module }; this.setState({}); },
+        () => this.setState({ broken: true }));
+      return html`<p class="empty">${this.state.broken ? "This page cannot be loaded: rmpa web does not answer." : "Loading …"}</p>`;
+    }
+    return html`<${loaded[lazy[1]]} key=${`${page} ${name}`} name=${name} state=${connection.state} connection=${connection} />`;
+  }
+
+  banner() {
+    const { connection } = this;
+    const reach = section(connection.state, "reach");
+    if (connection.phase === "lost")
+      return html`<div class="banner bad" role="status"><${Mark} state="refused" word="" /><span><strong>No connection to <code>rmpa web</code></strong> for <${Since} moment=${connection.lostAt / 1000} />.
+        ${connection.state ? " What is shown is as it was last known." : ""} The page connects again by itself.${connection.reason ? ` It said: ${connection.reason}` : ""}</span><button type="button" onClick=${() => connection.retry()}>Now</button></div>`;
+    if (reach.ok === false)
+      return html`<div class="banner bad" role="status"><${Mark} state="refused" word="" /><span><strong>The agent does not answer</strong> for <${Since} moment=${reach.since} />: ${reach.error}. ${reach.remedy} What is shown is as it was last known; this page comes back by itself.</span></div>`;
+    if (connection.notice)
+      return html`<div class="banner warn" role="status"><${Mark} state="WARN" word="" /><span>${connection.notice.error}. ${connection.notice.remedy}</span><button type="button" onClick=${() => { connection.notice = null; this.setState({}); }}>Close</button></div>`;
+    return null;
+  }
+
+  render() {
+    const { connection } = this;
+    const { page, overlay } = this.state;
+    const state = connection.state;
+    const agent = section(state, "agent").name || connection.hello.agent;
+    const alarms = Object.keys(section(state, "alarms")).length;
+    const gone = connection.phase === "lost" || section(state, "reach").ok === false;
+    const current = { topic: "topics", service: "services", resource: "resources", module: "" }[page] ?? page;
+    const dark = theme() === "dark";
+    return html`
+      <a class="skip" href="#main" onClick=${(event) => { event.preventDefault(); document.querySelector("h1")?.focus(); }}>To the content</a>
+      <header class="top">
+        <a class="brand" href="#/"><img src="static/icon.svg" alt="" width="28" height="28" /><span>RMPA<small>${agent || "…"}</small></span></a>
+        <nav aria-label="Pages">${PAGES.filter(([each]) => each !== "drive" || connection.may("drive") || page === "drive").map(([each, title]) => html`<a key=${each} href=${`#/${each}`} aria-current=${each === current ? "page" : undefined}>${title}${each === "alarms" && alarms > 0 ? html`<b class="badge">${alarms}<span class="unseen"> alarms stand</span></b>` : ""}</a>`)}</nav>
+        <div class="tools">
+          <button type="button" class="icon" aria-label="Search (/)" title="Search (/)" onClick=${() => this.setState({ overlay: "search" })}><svg viewBox="0 0 20 20" aria-hidden="true"><circle cx="8.5" cy="8.5" r="5.5" /><path d="m12.5 12.5 5 5" /></svg></button>
+          <button type="button" class="icon" aria-label=${dark ? "Light colours (c)" : "Dark colours (c)"} title="Colours (c)" onClick=${() => this.turn()}><svg viewBox="0 0 20 20" aria-hidden="true"><circle cx="10" cy="10" r="7" /><path class="fill" d="M10 3a7 7 0 0 1 0 14Z" /></svg></button>
+          <button type="button" class="icon help" aria-label="Keys (?)" title="Keys (?)" onClick=${() => this.setState({ overlay: "keys" })}><svg viewBox="0 0 20 20" aria-hidden="true"><path d="M7 7.5a3 3 0 1 1 4.5 2.6c-1 .6-1.5 1.1-1.5 2.4M10 15.5v.5" /></svg></button>
+        </div>
+      </header>
+      ${this.banner()}
+      <main id="main" class=${gone ? "gone" : ""}>${state ? this.page() : html`<p class="loading">${connection.phase === "lost" ? "Nothing is known yet." : "Connecting …"}</p>`}</main>
+      ${overlay === "search" && html`<${Search} state=${state} onClose=${() => this.setState({ overlay: "" })} />`}
+      ${overlay === "keys" && html`<${Shortcuts} pages=${PAGES} onClose=${() => this.setState({ overlay: "" })} />`}`;
+  }
+}
+
+applyTheme();
+const root = document.getElementById("app");
+root.textContent = "";
+render(html`<${App} />`, root);

@@ -1,0 +1,162 @@
+// One WebSocket to `rmpa web`: the state, live messages, and questions (docs/design/monitor-protocol.md).
+
+import { adopt, applyPatch } from "./state.js";
+
+const FIRST_WAIT = 300; // milliseconds until the next attempt, doubled up to LAST_WAIT
+const LAST_WAIT = 5000;
+const ANSWER_WAIT = 30000;
+
+export class Connection {
+  constructor(changed) {
+    this.changed = changed; // called after each change that a page can show
+    this.phase = "connecting"; // connecting, open, lost
+    this.lostAt = 0;
+    this.state = null;
+    this.hello = { may: [], agent: "" };
+    this.looks = [];
+    this.watches = new Map();
+    this.questions = new Map();
+    this.logSinks = new Set();
+    this.notice = null;
+    this.counter = 0;
+    this.wait = FIRST_WAIT;
+    this.frames = { patches: 0, bytes: 0 };
+    this.open();
+    addEventListener("online", () => this.retry());
+    document.addEventListener("visibilitychange", () => document.hidden || this.retry());
+  }
+
+  may(right) { return this.phase === "open" && this.hello.may.includes(right); }
+
+  retry() {
+    if (this.phase !== "lost") return;
+    clearTimeout(this.timer);
+    this.open();
+  }
+
+  open() {
+    const url = new URL("monitor", document.baseURI);
+    url.protocol = url.protocol.replace("http", "ws");
+    url.hash = "";
+    const socket = (this.socket = new WebSocket(url, "rmpa.monitor.v1"));
+    socket.binaryType = "arraybuffer";
+    socket.onmessage = (event) => this.receive(event.data);
+    socket.onclose = (event) => socket === this.socket && this.closed(event);
+    socket.onopen = () => {
+      this.phase = "open";
+      this.wait = FIRST_WAIT;
+      if (this.looks.length) this.send({ op: "look", at: this.looks });
+      for (const [id, watch] of this.watches) this.send({ op: "watch", id, ...watch.wanted });
+      if (this.logSinks.size) this.send({ op: "log", on: true });
+      this.changed();
+    };
+  }
+
+  closed(event) {
+    if (this.phase !== "lost") this.lostAt = Date.now();
+    this.phase = "lost";
+    this.reason = event.reason;
+    for (const question of this.questions.values()) question.reject({ error: "the connection was lost", remedy: "" });
+    this.questions.clear();
+    this.timer = setTimeout(() => this.open(), this.wait * (0.75 + Math.random() / 2));
+    this.wait = Math.min(LAST_WAIT, this.wait * 2);
+    this.changed();
+  }
+
+  send(message) {
+    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
+  }
+
+  receive(data) {
+    if (typeof data !== "string") return this.receiveBinary(data);
+    this.frames.bytes += data.length;
+    const message = JSON.parse(data);
+    switch (message.op) {
+      case "hello":
+        this.hello = message;
+        this.changed();
+        break;
+      case "state":
+        this.state = adopt(message.state);
+        this.shown(message.n);
+        break;
+      case "patch":
+        this.frames.patches += 1;
+        this.state = applyPatch(this.state, message.patch);
+        this.shown(message.n);
+        break;
+      case "value":
+      case "points":
+      case "scan":
+        this.watches.get(message.id)?.sink(message);
+        break;
+      case "answer":
+        this.settle(message.id)?.resolve(message.value);
+        break;
+      case "failed":
+        this.failed(message);
+        break;
+      case "log":
+        for (const sink of this.logSinks) sink(message.lines);
+    }
+  }
+
+  // The acknowledgement is sent when the browser has drawn: the server waits for it before it sends more than one further patch.
+  shown(n) {
+    this.changed(() => this.send({ op: "ack", n }));
+  }
+
+  receiveBinary(buffer) {
+    const view = new DataView(buffer);
+    if (buffer.byteLength < 20 || view.getUint8(0) !== 1) return;
+    const format = ["", "jpeg", "png", "rgb8", "mono8"][view.getUint8(1)];
+    const width = view.getUint16(2, true), height = view.getUint16(4, true);
+    this.watches.get(view.getUint32(8, true))?.sink({
+      op: "image", format, width, height, stamp: Number(view.getBigUint64(12, true)) / 1e9, bytes: new Uint8Array(buffer, 20),
+    });
+  }
+
+  failed(message) {
+    const question = this.settle(message.id);
+    if (question) question.reject(message);
+    else if (this.watches.has(message.id)) this.watches.get(message.id).sink(message);
+    else { this.notice = message; this.changed(); }
+  }
+
+  settle(id) {
+    const question = this.questions.get(id);
+    this.questions.delete(id);
+    if (question) clearTimeout(question.timer);
+    return question;
+  }
+
+  look(at) {
+    if (JSON.stringify(at) === JSON.stringify(this.looks)) return;
+    this.looks = at;
+    this.send({ op: "look", at });
+  }
+
+  // Gives messages of a topic to `sink` until the function that it returns is called.
+  watch(wanted, sink) {
+    const id = ++this.counter;
+    this.watches.set(id, { wanted, sink });
+    this.send({ op: "watch", id, ...wanted });
+    return () => { this.watches.delete(id); this.send({ op: "unwatch", id }); };
+  }
+
+  ask(what, args = {}) {
+    const id = ++this.counter;
+    return new Promise((resolve, reject) => {
+      if (this.phase !== "open") return reject({ error: "there is no connection to rmpa web", remedy: "" });
+      const timer = setTimeout(() => this.settle(id)?.reject({ error: "no answer came within 30 s", remedy: "" }), ANSWER_WAIT);
+      this.questions.set(id, { resolve, reject, timer });
+      this.send({ op: "ask", id, what, args });
+    });
+  }
+
+  followLog(sink) {
+    this.logSinks.add(sink);
+    if (this.logSinks.size === 1) this.send({ op: "log", on: true });
+    return () => { this.logSinks.delete(sink); if (!this.logSinks.size) this.send({ op: "log", on: false }); };
+  }
+}

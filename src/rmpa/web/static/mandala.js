@@ -1,0 +1,231 @@
+// The first page: all modules on a ring, their links, and what flows. A module keeps its place for as long as it is known.
+
+import { html, useEffect, useRef, useState } from "./vendor/htm-preact.js";
+import { bandwidth, hertz, seconds } from "./format.js";
+import { entries, section } from "./state.js";
+import { Link, Mark, Page, Panel, Since, Table, href, known, memo, shape } from "./parts.js";
+
+const SIZE = 1000;
+const CENTRE = SIZE / 2;
+const SPEEDS = [[0, ""], [0.5, "slow"], [5, "medium"], [30, "fast"]];
+
+function geometry(slots, compact) {
+  const node = compact ? (slots <= 8 ? 104 : 62) : slots <= 8 ? 78 : slots <= 16 ? 62 : slots <= 32 ? 40 : 22;
+  const small = node < 45; // then names stand outside of the ring
+  return { node, ring: CENTRE - node - (small ? 130 : 26), slots, small };
+}
+
+// Where a name stands outside of a small node, and how it is aligned.
+function outside(at, { node, ring }) {
+  const x = (at.x - CENTRE) / ring, y = (at.y - CENTRE) / ring;
+  return { x: at.x + x * (node + 18), y: at.y + y * (node + 22) + 7, anchor: x > 0.25 ? "start" : x < -0.25 ? "end" : "middle" };
+}
+
+const angle = (slot, slots) => (slot / slots) * 2 * Math.PI - Math.PI / 2;
+
+export function place(slot, { ring, slots }) {
+  const at = angle(slot, slots);
+  return { x: CENTRE + ring * Math.cos(at), y: CENTRE + ring * Math.sin(at) };
+}
+
+// A chord from edge to edge of two modules, bent towards the centre; `aside` shifts it, so that both directions are seen.
+export function chord(a, b, node, aside) {
+  const bend = { x: (a.x + b.x) / 2 + (CENTRE - (a.x + b.x) / 2) * 0.4, y: (a.y + b.y) / 2 + (CENTRE - (a.y + b.y) / 2) * 0.4 };
+  const dx = b.x - a.x, dy = b.y - a.y, far = Math.hypot(dx, dy) || 1;
+  const nx = (-dy / far) * aside, ny = (dx / far) * aside;
+  const edge = (from) => {
+    const ex = bend.x - from.x, ey = bend.y - from.y, length = Math.hypot(ex, ey) || 1;
+    return { x: from.x + (ex / length) * (node + 10) + nx, y: from.y + (ey / length) * (node + 10) + ny };
+  };
+  const start = edge(a), end = edge(b), middle = { x: bend.x + nx, y: bend.y + ny };
+  const at = (t) => ({
+    x: (1 - t) ** 2 * start.x + 2 * t * (1 - t) * middle.x + t * t * end.x,
+    y: (1 - t) ** 2 * start.y + 2 * t * (1 - t) * middle.y + t * t * end.y,
+  });
+  return { d: `M${start.x.toFixed(1)} ${start.y.toFixed(1)}Q${middle.x.toFixed(1)} ${middle.y.toFixed(1)} ${end.x.toFixed(1)} ${end.y.toFixed(1)}`, at };
+}
+
+const speed = (rate) => SPEEDS.reduce((found, [least, word]) => (rate > least ? word : found), "");
+const width = (bytes) => Math.min(9, 2 + Math.max(0, Math.log10((bytes || 0) / 100)) * 1.4);
+
+const Flow = memo(({ flow, from, to, a, b, geo, both, labelled, compact }) => {
+  const line = chord(a, b, geo.node, both ? 9 : 0);
+  const far = Math.hypot(a.x - b.x, a.y - b.y) > geo.ring * 0.9;
+  const label = line.at(geo.slots > 8 ? 0.16 : far ? 0.33 : 0.5); // near its source, where chords are apart
+  const text = flow.rate === undefined ? "" : hertz(flow.rate);
+  labelled = labelled && !(compact && geo.slots > 6 && flow.by === "resource");
+  return html`<g class="flow ${flow.by === "resource" ? "declared" : ""}">
+    <title>${from} to ${to}: ${text || "rate not known"}, ${flow.topics.join(", ")}</title>
+    <path class="pipe" d=${line.d} stroke-width=${width(flow.bandwidth) + 4} />
+    <path class="stream ${speed(flow.rate || 0)}" d=${line.d} stroke-width=${width(flow.bandwidth)} marker-end="url(#arrow)" />
+    ${labelled && text && html`<text class="rate" x=${label.x} y=${label.y + 6}>${text}</text>`}
+    ${labelled && !compact && text && geo.slots <= 8 && flow.bandwidth && html`<text class="minor" x=${label.x} y=${label.y + 30}>${bandwidth(flow.bandwidth)}</text>`}
+  </g>`;
+});
+
+const Wire = memo(({ name, module, a, b, geo, labelled }) => {
+  const line = chord(a, b, geo.node, 0);
+  const middle = line.at(0.5);
+  const about = known(module.state);
+  const quiet = module.state === "up" || module.state === "relayed";
+  return html`<g class="wire ${module.state} ${about.tone}"><path d=${line.d} />
+    ${!quiet && html`<g class="seal" transform="translate(${middle.x} ${middle.y})"><circle r="19" /><svg x="-11" y="-11" width="22" height="22" viewBox="0 0 16 16">${shape(module.state)}</svg></g>`}
+    ${!quiet && labelled && html`<text class="word" x=${middle.x} y=${middle.y + 42}>${about.word}</text>`}</g>`;
+});
+
+function arc(x, y, radius, from, to) {
+  const p = (at) => `${(x + radius * Math.cos(at)).toFixed(1)} ${(y + radius * Math.sin(at)).toFixed(1)}`;
+  return `M${p(from)}A${radius} ${radius} 0 ${to - from > Math.PI ? 1 : 0} 1 ${p(to)}`;
+}
+
+// One arc around its module for each Smart Resource; its colour is the quality's level, its pattern too.
+const Arcs = ({ at, geo, resources }) => {
+  const part = (2 * Math.PI) / resources.length;
+  const gap = 0.09;
+  return resources.map(([key, one], index) => html`<path key=${key} class="quality ${known(one.level).tone} level-${(one.level || "none").toLowerCase()}"
+    d=${arc(at.x, at.y, geo.node + 8, -Math.PI / 2 + index * part + gap, -Math.PI / 2 + (index + 1) * part - gap)} />`);
+};
+
+const LEVELS = ["ERROR", "STALE", "WARN", "OK"]; // the worst first
+const worst = (resources) => LEVELS.find((level) => resources.some(([, one]) => one.level === level)) || "";
+
+const Module = memo(({ name, module, at, geo, resources, alarms, compact }) => {
+  const about = known(module.state);
+  const profile = resources.length === 1 ? resources[0][1].profile : resources.length ? `${resources.length} resources` : "";
+  const { small } = geo;
+  const level = worst(resources);
+  const label = small ? outside(at, geo) : { x: at.x, y: at.y - (compact ? 22 : 16), anchor: "middle" };
+  const mark = small ? (geo.node > 30 ? 24 : 18) : compact ? 32 : 20;
+  const limit = compact ? 9 : small ? 12 : geo.slots > 8 ? 9 : 11;
+  const short = name.length > limit ? `${name.slice(0, limit - 1)}…` : name;
+  const word = small ? "" : profile && module.state !== "away" && module.state !== "linking" ? profile.slice(0, limit) : compact && module.state === "here" ? "here" : about.word;
+  // The name begins with the text that is seen, so that a user can say what they see.
+  const said = [short, word, alarms && `${alarms} alarm${alarms > 1 ? "s" : ""}`, short !== name && name, `link ${about.word}`, profile && `profile ${profile}`, level && `quality ${known(level).word}`].filter(Boolean).join(", ");
+  return html`<a class="module ${module.state} ${about.tone}" href=${href("module", name)} aria-label=${said} data-module=${name}>
+    <circle class="halo" cx=${at.x} cy=${at.y} r=${geo.node + 16} />
+    <circle class="body" cx=${at.x} cy=${at.y} r=${geo.node} />
+    ${resources.length > 0 && html`<${Arcs} at=${at} geo=${geo} resources=${resources} />`}
+    <text class="name" x=${label.x} y=${label.y} text-anchor=${label.anchor}>${short}</text>
+    <g class="state"><svg x=${at.x - mark / 2} y=${at.y - mark / 2 + (small ? 0 : compact ? 18 : 13)} width=${mark} height=${mark} viewBox="0 0 16 16">${shape(module.state)}</svg></g>
+    ${" "}${!small && html`<text class="word" x=${at.x} y=${at.y + (compact ? 66 : 46)}>${word}</text>`}
+    ${" "}${alarms > 0 && html`<g class="bell" transform="translate(${at.x + geo.node * 0.72} ${at.y - geo.node * 0.72})"><circle r="20" /><text y="8">${alarms}</text></g>`}
+  </a>`;
+});
+
+// The arrow keys go around the ring, in the order of the places.
+function step(event, order) {
+  const by = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 }[event.key];
+  const here = event.target.closest && event.target.closest("[data-module]");
+  if (!by || !here) return;
+  event.preventDefault();
+  const at = order.indexOf(here.dataset.module);
+  const next = order[(at + by + order.length) % order.length];
+  [...event.currentTarget.querySelectorAll("[data-module]")].find((each) => each.dataset.module === next)?.focus();
+}
+
+function useCompact() {
+  const query = useRef(matchMedia("(max-width: 640px)")).current;
+  const [compact, set] = useState(query.matches);
+  useEffect(() => {
+    const change = () => set(query.matches);
+    query.addEventListener("change", change);
+    return () => query.removeEventListener("change", change);
+  }, []);
+  return compact;
+}
+
+const fixed = new Map(); // one object for each place, so that what did not move is not drawn again
+function point(slot, geo) {
+  const key = `${slot} ${geo.slots} ${geo.node}`;
+  if (!fixed.has(key)) fixed.set(key, place(slot, geo));
+  return fixed.get(key);
+}
+const shapes = new Map();
+function sizes(slots, compact) {
+  const key = `${slots} ${compact}`;
+  if (!shapes.has(key)) shapes.set(key, geometry(slots, compact));
+  return shapes.get(key);
+}
+const lists = new Map();
+function same(key, list) {
+  const before = lists.get(key);
+  if (before && before.length === list.length && before.every((each, at) => each[0] === list[at][0] && each[1] === list[at][1])) return before;
+  lists.set(key, list);
+  return list;
+}
+
+export function Ring({ state }) {
+  const compact = useCompact();
+  const ring = section(state, "ring"), places = section(ring, "places");
+  const geo = sizes(ring.slots || 4, compact);
+  const modules = section(state, "modules");
+  const names = Object.keys(modules).filter((name) => name in places).sort((a, b) => places[a] - places[b]);
+  const at = (name) => point(places[name], geo);
+  const own = section(state, "agent").name;
+  const flows = entries(state, "flows").map(([key, flow]) => [...key.split(">"), flow]).filter(([from, to]) => from in places && to in places);
+  const resources = entries(state, "resources");
+  const alarms = entries(state, "alarms");
+  const labelled = names.length <= 16;
+  const taken = new Set(names.map((name) => places[name]));
+  return html`<svg class="mandala ${compact ? "compact" : ""} ${geo.slots > 8 ? "many" : ""}" viewBox="0 0 ${SIZE} ${SIZE}" role="group" aria-label="Modules, their links, and what flows between them" onKeyDown=${(event) => step(event, names)}>
+    <defs><marker id="arrow" viewBox="0 0 8 8" refX="6.5" refY="4" markerWidth="14" markerHeight="14" markerUnits="userSpaceOnUse" orient="auto"><path class="head" d="M.8.8 7 4 .8 7.2 2.6 4Z" /></marker></defs>
+    <circle class="dial" cx=${CENTRE} cy=${CENTRE} r=${geo.ring} />
+    ${Array.from({ length: geo.slots }, (_, slot) => slot).filter((slot) => !taken.has(slot)).map((slot) => html`<circle key=${slot} class="vacant" cx=${point(slot, geo).x} cy=${point(slot, geo).y} r="5" />`)}
+    <g>${names.filter((name) => name !== own).map((name) => html`<${Wire} key=${name} name=${name} module=${modules[name]} a=${at(own)} b=${at(name)} geo=${geo} labelled=${labelled && !compact} />`)}</g>
+    <g>${flows.map(([from, to, flow]) => html`<${Flow} key=${`${from}>${to}`} from=${from} to=${to} flow=${flow} a=${at(from)} b=${at(to)} geo=${geo} labelled=${labelled} compact=${compact} both=${`${to}>${from}` in section(state, "flows")} />`)}</g>
+    <g>${names.map((name) => html`<${Module} key=${name} name=${name} module=${modules[name]} at=${at(name)} geo=${geo} compact=${compact}
+      resources=${same(name, resources.filter(([, one]) => one.module === name))} alarms=${alarms.filter(([, one]) => one.module === name).length} />`)}</g>
+  </svg>`;
+}
+
+const URGENT = ["ERROR", "WARN", "STALE"];
+
+function concerns(state) {
+  const found = [];
+  for (const [id, alarm] of entries(state, "alarms")) found.push({ id, level: alarm.level, text: alarm.text, who: alarm.resource || alarm.module, to: alarm.resource ? href("resource", alarm.resource) : href("alarms"), since: alarm.at });
+  for (const [name, module] of entries(state, "modules")) {
+    if (module.state !== "up" && module.state !== "here" && module.state !== "relayed")
+      found.push({ id: `m${name}`, level: { refused: "ERROR", away: "STALE" }[module.state] || "WARN", text: `${known(module.state).word}${module.error ? `: ${module.error}` : ""}`, who: name, to: href("module", name), since: module.since });
+    else if (module.error) found.push({ id: `m${name}`, level: "WARN", text: module.error, who: name, to: href("module", name) });
+  }
+  for (const [name, topic] of entries(state, "topics")) if (topic.problem) found.push({ id: `t${name}`, level: "WARN", text: topic.problem, who: name, to: href("topic", name) });
+  for (const note of state.notes || []) found.push({ id: `n${note}`, level: "WARN", text: note, who: "the agent", to: href("module", section(state, "agent").name) });
+  return found.sort((a, b) => URGENT.indexOf(a.level) - URGENT.indexOf(b.level));
+}
+
+export function Concerns({ state, connection }) {
+  const found = concerns(state);
+  const reach = section(state, "reach");
+  if (connection.phase === "lost") found.unshift({ id: "lost", level: "ERROR", who: "rmpa web", text: "no connection: what is shown is as it was last known", to: location.hash || "#/", since: connection.lostAt / 1000 });
+  else if (reach.ok === false) found.unshift({ id: "mute", level: "ERROR", who: "the agent", text: `does not answer: ${reach.error}`, to: location.hash || "#/", since: reach.since });
+  if (!found.length) return html`<p class="well"><${Mark} state="OK" word="Nothing is wrong." /></p>`;
+  return html`<ul class="concerns">${found.slice(0, 50).map((one) => html`<li key=${one.id}><a href=${one.to}><${Mark} state=${one.level} word="" /><span><strong>${one.who}</strong><span>${one.text}</span></span>${one.since && html`<span class="muted"><${Since} moment=${one.since} /></span>`}</a></li>`)}</ul>`;
+}
+
+const Row = memo(({ name, module, resources }) => html`<tr>
+  <th scope="row"><${Link} page="module" name=${name} /></th>
+  <td><${Mark} state=${module.state} /></td>
+  <td class="number">${seconds(module.rtt)}</td>
+  <td class="number">${bandwidth(module.bytes_in)}</td>
+  <td class="number">${bandwidth(module.bytes_out)}</td>
+  <td>${resources.map(([key, one]) => html`<div key=${key}><a href=${href("resource", key)}><${Mark} state=${one.level} word=${one.profile || "no profile"} /></a></div>`)}</td></tr>`);
+
+const FlowRow = memo(({ from, to, flow }) => html`<tr><th scope="row">${from} → ${to}</th><td class="number">${hertz(flow.rate)}</td><td class="number">${bandwidth(flow.bandwidth)}</td>
+  <td>${flow.topics.map((topic, at) => html`${at > 0 && ", "}<a href=${href("topic", topic)}>${topic}</a>`)}</td></tr>`);
+
+export function Mandala({ state, connection }) {
+  const current = connection.phase !== "lost" && section(state, "reach").ok !== false;
+  const modules = entries(state, "modules"), resources = entries(state, "resources");
+  const up = modules.filter(([, one]) => one.state === "up" || one.state === "here").length;
+  const places = section(section(state, "ring"), "places");
+  const ordered = modules.sort(([a], [b]) => (places[a] ?? 1e9) - (places[b] ?? 1e9));
+  return html`<${Page} title="Mesh" kind=${`Domain ${section(state, "agent").domain ?? "–"} · ${up} of ${modules.length} modules up${current ? "" : " when last heard of"}`}>
+    <div class="overview"><div class="stage-area"><${Ring} state=${state} />
+      <p class="legend" aria-hidden="true">${["up", "silent", "linking", "refused", "away"].map((each) => html`<${Mark} key=${each} state=${each} />`)}<span class="mark flowkey"><svg viewBox="0 0 26 16"><path d="M1 8h22" /></svg>messages</span></p></div>
+    <div class="beside">
+      <${Panel} title="What is wrong"><${Concerns} state=${state} connection=${connection} /><//>
+      <${Panel} title="Modules"><${Table} caption="Modules" columns=${["Module", "Link", "#Round trip", "#In", "#Out", "Profile"]}>${ordered.map(([name, module]) => html`<${Row} key=${name} name=${name} module=${module} resources=${same(`row ${name}`, resources.filter(([, one]) => one.module === name))} />`)}<//><//>
+      <${Panel} title="Flows"><${Table} caption="Flows between modules" columns=${["From → to", "#Messages", "#Bytes", "Topics"]} empty="No messages cross at present.">${entries(state, "flows").map(([key, flow]) => { const [from, to] = key.split(">"); return html`<${FlowRow} key=${key} from=${from} to=${to} flow=${flow} />`; })}<//><//>
+    </div></div><//>`;
+}
+

@@ -1,0 +1,63 @@
+// A joystick for a robot. It drives only while it is held; the server stops the robot 0.3 s after the last command.
+
+import { html, useEffect, useRef, useState } from "../vendor/htm-preact.js";
+import { entries } from "../state.js";
+import { Page, Panel } from "../parts.js";
+
+const PERIOD = 100; // milliseconds between two commands
+const TYPE = "geometry_msgs/Twist";
+const KEYS = { ArrowUp: [0, 1], ArrowDown: [0, -1], ArrowLeft: [-1, 0], ArrowRight: [1, 0] };
+
+export function DrivePage({ state, connection }) {
+  const topics = entries(state, "topics").filter(([, one]) => one.type === TYPE).map(([name]) => name);
+  const [topic, setTopic] = useState("/cmd_vel");
+  const [armed, arm] = useState(false);
+  const allowed = connection.may("drive");
+  return html`<${Page} title="Drive" kind="A joystick for geometry_msgs/Twist"><div class="grid">
+    <${Panel} title="What is driven"><div class="form"><label>Topic<input class="mono" list="twists" value=${topic} onInput=${(event) => { arm(false); setTopic(event.target.value); }} /></label><datalist id="twists">${topics.map((each) => html`<option key=${each} value=${each} />`)}</datalist>
+      <label class="row"><span><input type="checkbox" checked=${armed} disabled=${!allowed} onChange=${(event) => arm(event.target.checked)} /> The robot may move: I see it</span></label>
+      <p class="muted">${allowed ? "It drives only while the stick is held. Let go, lose the connection or leave the page, and it is stopped within 0.3 s." : "Driving is not allowed for this page. It needs rmpa web with drive allowed, and a token whose role may."}</p></div><//>
+    <${Panel} title="Joystick"><${Stick} on=${allowed && armed} send=${(linear, angular) => connection.send({ op: "drive", topic, linear, angular })} release=${() => connection.send({ op: "release" })} /><//></div><//>`;
+}
+
+function Stick({ on, send, release }) {
+  const [at, setAt] = useState({ x: 0, y: 0 });
+  const held = useRef(null), pad = useRef(), pressed = useRef(new Set());
+  const stop = () => {
+    if (!held.current) return;
+    clearInterval(held.current.timer);
+    held.current = null;
+    pressed.current.clear();
+    setAt({ x: 0, y: 0 });
+    release();
+  };
+  const go = (x, y) => {
+    const far = Math.max(1, Math.hypot(x, y));
+    const next = { x: x / far, y: y / far };
+    setAt(next);
+    if (!held.current) held.current = { timer: setInterval(() => send(held.current.y, -held.current.x), PERIOD) };
+    Object.assign(held.current, next);
+    send(next.y, -next.x);
+  };
+  const end = useRef(stop);
+  end.current = stop;
+  useEffect(() => {
+    const leave = () => end.current();
+    addEventListener("blur", leave);
+    document.addEventListener("visibilitychange", leave);
+    return () => { leave(); removeEventListener("blur", leave); document.removeEventListener("visibilitychange", leave); };
+  }, []);
+  useEffect(() => { if (!on) end.current(); }, [on]);
+  const point = (event) => {
+    const box = pad.current.getBoundingClientRect();
+    go(((event.clientX - box.left) / box.width - 0.5) * 2.6, -((event.clientY - box.top) / box.height - 0.5) * 2.6);
+  };
+  const keys = () => [...pressed.current].reduce(([x, y], key) => [x + KEYS[key][0] * 0.6, y + KEYS[key][1] * 0.6], [0, 0]);
+  return html`<svg ref=${pad} class="stick ${on ? "" : "off"}" viewBox="-130 -130 260 260" tabindex=${on ? 0 : -1} role="application" aria-label=${on ? "Joystick: hold, or press the arrow keys" : "Joystick, off"} aria-disabled=${String(!on)}
+    onPointerDown=${(event) => { if (on) { event.preventDefault(); pad.current.focus(); pad.current.setPointerCapture(event.pointerId); point(event); } }}
+    onPointerMove=${(event) => held.current && event.buttons && point(event)} onPointerUp=${stop} onPointerCancel=${stop} onLostPointerCapture=${stop} onBlur=${stop}
+    onKeyDown=${(event) => { if (on && KEYS[event.key]) { event.preventDefault(); if (!event.repeat) { pressed.current.add(event.key); go(...keys()); } } }}
+    onKeyUp=${(event) => { if (pressed.current.delete(event.key)) { if (pressed.current.size) go(...keys()); else stop(); } }}>
+    <circle class="base" r="100" /><path class="cross" d="M-100 0H100M0-100V100" /><circle class="knob" cx=${at.x * 70} cy=${-at.y * 70} r="34" /></svg>
+    <p class="muted mono" aria-live="off">forward ${(at.y * 100).toFixed(0)} %, turn ${(-at.x * 100).toFixed(0)} %</p>`;
+}

@@ -1,0 +1,52 @@
+// A module: its link, its clock, what it offers, and what of it is hidden or dropped.
+
+import { html } from "../vendor/htm-preact.js";
+import { bandwidth, bounded, bytes, count, percent, seconds } from "../format.js";
+import { entries, section } from "../state.js";
+import { Facts, Gone, Link, Mark, Page, Panel, Since, Table, Uptime } from "../parts.js";
+import { TopicRow } from "./topics.js";
+import { Lines } from "../plot.js";
+
+const DIRECTIONS = [["bytes_in", "received"], ["bytes_out", "sent"]];
+
+export function ModulePage({ name, state, connection }) {
+  const module = section(state, "modules")[name];
+  if (!module) return html`<${Page} title=${name} kind="Module"><${Gone} kind="module" name=${name} /><//>`;
+  const own = section(state, "agent").name === name;
+  const detail = section(section(state, "detail"), `module:${name}`);
+  const topics = entries(state, "topics").filter(([, one]) => (one.from || []).includes(name));
+  const resources = entries(state, "resources").filter(([, one]) => one.module === name);
+  return html`<${Page} title=${name} kind="Module" aside=${html`<${Mark} state=${module.state} />`}><div class="grid">
+    ${own ? html`<${Agent} agent=${section(state, "agent")} detail=${detail} />` : html`<${LinkPanel} module=${module} detail=${detail} />`}
+    ${(module.error || (module.hidden || []).length > 0) && html`<${Panel} title="What is wrong">
+      ${module.error && html`<p class="failure">${module.error}${module.remedy && html`<br /><span class="muted">${module.remedy}</span>`}</p>`}
+      ${(module.hidden || []).map((text) => html`<p class="failure" key=${text}>${text}</p>`)}<//>`}
+    ${!own && html`<${Panel} title="Bytes a second on the link" wide><${Lines} label="Bytes a second" series=${DIRECTIONS.map(([key, text]) => ({ label: text, value: module[key] }))} format=${bandwidth} /><//>`}
+    ${resources.length > 0 && html`<${Panel} title="Smart Resources"><${Table} caption="Smart Resources" columns=${["Resource", "Quality", "Profile", "Says"]}>${resources.map(([key, one]) => html`<tr key=${key}><th scope="row"><${Link} page="resource" name=${key}>${one.name}<//></th><td><${Mark} state=${one.level} /></td><td>${one.profile || "none"}</td><td>${one.message}</td></tr>`)}<//><//>`}
+    ${own && html`<${Counters} state=${state} connection=${connection} />`}
+    <${Panel} title=${`Topics of ${name}`} wide><${Table} caption="Topics" columns=${["Topic", "Type", "#Rate", "#Bytes", "#Latency", "#Lost", "From → to"]} empty="It publishes no topic.">${topics.map(([topic, one]) => html`<${TopicRow} key=${topic} name=${topic} topic=${one} />`)}<//><//>
+  </div><//>`;
+}
+
+const LinkPanel = ({ module, detail }) => {
+  const link = section(detail, "link");
+  return html`<${Panel} title="Link"><${Facts} rows=${[
+    ["State", html`<${Mark} state=${module.state} />`], ["For", module.since && html`<${Uptime} since=${module.since} />`], ["Address", module.remote],
+    ["Round trip", seconds(module.rtt)], ["Clock offset", bounded(module.offset, module.offset_error)], ["In", bandwidth(module.bytes_in)], ["Out", bandwidth(module.bytes_out)],
+    ["Waiting to be sent", module.queued ? bytes(module.queued) : undefined], ["Dropped, link too slow", module.dropped ? count(module.dropped) : undefined],
+    ["Topics that it offers", count(module.topics_in)], ["Topics that it is offered", count(module.topics_out)], ["Direct subscribers here", module.direct_in || undefined],
+    ["Direct subscribers there", module.direct_out || undefined], ["Relayed by", module.via], ["Found by", module.source], ["Largest packet", link.packet && bytes(link.packet)],
+    ["Dialled by", link.dialled === undefined ? undefined : link.dialled ? "this module" : "the peer"], ["Next attempt in", detail.next_attempt !== undefined ? seconds(detail.next_attempt) : undefined], ["GUID", html`<code>${module.guid}</code>`]]} /><//>`;
+};
+
+const Agent = ({ agent, detail }) => html`<${Panel} title="Agent"><${Facts} rows=${[
+  ["Version", agent.version], ["Runs for", html`<${Since} moment=${agent.started} />`], ["CPU", agent.cpu !== undefined ? html`${percent(agent.cpu)} of a core` : undefined], ["Memory", bytes(agent.rss)],
+  ["Open files", agent.files_limit && `${count(agent.files_open)} of ${count(agent.files_limit)}`], ["Proxies", count(agent.proxies)], ["Domain", agent.domain], ["Core", html`<code>${agent.core_uri}</code>`],
+  ["Addresses", (agent.addresses || []).join(", ")], ["Settings", agent.config_file], ["Process", agent.pid], ["Core's memory", agent.core_memory], ["Connections of vanished hosts", detail.end_connections || undefined], ["Real time", (agent.realtime || []).join("; ")], ["GUID", html`<code>${agent.guid}</code>`]]} />
+  ${agent.files_problem && html`<p class="failure">${agent.files_problem}</p>`}<//>`;
+
+const Counters = ({ state, connection }) => {
+  const counters = entries(section(state, "detail"), "counters:");
+  connection.look([...new Map([...connection.looks, ["counters", ""]].map((each) => [each.join(), each])).values()]);
+  return html`<${Panel} title="Counted by the agent"><${Table} caption="Counters" columns=${["Reason", "#Count"]}>${counters.map(([name, value]) => html`<tr key=${name}><th scope="row"><code>${name}</code></th><td class="number">${count(value)}</td></tr>`)}<//><//>`;
+};

@@ -1,0 +1,49 @@
+// All services, and one of them: its types, and a call.
+
+import { html, useState } from "../vendor/htm-preact.js";
+import { count, seconds } from "../format.js";
+import { entries, section } from "../state.js";
+import { Facts, Failure, Gone, Link, Page, Panel, Question, Table, Why, memo } from "../parts.js";
+
+const Row = memo(({ name, service, own }) => html`<tr><th scope="row"><${Link} page="service" name=${name}>${service.name}<//>${service.problem && html`<div class="muted">${service.problem}</div>`}</th>
+  <td>${service.module || own}</td><td class="mono">${service.node}</td><td>${service.type || html`<span class="muted">not asked yet</span>`}</td><td>${service.state}</td><td class="number">${count(service.calls || 0)}</td><td class="number">${count(service.failed || 0)}</td></tr>`);
+
+export function Services({ state }) {
+  const [text, setText] = useState("");
+  const all = entries(state, "services");
+  const shown = all.filter(([name, one]) => `${name} ${one.type || ""}`.toLowerCase().includes(text.toLowerCase()));
+  return html`<${Page} title="Services" kind=${`${all.length} in all modules`}>
+    <input class="filter" type="search" placeholder="Filter by name or type" aria-label="Filter by name or type" value=${text} onInput=${(event) => setText(event.target.value)} />
+    <${Panel}><${Table} caption="Services" columns=${["Service", "Module", "Node", "Type", "State", "#Calls", "#Failed"]} empty="No service is like that.">${shown.slice(0, 300).map(([key, one]) => html`<${Row} key=${key} name=${key} service=${one} own=${section(state, "agent").name} />`)}<//><//><//>`;
+}
+
+export function ServicePage({ name, state, connection }) {
+  const service = section(state, "services")[name];
+  if (!service) return html`<${Page} title=${name} kind="Service"><${Gone} kind="service" name=${name} /><//>`;
+  const detail = section(section(state, "detail"), `service:${name}`);
+  const latency = section(detail, "latency");
+  return html`<${Page} title=${service.name} kind=${`Service of ${service.module || section(state, "agent").name}${service.type ? ` · ${service.type}` : ""}`}><div class="grid">
+    <${Panel} title="Service"><${Facts} rows=${[["Node", html`<code>${service.node}</code>`], ["State", service.state], ["Transport", service.transport], ["Relayed because", detail.relayed_because], ["Address", detail.address], ["Calls across the mesh", count(service.calls || 0)],
+      ["Failed", service.failed ? count(service.failed) : undefined], ["Under way", detail.active || undefined], ["Latency, median", latency.p50 !== undefined ? seconds(latency.p50) : undefined], ["Latency, 99th percentile", latency.p99 !== undefined ? seconds(latency.p99) : undefined], ["Crosses", detail.crosses ? "yes" : "no"], ["Because", detail.policy], ["MD5 sum", detail.md5 && html`<code>${detail.md5}</code>`]]} />
+      ${service.problem && html`<p class="failure">${service.problem}</p>`}<//>
+    <${Panel} title="Way of a call"><${Why} connection=${connection} kind="service" name=${service.name} peer=${service.module} /><//>
+    <${Panel} title="Types and call" wide><${Question} connection=${connection} what="describe" args=${{ service: service.name, peer: service.module || "" }} label="Show its types" now=${true}
+      show=${(value) => html`<${Call} connection=${connection} service=${service} about=${value} />`} /><//></div><//>`;
+}
+
+function Call({ connection, service, about }) {
+  const [text, setText] = useState(JSON.stringify(about.request ?? {}, null, 2));
+  const [state, set] = useState({});
+  const allowed = connection.may("call");
+  const call = (event) => {
+    event.preventDefault();
+    let request;
+    try { request = JSON.parse(text || "{}"); } catch (error) { return set({ failure: { error: `The request is not JSON: ${error.message}` } }); }
+    set({ waits: true });
+    connection.ask("call", { service: service.name, peer: service.module || "", request }).then((answer) => set({ answer }), (failure) => set({ failure }));
+  };
+  return html`<div class="grid"><div><h3>${about.type}</h3><pre class="tree">${about.text}</pre></div>
+    <form class="form" onSubmit=${call}><label>Request as JSON<textarea spellcheck="false" value=${text} onInput=${(event) => setText(event.target.value)} disabled=${!allowed}></textarea></label>
+    <div class="row"><button class="primary" disabled=${!allowed || state.waits}>${state.waits ? "Waiting for the response …" : "Call it"}</button>${!allowed && html`<span class="muted">This page may only look.</span>`}</div>
+    <div aria-live="polite"><${Failure} failure=${state.failure} />${state.answer && html`<p class="muted">Response after ${seconds(state.answer.seconds)}</p><pre class="tree">${JSON.stringify(state.answer.response, null, 2)}</pre>`}</div></form></div>`;
+}

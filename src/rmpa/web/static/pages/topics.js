@@ -1,0 +1,76 @@
+// All topics, and one of them: who sends it to whom, how fast, how late, what is lost, and what is in it.
+
+import { html, useState } from "../vendor/htm-preact.js";
+import { bandwidth, clock, count, hertz, seconds } from "../format.js";
+import { entries, section } from "../state.js";
+import { Choice, Facts, Gone, Link, Mark, Page, Panel, Table, Why, memo } from "../parts.js";
+import { Lines } from "../plot.js";
+import { Live } from "../live.js";
+
+const COLUMNS = ["Topic", "Type", "#Rate", "#Bytes", "#Latency", "#Lost", "From → to"];
+
+export const TopicRow = memo(({ name, topic }) => html`<tr>
+  <th scope="row"><${Link} page="topic" name=${name} />${topic.problem && html`<div class="muted"><${Mark} state="WARN" word=${""} />${topic.problem}</div>`}</th>
+  <td><span class="muted">${topic.type}</span></td><td class="number">${hertz(topic.rate)}</td><td class="number">${bandwidth(topic.bandwidth)}</td>
+  <td class="number">${seconds(topic.latency)}</td><td class="number">${topic.lost || topic.dropped ? count((topic.lost || 0) + (topic.dropped || 0)) : "–"}</td>
+  <td>${(topic.from || []).join(", ") || "–"} → ${(topic.to || []).join(", ") || "–"}${topic.crosses ? "" : html` <span class="muted">stays here</span>`}</td></tr>`);
+
+const FILTERS = {
+  flowing: ["Flowing", (one) => one.rate !== undefined], all: ["All", () => true],
+  wrong: ["With a problem", (one) => one.problem || one.lost || one.dropped],
+};
+const MOST = 300;
+
+export function Topics({ state }) {
+  const [filter, setFilter] = useState("all");
+  const [text, setText] = useState("");
+  const all = entries(state, "topics");
+  const shown = all.filter(([name, one]) => FILTERS[filter][1](one) && `${name} ${one.type}`.toLowerCase().includes(text.toLowerCase()));
+  const hidden = section(state, "hidden").topics;
+  return html`<${Page} title="Topics" kind=${`${all.filter(([, one]) => one.rate !== undefined).length} of ${all.length} flow between modules`} aside=${html`<${Choice} label="Which topics" value=${filter} onChoose=${setFilter} options=${Object.entries(FILTERS).map(([key, [word]]) => [key, word])} />`}>
+    <input class="filter" type="search" placeholder="Filter by name or type" aria-label="Filter by name or type" value=${text} onInput=${(event) => setText(event.target.value)} />
+    <${Panel}><${Table} caption="Topics" columns=${COLUMNS} empty="No topic is like that.">${shown.slice(0, MOST).map(([name, one]) => html`<${TopicRow} key=${name} name=${name} topic=${one} />`)}<//>
+    ${(shown.length > MOST || hidden) && html`<p class="empty">${shown.length > MOST ? `${shown.length - MOST} more: filter by name. ` : ""}${hidden ? `The server leaves out ${hidden} further topics.` : ""}</p>`}<//><//>`;
+}
+
+const FIGURES = [["rate", "Rate", hertz], ["latency", "Latency", seconds], ["jitter", "Jitter", seconds], ["bandwidth", "Bytes", bandwidth]];
+const figureOf = (route, key) => (key === "latency" ? section(route, "latency").p50 : route[key]);
+
+export function TopicPage({ name, state, connection }) {
+  const [figure, setFigure] = useState("rate");
+  const topic = section(state, "topics")[name];
+  if (!topic) return html`<${Page} title=${name} kind="Topic"><${Gone} kind="topic" name=${name} /><${Panel} title="Why?"><${Why} connection=${connection} kind="topic" name=${name} /><//><//>`;
+  const detail = section(section(state, "detail"), `topic:${name}`);
+  const routes = entries(detail, "routes");
+  const own = section(state, "agent").name;
+  const format = FIGURES.find(([key]) => key === figure)[2];
+  const flowing = routes.filter(([, route]) => route.rate !== undefined);
+  return html`<${Page} title=${name} kind=${`Topic · ${topic.type || "type not known"}`}><div class="grid">
+    ${topic.problem && html`<${Panel} title="What is wrong" wide><p class="failure">${topic.problem}</p><//>`}
+    <${Panel} title="Who sends it, who gets it"><${Facts} rows=${[
+      ["Published in", (topic.from || []).join(", ")], ["Subscribed in", (topic.to || []).join(", ")], [`Publishers in ${own}`, (detail.publishers || []).join(", ")], [`Subscribers in ${own}`, (detail.subscribers || []).join(", ")],
+      ["Crosses", topic.crosses ? "yes" : "no"], ["Because", detail.policy], ["MD5 sum", detail.md5 && html`<code>${detail.md5}</code>`]]} /><//>
+    <${Panel} title="Way of a message"><${Why} connection=${connection} kind="topic" name=${name} /><//>
+    ${flowing.length > 0 && html`<${Panel} wide title="Figures" aside=${html`<${Choice} label="Figure" value=${figure} onChoose=${setFigure} options=${FIGURES.map(([key, word]) => [key, word])} />`}>
+      <${Lines} key=${figure} label=${figure} format=${format} series=${flowing.map(([key, route]) => ({ label: key, value: figureOf(route, figure) }))} /><//>`}
+    <${Panel} title="Routes" wide><${Table} caption="Routes" columns=${["Source", "State", "#Rate", "#Jitter p99", "#Latency p50, p99", "#Lost", "#Dropped", "Transport", "Contract"]} empty="It has no route to or from a peer.">${routes.map(([key, route]) => html`<${Route} key=${key} route=${route} own=${own} />`)}<//><//>
+    <${Events} routes=${routes} />
+    <${Live} connection=${connection} topic=${name} type=${topic.type} />
+  </div><//>`;
+}
+
+const Route = memo(({ route, own }) => {
+  const latency = section(route, "latency");
+  const contract = Object.entries(route.contract || {}).map(([key, value]) => `${key} ${value}`).join(", ");
+  return html`<tr><th scope="row"><span class="mono">${route.node}</span><div class="muted">${route.direction === "in" ? `${route.peer} → ${own}` : `${own} → ${route.peer}`}</div></th>
+    <td>${route.state}${route.problem && html`<div class="muted">${route.problem}</div>`}</td><td class="number">${hertz(route.rate)}<div class="muted">${bandwidth(route.bandwidth)}</div></td><td class="number">${seconds(route.jitter)}</td>
+    <td class="number">${seconds(latency.p50)}, ${seconds(latency.p99)}<div class="muted">± ${seconds(latency.error)}</div></td>
+    <td class="number">${count((route.lost || 0) + (route.expired || 0))}</td><td class="number">${count((route.dropped || 0) + (route.oversized || 0))}</td>
+    <td>${route.transport || "–"}${route.lane && html`<div class="muted">${route.lane} lane</div>`}${route.condition_text && html`<div class="muted">${route.condition_text}</div>`}</td><td>${contract || "default"}</td></tr>`;
+});
+
+const Events = ({ routes }) => {
+  const events = routes.flatMap(([, route]) => (route.recent || []).map((event) => ({ ...event, from: `${route.peer} ${route.node}` })));
+  return events.length > 0 && html`<${Panel} title="Events of its contract" wide><${Table} caption="Events" columns=${["Time", "Event", "Source", "Text"]}>${events.sort((a, b) => a.ago - b.ago).map((event) => html`<tr key=${event.from + event.ago}><th scope="row">${clock(Date.now() / 1000 - event.ago)}</th><td>${event.kind.replaceAll("_", " ")}</td><td>${event.from}</td><td>${event.text}</td></tr>`)}<//><//>`;
+};
+

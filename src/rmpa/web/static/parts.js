@@ -1,0 +1,133 @@
+// Small parts that all pages are made of.
+
+import { Component, html, useEffect, useRef, useState } from "./vendor/htm-preact.js";
+import { ago } from "./format.js";
+
+// Each state and level has a word, a colour (by its class) and a shape, so that none of them is needed to tell them apart.
+export const STATES = {
+  here: { word: "this module", tone: "accent" },
+  up: { word: "up", tone: "good" },
+  silent: { word: "silent", tone: "warn" },
+  linking: { word: "no link", tone: "warn" },
+  refused: { word: "refused", tone: "bad" },
+  relayed: { word: "relayed", tone: "good" },
+  away: { word: "away", tone: "idle" },
+  OK: { word: "OK", tone: "good" },
+  WARN: { word: "warning", tone: "warn" },
+  ERROR: { word: "error", tone: "bad" },
+  STALE: { word: "stale", tone: "idle" },
+  "": { word: "not known", tone: "idle" },
+};
+
+const SHAPES = {
+  here: html`<path class="fill" d="M8 1.5 14.5 8 8 14.5 1.5 8Z" />`,
+  up: html`<circle class="fill" cx="8" cy="8" r="5.5" />`,
+  silent: html`<circle class="stroke" cx="8" cy="8" r="5.5" stroke-dasharray="3.4 2.4" />`,
+  linking: html`<circle class="stroke" cx="8" cy="8" r="5.5" /><path class="fill" d="M8 2.5a5.5 5.5 0 0 1 0 11Z" />`,
+  refused: html`<path class="stroke heavy" d="M3 3l10 10M13 3 3 13" />`,
+  relayed: html`<circle class="stroke" cx="8" cy="8" r="6" /><circle class="fill" cx="8" cy="8" r="3" />`,
+  away: html`<path class="stroke" d="M8 2 14 8 8 14 2 8Z" />`,
+  OK: html`<path class="stroke heavy" d="M2.5 8.5 6.5 12.5 13.5 4" />`,
+  WARN: html`<path class="fill" d="M8 1.5 15 14H1Z" />`,
+  ERROR: html`<path class="fill" d="M5 1.5h6L14.5 5v6L11 14.5H5L1.5 11V5Z" />`,
+  STALE: html`<circle class="stroke" cx="8" cy="8" r="6" /><path class="stroke" d="M8 4.5V8l2.5 2" />`,
+  "": html`<path class="stroke" d="M3 8h10" />`,
+};
+
+export const shape = (state) => SHAPES[state] || SHAPES[""];
+export const known = (state) => STATES[state] || STATES[""];
+
+export function Mark({ state, word }) {
+  const about = known(state);
+  return html`<span class="mark ${about.tone}"><svg viewBox="0 0 16 16" aria-hidden="true">${shape(state)}</svg>${word === undefined ? about.word : word}</span>`;
+}
+
+// Draws again only when one of its properties is another object.
+export function memo(draw) {
+  return class extends Component {
+    shouldComponentUpdate(next) {
+      const before = this.props;
+      const keys = Object.keys(next);
+      return keys.length !== Object.keys(before).length || keys.some((key) => key !== "children" && next[key] !== before[key]);
+    }
+    render(props) { return draw(props); }
+  };
+}
+
+export const href = (page, name) => (name === undefined ? `#/${page}` : `#/${page}/${encodeURIComponent(name)}`);
+export const Link = ({ page, name, children }) => html`<a href=${href(page, name)}>${children || name}</a>`;
+
+export function Facts({ rows }) {
+  const shown = rows.filter(([, value]) => value !== undefined && value !== null && value !== "" && value !== "–");
+  return html`<dl class="facts">${shown.map(([name, value]) => html`<div key=${name}><dt>${name}</dt><dd>${value}</dd></div>`)}</dl>`;
+}
+
+export function Table({ caption, columns, children, empty }) {
+  const rows = Array.isArray(children) ? children.flat() : [children];
+  if (!rows.filter(Boolean).length) return html`<p class="empty">${empty || "Nothing here."}</p>`;
+  return html`<div class="scroll" tabindex="0" role="region" aria-label=${caption}><table>
+    <caption class="unseen">${caption}</caption>
+    <thead><tr>${columns.map((column) => html`<th key=${column} scope="col" class=${column.startsWith("#") ? "number" : ""}>${column.replace("#", "") || html`<span class="unseen">Action</span>`}</th>`)}</tr></thead>
+    <tbody>${rows}</tbody></table></div>`;
+}
+
+export const Panel = ({ title, children, aside, wide }) => html`<section class=${wide ? "panel wide" : "panel"}>
+  ${title && html`<header><h2>${title}</h2>${aside}</header>`}${children}</section>`;
+
+export const Page = ({ title, kind, aside, children }) => {
+  const heading = useRef();
+  useEffect(() => { document.title = `${title} · RMPA`; }, [title]);
+  return html`<div class="page"><header class="title"><div>${kind && html`<p class="kind">${kind}</p>`}<h1 ref=${heading} tabindex="-1">${title}</h1></div><div class="actions">${aside}</div></header>${children}</div>`;
+};
+
+export const Gone = ({ kind, name }) => html`<p class="empty">There is no ${kind} <code>${name}</code> at present. It is shown here as soon as there is one.</p>`;
+
+export const Failure = ({ failure }) => failure && html`<p class="failure" role="alert"><${Mark} state="ERROR" word="" /> ${failure.error}${failure.remedy && html`<br /><span class="muted">${failure.remedy}</span>`}</p>`;
+
+// A time that has passed; it counts by itself, once a second.
+export function Since({ moment, text }) {
+  const [, tick] = useState(0);
+  useEffect(() => { const timer = setInterval(() => tick((n) => n + 1), 1000); return () => clearInterval(timer); }, []);
+  return html`<time datetime=${new Date(moment * 1000).toISOString()}>${text ? text(ago(moment)) : ago(moment)}</time>`;
+}
+
+export const Uptime = ({ since }) => html`<${Since} moment=${since} text=${(shown) => shown} />`;
+
+// One question to the server, asked by a button or at once; `show` draws the answer.
+export function Question({ connection, what, args, label, show, now }) {
+  const [state, set] = useState({});
+  const ask = () => {
+    set({ waits: true });
+    connection.ask(what, args).then((value) => set({ value }), (failure) => set({ failure }));
+  };
+  useEffect(() => { if (now) ask(); else set({}); }, [what, JSON.stringify(args)]);
+  return html`<div class="question">
+    <button type="button" onClick=${ask} disabled=${state.waits}>${state.waits ? "Asking …" : label}</button>
+    <div aria-live="polite"><${Failure} failure=${state.failure} />${state.value !== undefined && show(state.value)}</div></div>`;
+}
+
+const VERDICTS = { ok: "OK", warn: "WARN", fail: "ERROR", unknown: "STALE" };
+export function Diagnosis({ value }) {
+  if (!Array.isArray(value) || !value.length) return html`<p class="empty">There is nothing to say.</p>`;
+  return value.map((one) => html`<div class="diagnosis"><p><${Mark} state=${one.flows ? "OK" : "ERROR"} word=${one.flows ? "It flows" : "It does not flow"} />
+    ${one.node && html` <span class="muted">from ${one.node}${one.peer && ` of ${one.peer}`} to ${one.to}</span>`}</p>
+    <ol class="stages">${(one.stages || []).map((stage) => html`<li class=${known(VERDICTS[stage.verdict]).tone}>
+      <span class="stage"><svg viewBox="0 0 16 16" aria-hidden="true">${shape(VERDICTS[stage.verdict])}</svg>${stage.name}</span>
+      <span><span class="unseen">${stage.verdict}: </span>${stage.text}${stage.remedy && html`<br /><span class="remedy">${stage.remedy}</span>`}</span></li>`)}</ol></div>`);
+}
+
+export const Why = ({ connection, kind, name, peer, now }) => html`<${Question} connection=${connection} what="why" args=${{ kind, name, ...(peer ? { peer } : {}) }}
+  label="Why?" now=${now} show=${(value) => html`<${Diagnosis} value=${value} />`} />`;
+
+// A switch between few choices.
+export const Choice = ({ label, value, options, onChoose, disabled }) => html`<div class="choice" role="radiogroup" aria-label=${label}>${options.map(([key, text]) => html`<button type="button" role="radio"
+  aria-checked=${String(key === value)} tabindex=${key === value ? 0 : -1} disabled=${disabled} key=${key} onClick=${() => onChoose(key)}
+  onKeyDown=${(event) => {
+    const step = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 }[event.key];
+    if (!step) return;
+    event.preventDefault();
+    const at = (options.findIndex(([each]) => each === key) + step + options.length) % options.length;
+    event.currentTarget.parentNode.children[at].focus();
+    onChoose(options[at][0]);
+  }}>${text}</button>`)}</div>`;
+

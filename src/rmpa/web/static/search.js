@@ -1,0 +1,58 @@
+// Search over all that has a name, and the list of keys.
+
+import { html, useEffect, useRef, useState } from "./vendor/htm-preact.js";
+import { entries } from "./state.js";
+import { href } from "./parts.js";
+
+const MOST = 40;
+const KINDS = [["modules", "module", "module"], ["topics", "topic", "topic"], ["services", "service", "service"], ["resources", "resource", "resource"]];
+
+export function find(state, text) {
+  const words = text.toLowerCase().split(/\s+/).filter(Boolean);
+  const found = [];
+  for (const [part, kind, page] of KINDS)
+    for (const [name, value] of entries(state, part)) {
+      const about = `${kind} ${name} ${value.type || ""} ${value.description || ""}`.toLowerCase();
+      if (!words.every((word) => about.includes(word))) continue;
+      const last = words[words.length - 1] || "";
+      const rank = name.toLowerCase() === last ? 0 : name.toLowerCase().split("/").some((step) => step.startsWith(last)) ? 1 : 2;
+      found.push({ kind, name, to: href(page, name), about: value.type || value.description || value.state || "", rank });
+    }
+  return found.sort((a, b) => a.rank - b.rank || a.name.length - b.name.length || a.name.localeCompare(b.name)).slice(0, MOST);
+}
+
+function Dialog({ label, onClose, children }) {
+  const dialog = useRef();
+  useEffect(() => {
+    const before = document.activeElement;
+    dialog.current.showModal();
+    return () => before?.focus?.();
+  }, []);
+  return html`<dialog ref=${dialog} aria-label=${label} onClose=${onClose} onClick=${(event) => event.target === dialog.current && onClose()}>${children}</dialog>`;
+}
+
+export function Search({ state, onClose }) {
+  const [text, setText] = useState("");
+  const [at, setAt] = useState(0);
+  const found = find(state, text);
+  const chosen = Math.min(at, found.length - 1);
+  const go = (one) => { if (one) { location.hash = one.to; onClose(); } };
+  const key = (event) => {
+    const by = { ArrowDown: 1, ArrowUp: -1 }[event.key];
+    if (by) { event.preventDefault(); setAt(Math.max(0, Math.min(found.length - 1, chosen + by))); }
+    if (event.key === "Enter") { event.preventDefault(); go(found[chosen]); }
+  };
+  return html`<${Dialog} label="Search" onClose=${onClose}>
+    <input type="search" role="combobox" aria-expanded="true" aria-controls="found" aria-label="Name of a module, topic, service or resource" aria-activedescendant=${found.length ? `found-${chosen}` : undefined}
+      placeholder="Module, topic, service, resource …" autofocus value=${text} onInput=${(event) => { setText(event.target.value); setAt(0); }} onKeyDown=${key} />
+    <ul id="found" class="found" role="listbox" aria-label="Found">${found.map((one, index) => html`<li key=${one.kind + one.name} id=${`found-${index}`} role="option" aria-selected=${String(index === chosen)}
+      onClick=${() => go(one)}><span class="kind">${one.kind}</span><span class="what">${one.name}</span><span class="muted">${one.about}</span></li>`)}</ul>
+    ${!found.length && html`<p class="empty">Nothing has that name.</p>`}<//>`;
+}
+
+export function Shortcuts({ pages, onClose }) {
+  const keys = [["/", "Search"], ...pages.map(([, title, key]) => [`g ${key}`, title]), ["w", "Why? on the page of a topic or service"], ["c", "Dark or light colours"], ["← →", "Around the ring"], ["?", "These keys"], ["Esc", "Close"]];
+  return html`<${Dialog} label="Keys" onClose=${onClose}><h2>Keys</h2>
+    <dl class="keys">${keys.map(([key, text]) => html`<div key=${key}><dt>${key.split(" ").map((each) => html`<kbd>${each}</kbd> `)}</dt><dd>${text}</dd></div>`)}</dl>
+    <button type="button" onClick=${onClose}>Close</button><//>`;
+}

@@ -1,0 +1,187 @@
+"""A headless Chromium, driven by the DevTools protocol: real pages, keys, sizes and colour schemes in tests."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import itertools
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import aiohttp
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+BINARY = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+"""The program, or ``None``: then the tests of the pages are skipped."""
+FLAGS = (
+    "--headless=new",
+    "--disable-gpu",
+    "--no-first-run",
+    "--disable-extensions",
+    "--disable-background-networking",
+    "--hide-scrollbars",
+    "--remote-debugging-port=0",
+)
+DEADLINE = 30.0
+KEYS = {"Enter": 13, "Escape": 27, "ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40, "Tab": 9}
+
+
+class PageError(AssertionError):
+    """A script failed, or what was waited for did not come."""
+
+
+class Chromium:
+    """One browser with one page; an asynchronous context manager.
+
+    Attributes:
+        errors: What the page's console says of errors, also of what the CSP blocked.
+    """
+
+    def __init__(self) -> None:
+        self.errors: list[str] = []
+        self._numbers = itertools.count(1)
+        self._replies: dict[int, asyncio.Future[Any]] = {}
+
+    async def __aenter__(self) -> Self:
+        assert BINARY is not None
+        self._stack = contextlib.AsyncExitStack()
+        self._profile = Path(self._stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True)))
+        flags = [*FLAGS, f"--user-data-dir={self._profile}"]
+        if os.geteuid() == 0:
+            flags.append("--no-sandbox")
+        self._process = await asyncio.create_subprocess_exec(
+            BINARY, *flags, "about:blank", stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.DEVNULL
+        )
+        self._stack.push_async_callback(self._end)
+        try:
+            port = await self._port()
+            http = await self._stack.enter_async_context(aiohttp.ClientSession())
+            async with http.get(f"http://127.0.0.1:{port}/json") as response:
+                target = next(each for each in await response.json() if each["type"] == "page")
+            self._socket = await self._stack.enter_async_context(
+                http.ws_connect(target["webSocketDebuggerUrl"], max_msg_size=0)
+            )
+            self._reader = asyncio.create_task(self._read())
+            for domain in ("Page", "Runtime", "Log"):
+                await self.send(f"{domain}.enable")
+        except BaseException:
+            await self._stack.aclose()
+            raise
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._reader.cancel()
+        await self._stack.aclose()
+
+    async def _end(self) -> None:
+        if self._process.returncode is None:
+            self._process.terminate()
+            try:
+                await asyncio.wait_for(self._process.wait(), DEADLINE)
+            except TimeoutError:
+                self._process.kill()
+                await self._process.wait()
+
+    async def _port(self) -> int:
+        path = self._profile / "DevToolsActivePort"
+        async with asyncio.timeout(DEADLINE):
+            while not (path.exists() and path.read_text().count("\n")):
+                if self._process.returncode is not None:
+                    raise PageError(f"Chromium ended with {self._process.returncode}")
+                await asyncio.sleep(0.05)
+        return int(path.read_text().splitlines()[0])
+
+    async def _read(self) -> None:
+        async for frame in self._socket:
+            message = frame.json()
+            if "id" in message:
+                reply = self._replies.pop(message["id"], None)
+                if reply and not reply.done():
+                    reply.set_result(message)
+            elif message["method"] == "Runtime.exceptionThrown":
+                details = message["params"]["exceptionDetails"]
+                self.errors.append(str(details.get("exception", {}).get("description", details["text"])))
+            elif message["method"] == "Log.entryAdded" and message["params"]["entry"]["level"] == "error":
+                self.errors.append(str(message["params"]["entry"]["text"]))
+
+    async def send(self, method: str, **params: Any) -> dict[str, Any]:
+        """A command of the DevTools protocol, and its result."""
+        number = next(self._numbers)
+        reply = self._replies[number] = asyncio.get_running_loop().create_future()
+        await self._socket.send_json({"id": number, "method": method, "params": params})
+        message = await asyncio.wait_for(reply, DEADLINE)
+        if "error" in message:
+            raise PageError(f"{method}: {message['error']}")
+        result: dict[str, Any] = message["result"]
+        return result
+
+    async def look(self, width: int = 1440, height: int = 900, *, dark: bool = True, still: bool = True) -> None:
+        """The size of the window in CSS pixels, the colour scheme, and whether motion is to be reduced."""
+        await self.send(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600
+        )
+        features = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"},
+                    {"name": "prefers-reduced-motion", "value": "reduce" if still else "no-preference"}]  # fmt: skip
+        await self.send("Emulation.setEmulatedMedia", features=features)
+
+    async def goto(self, url: str) -> None:
+        """Open an address; ``wait`` says when it is there."""
+        await self.send("Page.navigate", url=url)
+
+    async def run(self, script: str) -> Any:
+        """The value of a JavaScript expression; a promise is awaited."""
+        result = await self.send("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
+        if "exceptionDetails" in result:
+            details = result["exceptionDetails"]
+            raise PageError(f"{script}: {details.get('exception', {}).get('description', details['text'])}")
+        return result["result"].get("value")
+
+    async def wait(self, script: str) -> None:
+        """Wait until a JavaScript expression is true.
+
+        Raises:
+            PageError: It was not within ``DEADLINE``; the text has what the page shows and its errors.
+        """
+        try:
+            async with asyncio.timeout(DEADLINE):
+                while True:
+                    with contextlib.suppress(PageError):
+                        if await self.run(f"Boolean({script})"):
+                            return
+                    await asyncio.sleep(0.05)
+        except TimeoutError:
+            text = await self.run("document.body.innerText")
+            raise PageError(f"not true: {script}; the page shows {text[:800]!r}, errors {self.errors}") from None
+
+    async def wait_text(self, text: str) -> None:
+        """Wait until the page shows a text."""
+        await self.wait(f"document.body.innerText.includes({text!r})")
+
+    async def press(self, key: str) -> None:
+        """Press and release one key."""
+        await self.down(key)
+        await self.up(key)
+
+    async def down(self, key: str) -> None:
+        """Press a key."""
+        text = {"text": key} if len(key) == 1 else {"text": "\r"} if key == "Enter" else {}
+        code = KEYS.get(key) or ord(key.upper())
+        await self.send("Input.dispatchKeyEvent", type="keyDown", key=key, windowsVirtualKeyCode=code, **text)
+
+    async def up(self, key: str) -> None:
+        """Release a key."""
+        code = KEYS.get(key) or ord(key.upper())
+        await self.send("Input.dispatchKeyEvent", type="keyUp", key=key, windowsVirtualKeyCode=code)
+
+    async def screenshot(self, path: Path) -> None:
+        """Write what is seen as PNG."""
+        result = await self.send("Page.captureScreenshot", format="png")
+        path.write_bytes(base64.b64decode(result["data"]))

@@ -1,0 +1,310 @@
+"""The monitor's pages in a real Chromium: what is shown, what changes, keys, sizes, colours, and what is kept out."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from rmpa.web.monitor.session import Rights
+
+if TYPE_CHECKING:
+    from tests.web.browser.chromium import Chromium
+    from tests.web.browser.conftest import Site
+
+AXE = Path(__file__).with_name("vendor") / "axe.min.js"
+PAGES = {
+    "": "Nothing is wrong.",
+    "module/base": "Found by",
+    "module/pc": "Counted by the agent",
+    "topics": "/velocity_order",
+    "topic/%2Fodom": "bridge.allow has",
+    "services": "/base/set_parameters",
+    "service/base%3A%2Fbase%2Fset_parameters": "std_srvs/SetBool",
+    "params": "rosdistro",
+    "resources": "a simulated Turtlebot",
+    "resource/velocity%3A%2Fvelocity": "For a robot that carries a full glass",
+    "alarms": "well again",
+    "log": "turn",
+    "drive": "The robot may move",
+}
+"""Each page, and a text that it shows of the demo."""
+
+
+async def violations(page: Chromium) -> list[str]:
+    """What axe-core finds, each with the rule and the element."""
+    await page.run(AXE.read_text(encoding="utf-8") + "; true")
+    found: list[Any] = await page.run(
+        "axe.run(document).then((done) => done.violations.flatMap((rule) => rule.nodes.map((node) =>"
+        " `${rule.id}: ${node.html.slice(0, 160)} ${node.failureSummary.slice(0, 200)}`)))"
+    )
+    return [str(each) for each in found]
+
+
+@pytest.mark.parametrize("address", PAGES)
+async def test_a_page_shows_its_thing_and_is_accessible_in_both_colours(site: Site, address: str) -> None:
+    page = await site.open(address)
+    await page.wait_text(PAGES[address])
+    assert await violations(page) == []
+    await page.look(dark=False)
+    assert await violations(page) == []
+    assert (site.server.reports, page.errors) == ([], [])
+
+
+@pytest.mark.parametrize("scene", ["sick", "mute", "large"])
+async def test_the_first_page_is_accessible_whatever_is_wrong(site: Site, scene: str) -> None:
+    page = await site.open("", scene)
+    assert await violations(page) == []
+    await page.look(360, 800, dark=False)
+    assert await violations(page) == []
+
+
+@pytest.mark.parametrize("address", PAGES)
+async def test_a_phone_shows_a_page_without_sideways_scrolling_and_with_large_targets(
+    site: Site, address: str
+) -> None:
+    await site.page.look(360, 740)
+    page = await site.open(address)
+    await page.wait_text(PAGES[address])
+    assert await page.run("document.documentElement.scrollWidth - innerWidth") == 0
+    small = await page.run(
+        "[...document.querySelectorAll('.top a, .top button, main button:not(.field), .module, .concerns a,"
+        " input:not([type=checkbox]), select')]"
+        ".map((each) => [each.outerHTML.slice(0, 80), each.getBoundingClientRect()])"
+        ".filter(([, box]) => box.width && (box.height < 43.5 || box.width < 43.5)).map(([text]) => text)"
+    )
+    assert small == []
+
+
+async def test_a_killed_module_shows_within_a_second_and_a_half_and_so_does_its_return(site: Site) -> None:
+    page = await site.open()
+    base = "document.querySelector('[data-module=base]')"
+    before = await page.run(f"JSON.stringify({base}.getBoundingClientRect())")
+    took = []
+    for _ in range(3):  # the best of three: other tests may have the processor
+        slowest = 0.0
+        for scene, up in (("killed", "false"), ("demo", "true")):
+            site.server.agent.scene = scene
+            changed = time.monotonic()
+            await page.wait(f"{base}.classList.contains('up') === {up}")
+            slowest = max(slowest, time.monotonic() - changed)
+        took.append(slowest)
+    assert min(took) < 1.5
+    assert await page.run(f"JSON.stringify({base}.getBoundingClientRect())") == before
+
+
+async def test_without_an_agent_the_page_says_so_and_comes_back_by_itself(site: Site) -> None:
+    page = await site.open()
+    site.server.agent.scene = "mute"
+    await page.wait_text("The agent does not answer")
+    await page.wait_text("Start one with `rmpa up`.")
+    assert "Nothing is wrong" not in await page.run("document.body.innerText")
+    assert await page.run("document.querySelectorAll('[data-module]').length") == 4
+    site.server.agent.scene = "demo"
+    await page.wait("!document.querySelector('.banner')")
+
+
+async def test_a_lost_connection_is_told_and_comes_back_by_itself(site: Site) -> None:
+    page = await site.open()
+    await page.run("window.before = window.rmpa.frames.patches; window.lost = false;"
+                   "new MutationObserver(() => { if (document.querySelector('.banner')) window.lost = true; })"
+                   ".observe(document.body, {childList: true, subtree: true}); true")  # fmt: skip
+    await site.server.drop()
+    await page.wait("window.lost && !document.querySelector('.banner') && window.rmpa.frames.patches > window.before")
+    assert await page.run("document.querySelectorAll('[data-module]').length") == 4
+
+
+async def test_the_keyboard_reaches_everything(site: Site) -> None:
+    page = await site.open()
+    await page.press("/")
+    await page.wait("document.activeElement.type === 'search'")
+    for key in "vel order":
+        await page.press(key)
+    await page.press("Enter")
+    await page.wait("location.hash === '#/topic/%2Fvelocity_order' && !document.querySelector('dialog')")
+    for key in "gr":
+        await page.press(key)
+    await page.wait("location.hash === '#/resources'")
+    await page.press("?")
+    await page.wait("document.querySelector('dialog').textContent.includes('Around the ring')")
+    await page.press("Escape")
+    await page.wait("!document.querySelector('dialog')")
+    for key in "gm":
+        await page.press(key)
+    await page.wait("document.querySelector('[data-module=pc]')")
+    await page.run("document.querySelector('[data-module=pc]').focus()")
+    seen = []
+    for _ in range(4):
+        await page.press("ArrowRight")
+        seen.append(await page.run("document.activeElement.dataset.module"))
+    assert sorted(seen) == ["base", "joystick", "pc", "velocity"]
+    await page.run("document.querySelector('[data-module=base]').focus()")
+    await page.press("Enter")
+    await page.wait("document.querySelector('h1').textContent === 'base'")
+
+
+async def test_the_colours_can_be_chosen_and_stay(site: Site) -> None:
+    page = await site.open()
+    ground = "getComputedStyle(document.documentElement).backgroundColor"
+    dark = await page.run(ground)
+    await page.press("c")
+    await page.wait(f"{ground} !== {json.dumps(dark)}")
+    await page.goto(f"http://127.0.0.1:{site.port}/?again")
+    await page.wait(f"document.querySelector('h1') && {ground} !== {json.dumps(dark)}")
+
+
+async def test_only_what_flows_moves_and_nothing_where_motion_is_to_be_reduced(site: Site) -> None:
+    page = await site.open()
+    moving = (
+        "document.getAnimations().filter((each) => each.playState === 'running')"
+        ".map((each) => each.effect.target.classList[0])"
+    )
+    assert await page.run(moving) == []
+    await page.look(still=False)
+    await page.wait(f"{moving}.length === 5")
+    assert set(await page.run(moving)) == {"stream"}
+
+
+async def test_only_what_changed_is_drawn_again(site: Site) -> None:
+    page = await site.open()
+    await page.run(
+        "window.drawn = []; new MutationObserver((all) => window.drawn.push(...all.map((each) => each.target.data)))"
+        ".observe(document.querySelector('.mandala'), {attributes: true, childList: true, subtree: true,"
+        " characterData: true}); true"
+    )
+    for number in range(10):
+        await receive(
+            page, {"modules": {"base": {"rtt": 0.01 + number}}, "topics": {f"/new{number}": {"type": "a/B"}}}
+        )
+    await receive(page, {"flows": {"joystick>pc": {"rate": 12.0}}})
+    await page.wait("window.drawn.length > 0")
+    assert set(await page.run("window.drawn")) == {"12\u2009Hz"}
+
+
+async def test_the_first_page_is_small(site: Site) -> None:
+    page = await site.open()
+    sizes: dict[str, int] = await page.run(
+        "Object.fromEntries(['navigation', 'resource'].flatMap((kind) => performance.getEntriesByType(kind))"
+        ".map((each) => [each.name, each.transferSize]))"
+    )
+    assert len(sizes) > 5
+    assert sum(sizes.values()) < 250_000
+    assert not [name for name in sizes if "uPlot" in name]
+    assert all(name.startswith(f"http://127.0.0.1:{site.port}/") for name in sizes)
+
+
+async def test_names_and_values_of_others_are_text(site: Site) -> None:
+    page = await site.open("topic/%2Fjoystick%2Fprofile")
+    await click(page, "On")
+    await page.wait_text("<script>alert(1)</script>")
+    evil = "<img src=x onerror='window.owned=1'>"
+    patch = {"modules": {evil: {"state": "up"}}, "ring": {"places": {evil: 1}}, "notes": ["<b id=owned>note</b>"]}
+    await receive(page, patch)
+    await page.run("location.hash = '#/'")
+    await page.wait_text("<b id=owned>note</b>")
+    assert await page.run("window.owned === undefined && !document.getElementById('owned')") is True
+    await receive(page, {"__proto__": {"polluted": 1}, "topics": {"__proto__": {"polluted": 1}}})
+    assert await page.run("({}).polluted === undefined") is True
+
+
+async def receive(page: Chromium, patch: dict[str, Any]) -> None:
+    """Let the page take a patch as if the server had sent it."""
+    message = json.dumps({"op": "patch", "n": 0, "patch": patch})
+    await page.run(f"window.rmpa.receive({json.dumps(message)}); true")
+
+
+async def click(page: Chromium, text: str) -> None:
+    """Press the button of that text as soon as it is there."""
+    found = (
+        f"[...document.querySelectorAll('button')].find((each) => each.textContent === {text!r} && !each.disabled)"
+    )
+    await page.wait(f"({found})?.click() ?? !!({found})")
+
+
+async def test_live_values_poses_and_chosen_fields_are_drawn(site: Site) -> None:
+    page = await site.open("topic/%2Fodom")
+    await click(page, "On")
+    await page.wait_text("base_link")
+    await page.wait("/x -?\\d+\\.\\d\\d m, y/.test(document.querySelector('figcaption').textContent)")
+    await page.wait("document.querySelector('[title=\"Plot twist.twist.linear.x\"]')")
+    await page.run("document.querySelector('[title=\"Plot twist.twist.linear.x\"]').click()")
+    await page.wait(
+        "[...document.querySelectorAll('.plot')].some((each) => each.ariaLabel.includes('twist.twist.linear.x 0.'))"
+    )
+    await page.wait("document.querySelectorAll('.uplot canvas').length === 2")
+    assert (site.server.reports, page.errors) == ([], [])
+
+
+@pytest.mark.parametrize("address", ["topic/%2Fscan", "topic/%2Fcamera%2Fimage"])
+async def test_scans_and_pictures_are_drawn(site: Site, address: str) -> None:
+    page = await site.open(address, "sensors")
+    await click(page, "On")
+    colours = (
+        "(() => { const view = document.querySelector('canvas.view');"
+        " const data = view.getContext('2d').getImageData(0, 0, view.width, view.height).data;"
+        " return new Set(new Uint32Array(data.buffer)).size; })()"
+    )
+    await page.wait(f"{colours} > 5")
+    assert (site.server.reports, page.errors) == ([], [])
+
+
+async def test_why_says_where_the_way_ends(site: Site) -> None:
+    page = await site.open("topic/%2Fodom", "killed")
+    await page.press("w")
+    await page.wait_text("no linked peer publishes it")
+    await page.wait_text("start the module base")
+
+
+async def test_a_service_is_called(site: Site) -> None:
+    page = await site.open("service/base%3A%2Fbase%2Fset_parameters")
+    await click(page, "Call it")
+    await page.wait_text("as asked")
+    assert site.server.asked[-1].args == {
+        "service": "/base/set_parameters",
+        "peer": "base",
+        "request": {"data": False},
+    }
+
+
+async def test_a_parameter_is_changed(site: Site) -> None:
+    page = await site.open("params")
+    await click(page, '"noetic"')
+    await page.wait("document.querySelector('form.row input')")
+    await page.run("(() => { const field = document.querySelector('form.row input'); field.value = 'melodic';"
+                   " field.dispatchEvent(new Event('input', {bubbles: true})); })()")  # fmt: skip
+    await click(page, "Set")
+    await page.wait_text('"melodic"')
+    assert site.server.params["/rosdistro"] == "melodic"
+
+
+async def test_who_may_only_look_sees_no_way_to_change_anything(site: Site) -> None:
+    site.server.rights = Rights()
+    page = await site.open("params")
+    await page.wait_text("noetic")
+    assert await page.run("document.querySelectorAll('main button.field, main button.primary').length") == 0
+    assert "Drive" not in await page.run("document.querySelector('nav').innerText")
+    page = await site.open("drive")
+    assert await page.run("document.querySelector('input[type=checkbox]').disabled") is True
+
+
+async def test_a_robot_moves_only_while_the_stick_is_held(site: Site) -> None:
+    page = await site.open("drive")
+    await page.run("document.querySelector('.stick').focus()")
+    await page.press("ArrowUp")
+    assert site.server.speeds == []  # it is not armed yet
+    await page.run("document.querySelector('input[type=checkbox]').click()")
+    await page.wait("!document.querySelector('.stick').classList.contains('off')")
+    await page.run("document.querySelector('.stick').focus()")
+    await page.down("ArrowUp")
+    await page.wait("document.querySelector('.stick + p').textContent.includes('forward 60 %')")
+    await page.up("ArrowUp")
+    await page.wait("document.querySelector('.stick + p').textContent.includes('forward 0 %')")
+    await page.wait("window.rmpa.socket.bufferedAmount === 0")
+    deadline = time.monotonic() + 10
+    while not (site.server.speeds and site.server.speeds[-1].linear == 0) and time.monotonic() < deadline:
+        await page.run("new Promise((done) => setTimeout(done, 50))")
+    assert site.server.speeds[0].linear == pytest.approx(1.2)
+    assert site.server.speeds[-1].linear == 0

@@ -1,0 +1,448 @@
+"""A server of the monitor that replays recorded snapshots of the demo: for tests, and to work on the pages.
+
+    python tests/web/monitor/fake_server.py --port 8480 [--scene demo]
+
+It has the real pages and the real ``MonitorSession``; the agent, the hub and all answers are made up here.
+Scenes: ``demo`` (all is well), ``killed`` (the module base was killed), ``sick`` (one of each state, and alarms),
+``large`` (16 modules, 300 topics), ``mute`` (the agent does not answer), ``sensors`` (a laser and a camera).
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import itertools
+import json
+import math
+import struct
+import time
+import zlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+from aiohttp import WSMsgType, web
+
+from rmpa.observe.snapshot import Snapshot
+from rmpa.web.hub import requests
+from rmpa.web.monitor import session as monitor
+from rmpa.web.monitor.messages import SUBPROTOCOL
+from rmpa.web.monitor.resources import ResourceFacts
+from rmpa.web.monitor.view import StateBuilder, details
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rmpa.web.monitor.patch import Tree
+
+FIXTURES = Path(__file__).with_name("fixtures")
+STATIC = Path(__file__).parents[3] / "src/rmpa/web/static"
+CSP = "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; object-src 'none'"
+TICK = 0.1
+SCENES = ("demo", "killed", "sick", "large", "mute", "sensors")
+_SENSORS = {"/scan": "sensor_msgs/LaserScan", "/camera/image": "sensor_msgs/CompressedImage"}
+
+
+def snapshots() -> list[Snapshot]:
+    """Two with all modules, base just killed, base long gone, and two with base back; as the module pc saw them."""
+    lines = (FIXTURES / "demo.jsonl").read_text(encoding="utf-8").splitlines()
+    return [msgspec.json.decode(line, type=Snapshot) for line in lines]
+
+
+def resources() -> list[ResourceFacts]:
+    """The demo's Smart Resources."""
+    return msgspec.convert(json.loads((FIXTURES / "resources.json").read_text())["resources"], list[ResourceFacts])
+
+
+class FakeAgent:
+    """Snapshots that look alive: counters grow, rates wobble within a percent."""
+
+    def __init__(self, scene: str = "demo") -> None:
+        self.scene = scene
+        self._recorded = snapshots()
+        self._resources = resources()
+        self._started = time.time() - 93.0
+        self._since: dict[str, float] = {}
+
+    def snapshot(self) -> Snapshot:
+        """The newest snapshot of the scene."""
+        now = time.time()
+        base = self._recorded[0]
+        if self.scene == "killed":
+            since = self._since.setdefault("killed", now)
+            base = self._recorded[2 if now - since < 7 else 3]
+        else:
+            self._since.clear()
+        if self.scene in ("sick", "large", "sensors"):
+            base = getattr(self, f"_{self.scene}")(base)
+        age = now - self._started
+        wobble = 1 + 0.004 * math.sin(now * 3)
+        peers = tuple(self._peer(peer, age, now) for peer in base.peers)
+        topics = tuple(
+            msgspec.structs.replace(
+                topic,
+                routes=tuple(
+                    msgspec.structs.replace(
+                        route,
+                        rate=route.rate and route.rate * wobble,
+                        messages=int(route.messages + (route.rate or 0) * age),
+                        age=route.age and abs(math.sin(now * 7)) / (route.rate or 1),
+                    )
+                    for route in topic.routes
+                ),
+            )
+            for topic in base.topics
+        )
+        agent = msgspec.structs.replace(base.agent, started=self._started, uptime=age, cpu=11 + 2 * math.sin(now / 3))
+        return msgspec.structs.replace(base, agent=agent, taken=now, peers=peers, topics=topics)
+
+    def _peer(self, peer: Any, age: float, now: float) -> Any:
+        link = peer.link
+        if link is not None:
+            link = msgspec.structs.replace(
+                link,
+                bytes_in=int(link.bytes_in / 90 * age),
+                bytes_out=int(link.bytes_out / 90 * age),
+                rtt=(link.rtt or 3e-4) * (1 + 0.1 * math.sin(now * 5)),
+                up_ago=age,
+            )
+        return msgspec.structs.replace(peer, link=link, since_ago=age if link else peer.since_ago)
+
+    def facts(self) -> list[ResourceFacts]:
+        """The resources of the scene."""
+        if self.scene == "killed":
+            return [one for one in self._resources if one.peer != "base"]
+        if self.scene == "sick":
+            ill = {
+                "velocity": {"level": "WARN", "message": "adapting: acceleration 3.2 m/s² instead of at most 1 m/s²"},
+                "joystick": {"level": "ERROR", "message": "non-adaptable: rate 3 Hz is below 10 Hz in every profile"},
+            }
+            return [
+                msgspec.structs.replace(one, health=(one.health or {}) | ill.get(str(one.peer), {}))
+                for one in self._resources
+            ]
+        return self._resources
+
+    def alarms(self) -> list[Tree]:
+        """The alarms that stand."""
+        if self.scene != "sick":
+            return []
+        return [
+            {
+                "id": one.key,
+                "module": str(one.peer),
+                "resource": one.key,
+                "level": one.level,
+                "text": str((one.health or {})["message"]),
+                "at": round(self._started + 40, 1),
+            }
+            for one in self.facts()
+            if one.level in ("WARN", "ERROR")
+        ]
+
+    def _sick(self, base: Snapshot) -> Snapshot:
+        replace = msgspec.structs.replace
+        linked = {peer.name: peer for peer in base.peers}
+        some, link = linked["base"], linked["velocity"].link
+        assert link is not None
+        peers = (
+            replace(
+                some, name="arm", state="linking", link=None, beacon_ago=2.0, last_error="10.0.0.7:40001: timed out"
+            ),
+            replace(
+                some, name="camera", state="refused", link=None, last_error="is of version 0.0.9, this one of 0.1.0"
+            ),
+            replace(some, name="gripper", state="linking", link=None, beacon_ago=60.0, last_error="No route to host"),
+            linked["joystick"],
+            replace(linked["velocity"], link=replace(link, heard_ago=1.8)),
+            some,
+        )
+        topics = tuple(
+            replace(
+                topic, mismatches=("/pc expects geometry_msgs/TwistStamped, /velocity publishes geometry_msgs/Twist",)
+            )
+            if topic.name == "/velocity_order"
+            else topic
+            for topic in base.topics
+        )
+        return replace(
+            base, peers=peers, topics=topics, notes=("multicast does not leave eth0: is there a firewall?",)
+        )
+
+    def _sensors(self, base: Snapshot) -> Snapshot:
+        odom = next(topic for topic in base.topics if topic.name == "/odom")
+        more = tuple(msgspec.structs.replace(odom, name=name, type=kind) for name, kind in _SENSORS.items())
+        return msgspec.structs.replace(base, topics=(*base.topics, *more))
+
+    def _large(self, base: Snapshot) -> Snapshot:
+        replace = msgspec.structs.replace
+        some = next(peer for peer in base.peers if peer.name == "base")
+        odom, idle = (
+            next(topic for topic in base.topics if topic.name == name) for name in ("/odom", "/base/context")
+        )
+        names = [f"module_{number:02d}" for number in range(1, 16)]
+        peers = tuple(replace(some, name=name) for name in names)
+        topics = tuple(
+            replace(
+                odom if number < 6 else idle,
+                name=f"/{name}/topic_{number:02d}",
+                routes=tuple(
+                    replace(route, peer=name, rate=route.rate and 1.0 + (at * 7 + number * 13) % 60)
+                    for route in (odom if number < 6 else idle).routes
+                ),
+            )
+            for at, name in enumerate(names)
+            for number in range(20)
+        )
+        return replace(base, peers=peers, topics=topics)
+
+
+class FakeServer:
+    """The pages, and one ``MonitorSession`` for each WebSocket.
+
+    Args:
+        scene: The first scene; ``agent.scene`` changes it.
+        rights: What clients may do.
+    """
+
+    def __init__(self, scene: str = "demo", rights: monitor.Rights | None = None) -> None:
+        self.agent = FakeAgent(scene)
+        self.rights = rights or monitor.Rights(call=True, param=True, resource=True, drive=True)
+        self.speeds: list[monitor.Speed] = []
+        self.reports: list[str] = []
+        self.asked: list[monitor.Question] = []
+        self.params: dict[str, Any] = {
+            "/rosdistro": "noetic",
+            "/use_sim_time": False,
+            "/base": {"rate": 50.0, "wheel": {"radius": 0.035, "track": 0.23}, "topics": ["odom", "imu"]},
+        }
+        self._builder = StateBuilder("pc")
+        self._snapshot = self.agent.snapshot()
+        self._state: Tree = {}
+        self._open: set[web.WebSocketResponse] = set()
+        self._odometry = json.loads((FIXTURES / "odometry.json").read_text())
+        self._why = json.loads((FIXTURES / "resources.json").read_text())["why"]
+        self._mute_since = 0.0
+
+    def app(self) -> web.Application:
+        """The application."""
+        app = web.Application()
+        app.router.add_get("/monitor", self._socket)
+        app.router.add_get("/", self._index)
+        app.router.add_post("/csp", self._report)
+        app.router.add_static("/static", STATIC)
+        app.on_response_prepare.append(self._headers)
+        return app
+
+    async def drop(self) -> None:
+        """Close all connections, as a server that ends."""
+        for socket in list(self._open):
+            await socket.close()
+
+    async def _headers(self, _request: web.Request, response: web.StreamResponse) -> None:
+        response.headers["Content-Security-Policy"] = f"{CSP}; report-uri /csp"
+        response.headers["X-Content-Type-Options"] = "nosniff"
+
+    async def _index(self, _request: web.Request) -> web.FileResponse:
+        return web.FileResponse(STATIC / "index.html")
+
+    async def _report(self, request: web.Request) -> web.Response:
+        self.reports.append(await request.text())
+        return web.Response()
+
+    def _next_state(self) -> Tree:
+        if self.agent.scene == "mute":
+            self._mute_since = self._mute_since or time.time()
+            return self._builder.unreachable(
+                self._mute_since, "no agent at /run/rmpa/pc.sock", "Start one with `rmpa up`."
+            )
+        self._mute_since = 0.0
+        self._snapshot = self.agent.snapshot()
+        return self._builder.build(self._snapshot, self.agent.facts(), self.agent.alarms())
+
+    def _details(self, kind: str, name: str) -> Tree | None:
+        return details(self._snapshot, {one.key: one for one in self.agent.facts()}, kind, name)
+
+    async def _socket(self, request: web.Request) -> web.WebSocketResponse:
+        socket = web.WebSocketResponse(protocols=(SUBPROTOCOL,), max_msg_size=2**20)
+        await socket.prepare(request)
+        self._open.add(socket)
+        client = _Client(self, socket)
+        beat = asyncio.ensure_future(client.run())
+        try:
+            async for message in socket:
+                if message.type is WSMsgType.TEXT:
+                    await client.act(client.session.receive(message.data, time.monotonic()))
+        finally:
+            beat.cancel()
+            self._open.discard(socket)
+            await client.act(client.session.close())
+        return socket
+
+    def odometry(self) -> dict[str, Any]:
+        """A nav_msgs/Odometry of the recorded drive."""
+        at = time.time() * 10 % len(self._odometry)
+        _, x, y, z, w, forward, turn = self._odometry[int(at)]
+        return {
+            "header": {"seq": int(at), "stamp": {"secs": int(time.time()), "nsecs": 0}, "frame_id": "odom"},
+            "child_frame_id": "base_link",
+            "pose": {
+                "pose": {"position": {"x": x, "y": y, "z": 0.0}, "orientation": {"x": 0.0, "y": 0.0, "z": z, "w": w}}
+            },
+            "twist": {
+                "twist": {"linear": {"x": forward, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": turn}}
+            },
+        }
+
+    def answer(self, question: monitor.Question) -> Any:
+        """The answer to a question of a page.
+
+        Raises:
+            LookupError: There is none.
+        """
+        self.asked.append(question)
+        answer = getattr(self, f"_answer_{question.what}", None)
+        if answer is None:
+            raise LookupError(question.what)
+        return answer(question.args)
+
+    def _answer_why(self, _args: dict[str, Any]) -> Any:
+        flows = self._why[0]
+        if self.agent.scene == "demo":
+            return [flows]
+        text = "no linked peer publishes it"
+        failed = {"name": "publisher", "verdict": "fail", "text": text, "remedy": "start the module base"}
+        return [{**flows, "flows": False, "stages": [*flows["stages"][:2], failed]}]
+
+    def _answer_params(self, _args: dict[str, Any]) -> Any:
+        return {"values": self.params}
+
+    def _answer_set_param(self, args: dict[str, Any]) -> Any:
+        self.params[str(args["name"])] = args["value"]
+        return {"values": self.params}
+
+    def _answer_delete_param(self, args: dict[str, Any]) -> Any:
+        self.params.pop(str(args["name"]), None)
+        return {"values": self.params}
+
+    def _answer_describe(self, _args: dict[str, Any]) -> Any:
+        text = "bool data\n---\nbool success\nstring message"
+        return {"type": "std_srvs/SetBool", "request": {"data": False}, "text": text}
+
+    def _answer_call(self, args: dict[str, Any]) -> Any:
+        return {"response": {"success": True, "message": f"as asked: {args['request']}"}, "seconds": 0.0031}
+
+    def _answer_profile(self, _args: dict[str, Any]) -> Any:
+        return {"text": "chosen"}
+
+    def _answer_context(self, _args: dict[str, Any]) -> Any:
+        return {"text": "chosen"}
+
+    def _answer_history(self, _args: dict[str, Any]) -> Any:
+        lines = ((300, "WARN", "adapting: acceleration"), (200, "OK", "well again"))
+        now = time.time()
+        return [
+            {"at": now - ago, "level": level, "resource": "velocity:/velocity", "text": text}
+            for ago, level, text in lines
+        ]
+
+
+class _Client:
+    def __init__(self, server: FakeServer, socket: web.WebSocketResponse) -> None:
+        self._server = server
+        self._socket = socket
+        self._watched: dict[int, str] = {}
+        self._log = False
+        self.session = monitor.MonitorSession(server._details, self._decode, server.rights, time.monotonic())
+
+    def _decode(self, message: requests.Received) -> Any:
+        topic = message.topic
+        if "scan" in topic:
+            ranges = [_room(number * math.pi / 180) for number in range(360)]
+            return {
+                "angle_min": 0.0,
+                "angle_increment": math.pi / 180,
+                "range_min": 0.1,
+                "range_max": 8.0,
+                "ranges": ranges,
+            }
+        if "image" in topic:
+            return {"format": "png", "data": _png(160, 120, time.time())}
+        if topic == "/odom":
+            return self._server.odometry()
+        return {"data": f"<script>alert(1)</script> {int(time.time())}", "values": list(range(200))}
+
+    async def run(self) -> None:
+        await self.act(self.session.open("pc"))
+        for tick in itertools.count():
+            now = time.monotonic()
+            if tick % 2 == 0:
+                await self.act(self.session.update(self._server._next_state(), now))
+            for handle, topic in list(self._watched.items()):
+                kind = (
+                    "sensor_msgs/LaserScan"
+                    if "scan" in topic
+                    else "sensor_msgs/CompressedImage"
+                    if "image" in topic
+                    else "nav_msgs/Odometry"
+                )
+                received = requests.Received(handle, topic, kind, memoryview(b"\0" * 712), time.time_ns())
+                await self.act(self.session.receive_message(received, now))
+            if self._log and tick % 10 == 0:
+                await self.act(
+                    self.session.log([{"at": time.time(), "level": "INFO", "node": "/base", "text": f"turn {tick}"}])
+                )
+            await self.act(self.session.handle_timer(now))
+            await asyncio.sleep(TICK)
+
+    async def act(self, outputs: Iterator[monitor.Output]) -> None:
+        for output in list(outputs):
+            if isinstance(output, str | bytes):
+                if not self._socket.closed:
+                    await (
+                        self._socket.send_str(output) if isinstance(output, str) else self._socket.send_bytes(output)
+                    )
+            elif isinstance(output, requests.Subscribe):
+                self._watched[output.handle] = output.topic
+            elif isinstance(output, requests.Unsubscribe):
+                self._watched.pop(output.handle, None)
+            elif isinstance(output, monitor.Question):
+                try:
+                    await self.act(self.session.answer(output.id, self._server.answer(output)))
+                except LookupError:
+                    await self.act(self.session.refuse(output.id, f"this server cannot answer {output.what}"))
+            elif isinstance(output, monitor.Speed):
+                self._server.speeds.append(output)
+            elif isinstance(output, monitor.FollowLog):
+                self._log = output.on
+            elif isinstance(output, monitor.Close):
+                await self._socket.close(code=output.code, message=output.reason.encode())
+
+
+def _room(angle: float) -> float:
+    """Metres to the walls of a room of 6 m by 4 m, with a pillar."""
+    walls = min(3 / max(abs(math.cos(angle)), 1e-6), 2 / max(abs(math.sin(angle)), 1e-6))
+    return 1.4 if abs(angle - 0.8) < 0.12 else walls
+
+
+def _png(width: int, height: int, at: float) -> bytes:
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    shift = int(at * 20)
+    rows = b"".join(b"\0" + bytes((x + y + shift) & 255 for x in range(width)) for y in range(height))
+    head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows, 1)) + chunk(b"IEND", b"")
+
+
+def main() -> None:
+    """Serve until Ctrl-C."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--port", type=int, default=8480)
+    parser.add_argument("--scene", choices=SCENES, default="demo")
+    options = parser.parse_args()
+    web.run_app(FakeServer(options.scene).app(), host="127.0.0.1", port=options.port)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,26 @@
+"""docs/design/monitor-protocol.md: its figures are the code's."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from rmpa.core.sizes import KIB
+from rmpa.web.monitor import limits, messages, session
+
+PAGE = (Path(__file__).parents[3] / "docs" / "design" / "monitor-protocol.md").read_text(encoding="utf-8")
+
+
+def test_the_page_says_the_bounds_of_the_code() -> None:
+    rows = re.findall(r"\| ([\d,]+)( KiB)? \| `([A-Z_]+)` \|", PAGE)
+    assert {name for name in vars(limits) if name.endswith("_MAX")} <= {name for _, _, name in rows}
+    for figure, unit, name in rows:
+        assert getattr(limits, name) == int(figure.replace(",", "")) * (KIB if unit else 1), name
+
+
+def test_the_page_has_each_question_and_message() -> None:
+    for what in (*session.ORDERS, "why", "history", "params", "describe"):
+        assert f"`{what}`" in PAGE
+    for kind in (messages.Ack, messages.Look, messages.Watch, messages.Unwatch, messages.Ask, messages.Log):
+        assert f"`{kind.__struct_config__.tag}`" in PAGE
+    assert f"`{messages.SUBPROTOCOL}`" in PAGE

@@ -1,0 +1,110 @@
+"""Live values: cut, by path, scans and pictures."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.web.monitor import limits
+from rmpa.web.monitor.live import IMAGE_HEADER, compressed_picture, cut, field_path, number_at, raw_picture, scan
+
+
+def test_a_value_is_cut_and_says_so() -> None:
+    shown: Any = cut(
+        {"text": "x" * 1000, "ranges": [0.5] * 1000, "data": memoryview(bytes(700)), "nan": float("nan")}
+    )
+    assert shown["text"].endswith("… 488 more")
+    assert len(shown["ranges"]) == limits.VALUE_ITEMS + 1
+    assert shown["ranges"][-1] == f"… {1000 - limits.VALUE_ITEMS} more"
+    assert shown["data"] == "700 bytes"
+    assert shown["nan"] == "nan"
+
+
+def test_a_value_with_many_parts_is_bounded() -> None:
+    wide: Any = [[[list(range(60)) for _ in range(60)] for _ in range(60)] for _ in range(3)]
+    assert len(json.dumps(cut(wide))) < 40 * limits.VALUE_NODES
+
+
+@pytest.mark.parametrize(
+    ("path", "number"),
+    [
+        ("pose.x", 1.5), ("axes.1", -1.0), ("axes[1]", -1.0), ("axes[9]", None), ("on", 1.0), ("name", None),
+        ("stamp", 2.5), ("pose", None), ("pose.y.z", None), ("axes.x", None),
+    ],
+)  # fmt: skip
+def test_a_number_is_found_by_its_path(path: str, number: float | None) -> None:
+    values = {
+        "pose": {"x": 1.5},
+        "axes": [0, -1.0],
+        "on": True,
+        "name": "3",
+        "stamp": {"secs": 2, "nsecs": 500_000_000},
+    }
+    assert number_at(values, field_path(path)) == number
+
+
+@pytest.mark.parametrize("path", ["", ".", "a..b", "x" * 1000])
+def test_what_is_no_path_is_refused(path: str) -> None:
+    with pytest.raises(RemoteProtocolError):
+        field_path(path)
+
+
+SCAN = {"angle_min": -1.0, "angle_increment": 0.5, "range_min": 0.1, "range_max": 8.0}
+
+
+def test_a_scan_has_null_where_nothing_was_measured() -> None:
+    made = scan({**SCAN, "ranges": [1.0, float("inf"), 0.05, None, 2.0004]})
+    assert made == {"start": -1.0, "step": 0.5, "most": 8.0, "ranges": [1.0, None, None, None, 2.0]}
+
+
+def test_a_fine_scan_keeps_the_nearest_of_each_part() -> None:
+    made = scan({**SCAN, "ranges": [5.0, 1.0] * limits.SCAN_POINTS})
+    assert made["ranges"] == [1.0] * limits.SCAN_POINTS
+    assert made["step"] == 1.0
+
+
+def test_what_is_no_scan_is_refused() -> None:
+    with pytest.raises(RemoteProtocolError, match="LaserScan"):
+        scan({"data": 3})
+
+
+def test_an_image_of_each_order_of_colours_is_shown_alike() -> None:
+    rgb = raw_picture(2, 2, "rgb8", 8, bytes([1, 2, 3, 4, 5, 6, 0, 0, 7, 8, 9, 10, 11, 12]))
+    assert (rgb.format, rgb.width, rgb.height, rgb.data) == ("rgb8", 2, 2, bytes(range(1, 13)))
+    bgra = raw_picture(1, 1, "bgra8", 4, bytes([3, 2, 1, 255]))
+    assert bgra.data == bytes([1, 2, 3])
+    assert raw_picture(2, 1, "mono8", 2, bytes([7, 8])).data == bytes([7, 8])
+
+
+def test_a_large_image_is_thinned() -> None:
+    made = raw_picture(1280, 720, "rgb8", 1280 * 3, bytes(1280 * 720 * 3))
+    assert made.width * made.height <= limits.IMAGE_PIXELS
+    assert len(made.data) == made.width * made.height * 3
+    assert made.every == 4
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "encoding", "step", "size"),
+    [
+        (2, 2, "rgb8", 6, 11),
+        (2, 2, "rgb8", 5, 99),
+        (0, 2, "mono8", 0, 0),
+        (2, 2, "32FC1", 8, 16),
+        (9**9, 9**9, "mono8", 9**9, 10),
+    ],
+)
+def test_an_image_that_cannot_be_is_refused(width: int, height: int, encoding: str, step: int, size: int) -> None:
+    with pytest.raises(RemoteProtocolError):
+        raw_picture(width, height, encoding, step, bytes(size))
+
+
+def test_a_compressed_image_is_passed_on_as_it_is() -> None:
+    jpeg = b"\xff\xd8\xff\xe0 and so on"
+    frame = compressed_picture("rgb8; jpeg compressed bgr8", jpeg).frame(7, 123)
+    assert IMAGE_HEADER.unpack_from(frame) == (1, 1, 0, 0, 0, 7, 123)
+    assert frame[IMAGE_HEADER.size :] == jpeg
+    with pytest.raises(RemoteProtocolError, match="neither JPEG nor PNG"):
+        compressed_picture("tiff", b"II*\0")

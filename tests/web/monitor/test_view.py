@@ -1,0 +1,201 @@
+"""The state of the pages, made of recorded snapshots of the demo."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import pytest
+
+from rmpa.web.monitor import limits
+from rmpa.web.monitor.patch import Tree, apply, difference
+from rmpa.web.monitor.resources import ResourceFacts
+from rmpa.web.monitor.view import StateBuilder, details, module_state
+from tests.web.monitor.fake_server import resources, snapshots
+from tests.web.snapshots import FULL, LINK, peer
+
+if TYPE_CHECKING:
+    from rmpa.observe.snapshot import PeerInfo, Snapshot
+
+RECORDED = snapshots()
+RESOURCES = resources()
+
+
+def build(snapshot: Snapshot, **more: Any) -> Any:
+    return StateBuilder(snapshot.agent.name).build(snapshot, **more)
+
+
+def has_null(value: object) -> bool:
+    if isinstance(value, dict):
+        return any(each is None or has_null(each) for each in value.values())
+    return False
+
+
+@pytest.mark.parametrize("snapshot", [FULL, *RECORDED])
+def test_a_state_is_json_without_unknown_members(snapshot: Snapshot) -> None:
+    state = build(snapshot, resources=RESOURCES)
+    assert not has_null(state)
+    assert json.loads(json.dumps(state)) == state
+
+
+def test_the_state_says_who_is_there_and_what_flows() -> None:
+    state = build(RECORDED[0], resources=RESOURCES)
+    assert {name: one["state"] for name, one in state["modules"].items()} == {
+        "pc": "here", "base": "up", "joystick": "up", "velocity": "up",
+    }  # fmt: skip
+    assert state["flows"]["base>pc"]["topics"] == ["/odom"]
+    assert state["flows"]["base>pc"]["rate"] == pytest.approx(50, rel=0.05)
+    assert state["topics"]["/odom"]["from"] == ["base"]
+    assert state["topics"]["/odom"]["to"] == ["pc"]
+
+
+def test_flows_between_other_modules_are_known_from_their_resources() -> None:
+    flows = build(RECORDED[0], resources=RESOURCES)["flows"]
+    assert flows["joystick>velocity"]["topics"] == ["/command_information"]
+    assert flows["joystick>velocity"]["rate"] == pytest.approx(10, rel=0.05)
+    assert flows["velocity>base"]["by"] == "resource"
+
+
+def test_a_killed_module_shows_in_the_next_state_and_comes_back_to_its_place() -> None:
+    builder = StateBuilder("pc")
+    states: list[Any] = [builder.build(snapshot) for snapshot in RECORDED]
+    assert [state["modules"]["base"]["state"] for state in states] == ["up", "up", "linking", "away", "up", "up"]
+    assert "refused" in states[2]["modules"]["base"]["error"]
+    assert "base>pc" not in states[2]["flows"]
+    assert len({json.dumps(state["ring"]) for state in states}) == 1
+
+
+def test_byte_rates_come_from_the_links_counters() -> None:
+    builder = StateBuilder("pc")
+    builder.build(RECORDED[0])
+    state: Any = builder.build(RECORDED[1])
+    assert state["modules"]["base"]["bytes_in"] == pytest.approx(37_000, rel=0.2)
+
+
+def test_a_link_that_is_new_has_no_rate_yet() -> None:
+    builder = StateBuilder("pc")
+    for snapshot in RECORDED[:2]:
+        builder.build(snapshot)
+    assert "bytes_in" not in builder.build(RECORDED[4])["modules"]["base"]  # type: ignore[operator, index, call-overload]
+
+
+def test_noise_changes_nothing() -> None:
+    builder = StateBuilder("pc")
+    before = builder.build(RECORDED[1], RESOURCES)
+    noisy = msgspec.structs.replace(
+        RECORDED[1],
+        topics=tuple(
+            msgspec.structs.replace(
+                topic,
+                routes=tuple(
+                    msgspec.structs.replace(route, rate=route.rate and route.rate * 1.01, messages=route.messages + 9)
+                    for route in topic.routes
+                ),
+            )
+            for topic in RECORDED[1].topics
+        ),
+    )
+    assert difference(before, builder.build(noisy, RESOURCES)) == {}
+
+
+def test_parts_that_did_not_change_are_the_same_objects() -> None:
+    builder = StateBuilder("pc")
+    before: Any = builder.build(RECORDED[1])
+    after: Any = builder.build(RECORDED[2])
+    assert after["topics"]["/rosout"] is before["topics"]["/rosout"]
+    assert after["agent"] is not None
+
+
+def test_patches_of_the_recorded_demo_are_small() -> None:
+    builder = StateBuilder("pc")
+    shown: Any = {}
+    sizes = []
+    for snapshot in RECORDED:
+        state = builder.build(snapshot, RESOURCES)
+        patch = difference(shown, state)
+        shown = apply(shown, patch)
+        assert shown == state
+        sizes.append(len(json.dumps(patch)))
+    assert sizes[0] < 20_000
+    assert sizes[1] < 1_500
+    assert sizes[5] < 1_500
+
+
+@pytest.mark.parametrize(
+    ("given", "word"),
+    [
+        (peer(), "up"),
+        (peer(link=msgspec.structs.replace(LINK, heard_ago=1.5)), "silent"),
+        (peer(state="linking", link=None, beacon_ago=0.5), "linking"),
+        (peer(state="linking", link=None, beacon_ago=8.0), "away"),
+        (peer(state="linking", link=None), "away"),
+        (peer(state="refused", link=None), "refused"),
+        (peer(state="conflict", link=None), "refused"),
+        (peer(state="relayed", link=None, via="gate"), "relayed"),
+    ],
+)
+def test_each_peer_has_a_word(given: PeerInfo, word: str) -> None:
+    assert module_state(given) == word
+
+
+def test_a_state_of_a_huge_mesh_is_bounded_and_says_what_is_left_out() -> None:
+    topic = RECORDED[0].topics[0]
+    many = tuple(msgspec.structs.replace(topic, name=f"/t{number}") for number in range(limits.TOPICS_SHOWN + 5))
+    peers = tuple(peer(f"m{number:04d}") for number in range(limits.MODULES_SHOWN + 3))
+    state = build(msgspec.structs.replace(RECORDED[0], topics=many, peers=peers))
+    assert len(state["topics"]) == limits.TOPICS_SHOWN
+    assert len(state["modules"]) <= limits.MODULES_SHOWN + 1
+    assert state["hidden"] == {"topics": 5, "modules": 3}
+
+
+def test_without_an_agent_the_last_state_stays_and_says_so() -> None:
+    builder = StateBuilder("pc")
+    known = builder.build(RECORDED[0])
+    gone: Any = builder.unreachable(5.0, "no agent", "start one")
+    assert gone["reach"] == {"ok": False, "since": 5.0, "error": "no agent", "remedy": "start one"}
+    assert gone["modules"] is known["modules"]
+    assert builder.build(RECORDED[0])["reach"] == {"ok": True}
+
+
+def test_there_may_be_no_agent_from_the_start() -> None:
+    assert StateBuilder("pc").unreachable(5.0, "no agent", "")["agent"] == {"name": "pc"}
+
+
+FACTS = {one.key: one for one in RESOURCES}
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "has"),
+    [
+        ("module", "base", "instance"),
+        ("module", "pc", "core_uri"),
+        ("topic", "/odom", "policy"),
+        ("service", "base:/base/set_parameters", "relayed_because"),
+        ("resource", "velocity:/velocity", "descriptor"),
+        ("counters", "", "xmlrpc.calls"),
+    ],
+)
+def test_details_have_all_of_one_thing(kind: str, name: str, has: str) -> None:
+    found: Tree | None = details(RECORDED[0], FACTS, kind, name)
+    assert found is not None
+    assert has in found
+    assert not has_null(found)
+
+
+def test_routes_of_a_topic_have_keys_so_that_a_patch_is_small() -> None:
+    found: Any = details(RECORDED[0], {}, "topic", "/odom")
+    assert list(found["routes"]) == ["in base /base"]
+
+
+@pytest.mark.parametrize("kind", ["module", "topic", "service", "resource", "else"])
+def test_what_is_not_there_has_no_details(kind: str) -> None:
+    assert details(RECORDED[0], FACTS, kind, "/nothing") is None
+
+
+def test_a_strange_descriptor_of_a_peer_breaks_nothing() -> None:
+    strange = ResourceFacts(
+        name="/x", peer="y", health={"values": {"rate": "much"}}, descriptor={"outputs": [3], "profiles": ["p"]}
+    )
+    state = build(RECORDED[0], resources=[strange])
+    assert state["resources"]["y:/x"]["module"] == "y"
