@@ -8,8 +8,9 @@ import msgspec
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.web.foxglove import protocol
-from rmpa.web.foxglove.session import FoxgloveSession, Output, Rights
+from rmpa.web.foxglove.session import FoxgloveSession, Output
 from rmpa.web.hub import requests
+from rmpa.web.hub.rights import Rights
 
 ALL = Rights(publish=True, call_services=True, read_parameters=True, set_parameters=True, fetch_assets=True)
 SEEDS: list[bytes] = [

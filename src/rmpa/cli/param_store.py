@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import os
-import secrets
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
-from rmpa.bridge.params import transfer
-from rmpa.bridge.params.rules import key_problem, leaves
+from rmpa.bridge.params.rules import key_problem
 from rmpa.config.values import did_you_mean
-from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaError, UnreachableError
+from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.names import is_legal_name
 from rmpa.observe import limits
 from rmpa.observe.io.control_client import ControlClient, choose_agent
+from rmpa.observe.io.peer_params import PeerParams, parameters_in
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Mapping
+    from collections.abc import Mapping
 
     from rmpa.cli.master import Master
     from rmpa.cli.options import GraphOptions
@@ -77,7 +76,7 @@ def open_store(peer: str | None, options: GraphOptions) -> ParamStore:
     if options.master_uri is not None:
         raise ConfigError("--peer", "a peer is asked through this machine's agent, not at a master", "leave one out")
     agent = choose_agent(os.environ, options.agent)
-    return _PeerStore(ControlClient(agent.path, limits.CONTROL_HANDLER_TIMEOUT), peer)
+    return PeerParams(ControlClient(agent.path, limits.CONTROL_HANDLER_TIMEOUT), peer)
 
 
 def read_key(text: str, environ: Mapping[str, str], *, root: bool = False) -> str:
@@ -103,21 +102,6 @@ def read_key(text: str, environ: Mapping[str, str], *, root: bool = False) -> st
     if problem := key_problem(key):
         raise ConfigError("KEY", problem, "one looks like /robot_description")
     return key
-
-
-def check(key: str, value: XmlRpcValue) -> list[tuple[str, XmlRpcValue]]:
-    """The parameters in a value, each with its name.
-
-    Raises:
-        RmpaError: A name in it is not a parameter's.
-    """
-    found = list(leaves(key, value))
-    for name, one in found:
-        if name == "/":
-            raise RmpaError(f"the root can only be set to a dictionary, not to {one!r}")
-        if problem := key_problem(name):
-            raise RmpaError(problem)
-    return found
 
 
 def absent(key: str, names: list[str], title: str) -> RmpaError:
@@ -155,7 +139,7 @@ class _MasterStore:
     def set(self, key: str, value: XmlRpcValue) -> int:
         from rmpa.ros.wire.xmlrpc import serialize_response
 
-        parameters = check(key, value)
+        parameters = parameters_in(key, value)
         serialize_response(value)  # a value that XML-RPC cannot hold is an error before anything is set
         for name, one in parameters:
             reply = self._call("setParam", name, one)
@@ -175,55 +159,3 @@ class _MasterStore:
             return asyncio.run(call_api(self.master.uri, method, _CALLER, *params, timeout=_FOR_ALL))
         except UnreachableError:
             raise self.master.unreachable() from None
-
-
-@dataclass
-class _PeerStore:
-    """The parameters of a peer's module, through both agents."""
-
-    client: ControlClient
-    peer: str
-
-    @property
-    def title(self) -> str:
-        return self.peer
-
-    def get(self, key: str) -> XmlRpcValue:
-        return self._value(transfer.GET, {"key": key})
-
-    def names(self) -> list[str]:
-        value = self._value(transfer.NAMES, {})
-        return sorted(str(name) for name in value) if isinstance(value, list) else []
-
-    def set(self, key: str, value: XmlRpcValue) -> int:
-        from rmpa.ros.wire.xmlrpc import serialize_response
-
-        check(key, value)
-        try:
-            text = serialize_response(value).decode()
-        except LocalProtocolError as error:
-            raise RmpaError(f"{key}: {error}") from None
-        return int(self._drive(transfer.writing(key, text, secrets.randbits(31))))
-
-    def delete(self, key: str) -> None:
-        self._ask((transfer.DELETE, {"key": key}))
-
-    def _value(self, what: str, args: dict[str, Any]) -> XmlRpcValue:
-        from rmpa.ros.wire.xmlrpc import parse_response
-
-        return parse_response(self._drive(transfer.reading(what, args)).encode())
-
-    def _drive(self, steps: Generator[transfer.Question, object, Any]) -> Any:
-        try:
-            question = next(steps)
-            while True:
-                question = steps.send(self._ask(question))
-        except StopIteration as done:
-            return done.value
-
-    def _ask(self, question: transfer.Question) -> object:
-        what, args = question
-        try:
-            return self.client.call("param", dict[str, Any], peer=self.peer, what=what, args=args)
-        except PeerRefused as error:
-            raise RmpaError(error.reason) from None  # this agent only passes on the answer of the peer's agent

@@ -59,6 +59,7 @@ Examples:
     is_flag=True,
     help="Let clients publish, call and offer services, and set parameters; they then need the token.",
 )
+@click.option("--drive", is_flag=True, help="Let the joystick of its pages command a robot; they need the token.")
 @click.option("--config", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]")
 @click.option("--with-agent", is_flag=True, hidden=True, help="End when standard input ends.")
 @agent_option
@@ -69,12 +70,13 @@ def web(
     token_file: str | None,
     hosts: tuple[str, ...],
     control: bool,
+    drive: bool,
     config: str | None,
     with_agent: bool,
     agent: str | None,
     as_json: bool,
 ) -> int:
-    """Serve this module's state: /metrics for Prometheus, /api/v1 as JSON, rosbridge and Foxglove clients.
+    """Show the mesh in a browser; serve rosbridge and Foxglove clients, /metrics for Prometheus, /api/v1 as JSON.
 
     It is a process of its own: the agent does not depend on it. It starts without an agent too, and finds it later.
     """
@@ -90,6 +92,7 @@ def web(
         listen=given.listen if listen is None else _host("--listen", listen),
         token_file=given.token_file if token_file is None else token_file,
         control=given.control or control,
+        drive=given.drive or drive,
         hosts=(*given.hosts, *(_host("--host", name) for name in hosts)),
     )
     from rmpa.web.server.process import access_of, serve

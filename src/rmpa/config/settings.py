@@ -267,6 +267,12 @@ class WebSettings:
         "Let clients publish, call and offer services, and set parameters; they then need the token.",
         env="RMPA_WEB_CONTROL",
     )
+    drive: bool = setting(
+        False,
+        BOOL,
+        "Let the monitor's joystick command a robot; clients then need the token.",
+        env="RMPA_WEB_DRIVE",
+    )
 
 
 @dataclass(frozen=True, slots=True)

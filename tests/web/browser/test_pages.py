@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.web.monitor.session import Rights
+from rmpa.web.hub.rights import Rights
 
 if TYPE_CHECKING:
     from tests.web.browser.chromium import Chromium

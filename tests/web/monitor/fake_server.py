@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import dataclasses
 import itertools
 import json
 import math
@@ -25,6 +26,7 @@ from aiohttp import WSMsgType, web
 
 from rmpa.observe.snapshot import Snapshot
 from rmpa.web.hub import requests
+from rmpa.web.hub.rights import FULL
 from rmpa.web.monitor import session as monitor
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from rmpa.web.monitor.resources import ResourceFacts
@@ -33,6 +35,7 @@ from rmpa.web.monitor.view import StateBuilder, details
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from rmpa.web.hub.rights import Rights
     from rmpa.web.monitor.patch import Tree
 
 FIXTURES = Path(__file__).with_name("fixtures")
@@ -205,9 +208,9 @@ class FakeServer:
         rights: What clients may do.
     """
 
-    def __init__(self, scene: str = "demo", rights: monitor.Rights | None = None) -> None:
+    def __init__(self, scene: str = "demo", rights: Rights | None = None) -> None:
         self.agent = FakeAgent(scene)
-        self.rights = rights or monitor.Rights(call=True, param=True, resource=True, drive=True)
+        self.rights = rights or dataclasses.replace(FULL, drive=True)
         self.speeds: list[monitor.Speed] = []
         self.reports: list[str] = []
         self.asked: list[monitor.Question] = []

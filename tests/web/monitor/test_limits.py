@@ -19,7 +19,7 @@ def test_the_page_says_the_bounds_of_the_code() -> None:
 
 
 def test_the_page_has_each_question_and_message() -> None:
-    for what in (*session.ORDERS, "why", "history", "params", "describe"):
+    for what in session.QUESTIONS:
         assert f"`{what}`" in PAGE
     for kind in (messages.Ack, messages.Look, messages.Watch, messages.Unwatch, messages.Ask, messages.Log):
         assert f"`{kind.__struct_config__.tag}`" in PAGE

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from rmpa.web.hub.requests import Received, Subscribe, Unsubscribe
+from rmpa.web.hub.rights import FULL, Rights
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.patch import apply
-from rmpa.web.monitor.session import Close, FollowLog, MonitorSession, Question, Rights, Speed
+from rmpa.web.monitor.session import Close, FollowLog, MonitorSession, Question, Speed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-ALL = Rights(call=True, param=True, resource=True, drive=True)
+ALL = dataclasses.replace(FULL, drive=True)
 
 
 class Page:
@@ -201,7 +203,7 @@ def test_who_may_only_look_can_change_nothing(what: str) -> None:
 
 
 def test_who_may_only_look_cannot_drive() -> None:
-    page = Page(Rights(call=True, param=True, resource=True))
+    page = Page(FULL)
     assert "may not drive" in page.send("drive", topic="/cmd_vel", linear=1, angular=0)[0]["error"]
     assert page.others == []
 
@@ -278,5 +280,5 @@ def test_the_log_is_left_out_for_a_slow_page() -> None:
 
 
 def test_the_first_message_says_what_the_page_may_do() -> None:
-    page = Page(Rights(call=True))
+    page = Page(Rights(call_services=True))
     assert page.take(page.session.open("pc"))[0]["may"] == ["call"]

@@ -116,10 +116,13 @@ async def test_the_server_ends_while_clients_are_connected() -> None:
 
 def test_rights_need_a_token() -> None:
     assert rights_of(has_token=False, control=True) is READ_ONLY
-    assert rights_of(has_token=True, control=True) is FULL
+    assert rights_of(has_token=True, control=True) == FULL
     readers = rights_of(has_token=True, control=False)
     assert readers.read_parameters
     assert (readers.publish, readers.call_services, readers.set_parameters, readers.serve_services) == (False,) * 4
+    assert not readers.drive
+    assert rights_of(has_token=True, control=False, drive=True).drive
+    assert not rights_of(has_token=False, control=True, drive=True).drive
 
 
 async def test_contracts_give_priorities() -> None:

@@ -112,6 +112,9 @@ class ClientConnection(ABC):
     def show_drops(self, dropped: dict[str, int]) -> None:
         """Tell the client how many messages of which topics it has missed so far."""
 
+    def closing(self) -> None:  # noqa: B027 - not each protocol has something to end
+        """The connection has ended; the hub still takes requests."""
+
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is to be called; ``None`` for never."""
         return None
@@ -155,6 +158,12 @@ class ClientConnection(ABC):
         else:
             self.answered(answer)
 
+    @property
+    def unsent(self) -> int:
+        """Bytes that wait, here and in the connection's own buffer."""
+        waiting = self._transport.get_write_buffer_size() if self._transport is not None else 0
+        return self.queue.bytes + waiting
+
     # --- the WebSocket ----------------------------------------------------------------------------------------
 
     async def run(self, request: web.Request, socket_: web.WebSocketResponse) -> None:
@@ -178,6 +187,7 @@ class ClientConnection(ABC):
                 tasks.append(self._loop.create_task(work, name=f"{name} {self.client.name}"))
             await self._read(socket_)
         finally:
+            self.closing()
             if self._timer is not None:
                 self._timer.cancel()
             self.hub.disconnect(self._client)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-PROTOCOLS: Final = ("foxglove", "rosbridge")
+PROTOCOLS: Final = ("foxglove", "monitor", "rosbridge")
 """The gateways, as ``ClientConnection.kind`` names them."""
 
 

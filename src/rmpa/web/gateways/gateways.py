@@ -1,4 +1,4 @@
-"""Both gateways at one path: the subprotocol that a client offers chooses."""
+"""The gateways: the subprotocol that a client offers chooses, and the pages have a path of their own."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import asyncio
 import logging
 import secrets
 from collections import Counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from aiohttp import web
 
@@ -15,7 +15,10 @@ from rmpa.web import limits
 from rmpa.web.foxglove.protocol import SUBPROTOCOLS, choose_subprotocol
 from rmpa.web.gateways.figures import PROTOCOLS, GatewayFigures
 from rmpa.web.gateways.foxglove import FoxgloveConnection
+from rmpa.web.gateways.monitor import MonitorConnection
 from rmpa.web.gateways.rosbridge import RosbridgeConnection
+from rmpa.web.monitor import limits as monitor_limits
+from rmpa.web.monitor.messages import SUBPROTOCOL
 from rmpa.web.rosbridge import limits as rosbridge_limits
 from rmpa.web.rosbridge.encodings import PublishFrames
 
@@ -25,7 +28,9 @@ if TYPE_CHECKING:
     from rmpa.web.gateways.connection import ClientConnection
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.rights import Rights
+    from rmpa.web.monitor.io.monitor import Monitor
 
+MONITOR_PATH: Final = "/monitor"
 _log = logging.getLogger(__name__)
 
 
@@ -42,6 +47,7 @@ class Gateways:
         name: The server's name, for users.
         rights_of: What the sender of a request may do.
         priority: The priority of a topic's messages: higher ones go first.
+        monitor: Serves the pages at ``MONITOR_PATH``; without it there are none.
     """
 
     def __init__(
@@ -50,7 +56,9 @@ class Gateways:
         name: str,
         rights_of: Callable[[web.Request], Rights],
         priority: Callable[[str], int] = lambda _: 0,
+        monitor: Monitor | None = None,
     ) -> None:
+        self._monitor = monitor
         self._hub = hub
         self._name = name
         self._rights_of = rights_of
@@ -85,8 +93,14 @@ class Gateways:
         protocol = choose_subprotocol(offered)
         address = request.remote or "?"
         rights = self._rights_of(request)
-        await self._hub.settled(limits.SETTLE)
         connection: ClientConnection
+        if request.path == MONITOR_PATH:
+            if self._monitor is None or SUBPROTOCOL not in offered:
+                return web.Response(status=400, text=f"pages speak {SUBPROTOCOL} here; see /rosbridge\n")
+            await self._monitor.ready()
+            connection = MonitorConnection(self._hub, rights, self._priority, address, monitor=self._monitor)
+            return await self._serve(request, connection, monitor_limits.REQUEST_MAX + 1)
+        await self._hub.settled(limits.SETTLE)
         if protocol is not None:
             connection = FoxgloveConnection(
                 self._hub, rights, self._priority, address, name=self._name, session_id=self._session_id
@@ -95,8 +109,11 @@ class Gateways:
         else:
             connection = RosbridgeConnection(self._hub, rights, self._priority, address, frames=self._frames)
             most = rosbridge_limits.FRAME_MAX
+        return await self._serve(request, connection, most)
+
+    async def _serve(self, request: web.Request, connection: ClientConnection, most: int) -> web.StreamResponse:
         response = web.WebSocketResponse(
-            protocols=SUBPROTOCOLS,
+            protocols=(*SUBPROTOCOLS, SUBPROTOCOL),
             autoping=False,
             compress=False,
             max_msg_size=most,
@@ -106,7 +123,7 @@ class Gateways:
         try:
             await connection.run(request, response)
         except PeerRefused as error:
-            _log.warning("! %s: %s", address, error)
+            _log.warning("! %s: %s", connection.address, error)
             return web.Response(status=503, text=f"{error}\n")
         finally:
             del self._open[connection]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 Key: TypeAlias = "tuple[int, int]"
 """The number of a client and one of its handles: unique in the hub."""
+OWN_CLIENT: Final = 0
+"""The number of the hub itself, and of what it keeps for all clients; clients count from 1."""
 Receive: TypeAlias = "Callable[[Answer], None]"
 
 

@@ -9,14 +9,14 @@ import itertools
 import logging
 import os
 import time
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.web import limits
 from rmpa.web.hub import requests
 from rmpa.web.hub.assets import read_asset
 from rmpa.web.hub.client_counts import ClientCounts
-from rmpa.web.hub.clients import Client
+from rmpa.web.hub.clients import OWN_CLIENT, Client
 from rmpa.web.hub.graph import GraphWatch
 from rmpa.web.hub.node_link import NodeLink
 from rmpa.web.hub.params import ParamMirror
@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from rmpa.web.hub.rights import Rights
 
 _log = logging.getLogger(__name__)
-_OWN: Final = 0
-"""The number of the hub itself among its clients."""
 
 
 class Hub:
@@ -85,8 +83,8 @@ class Hub:
             ended=self.topics.forget_own,
             now_ns=now_ns,
         )
-        self.time = RosTime(self.topics, self.params, (_OWN, 1), now_ns)
-        self.counts = ClientCounts(self.publishers, self.types, (_OWN, 2), now_ns)
+        self.time = RosTime(self.topics, self.params, (OWN_CLIENT, 1), now_ns)
+        self.counts = ClientCounts(self.publishers, self.types, (OWN_CLIENT, 2), now_ns)
         self._handlers: Mapping[type[Request], Callable[[Client, Any], None]] = {
             requests.Subscribe: self._subscribe,
             requests.Unsubscribe: self._unsubscribe,
@@ -432,8 +430,4 @@ def _check(right: bool, what: str) -> None:
 
 
 def _fail(client: Client, handle: int, error: RmpaError) -> None:
-    remedy = getattr(error, "remedy", "")
-    text = str(error)
-    if remedy and text.endswith(f"; {remedy}"):
-        text = text.removesuffix(f"; {remedy}")
-    client.receive(requests.Failed(handle, text, remedy if isinstance(remedy, str) else ""))
+    client.receive(requests.Failed.of(handle, error))

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, TypeAlias, Union
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from rmpa.core.errors import RmpaError
+
 ParamValue: TypeAlias = Union[  # noqa: UP007 - | does not take the forward references of a recursive type
     bool, int, float, str, bytes, list["ParamValue"], dict[str, "ParamValue"], None
 ]
@@ -226,6 +228,7 @@ Request: TypeAlias = (
 class Received:
     """One message for the subscription `handle`. `stamp_ns` is its time of receipt (UTC, nanoseconds).
 
+    `source` is the node that published it in this module's graph; "" for a client of the hub.
     `payload` stays valid and unchanged for as long as it is referenced; all sessions share it.
     """
 
@@ -235,6 +238,7 @@ class Received:
     payload: memoryview
     stamp_ns: int
     latched: bool = False
+    source: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -333,6 +337,14 @@ class Failed:
     handle: int
     error: str
     remedy: str = ""
+
+    @classmethod
+    def of(cls, handle: int, error: RmpaError) -> Failed:
+        """The answer for an error, whose text may end with the remedy."""
+        remedy = getattr(error, "remedy", "")
+        if not isinstance(remedy, str):
+            remedy = ""
+        return cls(handle, str(error).removesuffix(f"; {remedy}") if remedy else str(error), remedy)
 
 
 Answer: TypeAlias = (

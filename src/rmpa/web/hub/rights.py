@@ -7,7 +7,18 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Rights:
-    """What a client may do beyond reading topics and the graph; nothing unless it is said."""
+    """What a client may do beyond reading topics and the graph; nothing unless it is said.
+
+    Attributes:
+        publish: Publish messages.
+        call_services: Call services.
+        read_parameters: Read parameters.
+        set_parameters: Set and delete them.
+        fetch_assets: Read files of ROS packages.
+        serve_services: Offer services.
+        configure_resources: Choose the profile and the context of a Smart Resource.
+        drive: Command a robot by the monitor's joystick.
+    """
 
     publish: bool = False
     call_services: bool = False
@@ -15,6 +26,8 @@ class Rights:
     set_parameters: bool = False
     fetch_assets: bool = False
     serve_services: bool = False
+    configure_resources: bool = False
+    drive: bool = False
 
 
 READ_ONLY = Rights()
@@ -25,4 +38,6 @@ FULL = Rights(
     set_parameters=True,
     fetch_assets=True,
     serve_services=True,
+    configure_resources=True,
 )
+"""Everything but ``drive``, which has a setting of its own."""

@@ -228,7 +228,7 @@ class Topics:
                 if sink in had:
                     continue
                 had.add(sink)
-            sink.deliver(Received(sink.handle, there.name, type_, payload, stamp_ns))
+            sink.deliver(Received(sink.handle, there.name, type_, payload, stamp_ns, source=source))
 
     def _keep(self, there: _Topic, source: str, latched: _Latched) -> _Latched:
         self._forget_latched(there.name, source, there)
@@ -253,7 +253,15 @@ class Topics:
             if (source == OWN or source in connected) and sink.type in (None, latched.type):
                 latched.had.add(sink)
                 sink.deliver(
-                    Received(sink.handle, there.name, latched.type, latched.payload, latched.stamp_ns, latched=True)
+                    Received(
+                        sink.handle,
+                        there.name,
+                        latched.type,
+                        latched.payload,
+                        latched.stamp_ns,
+                        latched=True,
+                        source=source,
+                    )
                 )
 
 

@@ -11,6 +11,10 @@ from rmpa.core.sizes import KIB
 
 PATCH_PERIOD: Final = 0.15
 """Between two patches of one client: some 7 a second, which looks live and is read at leisure."""
+STATE_PERIOD: Final = 0.15
+"""Shortest time from one snapshot of the agent to the next while pages are open."""
+STATE_SHARE: Final = 4.0
+"""The pause between two snapshots is at least so many times as long as a snapshot takes: a fifth of a core."""
 UNACKNOWLEDGED_MAX: Final = 2
 """States and patches that a client has not acknowledged yet. A slow browser gets fewer patches, never a queue."""
 REQUEST_MAX: Final = 64 * KIB
@@ -73,3 +77,7 @@ DRIVE_SPEED: Final = 2.0
 """Magnitude of a linear speed that a joystick may command, m/s."""
 DRIVE_TURN: Final = 4.0
 """Magnitude of an angular speed that a joystick may command, rad/s."""
+RESOURCES_MAX: Final = 256
+"""Paths of Smart Resources that are followed; each is up to nine subscriptions."""
+LOOK_KEPT: Final = 10.0
+"""Time for which the details of a Smart Resource are followed after a page has shown it."""

@@ -20,26 +20,40 @@ from rmpa.web.monitor.patch import difference
 from rmpa.web.monitor.watches import WatchState
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
 
     from rmpa.web.hub.requests import Received
+    from rmpa.web.hub.rights import Rights
     from rmpa.web.monitor.patch import Tree, Value
     from rmpa.web.monitor.watches import Decode
 
-READ_ONLY = frozenset({"why", "history", "params", "describe"})
-"""Questions that change nothing; every client may ask them."""
-ORDERS = {"call": "call", "set_param": "param", "delete_param": "param", "profile": "resource", "context": "resource"}
-"""Questions that change something, and the right that each needs."""
+QUESTIONS: Mapping[str, str] = {
+    "why": "",
+    "history": "",
+    "describe": "",
+    "params": "read_params",
+    "call": "call",
+    "set_param": "param",
+    "delete_param": "param",
+    "profile": "resource",
+    "context": "resource",
+}
+"""All questions, with what a page must be allowed for each (``permissions``); empty: every page may ask it."""
+_PERMISSIONS = {
+    "call": "call_services",
+    "drive": "drive",
+    "param": "set_parameters",
+    "read_params": "read_parameters",
+    "resource": "configure_resources",
+}
+
+_NO_TOKEN = "this page may not read parameters", "open it with a token: rmpa web --token-file FILE, or --control"
+_NO_CONTROL = "this page may only look", "start rmpa web with --control"
 
 
-@dataclass(frozen=True, slots=True)
-class Rights:
-    """What a client may do beyond looking; nothing unless it is said."""
-
-    call: bool = False
-    param: bool = False
-    resource: bool = False
-    drive: bool = False
+def permissions(rights: Rights) -> tuple[str, ...]:
+    """What a page may do beyond looking, as ``hello`` lists it, in order."""
+    return tuple(name for name, right in _PERMISSIONS.items() if getattr(rights, right))
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,8 +132,8 @@ class MonitorSession:
 
     def open(self, agent: str) -> Iterator[Output]:
         """The first message, before any state; ``agent`` is the name of the agent's module."""
-        may = sorted(name for name in Rights.__slots__ if getattr(self._rights, name))
-        yield _text({"op": "hello", "version": VERSION, "agent": agent, "may": may, "period": limits.PATCH_PERIOD})
+        about = {"version": VERSION, "agent": agent, "period": limits.PATCH_PERIOD}
+        yield _text({"op": "hello", **about, "may": permissions(self._rights)})
 
     def receive(self, text: str | bytes, now: float) -> Iterator[Output]:
         """A message of the client."""
@@ -165,11 +179,11 @@ class MonitorSession:
         yield requests.Subscribe(message.id, message.topic)
 
     def _ask(self, message: Ask) -> Iterator[Output]:
-        right = ORDERS.get(message.what)
-        if right is None and message.what not in READ_ONLY:
+        needed = QUESTIONS.get(message.what)
+        if needed is None:
             raise RemoteProtocolError(f"there is no question {message.what[:40]!a}")
-        if right and not getattr(self._rights, right):
-            yield self._failed(message.id, "this page may only look", "open it with a token whose role may do more")
+        if needed and needed not in permissions(self._rights):
+            yield self._failed(message.id, *(_NO_TOKEN if needed == "read_params" else _NO_CONTROL))
         elif message.id in self._questions or len(self._questions) >= limits.ASKS_MAX:
             yield self._failed(message.id, f"{len(self._questions)} questions wait for an answer already")
         else:
@@ -178,7 +192,7 @@ class MonitorSession:
 
     def _drive(self, message: Drive, now: float) -> Iterator[Output]:
         if not self._rights.drive:
-            yield self._failed(0, "this page may not drive", "open it with a token whose role may")
+            yield self._failed(0, "this page may not drive", "start rmpa web with --drive")
             return
         if self._driven and self._driven != message.topic:
             yield from self._stop()
@@ -232,6 +246,10 @@ class MonitorSession:
         if question in self._questions:
             self._questions.discard(question)
             yield self._failed(question, error, remedy)
+
+    def failed(self, error: str, remedy: str = "") -> Iterator[Output]:
+        """What the page ordered cannot be done, and is neither a watch nor a question: driving."""
+        yield self._failed(0, error, remedy)
 
     def log(self, lines: list[dict[str, Any]]) -> Iterator[Output]:
         """Lines of the log, oldest first; left out while the client does not take what was sent."""

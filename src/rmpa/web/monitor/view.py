@@ -81,7 +81,8 @@ class StateBuilder:
     """
 
     def __init__(self, own: str) -> None:
-        self._own = own
+        self.own = own
+        """The name of the agent's module."""
         self._places = Places(own)
         self._steady = Steady()
         self._bytes = _ByteRates()
@@ -105,10 +106,10 @@ class StateBuilder:
             "agent": self._agent(snapshot),
             "ring": {"slots": self._places.slots, "places": dict(self._places.places)},
             "modules": dict(self._modules(snapshot, peers)),
-            "flows": {**self._flows(snapshot.topics), **resource_flows(resources, self._own, self._steady)},
+            "flows": {**self._flows(snapshot.topics), **resource_flows(resources, self.own, self._steady)},
             "topics": self._topics(snapshot.topics[: limits.TOPICS_SHOWN]),
             "services": {service_key(s): _service(s) for s in snapshot.services[: limits.SERVICES_SHOWN]},
-            "resources": {one.key: resource_entry(one, self._own) for one in resources},
+            "resources": {one.key: resource_entry(one, self.own) for one in resources},
             "alarms": {str(alarm.get("id", index)): alarm for index, alarm in enumerate(alarms)},
             "notes": list(snapshot.notes[:100]),
             "unreachable": [str(each) for each in snapshot.unreachable[:100]],
@@ -124,7 +125,7 @@ class StateBuilder:
 
     def unreachable(self, since: float, error: str, remedy: str) -> Tree:
         """The state while the agent does not answer: what was last known, marked as such."""
-        known: Tree = dict(self._sections) or {"agent": {"name": self._own}, "modules": {}, "topics": {}}
+        known: Tree = dict(self._sections) or {"agent": {"name": self.own}, "modules": {}, "topics": {}}
         return known | {"reach": {"ok": False, "since": round(since, 1), "error": error, "remedy": remedy}}
 
     def _shared(self, state: Tree) -> Tree:
@@ -166,7 +167,7 @@ class StateBuilder:
         })  # fmt: skip
 
     def _modules(self, snapshot: Snapshot, peers: Sequence[PeerInfo]) -> Iterable[tuple[str, Tree]]:
-        yield self._own, {"state": "here", "since": round(snapshot.agent.started, 1)}
+        yield self.own, {"state": "here", "since": round(snapshot.agent.started, 1)}
         for peer in peers:
             yield peer.name, self._module(peer, snapshot.taken)
         for name in self._places.absent(peer.name for peer in peers):
@@ -208,7 +209,7 @@ class StateBuilder:
         for topic in topics:
             for route in topic.routes:
                 if route.rate:
-                    ends = (route.peer, self._own) if route.direction == "in" else (self._own, route.peer)
+                    ends = (route.peer, self.own) if route.direction == "in" else (self.own, route.peer)
                     sums.setdefault(">".join(ends), []).append((route.rate, route.bandwidth or 0.0, topic.name))
         found: dict[str, Tree] = {}
         for key, parts in sums.items():
@@ -242,8 +243,8 @@ class StateBuilder:
         targets = {route.peer for route in topic.routes if route.direction == "out" and route.state == "open"}
         entry = {
             "type": topic.type,
-            "from": sorted(sources | {self._own} if topic.publishers else sources),
-            "to": sorted(targets | {self._own} if topic.subscribers else targets),
+            "from": sorted(sources | {self.own} if topic.publishers else sources),
+            "to": sorted(targets | {self.own} if topic.subscribers else targets),
             "rate": self._steady.figure(f"{topic.name} rate", max((r.rate or 0.0 for r in active), default=None)),
             "bandwidth": self._steady.figure(
                 f"{topic.name} bandwidth", sum(r.bandwidth or 0.0 for r in active) or None, share=0.1

@@ -16,7 +16,7 @@ from aiohttp.abc import AbstractAccessLogger
 
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.web import limits, rest
-from rmpa.web.gateways.gateways import is_upgrade
+from rmpa.web.gateways.gateways import MONITOR_PATH, is_upgrade
 from rmpa.web.metrics import exposition
 from rmpa.web.server.auth import TOKEN_PARAMETER, AccessPolicy, MoveToken, Refused, RequestFacts
 from rmpa.web.server.connections import GuardedConnection
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 _OPEN: Final = ("/healthz",)
 """Paths without a token: they tell only whether the agent answers."""
-WEBSOCKET_PATHS: Final = ("/", "/rosbridge", "/foxglove")
-"""Where WebSocket clients connect; the subprotocol that they offer chooses the gateway."""
+WEBSOCKET_PATHS: Final = ("/", "/rosbridge", "/foxglove", MONITOR_PATH)
+"""Where WebSocket clients connect. The pages have their own path; else the subprotocol chooses the gateway."""
 _METHODS: Final = ("GET", "HEAD")
 _JUDGED: Final = web.RequestKey("rmpa.judged", bool)
 """Marks requests that reached the middleware; aiohttp answers malformed ones before."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.contract import Priority
@@ -42,16 +43,17 @@ def make_hub(watch: AgentWatch, port: int) -> Hub:
     return Hub(where, make_node)
 
 
-def rights_of(*, has_token: bool, control: bool) -> Rights:
+def rights_of(*, has_token: bool, control: bool, drive: bool = False) -> Rights:
     """What clients may do.
 
     Args:
         has_token: Whether all clients have shown a token: without one parameters and files are not read either.
         control: Whether they may change anything.
+        drive: Whether the monitor's joystick may command a robot.
     """
     if not has_token:
         return READ_ONLY
-    return FULL if control else Rights(read_parameters=True, fetch_assets=True)
+    return replace(FULL if control else Rights(read_parameters=True, fetch_assets=True), drive=drive)
 
 
 def priority_of(hub: Hub, contracts: Contracts) -> Callable[[str], int]:

@@ -16,6 +16,7 @@ from rmpa.core.contract import Contracts
 from rmpa.core.errors import StartError
 from rmpa.runtime.state_dir import module_dir, state_dir
 from rmpa.web.gateways.gateways import Gateways
+from rmpa.web.monitor.io.monitor import Monitor
 from rmpa.web.server import auth
 from rmpa.web.server.agent_watch import AgentWatch, ControlReader
 from rmpa.web.server.hub_setup import make_hub, priority_of, rights_of
@@ -55,7 +56,7 @@ class Access:
 
 
 def access_of(web: WebSettings, module: str, environ: Mapping[str, str], state: str = "") -> Access:
-    """The token that the settings ask for: one beyond loopback, for control, or where a file is given.
+    """The token that the settings ask for: one beyond loopback, for control or driving, or where a file is given.
 
     Args:
         web: The settings.
@@ -66,7 +67,7 @@ def access_of(web: WebSettings, module: str, environ: Mapping[str, str], state: 
     Raises:
         StartError: The file cannot be used, or there is no place for one.
     """
-    if auth.is_loopback(web.listen) and not web.token_file and not web.control:
+    if auth.is_loopback(web.listen) and not (web.token_file or web.control or web.drive):
         return Access()
     if web.token_file:
         file = Path(web.token_file)
@@ -118,20 +119,27 @@ async def serve(
     policy = auth.AccessPolicy(web.port, hosts, access.token, origins)
     watch = AgentWatch(reader)
     hub = make_hub(watch, web.port)
-    rights = rights_of(has_token=bool(access.token), control=web.control)
+    rights = rights_of(has_token=bool(access.token), control=web.control, drive=web.drive)
+    monitor = Monitor(hub, watch, agent=agent)
     gateways = Gateways(
-        hub, f"RMPA {agent or socket.gethostname()}", lambda _: rights, priority_of(hub, contracts or Contracts())
+        hub,
+        f"RMPA {agent or socket.gethostname()}",
+        lambda _: rights,
+        priority_of(hub, contracts or Contracts()),
+        monitor,
     )
     server = WebServer(watch, policy, web.listen, gateways, web.ports)
     try:
         async with hub:
             await server.start()
+            monitor.start()
             if with_agent:
                 _stop_at_end_of_input(loop, stop)
             announce(address_of(web, access, server.port))
             await stop.wait()
             _log.info("= ending")
             await gateways.close()
+            await monitor.close()
     finally:
         await server.close()
         reader.close()

@@ -1,0 +1,116 @@
+"""The state of the mesh for all pages: snapshots of the agent are read while pages are open, and not otherwise."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from typing import TYPE_CHECKING
+
+from rmpa.web.monitor import limits
+from rmpa.web.monitor.view import StateBuilder, details
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.observe.snapshot import Snapshot
+    from rmpa.web.monitor.io.resource_watch import ResourceWatch
+    from rmpa.web.monitor.patch import Tree
+    from rmpa.web.server.agent_watch import AgentWatch, Reading
+
+_log = logging.getLogger(__name__)
+
+
+class MeshFeed:
+    """Builds one state of each snapshot, and gives it to all pages.
+
+    Args:
+        watch: Asks the agent.
+        resources: Knows the Smart Resources.
+        clock: Seconds since the epoch.
+    """
+
+    def __init__(self, watch: AgentWatch, resources: ResourceWatch, clock: Callable[[], float] = time.time) -> None:
+        self._watch = watch
+        self._resources = resources
+        self._clock = clock
+        self._builder: StateBuilder | None = None
+        self._snapshot: Snapshot | None = None
+        self._silent_since: float | None = None
+        self._number = 0
+        self._state: Tree | None = None
+        self._pages: dict[object, Callable[[Tree], None]] = {}
+        self._task: asyncio.Task[None] | None = None
+
+    @property
+    def agent(self) -> str:
+        """The name of the agent's module; empty until it has answered once."""
+        return self._snapshot.agent.name if self._snapshot is not None else ""
+
+    async def first(self) -> None:
+        """Ask the agent once, so that its name is known."""
+        self._take(await self._watch.reading())
+
+    def follow(self, page: object, show: Callable[[Tree], None]) -> None:
+        """Give a page each new state, beginning with the last one."""
+        self._pages[page] = show
+        self._resources.show_all(wanted=True)
+        if self._state is not None:
+            show(self._state)
+        if self._task is None:
+            self._task = asyncio.get_running_loop().create_task(self._run(), name="monitor's state")
+
+    def unfollow(self, page: object) -> None:
+        """End a ``follow``; after the last one nothing more is read."""
+        self._pages.pop(page, None)
+        if not self._pages:
+            self._resources.show_all(wanted=False)
+            if self._task is not None:
+                self._task.cancel()
+                self._task = None
+
+    async def close(self) -> None:
+        """End."""
+        self._pages.clear()
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.wait([self._task])
+
+    def details(self, kind: str, name: str) -> Tree | None:
+        """All that is known of one thing; ``None`` where there is no such thing."""
+        if self._snapshot is None:
+            return None
+        if kind == "resource":
+            self._resources.look(name)
+        return details(self._snapshot, self._resources.facts, kind, name)
+
+    async def _run(self) -> None:
+        while True:
+            began = time.monotonic()
+            try:
+                self._take(await self._watch.reading())
+            except Exception:  # noqa: BLE001 - a task's top
+                _log.exception("! the state of the mesh could not be built")
+            # A snapshot of thousands of topics takes time at both ends: at most a fifth of it is spent here.
+            took = time.monotonic() - began
+            await asyncio.sleep(max(limits.STATE_PERIOD - took, took * limits.STATE_SHARE))
+
+    def _take(self, reading: Reading) -> None:
+        if reading.number == self._number:
+            return
+        self._number = reading.number
+        if reading.snapshot is None:
+            if self._silent_since is None:
+                self._silent_since = self._clock()
+            builder = self._builder or StateBuilder("")
+            problem, _, remedy = reading.problem.partition("; ")
+            self._state = builder.unreachable(self._silent_since, problem, remedy)
+        else:
+            self._silent_since = None
+            self._snapshot = reading.snapshot
+            if self._builder is None or self._builder.own != reading.snapshot.agent.name:
+                self._builder = StateBuilder(reading.snapshot.agent.name)
+            facts = tuple(self._resources.facts.values())
+            self._state = self._builder.build(reading.snapshot, facts, self._resources.alarms())
+        for show in [*self._pages.values()]:
+            show(self._state)

@@ -1,0 +1,220 @@
+"""The answers to questions of pages, and what pages order (``docs/design/monitor-protocol.md``, "Questions")."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from typing import TYPE_CHECKING, Any, Final, cast
+
+import msgspec
+
+from rmpa.bridge.proxy_names import proxied_node
+from rmpa.core.errors import ConfigError, RmpaError
+from rmpa.core.names import is_global_name
+from rmpa.observe import limits as observe_limits
+from rmpa.observe.io.control_client import ControlClient, choose_agent
+from rmpa.observe.io.peer_params import PeerParams, parameters_in
+from rmpa.resource.run.dynamic_reconfigure import SERVICE_TYPE
+from rmpa.web.values.codec import codec_for
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Mapping
+
+    from rmpa.ros.types.service_types import ServiceType
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
+    from rmpa.web.hub.hub import Hub
+    from rmpa.web.hub.requests import ParamValue
+    from rmpa.web.monitor.io.resource_watch import ResourceWatch
+    from rmpa.web.monitor.session import Question
+
+Args = dict[str, Any]
+_CALL_TIMEOUT: Final = 30.0
+_KINDS: Final = ("topic", "service")
+
+
+class Answers:
+    """Answers questions; each is asked by a page that may ask it.
+
+    Args:
+        hub: Calls services, and has this module's parameters.
+        resources: Has the history of alarms.
+        environ: Says where the agents' sockets are.
+        agent: Returns the agent's name; empty for the only one.
+    """
+
+    def __init__(
+        self, hub: Hub, resources: ResourceWatch, environ: Mapping[str, str], agent: Callable[[], str]
+    ) -> None:
+        self._hub = hub
+        self._resources = resources
+        self._environ = environ
+        self._agent = agent
+        self._handlers: Mapping[str, Callable[[Args], Awaitable[Any]]] = {
+            "why": self._why,
+            "history": self._history,
+            "describe": self._describe,
+            "params": self._params,
+            "call": self._call,
+            "set_param": self._set_param,
+            "delete_param": self._delete_param,
+            "profile": self._profile,
+            "context": self._context,
+        }
+
+    async def answer(self, question: Question) -> Any:
+        """The answer, as values for JSON.
+
+        Raises:
+            RmpaError: There is none; the text says why.
+        """
+        return await self._handlers[question.what](question.args)
+
+    # --- what only looks --------------------------------------------------------------------------------------
+
+    async def _why(self, args: Args) -> Any:
+        kind = args.get("kind")
+        if kind not in _KINDS:
+            raise ConfigError("kind", f"{str(kind)[:40]!r} is not a topic or a service")
+        name, peer = _name(args, "name"), _text(args, "peer")
+
+        def ask() -> Any:
+            with self._control() as client:
+                return client.call("why", object, name=name, peer=peer or None, service=kind == "service")
+
+        return await asyncio.to_thread(ask)
+
+    async def _history(self, _args: Args) -> Any:
+        return list(self._resources.history)
+
+    async def _describe(self, args: Args) -> Any:
+        kind = await self._type_of(self._service(args))
+        empty = codec_for(kind.request)
+        example = empty.write({}, 0).payload
+        return {
+            "type": kind.name,
+            "text": f"{kind.request.definition.strip()}\n---\n{kind.response.definition.strip()}".strip(),
+            "request": _json(empty.json(memoryview(example))),
+        }
+
+    # --- parameters -------------------------------------------------------------------------------------------
+
+    async def _params(self, args: Args) -> Any:
+        peer = _text(args, "peer")
+        if not peer:
+            if not self._hub.params.loaded.is_set():
+                self._hub.link.need()
+            return {"values": _plain(self._hub.params.tree)}
+        return {"values": _plain(await self._of_peer(peer, lambda params: params.get("/")))}
+
+    async def _set_param(self, args: Args) -> Any:
+        name, peer, value = _name(args, "name"), _text(args, "peer"), args.get("value")
+        if value is None:
+            raise ConfigError("value", "a parameter cannot be null", "delete it instead")
+        if peer:
+            await self._of_peer(peer, lambda params: params.set(name, cast("XmlRpcValue", value)))
+        else:
+            parameters_in(name, cast("XmlRpcValue", value))
+            await self._hub.params.set(name, cast("ParamValue", value))
+        return await self._params(args)
+
+    async def _delete_param(self, args: Args) -> Any:
+        name, peer = _name(args, "name"), _text(args, "peer")
+        if name == "/":
+            raise ConfigError("name", "the root holds every parameter", "name the one that you mean")
+        if peer:
+            await self._of_peer(peer, lambda params: params.delete(name))
+        else:
+            await self._hub.params.delete(name)
+        return await self._params(args)
+
+    async def _of_peer(self, peer: str, do: Callable[[PeerParams], Any]) -> Any:
+        def ask() -> Any:
+            with self._control() as client:
+                return do(PeerParams(client, peer))
+
+        return await asyncio.to_thread(ask)
+
+    def _control(self) -> ControlClient:
+        agent = choose_agent(self._environ, self._agent() or None)
+        return ControlClient(agent.path, observe_limits.CONTROL_HANDLER_TIMEOUT)
+
+    # --- services and resources -------------------------------------------------------------------------------
+
+    async def _call(self, args: Args) -> Any:
+        service = self._service(args)
+        request = args.get("request", {})
+        kind = await self._type_of(service)
+        body = codec_for(kind.request).write_arguments(request, time.time_ns()).payload
+        began = time.monotonic()
+        response = await self._hub.calls.call(service, kind.md5sum, body, _CALL_TIMEOUT)
+        took = time.monotonic() - began
+        values = codec_for(kind.response).json(memoryview(response))
+        return {"response": _json(values), "seconds": round(took, 6)}
+
+    async def _profile(self, args: Args) -> Any:
+        return await self._choose(args, "profile")
+
+    async def _context(self, args: Args) -> Any:
+        return await self._choose(args, "context")
+
+    async def _choose(self, args: Args, what: str) -> Any:
+        resource, choice = _name(args, "resource"), _text(args, "choice")
+        service = self._service({"service": f"{resource}/set_parameters", "peer": args.get("peer", "")})
+        kind = self._hub.types.service(SERVICE_TYPE)
+        wanted = {"config": {"strs": [{"name": what, "value": choice}]}}
+        body = codec_for(kind.request).write(wanted, time.time_ns()).payload
+        await self._hub.calls.call(service, kind.md5sum, body, _CALL_TIMEOUT)
+        return {"text": f"{what} {choice} is chosen" if choice else f"the resource chooses its {what}"}
+
+    def _service(self, args: Args) -> str:
+        """The service that is meant, which this module's graph has and, if a peer is named, by that peer.
+
+        Raises:
+            RmpaError: There is none.
+        """
+        name, peer = _name(args, "service"), _text(args, "peer")
+        known = self._hub.graph.services.get(name)
+        if known is None:
+            raise RmpaError(f"the graph of this module has no service {name}")
+        proxies = [proxied_node(node) for node in known.providers]
+        peers = [proxy[0] if proxy is not None else "" for proxy in proxies]
+        if peers and peer not in peers:
+            whose = peers[0] or "this module"
+            raise RmpaError(f"the service {name} of {whose} has this name here, not that of {peer or 'this module'}")
+        return name
+
+    async def _type_of(self, service: str) -> ServiceType:
+        found = await self._hub.calls.find(service)
+        return await self._hub.types.find_service(found.type)
+
+
+def _text(args: Args, key: str) -> str:
+    value = args.get(key, "")
+    if not isinstance(value, str):
+        raise ConfigError(key, f"{str(value)[:40]!r} is not a text")
+    return value
+
+
+def _name(args: Args, key: str) -> str:
+    value = _text(args, key)
+    if value != "/" and not is_global_name(value):
+        raise ConfigError(key, f"{value[:80]!r} is not a name", "write it as /name")
+    return value
+
+
+def _json(text: bytes) -> Any:
+    return msgspec.json.decode(text)
+
+
+def _plain(value: object) -> Any:
+    """Parameters for JSON: bytes are shown by their number, dates as they are written."""
+    if isinstance(value, dict):
+        return {str(key): _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(inner) for inner in value]
+    if isinstance(value, bytes | bytearray | memoryview):
+        return f"{len(value)} bytes"
+    if isinstance(value, float):
+        return value if math.isfinite(value) else str(value)
+    return value if value is None or isinstance(value, bool | int | str) else str(value)

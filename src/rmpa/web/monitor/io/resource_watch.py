@@ -1,0 +1,238 @@
+"""The Smart Resources of all modules, and their alarms, from the topics that they publish about themselves."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from rmpa.bridge.proxy_names import proxied_node
+from rmpa.core.errors import RmpaError
+from rmpa.resource.run.descriptor import TOPIC as DESCRIPTOR
+from rmpa.resource.run.descriptor import Descriptor
+from rmpa.resource.run.dynamic_reconfigure import CONFIG_TYPE
+from rmpa.ros.types.diagnostic_array import ARRAY_TYPE, DiagnosticLevel
+from rmpa.web.hub.clients import OWN_CLIENT
+from rmpa.web.monitor import limits
+from rmpa.web.monitor.resources import ResourceFacts
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.web.hub.hub import Hub
+    from rmpa.web.hub.requests import GraphTopic, Received
+    from rmpa.web.monitor.io.values import MessageValues
+    from rmpa.web.monitor.patch import Tree
+
+_TEXT: Final = "std_msgs/String"
+_ALWAYS: Final = {DESCRIPTOR: _TEXT, "alarms": ARRAY_TYPE}
+"""Topics below each resource, with their types, that are followed for the history of alarms."""
+_SHOWN: Final = {"state": _TEXT, "profile": _TEXT, "context": _TEXT, "quality": ARRAY_TYPE}
+"""Those that are followed while pages are open."""
+_LOOKED_AT: Final = {"decision": _TEXT, "responses": ARRAY_TYPE, "parameter_updates": CONFIG_TYPE}
+"""Those of a resource that a page shows."""
+_FIRST_HANDLE: Final = 1000
+_GRAPH: Final = 999
+_BAD: Final = frozenset({"WARN", "ERROR", "STALE"})
+
+
+@dataclass(slots=True, eq=False)
+class _Path:
+    """The subscriptions below one path; several modules may have a resource of that path."""
+
+    handles: dict[str, int] = field(default_factory=dict)
+    looked: float = -1e9
+
+
+class ResourceWatch:
+    """Follows the resources of the graph.
+
+    Args:
+        hub: Subscribes to their topics.
+        values: Decodes their messages.
+        clock: Monotonic seconds.
+        now: Seconds since the epoch.
+    """
+
+    def __init__(
+        self,
+        hub: Hub,
+        values: MessageValues,
+        clock: Callable[[], float] = time.monotonic,
+        now: Callable[[], float] = time.time,
+    ) -> None:
+        self._hub = hub
+        self._values = values
+        self._clock = clock
+        self._now = now
+        self._numbers = itertools.count(_FIRST_HANDLE)
+        self._paths: dict[str, _Path] = {}
+        self._wanted = False
+        self._since: dict[str, tuple[str, float]] = {}
+        self.facts: dict[str, ResourceFacts] = {}
+        """By ``ResourceFacts.key``."""
+        self.history: deque[dict[str, Any]] = deque(maxlen=limits.ALARMS_KEPT)
+        """Alarms since the server started, oldest first: ``at``, ``level``, ``resource``, ``text``."""
+
+    def start(self) -> None:
+        """Begin to follow the graph."""
+        self._hub.graph.follow((OWN_CLIENT, _GRAPH), self._graph_changed)
+
+    def close(self) -> None:
+        """End all subscriptions."""
+        self._hub.graph.unfollow((OWN_CLIENT, _GRAPH))
+        for path in [*self._paths]:
+            self._forget(path)
+
+    def show_all(self, *, wanted: bool) -> None:
+        """Whether the state of each resource is shown anywhere."""
+        if wanted != self._wanted:
+            self._wanted = wanted
+            self._follow_all()
+
+    def look(self, key: str) -> None:
+        """A page shows this resource: follow all that it says, for ``limits.LOOK_KEPT`` from now on."""
+        facts = self.facts.get(key)
+        path = self._paths.get(facts.name) if facts is not None else None
+        if path is not None and facts is not None:
+            path.looked = self._clock()
+            self._follow(facts.name, path)
+
+    def alarms(self) -> list[Tree]:
+        """The alarms that stand, for the state."""
+        standing: list[Tree] = []
+        for key, facts in self.facts.items():
+            level = facts.level
+            before = self._since.get(key)
+            if before is None or before[0] != level:
+                before = self._since[key] = level, self._now()
+            if level in _BAD:
+                standing.append({
+                    "id": key,
+                    "module": facts.peer or "",
+                    "resource": key,
+                    "level": level,
+                    "text": str((facts.health or {}).get("message", "")),
+                    "at": round(before[1], 1),
+                })  # fmt: skip
+        return standing
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    def _graph_changed(self) -> None:
+        ending = f"/{DESCRIPTOR}"
+        present = {
+            name.removesuffix(ending): topic
+            for name, topic in self._hub.graph.topics.items()
+            if name.endswith(ending) and topic.publishers and _TEXT in topic.types
+        }
+        for path in self._paths.keys() - present.keys():
+            self._forget(path)
+        for path, topic in present.items():
+            if path not in self._paths and len(self._paths) < limits.RESOURCES_MAX:
+                self._paths[path] = _Path()
+            self._keep_publishers(path, topic)
+        self._follow_all()
+
+    def _keep_publishers(self, path: str, topic: GraphTopic) -> None:
+        peers = {_peer_of(node) for node in topic.publishers}
+        for key, facts in [*self.facts.items()]:
+            if facts.name == path and facts.peer not in peers:
+                del self.facts[key]
+                self._since.pop(key, None)
+
+    def _follow_all(self) -> None:
+        for name, path in self._paths.items():
+            self._follow(name, path)
+
+    def _follow(self, name: str, path: _Path) -> None:
+        wanted = dict(_ALWAYS)
+        if self._wanted:
+            wanted |= _SHOWN
+            if self._clock() - path.looked < limits.LOOK_KEPT:
+                wanted |= _LOOKED_AT
+        for topic in path.handles.keys() - wanted.keys():
+            self._hub.topics.unsubscribe((OWN_CLIENT, path.handles.pop(topic)), f"{name}/{topic}")
+        for topic in wanted.keys() - path.handles.keys():
+            handle = path.handles[topic] = next(self._numbers)
+
+            def take(message: Received, topic: str = topic) -> None:
+                self._take(name, topic, message)
+
+            self._hub.topics.subscribe(
+                (OWN_CLIENT, handle), f"{name}/{topic}", wanted[topic], take, lambda _error: None
+            )
+
+    def _forget(self, name: str) -> None:
+        path = self._paths.pop(name)
+        for topic, handle in path.handles.items():
+            self._hub.topics.unsubscribe((OWN_CLIENT, handle), f"{name}/{topic}")
+        for key in [key for key, facts in self.facts.items() if facts.name == name]:
+            del self.facts[key]
+            self._since.pop(key, None)
+
+    def _take(self, name: str, topic: str, message: Received) -> None:
+        peer = _peer_of(message.source)
+        key = f"{peer}:{name}" if peer else name
+        try:
+            values = self._values.of(message)
+            if topic == DESCRIPTOR:
+                known = self.facts.get(key) or ResourceFacts(name=name, peer=peer)
+                self.facts[key] = msgspec.structs.replace(known, **_described(values["data"]))
+            elif topic == "alarms":
+                self._alarm(key, values)
+            elif key in self.facts:
+                facts = self.facts[key]
+                self.facts[key] = msgspec.structs.replace(facts, **_said(facts, topic, values))
+        except (RmpaError, msgspec.DecodeError, KeyError, TypeError):
+            return  # another program's topic of that name
+
+    def _alarm(self, key: str, values: Any) -> None:
+        for status in map(_status, values["status"]):
+            self.history.append(
+                {"at": round(self._now(), 3), "level": status["level"], "resource": key, "text": status["message"]}
+            )
+
+
+def _described(text: str) -> dict[str, Any]:
+    """What a descriptor says."""
+    descriptor = Descriptor.parse(text)
+    return {
+        "descriptor": msgspec.to_builtins(descriptor),
+        "contexts": tuple(map(msgspec.to_builtins, descriptor.contexts)),
+    }
+
+
+def _said(facts: ResourceFacts, topic: str, values: Any) -> dict[str, Any]:
+    """What a message says of a resource: members of ``ResourceFacts``."""
+    if topic in ("state", "profile", "context"):
+        return {topic: str(values["data"])}
+    if topic == "decision":
+        decision = msgspec.json.decode(values["data"] or "{}")
+        return {"decision": decision if isinstance(decision, dict) else facts.decision}
+    if topic == "responses":
+        return {"clients": tuple(map(_status, values["status"]))}
+    if topic == "parameter_updates":
+        pairs = [pair for kind in ("bools", "ints", "strs", "doubles") for pair in values[kind]]
+        return {"parameters": {pair["name"]: pair["value"] for pair in pairs}}
+    statuses = [*map(_status, values["status"]), facts.health]
+    return {"health": statuses[0]}
+
+
+def _status(values: Any) -> dict[str, Any]:
+    """A ``diagnostic_msgs/DiagnosticStatus`` as ``rmpa resource info --json`` has it."""
+    return {
+        "name": values["name"],
+        "level": DiagnosticLevel(values["level"] & 3).name,
+        "message": values["message"],
+        "values": {pair["key"]: pair["value"] for pair in values["values"]},
+    }
+
+
+def _peer_of(node: str) -> str | None:
+    proxy = proxied_node(node)
+    return proxy[0] if proxy is not None else None
