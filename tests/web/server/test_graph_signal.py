@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import secrets
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,12 @@ from tests.web.hub.client import local_core, node, running_hub
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from rmpa.web.hub.hub import Hub
+
+
+def _has_topic(hub: Hub, name: str) -> bool:
+    return name in hub.graph.topics
 
 
 async def test_a_new_topic_is_seen_by_the_agents_word_and_again_after_its_restart(tmp_path: Path) -> None:
@@ -28,7 +35,7 @@ async def test_a_new_topic_is_seen_by_the_agents_word_and_again_after_its_restar
             reads = hub.graph.reads
             async with asyncio.timeout(DEADLINE):
                 await talker.advertise(name, LATCHED)
-                await until(lambda name=name: name in hub.graph.topics)
+                await until(functools.partial(_has_topic, hub, name))
             assert hub.graph.reads > reads
             await server.close()
             await until(lambda: not hub.graph.told)
