@@ -228,7 +228,8 @@ Request: TypeAlias = (
 class Received:
     """One message for the subscription `handle`. `stamp_ns` is its time of receipt (UTC, nanoseconds).
 
-    `source` is the node that published it in this module's graph; "" for a client of the hub.
+    `source` is the node that published it in this module's graph; "" for a client of the hub. `md5sum` is that of
+    the publisher's version of the type; "" where it is not told.
     `payload` stays valid and unchanged for as long as it is referenced; all sessions share it.
     """
 
@@ -239,6 +240,7 @@ class Received:
     stamp_ns: int
     latched: bool = False
     source: str = ""
+    md5sum: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -52,6 +52,10 @@ class GraphView(Protocol):
 class TypeSource(Protocol):
     """Finds definitions: those that rmpa brings, this machine's, and those that peers described."""
 
+    def version(self, name: str, md5sum: str) -> MessageType:
+        """The version that a publisher has; errors as for ``message``."""
+        ...
+
     def message(self, name: str) -> MessageType:
         """A message type; raises `DefinitionError` if none is known."""
 
