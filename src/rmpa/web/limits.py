@@ -59,6 +59,8 @@ GRAPH_CHANGED_SHARE: Final = 1.0
 """The same after a look that found a change, which is parsed: that takes ten times as long as to compare."""
 PROBES_AT_ONCE: Final = 8
 """Servers that are asked for their service's type at one time."""
+FIND_ALL_TIMEOUT: Final = 3.0
+"""Time in which all servers that did not tell their service's type yet are asked, for one question of a client."""
 PROBE_RETRY: Final = 10.0
 """Time before a server that did not tell its service's type, or a type that was not found, is asked for again."""
 DESCRIBE_AT_ONCE: Final = 4

@@ -86,6 +86,16 @@ class FindService:
 
 
 @dataclass(frozen=True, slots=True)
+class FindServices:
+    """Asks for the types of all services whose types the graph does not say.
+
+    Answered by `ServiceFound` without a type once the graph has them; some may stay unknown.
+    """
+
+    handle: int
+
+
+@dataclass(frozen=True, slots=True)
 class CancelCall:
     """The answer of the call `handle` is no longer wanted."""
 
@@ -205,6 +215,7 @@ Request: TypeAlias = (
     | Publish
     | CallService
     | FindService
+    | FindServices
     | CancelCall
     | ServeService
     | EndService
@@ -255,7 +266,7 @@ class ServiceResult:
 
 @dataclass(frozen=True, slots=True)
 class ServiceFound:
-    """The answer to `FindService`."""
+    """The answer to `FindService`; without a type that to `FindServices`."""
 
     handle: int
     type: str
