@@ -63,6 +63,8 @@ class TypeLibrary:
             try:
                 kind = MessageType(name) if known_text(name) is not None else find_message_type(name)
             except RmpaError as error:
+                if isinstance(error, UnknownTypeError) and error.fetchable:
+                    self._start_finding(name)  # a publisher may tell it, for the next question
                 raise self._remember(name, error, service=False) from None
             self._keep(name, kind)
         return kind
@@ -105,11 +107,7 @@ class TypeLibrary:
         kind = self._messages.get(name)
         if kind is not None:
             return kind
-        finding = self._finding.get(name)
-        if finding is None:
-            finding = self._finding[name] = asyncio.ensure_future(self._find(name))
-            finding.add_done_callback(lambda _: self._finding.pop(name, None))
-        return await asyncio.shield(finding)
+        return await asyncio.shield(self._start_finding(name))
 
     async def find_service(self, name: str) -> ServiceType:
         """A service type that is known or on this machine.
@@ -166,6 +164,19 @@ class TypeLibrary:
         await asyncio.gather(*finding, return_exceptions=True)
 
     # --- inside -----------------------------------------------------------------------------------------------
+
+    def _start_finding(self, name: str) -> asyncio.Future[MessageType]:
+        finding = self._finding.get(name)
+        if finding is None:
+            finding = self._finding[name] = asyncio.ensure_future(self._find(name))
+
+            def found(finding: asyncio.Future[MessageType]) -> None:
+                del self._finding[name]
+                if not finding.cancelled():
+                    finding.exception()  # nothing may wait for it
+
+            finding.add_done_callback(found)
+        return finding
 
     async def _find(self, name: str) -> MessageType:
         async with self._asked:
