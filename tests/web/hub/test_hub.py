@@ -6,8 +6,6 @@ import asyncio
 import time
 from typing import TYPE_CHECKING, Any
 
-import pytest
-
 from rmpa.core.errors import RmpaError
 from rmpa.ros.types.definitions import parse_definition
 from rmpa.ros.types.messages import MessageType
@@ -42,6 +40,8 @@ from tests.ros.node.peers import DEADLINE, LATCHED, STRING, until
 from tests.web.hub.client import FakeClient, node, running_hub
 
 if TYPE_CHECKING:
+    import pytest
+
     from rmpa.ros.core.embedded import RosCore
 
 ONE, TWO = b"\x03\0\0\0one", b"\x03\0\0\0two"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from array import array
+import struct
 from typing import Any
 
 import pytest
@@ -120,7 +120,7 @@ def test_an_integer_that_a_browser_would_round_is_sent_as_text() -> None:
 )
 def test_a_depth_image_is_shown_from_near_to_far(encoding: str, letter: str, nothing: float) -> None:
     rows = [[nothing, 1000, 2000], [3000, 1000, 3000]]
-    packed = [array(letter, [int(value) if letter == "H" else value for value in row]).tobytes() for row in rows]
+    packed = [struct.pack(f"<3{letter}", *row) for row in rows]
     step = len(packed[0]) + 4
     picture = raw_picture(3, 2, encoding, step, b"".join(row + b"pad!" for row in packed))
     assert (picture.format, picture.width, picture.height) == ("mono8", 3, 2)
