@@ -119,7 +119,7 @@ def test_an_integer_that_a_browser_would_round_is_sent_as_text() -> None:
     ("encoding", "letter", "nothing"), [("16UC1", "H", 0), ("mono16", "H", 0), ("32FC1", "f", float("nan"))]
 )
 def test_a_depth_image_is_shown_from_near_to_far(encoding: str, letter: str, nothing: float) -> None:
-    rows = [[nothing, 1000, 2000], [3000, 1000, 3000]]
+    rows: list[list[float]] = [[nothing, 1000, 2000], [3000, 1000, 3000]]
     packed = [struct.pack(f"<3{letter}", *row) for row in rows]
     step = len(packed[0]) + 4
     picture = raw_picture(3, 2, encoding, step, b"".join(row + b"pad!" for row in packed))
