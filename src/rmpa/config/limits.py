@@ -31,6 +31,10 @@ FOLLOWED_MAX: Final = 256
 counts as one."""
 FOLLOW_RULES_MAX: Final = 2048
 """Tables ``[[param]]`` in a file, whatever ``limits.params`` says: each is compared with each other one."""
+PERMISSION_RULES_MAX: Final = 4096
+"""Tables ``[[permission]]`` in a file; each decision compares a name with all that are about one module."""
+GROUPS_MAX: Final = 256
+"""Groups of modules in ``[trust.groups]``: as many as a large network has modules."""
 BOUND_MAX: Final = 1_000_000
 """Highest value of a setting in ``[limits]``: such a graph takes some gigabytes."""
 CPU_MAX: Final = 1023

@@ -16,6 +16,7 @@ from rmpa.config import limits
 from rmpa.config.contract_rules import ConfigWarning
 from rmpa.config.policy import PolicySettings
 from rmpa.config.values import (
+    PEER_GLOB,
     TYPE_GLOB,
     BadValue,
     JsonSchema,
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
 PEER: Final = "{peer}"
 """Stands for the peer's name in a rule."""
 _SOME_PEER: Final = "peer"
-_PEER_GLOB: Final = re.compile(r"[A-Za-z0-9_*?]+")
 _DIRECTIONS: Final = ("in", "out")
 
 
@@ -141,15 +141,6 @@ def _read_rule(table: Mapping[str, object]) -> tuple[PeerRule, dict[str, list[_P
     incoming, outgoing = (tuple(p.remap for p in placed[direction]) for direction in _DIRECTIONS)
     name, prefix = values.pop("name"), values.pop("prefix", "")
     return PeerRule(name, prefix, incoming, outgoing, PolicySettings(**values)), placed
-
-
-def _read_peer_glob(raw: object) -> str:
-    glob = read_text(raw).strip()
-    if not _PEER_GLOB.fullmatch(glob) or "**" in glob:
-        raise BadValue(
-            f"{glob!r} is not a glob over peers' names", "such as robot1, robot* or robot?; * is every peer"
-        )
-    return glob
 
 
 def _read_prefix(raw: object) -> str:
@@ -256,7 +247,7 @@ _RENAMES: Final[JsonSchema] = {"type": "object", "additionalProperties": {"type"
 _KEYS: Final = (
     RuleKey(
         "name",
-        ValueType(_read_peer_glob, {"type": "string", "examples": ["robot*"]}),
+        PEER_GLOB,
         "The peers, by a glob over their names.",
         required=True,
     ),

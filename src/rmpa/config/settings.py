@@ -13,6 +13,13 @@ from rmpa.config import limits
 from rmpa.config.contract_rules import CONTRACT_RULES
 from rmpa.config.param_rules import PARAM_RULES, FollowRule
 from rmpa.config.peer_rules import PEER_RULES, PeerRule, Remap
+from rmpa.config.permission_rules import (
+    MODULE_GROUPS,
+    PERMISSION_DEFAULT,
+    PERMISSION_RULES,
+    ModuleGroup,
+    PermissionRule,
+)
 from rmpa.config.policy import PolicySettings
 from rmpa.config.quantities import TIMEOUT
 from rmpa.config.schema import setting, settings_of, table
@@ -36,6 +43,7 @@ from rmpa.config.values import (
     NODE_GLOB,
     PACKET_PRIORITY,
     PARAM_GLOB,
+    PEER_GLOB,
     PORT,
     PORT_OR_ANY,
     SERVICE_GLOB,
@@ -59,10 +67,12 @@ __all__ = [
     "HostPort",
     "LaneSettings",
     "LimitSettings",
+    "ModuleGroup",
     "Multicast",
     "NodeSettings",
     "ParamSettings",
     "PeerRule",
+    "PermissionRule",
     "PolicySettings",
     "RealtimeSettings",
     "Remap",
@@ -70,6 +80,7 @@ __all__ = [
     "ServiceSettings",
     "Settings",
     "TimeSettings",
+    "TrustSettings",
     "WebSettings",
 ]
 
@@ -276,6 +287,43 @@ class WebSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class TrustSettings:
+    """What the modules of a secured mesh may do here, and whether this agent runs without trust."""
+
+    default: str = setting(
+        "deny",
+        PERMISSION_DEFAULT,
+        "What holds where no [[permission]] fits: deny; or allow, and every member of the mesh may do everything.",
+        env="RMPA_TRUST_DEFAULT",
+        live=True,
+    )
+    groups: tuple[ModuleGroup, ...] = setting(
+        (),
+        MODULE_GROUPS,
+        "Names for sets of modules, each a list of globs over modules' names.",
+        shown_default="none",
+        live=True,
+    )
+    relays: tuple[str, ...] = setting(
+        (),
+        list_of(PEER_GLOB),
+        "Modules that may pass on what others offer; the origin that they name cannot be proved.",
+        env="RMPA_TRUST_RELAYS",
+        live=True,
+    )
+    require: bool = setting(
+        False, BOOL, "Refuse to start while this module has not joined a secured mesh.", env="RMPA_TRUST_REQUIRE"
+    )
+    rules: tuple[PermissionRule, ...] = setting(
+        (),
+        PERMISSION_RULES,
+        "What other modules may do here; a deny that fits wins over an allow.",
+        key="permission",
+        live=True,
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class Settings:
     """All settings of one agent.
 
@@ -389,6 +437,7 @@ class Settings:
     lanes: LaneSettings = table(LaneSettings, "lanes")
     realtime: RealtimeSettings = table(RealtimeSettings, "realtime")
     web: WebSettings = table(WebSettings, "web")
+    trust: TrustSettings = table(TrustSettings, "trust")
     relay: bool = setting(
         False,
         BOOL,
@@ -457,6 +506,7 @@ TABLES: Final = {
     "lanes": "How the packets of each lane are marked.",
     "realtime": "What the agent asks the kernel for.",
     "web": "Where the module's state is served over HTTP (docs/web.md).",
+    "trust": "What the modules of a secured mesh may do here (docs/design/trust.md).",
     "relay": "Whether this module joins networks that are not routed to each other.",
     "log": "What the log says, and how.",
 }

@@ -20,6 +20,7 @@ from rmpa.config.contract_rules import contract_warnings
 from rmpa.config.file import dotted, parse_config
 from rmpa.config.param_rules import follow_problems
 from rmpa.config.peer_rules import peer_warnings
+from rmpa.config.permission_rules import permission_problems
 from rmpa.config.settings import SETTINGS, Settings
 from rmpa.config.toml_lines import line_of
 from rmpa.config.values import BadValue, did_you_mean
@@ -173,6 +174,8 @@ def _check_together(settings: Settings, given: _Layer) -> None:
     if (count := len(settings.params.follow)) > settings.limits.params:
         problem = f"{count} rules, more than limits.params = {settings.limits.params}"
         raise given["params.follow"].error(problem, "raise that, or follow a namespace as a whole", ())
+    for at, problem, remedy in permission_problems(settings.trust.rules, settings.trust.groups):
+        raise given["trust.rules"].error(problem, remedy, at)
     for name, at, problem in follow_problems(settings.params.follow, settings.time.follow, settings.name):
         raise given[name].error(problem, "name another module", at)
 

@@ -35,6 +35,7 @@ _MASTER: Final = re.compile(r"http://(?P<host>[^\s/:\[\]]+):(?P<port>[0-9]{1,5})
 _HOST: Final = re.compile(r"(?=.{1,253}\Z)[A-Za-z0-9_](?:[A-Za-z0-9_.-]*[A-Za-z0-9_])?")
 _NUMERIC: Final = re.compile(r"[0-9.]+")
 _TOPIC_GLOB: Final = re.compile(r"[A-Za-z0-9_/*?]+")
+_PEER_GLOB: Final = re.compile(r"[A-Za-z0-9_*?]+")
 _INTERFACE: Final = re.compile(r"[^\s/]{1,15}")
 _BOOLEANS: Final = {
     "1": True,
@@ -350,6 +351,16 @@ def read_type_glob(raw: object) -> str:
     return glob
 
 
+def read_peer_glob(raw: object) -> str:
+    """A glob over peers' names."""
+    glob = read_text(raw).strip()
+    if not _PEER_GLOB.fullmatch(glob) or "**" in glob:
+        raise BadValue(
+            f"{glob!r} is not a glob over peers' names", "such as robot1, robot* or robot?; * is every peer"
+        )
+    return glob
+
+
 def _glob_over(what: str) -> ValueType[str]:
     """A glob over other ROS names than topics; the errors name what it is for."""
 
@@ -365,6 +376,7 @@ def _glob_over(what: str) -> ValueType[str]:
 
 TOPIC_GLOB: Final = ValueType(read_topic_glob, {"type": "string", "examples": ["/camera/**"]}, "GLOB")
 TYPE_GLOB: Final = ValueType(read_type_glob, {"type": "string", "examples": ["sensor_msgs/*"]}, "GLOB")
+PEER_GLOB: Final = ValueType(read_peer_glob, {"type": "string", "examples": ["robot*"]}, "GLOB")
 SERVICE_GLOB: Final = _glob_over("service")
 NODE_GLOB: Final = _glob_over("node")
 PARAM_GLOB: Final = _glob_over("parameter")

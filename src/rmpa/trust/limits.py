@@ -1,0 +1,85 @@
+"""Limits and time-outs of trust.
+
+Each has its reason beside it. Seconds and bytes, unless the name says otherwise.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from rmpa.core.sizes import KIB, MIB
+
+# --- permissions ------------------------------------------------------------------------------------------------
+MODULES_REMEMBERED: Final = 256
+"""Modules whose rules are cached: as many as a large network has."""
+SROS_FILE_MAX: Final = 4 * MIB
+"""Bytes of an SROS 2 file of permissions; DDS's own files fail above 64 KB, and a large one has some 300 KB."""
+SROS_DEPTH_MAX: Final = 32
+"""Nested elements of such a file; its schema has nine."""
+SROS_RULES_MAX: Final = 4096
+"""Rules that are made of one file: as many as ``rmpa.toml`` may have."""
+
+# --- packets ----------------------------------------------------------------------------------------------------
+TAG_BYTES: Final = 16
+"""Bytes of an HMAC-SHA256 that are sent, half of it (RFC 2104, section 5): forging one takes 2¹²⁸ attempts."""
+GROUP_KEY_BYTES: Final = 32
+"""A group key is as long as the hash (RFC 2104, section 3)."""
+REPLAY_WINDOW: Final = 64
+"""Numbers below the highest one of a run that are still accepted once (RFC 4303, section 3.4.3): multicasts over
+Wi-Fi are overtaken by unicasts."""
+RUNS_MAX: Final = 1024
+"""Runs of agents whose numbers are remembered: two of each member of a full roster. The one that was silent for
+longest is forgotten first."""
+CLOCK_TOLERANCE: Final = 30.0
+"""Difference of two set clocks above which a packet counts as an old one that is sent again. NTP holds 10 ms, a watch
+set by hand 10 s."""
+KEYS_MAX: Final = 8
+"""Group keys that are known: the one that signs, the next, and older ones, with which a module that was away is
+recognised."""
+KEY_SPREAD: Final = 30.0
+"""A new group key signs this long after it was made; by then it has reached every linked module."""
+KEY_OVERLAP: Final = 3600.0
+"""The group key before verifies for this long after the next one began to sign."""
+OLD_KEY_PACKETS_RATE: Final = 5.0
+"""Packets a second with an older group key that are accepted, over all senders: each leads to one dial, 3 ms."""
+
+# --- joining ----------------------------------------------------------------------------------------------------
+TOKEN_SECRET_BYTES: Final = 16
+"""Random bytes of a token: 128 bits cannot be guessed."""
+FINGERPRINT_BYTES: Final = 16
+"""Bytes of the CA's fingerprint in a token: another certificate with this one takes 2¹²⁸ attempts."""
+TOKEN_LIFETIME: Final = 900.0
+"""Validity of a token, unless a user says otherwise: the way from one machine to the other."""
+TOKEN_LIFETIME_MAX: Final = 30 * 86_400.0
+"""The longest validity of a token, for the delivery of a robot."""
+TOKENS_MAX: Final = 256
+"""Tokens of one authority that are remembered, used ones too; the one that ended first is forgotten first."""
+TOKEN_TEXT_MAX: Final = 256
+"""Characters of a token that are read; one has 91."""
+NONCE_BYTES: Final = 32
+"""Random bytes of each side's part of the six-digit code, as many as the hash has."""
+CODE_TIMEOUT: Final = 300.0
+"""Time in which both users compare the code: one of them walks to the other machine."""
+
+# --- certificates -----------------------------------------------------------------------------------------------
+CERTIFICATE_LIFETIME: Final = 7 * 86_400
+"""Validity of a module's certificate. It bounds how long a stolen key is of use where no deny list arrives."""
+CERTIFICATE_BACKDATE: Final = 3600
+"""A certificate begins this long before it is issued: clocks of new modules are late."""
+CA_LIFETIME: Final = 3652 * 86_400
+"""Validity of a CA: ten years, the life of a robot."""
+RENEWAL_SHARE: Final = 0.5
+"""Part of a certificate's validity after which it is renewed; three and a half days are left for the authority to
+be there."""
+RENEWAL_GRACE: Final = 365 * 86_400
+"""A certificate that ended less than this long ago is renewed without a new invitation: a robot was in a drawer."""
+CSR_MAX: Final = 4 * KIB
+"""Bytes of a request for a certificate (DER); one has some 250."""
+CERTIFICATE_MAX: Final = 8 * KIB
+"""Bytes of a certificate (DER or PEM) that are parsed; one has some 600."""
+
+# --- documents --------------------------------------------------------------------------------------------------
+DENY_MAX: Final = 1024
+"""Names on a deny list, two for each member of a full roster."""
+DOCUMENT_MAX: Final = 256 * KIB
+"""Bytes of a signed document: a full deny list has some 100 KB."""
