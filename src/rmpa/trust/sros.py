@@ -1,7 +1,7 @@
 """Reads the permissions of SROS 2 (``permissions.xml`` of DDS Security 1.1, section 9.4.1.3) as rules of RMPA.
 
-A grant says what its subject may do; in RMPA each module says what others may do there. So a grant becomes rules about
-the module of its subject, to be used at the other modules:
+A grant says what its subject may do; in RMPA each module says what others may do there. So a grant becomes rules
+about the module of its subject, to be used at the other modules:
 
 =================================  ===================================
 topic of DDS (design.ros2.org)     key of the rule
@@ -221,7 +221,7 @@ def _service(
     is_client = (kind == "rq") is (direction == _PUBLISHED)
     if _ACTION in name:
         action, _, part = name.partition(_ACTION)
-        if part == "send_goal":
+        if part == "send_goal" and action:
             yield (ACTION_CLIENT if is_client else ACTION_SERVER), action
     elif _PARAMETER_SERVICES.search(name):
         notes["services of ROS 2's parameters are left out: write param = [...] for parameters"] = None
