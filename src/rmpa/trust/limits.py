@@ -43,6 +43,16 @@ KEY_OVERLAP: Final = 3600.0
 OLD_KEY_PACKETS_RATE: Final = 5.0
 """Packets a second with an older group key that are accepted, over all senders: each leads to one dial, 3 ms."""
 
+# --- connections ------------------------------------------------------------------------------------------------
+PREFACE_NONCE_BYTES: Final = 16
+"""Random bytes of a preface: 128 bits, so that two never have the same."""
+NONCE_KEPT: Final = 2 * CLOCK_TOLERANCE
+"""The nonce of a preface is remembered this long: from a clock that is as far ahead as is allowed to one that is as
+far behind."""
+NONCES_MAX: Final = 4096
+"""Nonces that are remembered: 68 handshakes a second for a minute, 512 members that dial twice and again. Beyond it
+prefaces are refused; only members and holders of tokens come so far."""
+
 # --- joining ----------------------------------------------------------------------------------------------------
 TOKEN_SECRET_BYTES: Final = 16
 """Random bytes of a token: 128 bits cannot be guessed."""

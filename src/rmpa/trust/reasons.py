@@ -1,0 +1,55 @@
+"""The reasons for which a secured mesh refuses a connection: one word each, for wire, counters, commands and logs."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Final
+
+
+class TrustReason(IntEnum):
+    """Why a connection is refused; the numbers continue those of ``mesh.handshake.Refusal`` on the wire."""
+
+    PLAIN = 11
+    """The dialler does not use TLS, and this mesh does."""
+    UNSECURED = 12
+    """The acceptor has not joined a secured mesh, and the dialler has."""
+    KEY = 13
+    """The group key is unknown, or the proof of it is wrong."""
+    CLOCK = 14
+    """The clocks are too far apart, or a certificate begins in the future."""
+    FOREIGN = 15
+    """The certificate is of another CA."""
+    EXPIRED = 16
+    """The certificate's time is over."""
+    REVOKED = 17
+    """The certificate is on the deny list."""
+    NAME = 18
+    """The certificate is of another module than the hello says."""
+    DOWNGRADE = 19
+    """The connection does not use TLS 1.3 with this protocol."""
+    FLOOD = 20
+    """Too many handshakes come from there, or the same one came twice."""
+
+    @property
+    def label(self) -> str:
+        """The word for people and counters: ``expired``."""
+        return self.name.lower()
+
+    @property
+    def remedy(self) -> str:
+        """What to do, as a sentence part."""
+        return _REMEDIES[self]
+
+
+_REMEDIES: Final = {
+    TrustReason.PLAIN: "let that module join: rmpa trust invite here, rmpa trust join there",
+    TrustReason.UNSECURED: "let that module join this mesh, or leave it here with rmpa trust leave",
+    TrustReason.KEY: "is it of this mesh? if it was away for long, rmpa trust renew there",
+    TrustReason.CLOCK: "set both clocks: date, timedatectl",
+    TrustReason.FOREIGN: "that module has joined another mesh: rmpa trust join there, with a token of this one",
+    TrustReason.EXPIRED: "rmpa trust renew on the module whose certificate it is, while the authority is reachable",
+    TrustReason.REVOKED: "if that module is to come back: rmpa trust invite at the authority, rmpa trust join there",
+    TrustReason.NAME: "start that module with the name that it joined with, or let it join again",
+    TrustReason.DOWNGRADE: "install the same release of rmpa on both",
+    TrustReason.FLOOD: "it is tried again; is something else connecting to this port?",
+}
