@@ -1,0 +1,264 @@
+"""One-time tokens: an invitation to join a mesh, as a text that a user carries from one machine to the other.
+
+The text is ``rmpa1-`` and 85 characters of base32 (RFC 4648, lower case, no padding) of 53 bytes::
+
+     0 format       1 byte    1
+     1 expires      4 bytes   seconds since 1970
+     5 address      4 bytes   of the authority, IPv4
+     9 port         2 bytes   its mesh port
+    11 fingerprint 16 bytes   of the CA's certificate: the first half of the SHA-256 of its DER
+    27 secret      16 bytes   random
+    43 checksum    10 bytes   the begin of the SHA-256 of all before it
+
+The authority keeps the id and the key of a token, and not its text. Spaces, line ends and upper case in a text that was
+typed or copied do not matter.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+import hmac
+import re
+import struct
+from dataclasses import dataclass, field
+from enum import StrEnum
+from ipaddress import IPv4Address
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core.errors import RmpaError
+from rmpa.core.guid import dialable
+from rmpa.core.identity import peer_name_problem
+from rmpa.core.sizes import UINT32_MAX
+from rmpa.trust import limits
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+PREFIX: Final = "rmpa1-"
+FORMAT: Final = 1
+_BODY: Final = struct.Struct(">BI4sH16s16s")
+_CHECKSUM: Final = 10
+_CHARACTERS: Final = 85
+_ID: Final = 8
+_TEXT: Final = re.compile(r"[a-z2-7]+")
+_REMEDY: Final = "copy it whole from the output of rmpa trust invite"
+
+
+class TokenProblem(StrEnum):
+    """Why a token is not taken; the value is the word for ``--json`` and counters."""
+
+    TOKEN = "token"  # noqa: S105 - a word, not a secret
+    """It is unknown at this authority, or was withdrawn."""
+    USED = "used"
+    """A module has joined with it."""
+    LATE = "late"
+    """Its time is over."""
+    NAME = "name"
+    """It is for another module."""
+
+
+@dataclass(eq=False)
+class TokenError(RmpaError):
+    """A text that is not a token.
+
+    Args:
+        problem: What is wrong with it; never has a part of the text, which may be a secret.
+        remedy: What to do.
+    """
+
+    problem: str
+    remedy: str = _REMEDY
+
+    def __str__(self) -> str:
+        """``the token …; …``."""
+        return f"the token {self.problem}; {self.remedy}"
+
+
+@dataclass(frozen=True, slots=True)
+class Token:
+    """One invitation.
+
+    Args:
+        expires: Seconds since 1970; 32 bits.
+        address: Where the authority is reached.
+        port: Its mesh port.
+        fingerprint: Of the CA, ``limits.FINGERPRINT_BYTES``; see ``fingerprint_of``.
+        secret: ``limits.TOKEN_SECRET_BYTES`` random bytes; not in ``repr``.
+
+    Raises:
+        ValueError: A part is out of its range.
+    """
+
+    expires: int
+    address: IPv4Address
+    port: int
+    fingerprint: bytes
+    secret: bytes = field(repr=False)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.expires <= UINT32_MAX:
+            raise ValueError("the end of a token has 32 bits")
+        if not 0 <= self.port < 1 << 16 or not dialable(self.address, self.port):
+            raise ValueError(f"no authority can be reached at {self.address}:{self.port}")
+        if len(self.fingerprint) != limits.FINGERPRINT_BYTES or len(self.secret) != limits.TOKEN_SECRET_BYTES:
+            raise ValueError("the fingerprint or the secret has a wrong length")
+
+    @classmethod
+    def parse(cls, text: str) -> Token:
+        """Read a token as a user gives it.
+
+        Raises:
+            TokenError: It is not one; the text says whether it is cut off, mistyped or of a later release.
+        """
+        if len(text) > limits.TOKEN_TEXT_MAX:
+            raise TokenError(f"has {len(text)} characters, a token has {len(PREFIX) + _CHARACTERS}")
+        packed = "".join(text.split()).lower()
+        if not packed.startswith(PREFIX):
+            if re.match(r"rmpa[0-9]+-", packed):
+                raise TokenError("is of another release", "install the same release of rmpa on both machines")
+            raise TokenError(f"does not begin with {PREFIX}")
+        body = packed[len(PREFIX) :]
+        if len(body) != _CHARACTERS:
+            raise TokenError(f"has {len(body)} characters behind {PREFIX}, not {_CHARACTERS}: it is not whole")
+        if not _TEXT.fullmatch(body):
+            raise TokenError("has characters that no token has")
+        try:
+            data = base64.b32decode(body.upper() + "=" * (-len(body) % 8))
+        except binascii.Error:
+            raise TokenError("is mistyped") from None
+        if len(data) != _BODY.size + _CHECKSUM or _checksum(data[: _BODY.size]) != data[_BODY.size :]:
+            raise TokenError("is mistyped")
+        form, expires, address, port, fingerprint, secret = _BODY.unpack_from(data)
+        if form != FORMAT:
+            raise TokenError("is of another release", "install the same release of rmpa on both machines")
+        try:
+            return cls(expires, IPv4Address(address), port, fingerprint, secret)
+        except ValueError as error:
+            raise TokenError(f"cannot be used: {error}") from None
+
+    def serialize(self) -> str:
+        """The text that ``parse`` reads."""
+        body = _BODY.pack(FORMAT, self.expires, self.address.packed, self.port, self.fingerprint, self.secret)
+        return PREFIX + base64.b32encode(body + _checksum(body)).decode().rstrip("=").lower()
+
+    @property
+    def token_id(self) -> bytes:
+        """The id of 8 bytes by which the authority knows it."""
+        return hashlib.sha256(b"rmpa token id 1" + self.secret).digest()[:_ID]
+
+    @property
+    def key(self) -> bytes:
+        """The key that signs the preface of a join (``trust.preface``)."""
+        return hmac.digest(self.secret, b"rmpa token key 1", hashlib.sha256)
+
+    def __str__(self) -> str:
+        """``token 1f0a… of 10.0.0.1:40001``: fit for a log."""
+        return f"token {self.token_id.hex()[:8]} of {self.address}:{self.port}"
+
+
+def fingerprint_of(certificate: bytes) -> bytes:
+    """The fingerprint of a certificate (DER) as tokens have it."""
+    return hashlib.sha256(certificate).digest()[: limits.FINGERPRINT_BYTES]
+
+
+def _checksum(body: bytes) -> bytes:
+    return hashlib.sha256(body).digest()[:_CHECKSUM]
+
+
+@dataclass(slots=True)
+class Invitation:
+    """One token as the authority keeps it.
+
+    Args:
+        token_id: Its id.
+        key: Its key; empty once it is used or has ended. Not in ``repr``.
+        expires: Seconds since 1970.
+        name: The module that it is for; empty for any.
+        used_by: The module that joined with it.
+    """
+
+    token_id: bytes
+    key: bytes = field(repr=False)
+    expires: int
+    name: str = ""
+    used_by: str = ""
+
+
+class TokenBook:
+    """The tokens of one authority: each lets one module join once.
+
+    Args:
+        invitations: Those of its file.
+    """
+
+    def __init__(self, invitations: Iterable[Invitation] = ()) -> None:
+        self._all = {invitation.token_id: invitation for invitation in invitations}
+
+    def __len__(self) -> int:
+        return len(self._all)
+
+    @property
+    def invitations(self) -> tuple[Invitation, ...]:
+        """All that are remembered, for the file and ``rmpa trust status``."""
+        return tuple(self._all.values())
+
+    def invite(self, token: Token, name: str = "") -> None:
+        """Remember a new token.
+
+        Args:
+            token: The token.
+            name: The module that it is for; empty for any.
+
+        Raises:
+            ValueError: No module can have that name.
+        """
+        if name and (problem := peer_name_problem(name)):
+            raise ValueError(problem)
+        while len(self._all) >= limits.TOKENS_MAX:
+            del self._all[min(self._all, key=lambda each: (not self._all[each].used_by, self._all[each].expires))]
+        self._all[token.token_id] = Invitation(token.token_id, token.key, token.expires, name)
+
+    def key_of(self, token_id: bytes) -> bytes | None:
+        """The key of a token that may still be used; ``None``: it is unknown or used.
+
+        A token whose time is over keeps its key, so that its holder is told so and not that it is unknown.
+        """
+        invitation = self._all.get(token_id)
+        return invitation.key if invitation is not None and invitation.key else None
+
+    def judge(self, token_id: bytes, name: str, wall: float) -> TokenProblem | None:
+        """Why a module may not join with a token; ``None``: it may.
+
+        Args:
+            token_id: The token's.
+            name: The module's.
+            wall: Seconds since 1970.
+        """
+        invitation = self._all.get(token_id)
+        if invitation is None:
+            return TokenProblem.TOKEN
+        if invitation.used_by:
+            return TokenProblem.USED
+        if wall >= invitation.expires:
+            return TokenProblem.LATE
+        if invitation.name and invitation.name != name:
+            return TokenProblem.NAME
+        return None
+
+    def use(self, token_id: bytes, name: str, wall: float) -> TokenProblem | None:
+        """Let a module join with a token, which then is used; return why not, as ``judge``."""
+        problem = self.judge(token_id, name, wall)
+        if problem is None:
+            invitation = self._all[token_id]
+            invitation.used_by, invitation.key = name, b""
+        return problem
+
+    def withdraw(self, token_id: bytes) -> bool:
+        """Forget a token that was not used; return whether there was one."""
+        invitation = self._all.get(token_id)
+        if invitation is None or invitation.used_by:
+            return False
+        del self._all[token_id]
+        return True

@@ -1,0 +1,205 @@
+"""Tokens: golden text, mistakes of typing, and that each lets one module join once."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from ipaddress import IPv4Address
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rmpa.trust import limits
+from rmpa.trust.preface import NO_ID
+from rmpa.trust.tokens import PREFIX, Invitation, Token, TokenBook, TokenError, TokenProblem, fingerprint_of
+from tests.fuzz import target_token
+
+SECRET = bytes(range(100, 116))
+TOKEN = Token(1_790_000_000, IPv4Address("10.0.0.1"), 40001, bytes(range(16)), SECRET)
+BODY = bytes.fromhex("01 6ab13b80 0a000001 9c41 000102030405060708090a0b0c0d0e0f 6465666768696a6b6c6d6e6f70717273")
+TEXT = PREFIX + base64.b32encode(BODY + hashlib.sha256(BODY).digest()[:10]).decode().rstrip("=").lower()
+WALL = 1_789_999_999.0
+
+
+def test_golden_text_both_ways() -> None:
+    assert TOKEN.serialize() == TEXT
+    assert len(TEXT) == 91
+    assert Token.parse(TEXT) == TOKEN
+
+
+def test_id_and_key_are_golden() -> None:
+    assert TOKEN.token_id == hashlib.sha256(b"rmpa token id 1" + SECRET).digest()[:8]
+    assert len(TOKEN.token_id) == len(NO_ID)
+    assert len(TOKEN.key) == 32
+    assert TOKEN.token_id not in TOKEN.key
+
+
+def test_typing_does_not_matter() -> None:
+    typed = f"  {TEXT[:40].upper()} \n {TEXT[40:]}\r\n"
+    assert Token.parse(typed) == TOKEN
+
+
+def test_the_secret_is_never_shown() -> None:
+    for shown in (repr(TOKEN), str(TOKEN), repr(Invitation(TOKEN.token_id, TOKEN.key, 1))):
+        assert SECRET.hex() not in shown
+        assert str(SECRET) not in shown
+        assert repr(TOKEN.key) not in shown
+    assert str(TOKEN).endswith("of 10.0.0.1:40001")
+
+
+@pytest.mark.parametrize("length", range(len(TEXT)))
+def test_every_shorter_text_is_no_token(length: int) -> None:
+    with pytest.raises(TokenError):
+        Token.parse(TEXT[:length])
+
+
+def test_every_changed_character_is_noticed() -> None:
+    for offset in range(len(TEXT)):
+        for other in "a3-ß":
+            changed = TEXT[:offset] + other + TEXT[offset + 1 :]
+            if changed == TEXT:
+                continue
+            try:
+                token = Token.parse(changed)
+            except TokenError:
+                continue
+            # The last character has one bit that belongs to no byte.
+            assert (offset, token) == (len(TEXT) - 1, TOKEN)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "does not begin with rmpa1-"),
+        ("hello", "does not begin with rmpa1-"),
+        ("rmpa2-" + "a" * 85, "is of another release; install the same"),
+        (TEXT[:-1], "has 84 characters behind rmpa1-, not 85: it is not whole; copy it whole"),
+        (TEXT + "a", "not 85"),
+        (PREFIX + "a" * 84 + "1", "has characters that no token has"),
+        (PREFIX + "a" * 85, "is mistyped"),
+        ("x" * 1000, "has 1000 characters"),
+    ],
+)
+def test_mistakes_are_named_without_the_text(text: str, words: str) -> None:
+    with pytest.raises(TokenError) as caught:
+        Token.parse(text)
+    assert words in str(caught.value)
+    assert len(str(caught.value)) < 200
+
+
+def _text(body: bytes) -> str:
+    return PREFIX + base64.b32encode(body + hashlib.sha256(body).digest()[:10]).decode().rstrip("=").lower()
+
+
+def test_well_typed_nonsense_is_refused() -> None:
+    with pytest.raises(TokenError, match="another release"):
+        Token.parse(_text(b"\x02" + BODY[1:]))
+    with pytest.raises(TokenError, match="no authority can be reached at 224"):
+        Token.parse(_text(BODY[:5] + b"\xe0" + BODY[6:]))
+    with pytest.raises(TokenError, match="no authority can be reached"):
+        Token.parse(_text(BODY[:9] + b"\x00\x00" + BODY[11:]))
+
+
+@pytest.mark.parametrize(
+    ("expires", "address", "port", "fingerprint", "secret"),
+    [
+        (-1, "10.0.0.1", 1, bytes(16), bytes(16)),
+        (1 << 32, "10.0.0.1", 1, bytes(16), bytes(16)),
+        (1, "0.0.0.0", 1, bytes(16), bytes(16)),
+        (1, "10.0.0.1", 0, bytes(16), bytes(16)),
+        (1, "10.0.0.1", 1 << 16, bytes(16), bytes(16)),
+        (1, "10.0.0.1", 1, bytes(15), bytes(16)),
+        (1, "10.0.0.1", 1, bytes(16), bytes(17)),
+    ],
+)
+def test_what_cannot_be_is_no_token(expires: int, address: str, port: int, fingerprint: bytes, secret: bytes) -> None:
+    with pytest.raises(ValueError, match="token|authority|length"):
+        Token(expires, IPv4Address(address), port, fingerprint, secret)
+
+
+def test_a_fingerprint_is_half_a_hash() -> None:
+    assert fingerprint_of(b"der") == hashlib.sha256(b"der").digest()[:16]
+
+
+def test_a_token_lets_one_module_join_once() -> None:
+    book = TokenBook()
+    book.invite(TOKEN)
+    assert book.key_of(TOKEN.token_id) == TOKEN.key
+    assert book.judge(TOKEN.token_id, "arm", WALL) is None
+    assert book.use(TOKEN.token_id, "arm", WALL) is None
+    assert book.use(TOKEN.token_id, "arm", WALL) is TokenProblem.USED
+    assert book.key_of(TOKEN.token_id) is None
+    assert [i.used_by for i in book.invitations] == ["arm"]
+
+
+def test_unknown_late_and_other_names_are_told_apart() -> None:
+    book = TokenBook()
+    book.invite(TOKEN, "arm")
+    assert book.use(bytes(8), "arm", WALL) is TokenProblem.TOKEN
+    assert book.use(TOKEN.token_id, "base", WALL) is TokenProblem.NAME
+    assert book.use(TOKEN.token_id, "arm", TOKEN.expires) is TokenProblem.LATE
+    assert book.key_of(TOKEN.token_id) == TOKEN.key
+    assert book.use(TOKEN.token_id, "arm", WALL) is None
+
+
+def test_a_token_that_was_used_stays_used_over_a_restart() -> None:
+    book = TokenBook()
+    book.invite(TOKEN)
+    book.use(TOKEN.token_id, "arm", WALL)
+    again = TokenBook(book.invitations)
+    assert again.use(TOKEN.token_id, "arm", WALL) is TokenProblem.USED
+
+
+def test_a_token_can_be_withdrawn() -> None:
+    book = TokenBook()
+    book.invite(TOKEN)
+    assert book.withdraw(TOKEN.token_id)
+    assert not book.withdraw(TOKEN.token_id)
+    assert book.use(TOKEN.token_id, "arm", WALL) is TokenProblem.TOKEN
+
+
+def test_names_are_checked() -> None:
+    with pytest.raises(ValueError, match="not a ROS base name"):
+        TokenBook().invite(TOKEN, "my arm")
+
+
+def test_tokens_are_bounded_and_used_ones_go_first() -> None:
+    book = TokenBook()
+    tokens = [
+        Token(1000 + n, IPv4Address("10.0.0.1"), 1, bytes(16), n.to_bytes(16, "big"))
+        for n in range(limits.TOKENS_MAX + 2)
+    ]
+    for token in tokens[: limits.TOKENS_MAX]:
+        book.invite(token)
+    book.use(tokens[7].token_id, "arm", 0.0)
+    book.invite(tokens[-2])
+    book.invite(tokens[-1])
+    assert len(book) == limits.TOKENS_MAX
+    assert book.judge(tokens[7].token_id, "arm", 0.0) is TokenProblem.TOKEN
+    assert book.judge(tokens[0].token_id, "arm", 0.0) is TokenProblem.TOKEN
+    assert book.judge(tokens[1].token_id, "arm", 0.0) is None
+
+
+@given(
+    st.integers(0, (1 << 32) - 1),
+    st.integers(0x01000000, 0xDFFFFFFF),
+    st.integers(1, 65535),
+    st.binary(min_size=16, max_size=16),
+    st.binary(min_size=16, max_size=16),
+)
+def test_tokens_survive_their_round_trip(expires: int, address: int, port: int, mark: bytes, secret: bytes) -> None:
+    token = Token(expires, IPv4Address(address), port, mark, secret)
+    assert Token.parse(token.serialize()) == token
+
+
+@given(st.text())
+def test_anything_at_all_is_refused(text: str) -> None:
+    for each in (text, PREFIX + text):
+        with pytest.raises(TokenError):
+            Token.parse(each)
+
+
+def test_the_fuzz_target_takes_its_seeds() -> None:
+    for seed in target_token.SEEDS:
+        target_token.fuzz(seed)
