@@ -60,12 +60,8 @@ def test_every_changed_character_is_noticed() -> None:
             changed = TEXT[:offset] + other + TEXT[offset + 1 :]
             if changed == TEXT:
                 continue
-            try:
-                token = Token.parse(changed)
-            except TokenError:
-                continue
-            # The last character has one bit that belongs to no byte.
-            assert (offset, token) == (len(TEXT) - 1, TOKEN)
+            with pytest.raises(TokenError):
+                Token.parse(changed)
 
 
 @pytest.mark.parametrize(
@@ -114,7 +110,7 @@ def test_well_typed_nonsense_is_refused() -> None:
     ],
 )
 def test_what_cannot_be_is_no_token(expires: int, address: str, port: int, fingerprint: bytes, secret: bytes) -> None:
-    with pytest.raises(ValueError, match="token|authority|length"):
+    with pytest.raises(ValueError, match=r"token|authority|length"):
         Token(expires, IPv4Address(address), port, fingerprint, secret)
 
 

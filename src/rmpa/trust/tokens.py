@@ -10,8 +10,8 @@ The text is ``rmpa1-`` and 85 characters of base32 (RFC 4648, lower case, no pad
     27 secret      16 bytes   random
     43 checksum    10 bytes   the begin of the SHA-256 of all before it
 
-The authority keeps the id and the key of a token, and not its text. Spaces, line ends and upper case in a text that was
-typed or copied do not matter.
+The authority keeps the id and the key of a token, and not its text. Spaces, line ends and upper case in a text that
+was typed or copied do not matter.
 """
 
 from __future__ import annotations
@@ -128,7 +128,8 @@ class Token:
             data = base64.b32decode(body.upper() + "=" * (-len(body) % 8))
         except binascii.Error:
             raise TokenError("is mistyped") from None
-        if len(data) != _BODY.size + _CHECKSUM or _checksum(data[: _BODY.size]) != data[_BODY.size :]:
+        # The last character has one bit that belongs to no byte: a token has one text.
+        if _checksum(data[: _BODY.size]) != data[_BODY.size :] or _base32(data) != body:
             raise TokenError("is mistyped")
         form, expires, address, port, fingerprint, secret = _BODY.unpack_from(data)
         if form != FORMAT:
@@ -141,7 +142,7 @@ class Token:
     def serialize(self) -> str:
         """The text that ``parse`` reads."""
         body = _BODY.pack(FORMAT, self.expires, self.address.packed, self.port, self.fingerprint, self.secret)
-        return PREFIX + base64.b32encode(body + _checksum(body)).decode().rstrip("=").lower()
+        return PREFIX + _base32(body + _checksum(body))
 
     @property
     def token_id(self) -> bytes:
@@ -161,6 +162,10 @@ class Token:
 def fingerprint_of(certificate: bytes) -> bytes:
     """The fingerprint of a certificate (DER) as tokens have it."""
     return hashlib.sha256(certificate).digest()[: limits.FINGERPRINT_BYTES]
+
+
+def _base32(data: bytes) -> str:
+    return base64.b32encode(data).decode().rstrip("=").lower()
 
 
 def _checksum(body: bytes) -> bytes:
