@@ -1,10 +1,10 @@
 """The six-digit code of a join: two users compare it, so that nothing between the machines takes part in it.
 
-Two machines, one for each side. The joining side is bound to its nonce by a *commitment* before it sees the other one,
-and the inviting side chooses its nonce before it sees the joining one. So neither side, nor anything between them that
-has keys of its own, can try nonces until the codes agree: there is one attempt, with a chance of 1 in 1,000,000
-(Vaudenay, *Secure Communications over Insecure Channels Based on Short Authenticated Strings*, 2005; as in ZRTP, RFC
-6189, section 4.4.1.1).
+Two machines, one for each side. The joining side is bound to its nonce by a *commitment* before it sees the other
+one, and the inviting side chooses its nonce before it sees the joining one. So neither side, nor anything between
+them that has keys of its own, can try nonces until the codes agree: there is one attempt, with a chance of 1 in
+1,000,000 (Vaudenay, *Secure Communications over Insecure Channels Based on Short Authenticated Strings*, 2005; as in
+ZRTP, RFC 6189, section 4.4.1.1).
 
 ::
 
@@ -21,14 +21,16 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum, auto
 from types import MappingProxyType
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from rmpa.trust import limits
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 _DIGITS: Final = 6
 _COMMIT: Final = b"rmpa commit 1"
