@@ -1,0 +1,359 @@
+"""Certificates: the CA of a mesh, requests, and certificates that prove a module's name (RFC 5280).
+
+Keys are P-256. A module's certificate has its name as CN and as SAN ``urn:rmpa:<name>``; the SAN decides. This module
+needs the library ``cryptography`` (extra ``rmpa[trust]``); links do without it, as OpenSSL checks the chain there.
+
+Errors::
+
+    RemoteProtocolError
+    └── CertificateError    a certificate or a request is refused; ``reason`` is the word for it
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import TYPE_CHECKING, Final
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.identity import peer_name_problem
+from rmpa.trust import limits
+from rmpa.trust.reasons import TrustReason
+
+if TYPE_CHECKING:
+    from rmpa.trust.documents import DenyList
+
+URN: Final = "urn:rmpa:"
+"""What a module's name follows in the SAN."""
+CURVE: Final = ec.SECP256R1()
+"""The curve of all keys; browsers, which ``rmpa web`` serves, know it."""
+_PURPOSES: Final = (ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH)
+_UNREADABLE: Final = (ValueError, TypeError, UnsupportedAlgorithm, x509.DuplicateExtension)
+
+
+class CertificateError(RemoteProtocolError):
+    """A certificate or a request is refused.
+
+    Args:
+        reason: The word for it; a request that is malformed is ``foreign``.
+        text: What is wrong.
+    """
+
+    def __init__(self, reason: TrustReason, text: str) -> None:
+        super().__init__(text)
+        self.reason = reason
+
+
+@dataclass(frozen=True, slots=True)
+class CertificateRequest:
+    """A request for a certificate (PKCS #10, RFC 2986) whose signature is valid.
+
+    Args:
+        name: The module's.
+        public_key: Its public key (SubjectPublicKeyInfo, DER).
+    """
+
+    name: str
+    public_key: bytes
+
+    @property
+    def key_hash(self) -> bytes:
+        """SHA-256 of the key, which the six-digit code is bound to."""
+        return hashlib.sha256(self.public_key).digest()
+
+
+@dataclass(frozen=True, slots=True)
+class ModuleCertificate:
+    """What a module's certificate says, once it was verified.
+
+    Args:
+        name: The module's.
+        serial: The certificate's number.
+        issued: When it was issued, seconds since 1970.
+        expires: When it ends.
+        public_key: The key (SubjectPublicKeyInfo, DER).
+    """
+
+    name: str
+    serial: int
+    issued: float
+    expires: float
+    public_key: bytes
+
+    @property
+    def renew_at(self) -> float:
+        """When it should be renewed, seconds since 1970."""
+        return self.issued + (self.expires - self.issued) * limits.RENEWAL_SHARE
+
+    def __str__(self) -> str:
+        """``arm (certificate 1f0a…)``."""
+        return f"{self.name} (certificate {self.serial:x})"
+
+
+# --- making ---------------------------------------------------------------------------------------------------------
+
+
+def make_ca(key: ec.EllipticCurvePrivateKey, label: str, serial: int, wall: float) -> bytes:
+    """A CA's certificate (DER), signed by itself.
+
+    Args:
+        key: The CA's key.
+        label: What users call the mesh; part of the CN.
+        serial: A random positive number of at most 159 bits.
+        wall: Seconds since 1970.
+    """
+    name = _name(f"RMPA {label}"[:64])
+    begin = _time(wall - limits.CERTIFICATE_BACKDATE)
+    usage = _key_usage(signs_certificates=True)
+    certificate = (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(name)
+        .public_key(key.public_key())
+        .serial_number(serial)
+        .not_valid_before(begin)
+        .not_valid_after(_time(wall) + timedelta(seconds=limits.CA_LIFETIME))
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(usage, critical=True)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+        .sign(key, hashes.SHA256())
+    )
+    return certificate.public_bytes(serialization.Encoding.DER)
+
+
+def make_request(key: ec.EllipticCurvePrivateKey, name: str) -> bytes:
+    """A request (DER) for a certificate of a module with this name.
+
+    Raises:
+        ValueError: No module can have that name.
+    """
+    if problem := peer_name_problem(name):
+        raise ValueError(problem)
+    request = (
+        x509.CertificateSigningRequestBuilder()
+        .subject_name(_name(name))
+        .add_extension(_subject_alternative(name), critical=False)
+        .sign(key, hashes.SHA256())
+    )
+    return request.public_bytes(serialization.Encoding.DER)
+
+
+def issue(
+    request: CertificateRequest,
+    ca: bytes,
+    ca_key: ec.EllipticCurvePrivateKey,
+    serial: int,
+    wall: float,
+    lifetime: float = limits.CERTIFICATE_LIFETIME,
+) -> bytes:
+    """A certificate (DER) for a request. Nothing of the request but its name and key is taken over.
+
+    Args:
+        request: As ``read_request`` returned it.
+        ca: The CA's certificate (DER).
+        ca_key: Its key.
+        serial: A random positive number of at most 159 bits.
+        wall: Seconds since 1970.
+        lifetime: Seconds of its validity from now on.
+    """
+    authority = x509.load_der_x509_certificate(ca)
+    key = _load_key(request.public_key)
+    certificate = (
+        x509.CertificateBuilder()
+        .subject_name(_name(request.name))
+        .issuer_name(authority.subject)
+        .public_key(key)
+        .serial_number(serial)
+        .not_valid_before(_time(wall - limits.CERTIFICATE_BACKDATE))
+        .not_valid_after(_time(wall + lifetime))
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(_key_usage(signs_certificates=False), critical=True)
+        .add_extension(x509.ExtendedKeyUsage(_PURPOSES), critical=False)
+        .add_extension(_subject_alternative(request.name), critical=False)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(_authority_key(authority)), critical=False)
+        .sign(ca_key, hashes.SHA256())
+    )
+    return certificate.public_bytes(serialization.Encoding.DER)
+
+
+# --- checking -------------------------------------------------------------------------------------------------------
+
+
+def read_request(data: bytes) -> CertificateRequest:
+    """Read a request (DER), and check that its sender has the key.
+
+    Raises:
+        CertificateError: It is too long, malformed, or wrongly signed; or key or name are not allowed.
+    """
+    if len(data) > limits.CSR_MAX:
+        raise CertificateError(TrustReason.FOREIGN, f"a request of {len(data)} bytes")
+    try:
+        request = x509.load_der_x509_csr(data)
+        key = request.public_key()
+        valid = isinstance(key, ec.EllipticCurvePublicKey) and request.is_signature_valid
+        name = _module_name(request)
+    except _UNREADABLE as error:
+        raise CertificateError(TrustReason.FOREIGN, f"the request cannot be read: {error!s:.200}") from None
+    if not isinstance(key, ec.EllipticCurvePublicKey) or key.curve.name != CURVE.name:
+        raise CertificateError(TrustReason.FOREIGN, f"the request's key is not of {CURVE.name}")
+    if not valid:
+        raise CertificateError(TrustReason.FOREIGN, "the request is not signed with its own key")
+    return CertificateRequest(name, _public_bytes(key))
+
+
+def verify(
+    data: bytes, ca: bytes, wall: float, *, name: str = "", deny: DenyList | None = None, grace: float = 0.0
+) -> ModuleCertificate:
+    """Verify a module's certificate.
+
+    Args:
+        data: The certificate (DER).
+        ca: The CA's (DER), which this module trusts.
+        wall: Seconds since 1970.
+        name: The module that it must be of; empty for any.
+        deny: The names that were revoked.
+        grace: Seconds for which an expired certificate is still accepted, to be renewed.
+
+    Raises:
+        CertificateError: It is of another CA, not valid yet, expired, of another module, or revoked; the first of these.
+    """
+    found = _read(data, ca)
+    begin = found.issued - limits.CERTIFICATE_BACKDATE
+    if wall < begin:
+        ahead = begin - wall
+        text = f"the certificate of {found.name} begins in {ahead:.0f} s: one of the clocks is off"
+        raise CertificateError(TrustReason.CLOCK, text)
+    if wall > found.expires + grace:
+        raise CertificateError(
+            TrustReason.EXPIRED, f"the certificate of {found.name} ended {wall - found.expires:.0f} s ago"
+        )
+    if name and found.name != name:
+        raise CertificateError(TrustReason.NAME, f"the certificate is of {found.name}, not of {name}")
+    if deny is not None and deny.denies(found.name, found.issued):
+        raise CertificateError(TrustReason.REVOKED, f"{found.name} was revoked (deny list {deny.number})")
+    return found
+
+
+def _read(data: bytes, ca: bytes) -> ModuleCertificate:
+    """What a certificate says, if the CA has signed it for a module."""
+    if len(data) > limits.CERTIFICATE_MAX:
+        raise CertificateError(TrustReason.FOREIGN, f"a certificate of {len(data)} bytes")
+    authority = x509.load_der_x509_certificate(ca)
+    try:
+        certificate = x509.load_der_x509_certificate(data)
+        certificate.verify_directly_issued_by(authority)
+        name = _module_name(certificate)
+        constraints = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value
+        key = certificate.public_key()
+    except InvalidSignature:
+        raise CertificateError(TrustReason.FOREIGN, "the certificate is of another CA") from None
+    except (*_UNREADABLE, x509.ExtensionNotFound) as error:
+        text = f"the certificate is of another CA, or cannot be read: {error!s:.200}"
+        raise CertificateError(TrustReason.FOREIGN, text) from None
+    if constraints.ca or not isinstance(key, ec.EllipticCurvePublicKey):
+        raise CertificateError(TrustReason.FOREIGN, "the certificate is not one of a module")
+    issued = certificate.not_valid_before_utc.timestamp() + limits.CERTIFICATE_BACKDATE
+    expires = certificate.not_valid_after_utc.timestamp()
+    return ModuleCertificate(name, certificate.serial_number, issued, expires, _public_bytes(key))
+
+
+def check_ca(data: bytes, fingerprint: bytes) -> None:
+    """Check that a CA's certificate (DER) has a fingerprint, and that it is signed by itself.
+
+    Raises:
+        CertificateError: It has another fingerprint, or is not a CA.
+    """
+    if len(data) > limits.CERTIFICATE_MAX or hashlib.sha256(data).digest()[: len(fingerprint)] != fingerprint:
+        raise CertificateError(TrustReason.FOREIGN, "the CA does not have the fingerprint of the token")
+    try:
+        certificate = x509.load_der_x509_certificate(data)
+        certificate.verify_directly_issued_by(certificate)
+        constraints = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value
+    except (*_UNREADABLE, InvalidSignature, x509.ExtensionNotFound) as error:
+        raise CertificateError(TrustReason.FOREIGN, f"the CA's certificate cannot be used: {error!s:.200}") from None
+    if not constraints.ca:
+        raise CertificateError(TrustReason.FOREIGN, "the certificate is not one of a CA")
+
+
+def ca_public_key(ca: bytes) -> ec.EllipticCurvePublicKey:
+    """The key of a CA's certificate (DER), which documents are verified with.
+
+    Raises:
+        CertificateError: It cannot be read, or has no such key.
+    """
+    try:
+        return _authority_key(x509.load_der_x509_certificate(ca))
+    except _UNREADABLE as error:
+        raise CertificateError(TrustReason.FOREIGN, f"the CA's certificate cannot be read: {error!s:.200}") from None
+
+
+def _authority_key(authority: x509.Certificate) -> ec.EllipticCurvePublicKey:
+    key = authority.public_key()
+    if not isinstance(key, ec.EllipticCurvePublicKey):
+        raise TypeError("its key is not of an elliptic curve")
+    return key
+
+
+def _module_name(holder: x509.Certificate | x509.CertificateSigningRequest) -> str:
+    """The module that a certificate or a request is of.
+
+    Raises:
+        ValueError: SAN and CN do not have one and the same valid name.
+    """
+    names = [attribute.value for attribute in holder.subject.get_attributes_for_oid(NameOID.COMMON_NAME)]
+    try:
+        alternative = holder.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        raise ValueError("it has no subject alternative name") from None
+    uris = alternative.get_values_for_type(x509.UniformResourceIdentifier)
+    if len(uris) != 1 or not uris[0].startswith(URN) or names != [uris[0].removeprefix(URN)]:
+        raise ValueError(f"it does not have one name, as CN and as {URN}NAME")
+    name = uris[0].removeprefix(URN)
+    if problem := peer_name_problem(name):
+        raise ValueError(problem)
+    return name
+
+
+def _load_key(data: bytes) -> ec.EllipticCurvePublicKey:
+    key = serialization.load_der_public_key(data)
+    if not isinstance(key, ec.EllipticCurvePublicKey):
+        raise TypeError("the key is not of an elliptic curve")
+    return key
+
+
+def _public_bytes(key: ec.EllipticCurvePublicKey) -> bytes:
+    return key.public_bytes(serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo)
+
+
+def _name(common: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
+
+
+def _subject_alternative(name: str) -> x509.SubjectAlternativeName:
+    return x509.SubjectAlternativeName([x509.UniformResourceIdentifier(URN + name)])
+
+
+def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=True,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=signs_certificates,
+        crl_sign=signs_certificates,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _time(wall: float) -> datetime:
+    return datetime.fromtimestamp(int(wall), UTC)
