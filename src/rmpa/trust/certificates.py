@@ -35,7 +35,14 @@ URN: Final = "urn:rmpa:"
 CURVE: Final = ec.SECP256R1()
 """The curve of all keys; browsers, which ``rmpa web`` serves, know it."""
 _PURPOSES: Final = (ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH)
-_UNREADABLE: Final = (ValueError, TypeError, UnsupportedAlgorithm, x509.DuplicateExtension)
+_UNREADABLE: Final = (
+    ValueError,
+    TypeError,
+    UnsupportedAlgorithm,
+    x509.DuplicateExtension,
+    x509.UnsupportedGeneralNameType,
+)
+"""What ``cryptography`` raises about malformed input."""
 
 
 class CertificateError(RemoteProtocolError):
@@ -223,7 +230,8 @@ def verify(
         grace: Seconds for which an expired certificate is still accepted, to be renewed.
 
     Raises:
-        CertificateError: It is of another CA, not valid yet, expired, of another module, or revoked; the first of these.
+        CertificateError: It is of another CA, not valid yet, expired, of another module, or revoked; the first of
+            these.
     """
     found = _read(data, ca)
     begin = found.issued - limits.CERTIFICATE_BACKDATE

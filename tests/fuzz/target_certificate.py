@@ -1,0 +1,49 @@
+"""Fuzz target: requests, certificates and signed documents."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rmpa.core.errors import RemoteProtocolError
+
+try:
+    from rmpa.trust.certificates import ca_public_key, make_request, read_request, verify
+    from rmpa.trust.documents import DenyList, KeyList, read_deny_list, read_key_list, sign
+    from rmpa.trust.keyring import GroupKey
+    from tests.trust.authority import WALL, Authority, new_key
+except ImportError:  # the extra "trust" is not installed
+    SEEDS: list[bytes] = [b""]
+
+    def fuzz(_data: bytes) -> None:
+        """Nothing can be read without the library."""
+
+else:
+    if TYPE_CHECKING:
+        from collections.abc import Callable
+
+    _LAB = Authority()
+    _ARM = _LAB.module("arm")
+    _DENY = sign(DenyList().with_name("arm", WALL), _LAB.key)
+    _KEYS = sign(KeyList.of(1, [GroupKey(1, bytes(32))]), _LAB.key)
+    _KEY = ca_public_key(_LAB.certificate)
+    SEEDS = [b"", make_request(new_key(), "arm"), _ARM, _LAB.certificate, _DENY, _KEYS]
+
+    def fuzz(data: bytes) -> None:
+        """Whatever comes in: a documented error, or what the authority has signed."""
+        readers: list[Callable[[], object]] = [
+            lambda: verify(data, _LAB.certificate, WALL),
+            lambda: read_deny_list(data, _KEY),
+            lambda: read_key_list(data, _KEY),
+        ]
+        for reader in readers:
+            try:
+                found = reader()
+            except RemoteProtocolError as error:
+                str(error)
+                continue
+            if data not in SEEDS and not isinstance(found, DenyList | KeyList):
+                raise AssertionError(f"{found} was not issued")
+        try:
+            read_request(data)
+        except RemoteProtocolError as error:
+            str(error)

@@ -1,0 +1,240 @@
+"""Certificates: what is issued is verified, and each other one is refused with its reason."""
+
+from __future__ import annotations
+
+import ssl
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+pytest.importorskip("cryptography")
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec, ed25519
+from cryptography.x509.oid import NameOID
+
+from rmpa.trust import limits
+from rmpa.trust.certificates import (
+    URN,
+    CertificateError,
+    ca_public_key,
+    check_ca,
+    issue,
+    make_request,
+    read_request,
+    verify,
+)
+from rmpa.trust.documents import DenyList
+from rmpa.trust.reasons import TrustReason
+from rmpa.trust.tokens import fingerprint_of
+from tests.fuzz import target_certificate
+from tests.trust.authority import WALL, Authority, new_key
+
+LAB, OTHER = Authority(), Authority()
+ARM_KEY = new_key()
+ARM = LAB.module("arm", key=ARM_KEY)
+DAY = 86_400.0
+
+
+def _refused(data: bytes, wall: float = WALL, *, ca: bytes = LAB.certificate, **kwargs: object) -> TrustReason:
+    with pytest.raises(CertificateError) as caught:
+        verify(data, ca, wall, **kwargs)  # type: ignore[arg-type] # the test's own words
+    assert str(caught.value)
+    return caught.value.reason
+
+
+def test_what_is_issued_is_verified() -> None:
+    found = verify(ARM, LAB.certificate, WALL, name="arm", deny=DenyList())
+    assert found.name == "arm"
+    assert found.issued == WALL
+    assert found.expires == WALL + limits.CERTIFICATE_LIFETIME
+    assert found.renew_at == WALL + 3.5 * DAY
+    spki = (serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo)
+    assert found.public_key == ARM_KEY.public_key().public_bytes(*spki)
+
+
+def test_a_certificate_says_what_openssl_needs() -> None:
+    certificate = x509.load_der_x509_certificate(ARM)
+    assert certificate.version is x509.Version.v3
+    assert certificate.subject.rfc4514_string() == "CN=arm"
+    extensions = certificate.extensions
+    assert not extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+    usages = extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+    assert {usage.dotted_string for usage in usages} == {"1.3.6.1.5.5.7.3.1", "1.3.6.1.5.5.7.3.2"}
+    names = extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert names.get_values_for_type(x509.UniformResourceIdentifier) == ["urn:rmpa:arm"]
+
+
+def test_tls_accepts_members_and_refuses_others(tmp_path: object) -> None:
+    assert _tls(LAB, LAB) == ("", "")
+    here, there = _tls(LAB, OTHER)
+    assert "CERTIFICATE_VERIFY_FAILED" in here
+    assert there == ""
+
+
+def _tls(server_ca: Authority, client_ca: Authority) -> tuple[str, str]:
+    """A TLS 1.3 handshake of two members, each with the CA of its own mesh: the reasons of client and server."""
+    now = datetime.now(UTC).timestamp()
+    contexts = []
+    for authority, protocol in ((client_ca, ssl.PROTOCOL_TLS_CLIENT), (server_ca, ssl.PROTOCOL_TLS_SERVER)):
+        key = new_key()
+        context = ssl.SSLContext(protocol)
+        context.minimum_version = ssl.TLSVersion.TLSv1_3
+        context.check_hostname = False
+        context.verify_mode = ssl.CERT_REQUIRED
+        context.load_verify_locations(cadata=authority.certificate)
+        _load(context, authority.module("arm", now, key), key)
+        contexts.append(context)
+    to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
+    client = contexts[0].wrap_bio(to_client, to_server)
+    server = contexts[1].wrap_bio(to_server, to_client, server_side=True)
+    for _ in range(4):
+        for end in (client, server):
+            try:
+                end.do_handshake()
+            except ssl.SSLWantReadError:
+                continue
+            except ssl.SSLError as error:
+                return (error.reason or "", "") if end is client else ("", error.reason or "")
+    assert client.getpeercert()["subjectAltName"] == (("URI", "urn:rmpa:arm"),)  # type: ignore[index] # there is one
+    return "", ""
+
+
+def _load(context: ssl.SSLContext, certificate: bytes, key: ec.EllipticCurvePrivateKey) -> None:
+    import tempfile
+
+    pem = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    with tempfile.NamedTemporaryFile() as file:
+        file.write(pem + ssl.DER_cert_to_PEM_cert(certificate).encode())
+        file.flush()
+        context.load_cert_chain(file.name)
+
+
+def test_each_other_certificate_has_its_reason() -> None:
+    deny = DenyList().with_name("arm", WALL)
+    assert _refused(ARM, ca=OTHER.certificate) is TrustReason.FOREIGN
+    assert _refused(ARM, WALL + limits.CERTIFICATE_LIFETIME + 1) is TrustReason.EXPIRED
+    assert _refused(ARM, WALL - limits.CERTIFICATE_BACKDATE - 1) is TrustReason.CLOCK
+    assert _refused(ARM, name="base") is TrustReason.NAME
+    assert _refused(ARM, deny=deny) is TrustReason.REVOKED
+    assert _refused(LAB.certificate) is TrustReason.FOREIGN
+    assert _refused(b"") is TrustReason.FOREIGN
+    assert _refused(bytes(limits.CERTIFICATE_MAX + 1)) is TrustReason.FOREIGN
+
+
+def test_a_revoked_name_can_be_invited_again() -> None:
+    deny = DenyList().with_name("arm", WALL)
+    again = LAB.module("arm", WALL + 1)
+    assert verify(again, LAB.certificate, WALL + 1, deny=deny).name == "arm"
+    assert verify(LAB.module("base"), LAB.certificate, WALL, deny=deny).name == "base"
+
+
+def test_grace_is_for_renewal_alone() -> None:
+    late = WALL + limits.CERTIFICATE_LIFETIME + 30 * DAY
+    assert _refused(ARM, late) is TrustReason.EXPIRED
+    assert verify(ARM, LAB.certificate, late, grace=limits.RENEWAL_GRACE).name == "arm"
+    assert _refused(ARM, WALL + 400 * DAY, grace=limits.RENEWAL_GRACE) is TrustReason.EXPIRED
+    deny = DenyList().with_name("arm", WALL)
+    assert _refused(ARM, late, grace=limits.RENEWAL_GRACE, deny=deny) is TrustReason.REVOKED
+
+
+def test_every_changed_byte_is_refused() -> None:
+    for offset in range(len(ARM)):
+        changed = ARM[:offset] + bytes([ARM[offset] ^ 1]) + ARM[offset + 1 :]
+        assert _refused(changed) is TrustReason.FOREIGN, offset
+
+
+def test_a_member_cannot_issue() -> None:
+    request = read_request(make_request(new_key(), "evil"))
+    # Signed by the arm's key, in the CA's name.
+    forged = issue(request, LAB.certificate, ARM_KEY, 5, WALL)
+    assert _refused(forged) is TrustReason.FOREIGN
+    # Signed by the arm's key, in its own name.
+    assert _refused(issue(request, ARM, ARM_KEY, 5, WALL)) is TrustReason.FOREIGN
+
+
+def test_a_request_proves_its_key() -> None:
+    request = make_request(ARM_KEY, "arm")
+    found = read_request(request)
+    assert found.name == "arm"
+    assert found.public_key == verify(ARM, LAB.certificate, WALL).public_key
+    assert len(found.key_hash) == 32
+    for offset in range(len(request)):
+        changed = request[:offset] + bytes([request[offset] ^ 1]) + request[offset + 1 :]
+        with pytest.raises(CertificateError):
+            read_request(changed)
+
+
+@pytest.mark.parametrize(
+    ("common", "uris"),
+    [
+        ("arm", ["urn:rmpa:base"]),
+        ("arm", []),
+        ("arm", ["urn:rmpa:arm", "urn:rmpa:base"]),
+        ("arm", ["urn:other:arm"]),
+        ("my arm", ["urn:rmpa:my arm"]),
+        ("a/../b", ["urn:rmpa:a/../b"]),
+    ],
+)
+def test_a_request_has_one_valid_name(common: str, uris: list[str]) -> None:
+    with pytest.raises(CertificateError):
+        read_request(_request(new_key(), common, uris))
+
+
+def test_other_keys_are_refused() -> None:
+    for key in (ec.generate_private_key(ec.SECP384R1()), ed25519.Ed25519PrivateKey.generate()):
+        with pytest.raises(CertificateError, match="key is not of secp256r1"):
+            read_request(_request(key, "arm", [URN + "arm"]))
+
+
+def _request(key: ec.EllipticCurvePrivateKey | ed25519.Ed25519PrivateKey, common: str, uris: list[str]) -> bytes:
+    builder = x509.CertificateSigningRequestBuilder().subject_name(
+        x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
+    )
+    if uris:
+        names = [x509.UniformResourceIdentifier(uri) for uri in uris]
+        builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
+    algorithm = hashes.SHA256() if isinstance(key, ec.EllipticCurvePrivateKey) else None
+    return builder.sign(key, algorithm).public_bytes(serialization.Encoding.DER)
+
+
+def test_nothing_but_name_and_key_of_a_request_is_taken_over() -> None:
+    asked = replace(read_request(make_request(ARM_KEY, "arm")))
+    names = {extension.oid.dotted_string for extension in x509.load_der_x509_certificate(ARM).extensions}
+    again = issue(asked, LAB.certificate, LAB.key, 7, WALL)
+    assert {extension.oid.dotted_string for extension in x509.load_der_x509_certificate(again).extensions} == names
+
+
+def test_a_module_needs_a_valid_name() -> None:
+    with pytest.raises(ValueError, match="not a ROS base name"):
+        make_request(ARM_KEY, "my arm")
+
+
+def test_a_ca_is_pinned_by_its_fingerprint() -> None:
+    check_ca(LAB.certificate, fingerprint_of(LAB.certificate))
+    with pytest.raises(CertificateError, match="does not have the fingerprint"):
+        check_ca(LAB.certificate, fingerprint_of(OTHER.certificate))
+    for other in (ARM, b"", b"nonsense"):
+        with pytest.raises(CertificateError):
+            check_ca(other, fingerprint_of(other))
+    assert ca_public_key(LAB.certificate) == LAB.key.public_key()
+    with pytest.raises(CertificateError):
+        ca_public_key(b"nonsense")
+
+
+@given(st.binary(max_size=200))
+def test_anything_at_all_is_refused(data: bytes) -> None:
+    _refused(data)
+    with pytest.raises(CertificateError):
+        read_request(data)
+
+
+def test_the_fuzz_target_takes_its_seeds() -> None:
+    for seed in target_certificate.SEEDS:
+        target_certificate.fuzz(seed)

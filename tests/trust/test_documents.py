@@ -1,0 +1,143 @@
+"""Signed documents: they survive, and nothing else is taken for one."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+pytest.importorskip("cryptography")
+
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+
+from rmpa.core.errors import LimitExceeded
+from rmpa.trust import limits
+from rmpa.trust.documents import (
+    DenyEntry,
+    DenyList,
+    DocumentError,
+    KeyList,
+    read_deny_list,
+    read_key_list,
+    sign,
+)
+from rmpa.trust.keyring import GroupKey
+from tests.trust.authority import WALL, Authority, new_key
+
+LAB = Authority()
+PUBLIC = LAB.key.public_key()
+DENY = DenyList(7, (DenyEntry("arm", 1_790_000_000), DenyEntry("base", 5)))
+KEYS = KeyList.of(3, [GroupKey(2, b"a" * 32), GroupKey(3, b"b" * 32)])
+
+
+def _signed(text: str, label: bytes = b"rmpa deny 1", key: ec.EllipticCurvePrivateKey = LAB.key) -> bytes:
+    signature = key.sign(label + b"\x00" + text.encode(), ec.ECDSA(hashes.SHA256()))
+    return msgspec.json.encode({"signed": text, "signature": signature})
+
+
+def test_documents_survive_their_round_trip() -> None:
+    assert read_deny_list(sign(DENY, LAB.key), PUBLIC) == DENY
+    assert read_key_list(sign(KEYS, LAB.key), PUBLIC) == KEYS
+    assert KEYS.group_keys == (GroupKey(2, b"a" * 32), GroupKey(3, b"b" * 32))
+
+
+def test_the_text_is_golden() -> None:
+    envelope = msgspec.json.decode(sign(DENY, LAB.key))
+    assert envelope["signed"] == (
+        '{"number":7,"entries":[{"name":"arm","before":1790000000},{"name":"base","before":5}]}'
+    )
+    assert set(envelope) == {"signed", "signature"}
+    assert read_deny_list(_signed(envelope["signed"]), PUBLIC) == DENY
+
+
+def test_keys_of_later_versions_are_ignored() -> None:
+    text = '{"number":1,"entries":[{"name":"arm","before":5,"why":"lost"}],"mesh":"lab"}'
+    assert read_deny_list(_signed(text), PUBLIC) == DenyList(1, (DenyEntry("arm", 5),))
+
+
+def test_every_changed_byte_is_refused() -> None:
+    document = sign(DENY, LAB.key)
+    for offset in range(len(document)):
+        changed = document[:offset] + bytes([document[offset] ^ 1]) + document[offset + 1 :]
+        with pytest.raises(DocumentError):
+            read_deny_list(changed, PUBLIC)
+
+
+def test_other_signers_and_other_kinds_are_refused() -> None:
+    with pytest.raises(DocumentError, match="not signed by our authority"):
+        read_deny_list(sign(DENY, new_key()), PUBLIC)
+    with pytest.raises(DocumentError, match="not signed by our authority"):
+        read_deny_list(sign(KEYS, LAB.key), PUBLIC)
+    with pytest.raises(DocumentError, match="not signed by our authority"):
+        read_key_list(sign(DENY, LAB.key), PUBLIC)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        '{"entries":5}',
+        '{"number":-1}',
+        '{"number":4294967296}',
+        '{"number":1,"entries":[{"name":"my arm","before":5}]}',
+        '{"number":1,"entries":[{"name":"arm"}]}',
+    ],
+)
+def test_signed_nonsense_is_refused(text: str) -> None:
+    with pytest.raises(DocumentError):
+        read_deny_list(_signed(text), PUBLIC)
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        "[]",
+        '[{"number":1,"key":"AAAA"}]',
+        '[{"number":0,"key":"' + "A" * 43 + '="}]',
+        '[{"number":1,"key":"' + "A" * 43 + '="},{"number":1,"key":"' + "A" * 43 + '="}]',
+        "[" + ",".join(f'{{"number":{n},"key":"' + "A" * 43 + '="}' for n in range(1, 10)) + "]",
+    ],
+)
+def test_key_lists_that_cannot_be_are_refused(keys: str) -> None:
+    with pytest.raises(DocumentError):
+        read_key_list(_signed('{"number":1,"keys":' + keys + "}", b"rmpa keys 1"), PUBLIC)
+
+
+def test_long_documents_are_refused_before_they_are_read() -> None:
+    with pytest.raises(LimitExceeded):
+        read_deny_list(b" " * (limits.DOCUMENT_MAX + 1), PUBLIC)
+
+
+def test_a_full_list_fits() -> None:
+    full = DenyList(1, tuple(DenyEntry(f"{'m' * 58}{n:06}", 1_790_000_000) for n in range(limits.DENY_MAX)))
+    document = sign(full, LAB.key)
+    assert len(document) <= limits.DOCUMENT_MAX
+    assert read_deny_list(document, PUBLIC) == full
+    with pytest.raises(ValueError, match="at most 1024 names"):
+        full.with_name("one_more", WALL)
+
+
+def test_revoking_counts_up_and_replaces() -> None:
+    once = DenyList().with_name("arm", 100.9)
+    twice = once.with_name("arm", 200.0)
+    assert (once.number, once.entries) == (1, (DenyEntry("arm", 100),))
+    assert (twice.number, twice.entries) == (2, (DenyEntry("arm", 200),))
+    assert twice.denies("arm", 200.0)
+    assert not twice.denies("arm", 201.0)
+    assert not twice.denies("base", 100.0)
+    with pytest.raises(ValueError, match="not a ROS base name"):
+        once.with_name("my arm", 1.0)
+
+
+def test_secrets_are_never_shown() -> None:
+    assert repr(KEYS) == str(KEYS) == "KeyList(number=3, keys=[2, 3])"
+
+
+@given(st.binary(max_size=200))
+def test_anything_at_all_is_refused(data: bytes) -> None:
+    for read in (read_deny_list, read_key_list):
+        with pytest.raises(DocumentError):
+            read(data, PUBLIC)
