@@ -97,6 +97,9 @@ class _KeyEntry(msgspec.Struct, frozen=True):
     number: int
     key: bytes
 
+    def __repr__(self) -> str:
+        return f"_KeyEntry({self.number})"
+
 
 class KeyList(msgspec.Struct, frozen=True):
     """The group keys of a mesh. It is secret: only members get it, over their links.
