@@ -217,14 +217,14 @@ def read_request(data: bytes) -> CertificateRequest:
 
 
 def verify(
-    data: bytes, ca: bytes, wall: float, *, name: str = "", deny: DenyList | None = None, grace: float = 0.0
+    data: bytes, ca: bytes, wall: float | None, *, name: str = "", deny: DenyList | None = None, grace: float = 0.0
 ) -> ModuleCertificate:
     """Verify a module's certificate.
 
     Args:
         data: The certificate (DER).
         ca: The CA's (DER), which this module trusts.
-        wall: Seconds since 1970.
+        wall: Seconds since 1970; ``None`` checks no times, for a new module whose clock is not set.
         name: The module that it must be of; empty for any.
         deny: The names that were revoked.
         grace: Seconds for which an expired certificate is still accepted, to be renewed.
@@ -234,20 +234,23 @@ def verify(
             these.
     """
     found = _read(data, ca)
-    begin = found.issued - limits.CERTIFICATE_BACKDATE
-    if wall < begin:
-        ahead = begin - wall
-        text = f"the certificate of {found.name} begins in {ahead:.0f} s: one of the clocks is off"
-        raise CertificateError(TrustReason.CLOCK, text)
-    if wall > found.expires + grace:
-        raise CertificateError(
-            TrustReason.EXPIRED, f"the certificate of {found.name} ended {wall - found.expires:.0f} s ago"
-        )
+    if wall is not None:
+        _check_times(found, wall, grace)
     if name and found.name != name:
         raise CertificateError(TrustReason.NAME, f"the certificate is of {found.name}, not of {name}")
     if deny is not None and deny.denies(found.name, found.issued):
         raise CertificateError(TrustReason.REVOKED, f"{found.name} was revoked (deny list {deny.number})")
     return found
+
+
+def _check_times(found: ModuleCertificate, wall: float, grace: float) -> None:
+    begin = found.issued - limits.CERTIFICATE_BACKDATE
+    if wall < begin:
+        text = f"the certificate of {found.name} begins in {begin - wall:.0f} s: one of the clocks is off"
+        raise CertificateError(TrustReason.CLOCK, text)
+    if wall > found.expires + grace:
+        text = f"the certificate of {found.name} ended {wall - found.expires:.0f} s ago"
+        raise CertificateError(TrustReason.EXPIRED, text)
 
 
 def _read(data: bytes, ca: bytes) -> ModuleCertificate:

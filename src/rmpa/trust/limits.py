@@ -71,6 +71,11 @@ NONCE_BYTES: Final = 32
 CODE_TIMEOUT: Final = 300.0
 """Time in which both users compare the code: one of them walks to the other machine."""
 
+JOIN_REQUEST_MAX: Final = 16 * KIB
+"""Bytes of one message of a joining module: a request for a certificate in base64 is 6 KiB at most."""
+JOIN_ANSWER_MAX: Final = 1 * MIB
+"""Bytes of one message of the authority: two signed documents in base64."""
+
 # --- certificates -----------------------------------------------------------------------------------------------
 CERTIFICATE_LIFETIME: Final = 7 * 86_400
 """Validity of a module's certificate. It bounds how long a stolen key is of use where no deny list arrives."""
