@@ -12,8 +12,8 @@
                 ◄── grant {certificate, keys, deny}
     either side at any time: refuse {reason, text}
 
-A message is a JSON object with its length in front (4 bytes, big-endian); bytes in it are base64. Times are arguments,
-and so are random bytes. A machine that is over ignores what comes, and its driver closes the connection.
+A message is a JSON object with its length in front (4 bytes, big-endian); bytes in it are base64. Times are
+arguments, and so are random bytes. A machine that is over ignores what comes, and its driver closes the connection.
 """
 
 from __future__ import annotations
