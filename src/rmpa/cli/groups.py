@@ -148,6 +148,15 @@ alarm: Final = _group(
     },
     _RESOURCE,
 )
+trust: Final = _group(
+    "See what other modules may do here.",
+    {
+        "trust": {
+            "check": "Say whether a peer may do something here, and by which rule.",
+            "import": "Print the rules for the permissions of SROS 2.",
+        }
+    },
+)
 multicast: Final = _group(
     "Send and receive multicast packets by hand.",
     {"multicast": {"send": "Send packets to the group.", "receive": "Wait for packets of the group."}},

@@ -82,6 +82,10 @@ class ModuleGroup:
     name: str
     modules: tuple[str, ...]
 
+    def __str__(self) -> str:
+        """``operators: joystick, laptop*``."""
+        return f"{self.name}: {', '.join(self.modules)}"
+
 
 @dataclass(frozen=True, slots=True)
 class PermissionRule:

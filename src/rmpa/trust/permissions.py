@@ -133,9 +133,8 @@ class Permissions:
                 if key not in (ACTION_CLIENT, ACTION_SERVER):
                     yield Access(key), _Pattern(filled, rule.effect, number, text)
                     continue
-                for access in (Access.PUBLISH, Access.SUBSCRIBE):
-                    for topic in _ACTION_TOPICS[key, access]:
-                        yield access, _Pattern(f"{filled.rstrip('/')}/{topic}", rule.effect, number, text)
+                for access, topic in action_topics(key, filled):
+                    yield access, _Pattern(topic, rule.effect, number, text)
 
     def _fit(self, rule: PermissionRule, module: str) -> str | None:
         """Why a rule is about a module, as text; ``None``: it is not."""
@@ -146,6 +145,18 @@ class Permissions:
             if _first(self._groups.get(name, ()), module) is not None:
                 return f"group {name!r}"
         return None
+
+
+def action_topics(key: str, name: str) -> Iterator[tuple[Access, str]]:
+    """The five topics of an action, each with what the other module does with it.
+
+    Args:
+        key: ``ACTION_CLIENT`` if the other module is the client, ``ACTION_SERVER`` if it is the server.
+        name: The action's name, or a glob.
+    """
+    for access in (Access.PUBLISH, Access.SUBSCRIBE):
+        for topic in _ACTION_TOPICS[key, access]:
+            yield access, f"{name.rstrip('/')}/{topic}"
 
 
 def _first(globs: tuple[str, ...], name: str) -> str | None:

@@ -1,0 +1,93 @@
+"""``rmpa trust``: what other modules may do here."""
+
+from __future__ import annotations
+
+import os
+import socket
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import click
+
+from rmpa.cli.options import json_option
+from rmpa.cli.output import print_json, printable
+from rmpa.config.permission_rules import ACTION_CLIENT, ACTION_SERVER, Access
+from rmpa.config.sources import load_settings
+from rmpa.core.errors import ConfigError
+from rmpa.core.identity import peer_name_problem
+from rmpa.core.names import is_global_name
+from rmpa.trust import limits
+from rmpa.trust.permissions import Permissions, action_topics
+
+if TYPE_CHECKING:
+    from rmpa.trust.permissions import PermissionDecision
+
+_WORDS: Final = (*(access.value for access in Access), ACTION_CLIENT, ACTION_SERVER)
+
+
+@click.command()
+@click.argument("peer")
+@click.argument("what", type=click.Choice(_WORDS), metavar="|".join(_WORDS))
+@click.argument("name")
+@click.option("--config", "file", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]")
+@json_option
+@click.pass_context
+def check(ctx: click.Context, peer: str, what: str, name: str, file: str | None, as_json: bool) -> None:
+    """Say whether the [[permission]] of this module let PEER do something here, and which of them decides.
+
+    The exit code is 0 for yes and 1 for no. What [bridge], [[peer]], [services] and [params] say comes on top.
+    """
+    if problem := peer_name_problem(peer):
+        raise ConfigError("PEER", problem)
+    if not is_global_name(name):
+        raise ConfigError("NAME", f"{name!r} is not a global name", "one looks like /cmd_vel")
+    settings = load_settings({"config": file}, dict(os.environ), host_name=socket.gethostname()).settings
+    permissions = Permissions(settings.trust)
+    decisions = [permissions.judge(access, peer, each) for access, each in _asked(what, name)]
+    decision = next((each for each in decisions if not each.allowed), decisions[0])
+    _show(decision, permissions.groups_of(peer), as_json=as_json)
+    ctx.exit(0 if decision.allowed else 1)
+
+
+def _asked(what: str, name: str) -> list[tuple[Access, str]]:
+    """What a user asks for, as single accesses: five for an action."""
+    if what in (ACTION_CLIENT, ACTION_SERVER):
+        return list(action_topics(what, name))
+    return [(Access(what), name)]
+
+
+def _show(decision: PermissionDecision, groups: tuple[str, ...], *, as_json: bool) -> None:
+    if as_json:
+        print_json(
+            {"allowed": decision.allowed, "rule": decision.rule, "number": decision.number, "groups": list(groups)}
+        )
+        return
+    click.echo(f"{'yes' if decision.allowed else 'no'}: {printable(decision.rule)}")
+
+
+@click.command("import")
+@click.argument("file", type=click.Path(path_type=Path))
+@json_option
+def import_(file: Path, as_json: bool) -> None:
+    """Print the [[permission]] tables for the grants of a permissions.xml of SROS 2.
+
+    Put them into the rmpa.toml of the modules that the grants' subject talks to. Comments say what does not fit.
+    """
+    from rmpa.trust.sros import read_sros, to_toml
+
+    try:
+        with file.open("rb") as stream:
+            data = stream.read(limits.SROS_FILE_MAX + 1)
+    except OSError as error:
+        raise ConfigError(str(file), f"cannot be read: {error.strerror}") from None
+    try:
+        imported = read_sros(data)
+    except ConfigError as error:
+        raise ConfigError(str(file), error.problem, error.remedy) from None
+    if as_json:
+        rules = [
+            {"modules": rule.modules, "effect": rule.effect.value, **dict(rule.names)} for rule in imported.rules
+        ]
+        print_json({"rules": rules, "notes": imported.notes})
+    else:
+        click.echo(to_toml(imported), nl=False)

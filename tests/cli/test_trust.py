@@ -1,0 +1,109 @@
+"""``rmpa trust check`` and ``rmpa trust import``."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.cli.main import main
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+FILE = """
+[trust.groups]
+operators = ["joystick", "laptop*"]
+[[permission]]
+groups = ["operators"]
+publish = ["/cmd_vel"]
+action = ["/arm/move"]
+[[permission]]
+modules = ["laptop2"]
+effect = "deny"
+publish = ["/arm/move/cancel"]
+"""
+GRANT = """<dds><permissions><grant name="x"><subject_name>CN=/lab/talker</subject_name><allow_rule><publish><topics>
+<topic>rt/chatter</topic></topics></publish></allow_rule><default>DENY</default></grant></permissions></dds>"""
+
+
+def _run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    code = main(["trust", *arguments])
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> str:
+    path = tmp_path / "rmpa.toml"
+    path.write_text(FILE)
+    return str(path)
+
+
+def test_yes_and_no_with_the_rule(capsys: pytest.CaptureFixture[str], file: str) -> None:
+    assert _run(capsys, "check", "joystick", "publish", "/cmd_vel", "--config", file) == (
+        0,
+        "yes: [[permission]] 1 allows publish of '/cmd_vel' to group 'operators'\n",
+        "",
+    )
+    assert _run(capsys, "check", "base", "publish", "/cmd_vel", "--config", file) == (
+        1,
+        "no: no [[permission]] lets base publish /cmd_vel\n",
+        "",
+    )
+
+
+def test_an_action_is_allowed_as_a_whole(capsys: pytest.CaptureFixture[str], file: str) -> None:
+    assert _run(capsys, "check", "laptop1", "action", "/arm/move", "--config", file)[0] == 0
+    code, out, _ = _run(capsys, "check", "laptop2", "action", "/arm/move", "--config", file)
+    assert code == 1
+    assert "[[permission]] 2 denies publish" in out
+
+
+def test_json_has_the_decision(capsys: pytest.CaptureFixture[str], file: str) -> None:
+    code, out, _ = _run(capsys, "check", "laptop2", "publish", "/cmd_vel", "--json", "--config", file)
+    assert code == 0
+    assert json.loads(out) == {
+        "allowed": True,
+        "rule": "[[permission]] 1 allows publish of '/cmd_vel' to group 'operators'",
+        "number": 1,
+        "groups": ["operators"],
+    }
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("my arm", "publish", "/a"), "not a ROS base name"),
+        (("arm", "publish", "a"), "'a' is not a global name"),
+        (("arm", "write", "/a"), "'write' is not one of"),
+    ],
+)
+def test_what_cannot_be_asked_exits_2(
+    capsys: pytest.CaptureFixture[str], file: str, arguments: tuple[str, ...], words: str
+) -> None:
+    code, _, err = _run(capsys, "check", *arguments, "--config", file)
+    assert code == 2
+    assert words in err
+
+
+def test_permissions_of_sros_are_printed_as_tables(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "permissions.xml"
+    path.write_text(GRANT)
+    tables = '[[permission]]\nmodules = ["talker"]\npublish = ["/chatter"]\n'
+    assert _run(capsys, "import", str(path)) == (0, tables, "")
+    _, out, _ = _run(capsys, "import", str(path), "--json")
+    assert json.loads(out) == {
+        "rules": [{"modules": ["talker"], "effect": "allow", "publish": ["/chatter"]}],
+        "notes": [],
+    }
+
+
+def test_a_file_that_cannot_be_read_exits_2(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "permissions.xml"
+    assert _run(capsys, "import", str(path))[0] == 2
+    path.write_text("<!DOCTYPE a><dds/>")
+    code, _, err = _run(capsys, "import", str(path))
+    assert code == 2
+    assert f"{path}: not XML that can be read" in err
