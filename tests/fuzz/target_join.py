@@ -14,7 +14,7 @@ try:
 except ImportError:  # the extra "trust" is not installed
     SEEDS: list[bytes] = [b""]
 
-    def fuzz(_data: bytes) -> None:
+    def fuzz(data: bytes) -> None:
         """Nothing can join without the library."""
 
 else:

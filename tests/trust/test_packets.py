@@ -28,6 +28,8 @@ NOW = 50.0
 BEACON = Beacon(
     BeaconKind.HEARTBEAT, Identity(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base", 5), 16000, 42
 ).serialize()
+GOLDEN_TAG = "40b78c7d44f97c0c01aa00601de17775"
+"""As ``openssl dgst -sha256 -mac HMAC`` computes it, of 32 zero bytes and the trailer's begin."""
 HEAD = "01 01 0003 0000000000000001 6ab13b80"  # format, clock set, key 3, number 1, 1790000000
 
 
@@ -57,9 +59,6 @@ def test_the_tag_itself_is_golden() -> None:
     assert _signer().sign(bytes(32), KeyPurpose.SWIM, NOW, None)[-32:].hex() == (
         "010000030000000000000001" + "00000000" + GOLDEN_TAG
     )
-
-
-GOLDEN_TAG = "TO BE FILLED"
 
 
 def test_a_reader_without_trust_ignores_the_trailer() -> None:
