@@ -84,6 +84,20 @@ INTERNAL: Final = {
     "TYPES_FOUND_MAX",
     "TYPES_MISSING_MAX",
     "XMLRPC_DEPTH_MAX",
+    "CERTIFICATE_MAX",
+    "CONTROL_WAIT_MAX",
+    "CSR_MAX",
+    "DENY_MAX",
+    "DOCUMENT_MAX",
+    "JOIN_ANSWER_MAX",
+    "JOIN_REQUEST_MAX",
+    "KEYS_MAX",
+    "NONCES_MAX",
+    "RUNS_MAX",
+    "SROS_DEPTH_MAX",
+    "TOKENS_MAX",
+    "TOKEN_LIFETIME_MAX",
+    "TOKEN_TEXT_MAX",
 }
 """Of parsers, packets, retries and caches: nothing that a user could notice or mend."""
 

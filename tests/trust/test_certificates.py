@@ -144,15 +144,19 @@ def test_grace_is_for_renewal_alone() -> None:
     assert _refused(ARM, late, grace=limits.RENEWAL_GRACE, deny=deny) is TrustReason.REVOKED
 
 
+def _outcome(data: bytes) -> object:
+    """What a certificate says, or why it is refused."""
+    try:
+        return verify(data, LAB.certificate, WALL)
+    except CertificateError as error:
+        return error.reason
+
+
 def test_every_changed_byte_is_refused() -> None:
+    original = _outcome(ARM)
     for offset in range(len(ARM)):
         changed = ARM[:offset] + bytes([ARM[offset] ^ 1]) + ARM[offset + 1 :]
-        try:
-            found = verify(changed, LAB.certificate, WALL)
-        except CertificateError as error:
-            assert error.reason is TrustReason.FOREIGN, offset
-        else:
-            assert found == verify(ARM, LAB.certificate, WALL), offset  # a spare bit behind the signature
+        assert _outcome(changed) in (TrustReason.FOREIGN, original), offset  # the same: a spare bit of the signature
 
 
 def test_a_member_cannot_issue() -> None:

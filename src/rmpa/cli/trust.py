@@ -25,7 +25,10 @@ if TYPE_CHECKING:
 _WORDS: Final = (*(access.value for access in Access), ACTION_CLIENT, ACTION_SERVER)
 
 
-@click.command()
+@click.command(
+    epilog="\b\nExamples:\n  rmpa trust check joystick publish /cmd_vel\n"
+    "  rmpa trust check joystick action /arm/move --config new.toml\n"
+)
 @click.argument("peer")
 @click.argument("what", type=click.Choice(_WORDS), metavar="|".join(_WORDS))
 @click.argument("name")
@@ -65,7 +68,9 @@ def _show(decision: PermissionDecision, groups: tuple[str, ...], *, as_json: boo
     click.echo(f"{'yes' if decision.allowed else 'no'}: {printable(decision.rule)}")
 
 
-@click.command("import")
+@click.command(
+    "import", epilog="\b\nExamples:\n  rmpa trust import keystore/enclaves/lab/talker/permissions.xml >> rmpa.toml\n"
+)
 @click.argument("file", type=click.Path(path_type=Path))
 @json_option
 def import_(file: Path, as_json: bool) -> None:
