@@ -220,7 +220,7 @@ class SecureSocket:
         count, size = 0, len(buffer)
         more = True
         try:
-            # Asking first: the error by which OpenSSL says that there is no more takes a quarter of a small message's time.
+            # Asking first: the error by which OpenSSL says that there is no more takes a quarter of a message's time.
             while more and count < size:
                 got: int = self._tls.read(size - count, buffer[count:])  # type: ignore[assignment] # with a buffer
                 count += got
