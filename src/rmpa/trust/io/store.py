@@ -1,0 +1,217 @@
+"""The files of a member, and of the authority: ``trust/`` in the module's state directory.
+
+The directory has mode 0700 and each file 0600 from the moment it exists; a file is written beside its place, synced,
+and renamed. A set of files that is not whole or cannot be read is an error with a remedy: an agent never starts
+without trust because its files are broken.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import ssl
+import stat
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from rmpa.core.errors import StartError
+from rmpa.runtime.state_dir import module_dir
+from rmpa.trust import limits
+from rmpa.trust.tokens import Invitation, TokenBook
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+FOLDER: Final = "trust"
+KEY: Final = "module.key"
+CERTIFICATE: Final = "module.crt"
+CA: Final = "ca.crt"
+KEYS: Final = "keys.json"
+DENY: Final = "deny.json"
+CA_KEY: Final = "ca.key"
+TOKENS: Final = "tokens.json"
+_MEMBER: Final = (KEY, CERTIFICATE, CA, KEYS)
+"""Files that each member must have."""
+_ALL: Final = (*_MEMBER, DENY, CA_KEY, TOKENS)
+_FILE_MAX: Final = limits.DOCUMENT_MAX
+_JOIN: Final = "join again: rmpa trust invite at the authority, rmpa trust join TOKEN here; or rmpa trust leave"
+_OPEN: Final = os.O_CLOEXEC | os.O_NOFOLLOW
+
+
+@dataclass(frozen=True, slots=True)
+class MemberFiles:
+    """What a member keeps.
+
+    Args:
+        key: Its private key (PEM).
+        certificate: Its certificate (DER).
+        ca: The CA's (DER).
+        keys: The signed list of group keys.
+        deny: The signed deny list; empty if nothing was revoked.
+    """
+
+    key: bytes = field(repr=False)
+    certificate: bytes
+    ca: bytes
+    keys: bytes = field(repr=False)
+    deny: bytes = b""
+
+
+class TrustStore:
+    """Reads and writes the files of one module.
+
+    Args:
+        state: The state directory.
+        module: The module's name.
+    """
+
+    def __init__(self, state: Path, module: str) -> None:
+        self.folder = module_dir(state, module) / FOLDER
+
+    def path(self, name: str) -> Path:
+        """Where a file is."""
+        return self.folder / name
+
+    @property
+    def exists(self) -> bool:
+        """Whether trust is on here: there is any of the files, whole or not."""
+        return any(os.path.lexists(self.path(name)) for name in _ALL)
+
+    @property
+    def is_authority(self) -> bool:
+        """Whether this module has the CA's key."""
+        return os.path.lexists(self.path(CA_KEY))
+
+    def load(self) -> MemberFiles:
+        """The files of a member.
+
+        Raises:
+            StartError: One is missing, cannot be read, belongs to another user, or others may read it.
+        """
+        found = {name: self._read(name) for name in _MEMBER}
+        deny = self._read(DENY) if os.path.lexists(self.path(DENY)) else b""
+        return MemberFiles(found[KEY], self._der(CERTIFICATE, found), self._der(CA, found), found[KEYS], deny)
+
+    def save(self, files: MemberFiles) -> None:
+        """Write the files of a member; the certificate last, so that a set with one is whole.
+
+        Raises:
+            StartError: They cannot be written.
+        """
+        contents = {KEY: files.key, CA: _pem(files.ca), KEYS: files.keys, DENY: files.deny}
+        for name, data in contents.items():
+            if data:
+                self.write(name, data)
+        self.write(CERTIFICATE, _pem(files.certificate))
+
+    def load_ca_key(self) -> bytes:
+        """The CA's private key (PEM); raises as ``load``."""
+        return self._read(CA_KEY, "only a copy brings it back; without one make a new mesh: rmpa trust init")
+
+    def load_tokens(self) -> TokenBook:
+        """The tokens of the authority; none if the file is missing.
+
+        Raises:
+            StartError: The file cannot be read or is broken.
+        """
+        if not os.path.lexists(self.path(TOKENS)):
+            return TokenBook()
+        remedy = "remove it: open tokens are then void"
+        try:
+            invitations = msgspec.json.decode(self._read(TOKENS, remedy), type=list[Invitation])
+        except (msgspec.MsgspecError, UnicodeError) as error:
+            raise StartError(str(self.path(TOKENS)), f"is broken: {error!s:.200}", remedy) from None
+        return TokenBook(invitations)
+
+    def save_tokens(self, book: TokenBook) -> None:
+        """Write the tokens of the authority; raises as ``save``."""
+        self.write(TOKENS, msgspec.json.encode(book.invitations))
+
+    def write(self, name: str, data: bytes) -> None:
+        """Write one file atomically, for this user alone.
+
+        Raises:
+            StartError: It cannot be written.
+        """
+        path = self.path(name)
+        temporary = path.with_name(f".{name}.{os.getpid()}")
+        try:
+            self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self.folder.chmod(0o700)
+            with contextlib.suppress(FileNotFoundError):
+                temporary.unlink()  # of a run that was killed, with this process id
+            with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _OPEN, 0o600), "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(path)
+            _sync_folder(self.folder)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+            raise StartError(str(path), f"cannot be written: {error.strerror}", "is the disk full?") from None
+
+    def remove(self) -> list[str]:
+        """Leave the mesh: remove all files; return the names of those that were there.
+
+        Raises:
+            StartError: One cannot be removed.
+        """
+        removed = [name for name in _ALL if os.path.lexists(self.path(name))]
+        for name in removed:
+            try:
+                self.path(name).unlink()
+            except OSError as error:
+                raise StartError(str(self.path(name)), f"cannot be removed: {error.strerror}") from None
+        with contextlib.suppress(OSError):
+            self.folder.rmdir()
+        return removed
+
+    def _read(self, name: str, remedy: str = _JOIN) -> bytes:
+        path = self.path(name)
+        try:
+            with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | _OPEN), "rb") as file:
+                problem = _exposed(os.fstat(file.fileno()))
+                data = b"" if problem else file.read(_FILE_MAX + 1)
+        except FileNotFoundError:
+            raise StartError(str(path), "is missing", remedy) from None
+        except OSError as error:
+            raise StartError(str(path), f"cannot be read: {error.strerror}", remedy) from None
+        if problem:
+            raise StartError(str(path), problem, f"if the others are trusted: chmod 600 {path}; else {remedy}")
+        if not data or len(data) > _FILE_MAX:
+            raise StartError(str(path), f"is broken: {len(data)} bytes", remedy)
+        return data
+
+    def _der(self, name: str, found: Mapping[str, bytes]) -> bytes:
+        try:
+            return ssl.PEM_cert_to_DER_cert(found[name].decode("ascii"))
+        except ValueError:
+            raise StartError(str(self.path(name)), "is broken: not a certificate in PEM", _JOIN) from None
+
+
+def _pem(certificate: bytes) -> bytes:
+    return ssl.DER_cert_to_PEM_cert(certificate).encode()
+
+
+def _exposed(info: os.stat_result) -> str:
+    """Why a file may have been read or changed by others; empty: it was not."""
+    if not stat.S_ISREG(info.st_mode):
+        return "is not a file"
+    if info.st_uid not in {os.geteuid(), 0}:
+        return f"belongs to user {info.st_uid}"
+    if info.st_mode & 0o077:
+        return f"can be read by others (mode {stat.S_IMODE(info.st_mode):o})"
+    return ""
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a rename survive a power failure."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

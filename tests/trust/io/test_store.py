@@ -1,0 +1,147 @@
+"""The files of trust: their modes, that they are whole, and what is said of broken ones."""
+
+from __future__ import annotations
+
+import os
+import stat
+from ipaddress import IPv4Address
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.core.errors import StartError
+from rmpa.trust import limits
+from rmpa.trust.io import store
+from rmpa.trust.io.store import MemberFiles, TrustStore
+from rmpa.trust.tokens import Token, TokenProblem
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+FILES = MemberFiles(b"a private key", b"certificate", b"ca", b'{"keys": 1}', b'{"deny": 1}')
+
+
+@pytest.fixture
+def trust(tmp_path: Path) -> TrustStore:
+    return TrustStore(tmp_path / "state", "arm")
+
+
+def test_what_is_saved_is_loaded(trust: TrustStore) -> None:
+    on = [trust.exists]
+    trust.save(FILES)
+    assert [*on, trust.exists] == [False, True]
+    assert not trust.is_authority
+    assert trust.load() == FILES
+    again = MemberFiles(b"another key", b"new", b"ca", b"keys", b"deny")
+    trust.save(again)
+    assert trust.load() == again
+
+
+def test_no_file_is_for_others_whatever_the_umask(trust: TrustStore) -> None:
+    before = os.umask(0)
+    try:
+        trust.save(FILES)
+        trust.write(store.CA_KEY, b"key")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(trust.folder.stat().st_mode) == 0o700
+    names = sorted(path.name for path in trust.folder.iterdir())
+    assert names == sorted([store.KEY, store.CERTIFICATE, store.CA, store.KEYS, store.DENY, store.CA_KEY])
+    assert {stat.S_IMODE(path.stat().st_mode) for path in trust.folder.iterdir()} == {0o600}
+    assert trust.is_authority
+
+
+@pytest.mark.parametrize("name", [store.KEY, store.CERTIFICATE, store.CA, store.KEYS])
+def test_a_missing_or_empty_file_is_named_with_a_remedy(trust: TrustStore, name: str) -> None:
+    trust.save(FILES)
+    trust.path(name).unlink()
+    with pytest.raises(StartError, match=rf"{name}: is missing; join again: rmpa trust invite"):
+        trust.load()
+    assert trust.exists
+    trust.write(name, b"")
+    with pytest.raises(StartError, match="is broken: 0 bytes"):
+        trust.load()
+
+
+def test_a_broken_certificate_is_named(trust: TrustStore) -> None:
+    trust.save(FILES)
+    trust.write(store.CERTIFICATE, b"\xff nonsense")
+    with pytest.raises(StartError, match=r"module.crt: is broken: not a certificate"):
+        trust.load()
+
+
+def test_a_file_that_others_may_read_is_refused(trust: TrustStore) -> None:
+    trust.save(FILES)
+    trust.path(store.KEY).chmod(0o644)
+    with pytest.raises(StartError, match=r"can be read by others \(mode 644\).*chmod 600"):
+        trust.load()
+
+
+def test_links_and_pipes_are_not_followed(trust: TrustStore) -> None:
+    trust.save(FILES)
+    path = trust.path(store.KEYS)
+    path.rename(path.with_name("elsewhere"))
+    path.symlink_to(path.with_name("elsewhere"))
+    with pytest.raises(StartError, match="cannot be read"):
+        trust.load()
+    path.unlink()
+    os.mkfifo(path, 0o600)
+    with pytest.raises(StartError, match="is not a file"):
+        trust.load()
+
+
+def test_a_huge_file_is_not_read(trust: TrustStore) -> None:
+    trust.save(FILES)
+    trust.write(store.KEYS, bytes(limits.DOCUMENT_MAX + 1))
+    with pytest.raises(StartError, match="is broken"):
+        trust.load()
+
+
+def test_a_failed_write_leaves_the_old_file(trust: TrustStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    trust.save(FILES)
+
+    def full(_descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(StartError, match="No space left"):
+        trust.write(store.KEY, b"new")
+    monkeypatch.undo()
+    assert trust.load() == FILES
+    assert not [path for path in trust.folder.iterdir() if path.name.startswith(".")]
+
+
+def test_tokens_survive_and_stay_used(trust: TrustStore) -> None:
+    token = Token(1_790_000_000, IPv4Address("10.0.0.1"), 1, bytes(16), b"s" * 16)
+    book = trust.load_tokens()
+    book.invite(token, "arm")
+    trust.save_tokens(book)
+    again = trust.load_tokens()
+    assert again.key_of(token.token_id) == token.key
+    assert again.use(token.token_id, "arm", 0.0) is None
+    trust.save_tokens(again)
+    assert trust.load_tokens().use(token.token_id, "arm", 0.0) is TokenProblem.USED
+    assert b"s" * 16 not in trust.path(store.TOKENS).read_bytes()
+    trust.write(store.TOKENS, b"{}")
+    with pytest.raises(StartError, match=r"tokens.json: is broken: .*; remove it"):
+        trust.load_tokens()
+
+
+def test_a_lost_ca_key_has_a_remedy_of_its_own(trust: TrustStore) -> None:
+    with pytest.raises(StartError, match=r"ca.key: is missing; only a copy brings it back"):
+        trust.load_ca_key()
+    trust.write(store.CA_KEY, b"key")
+    assert trust.load_ca_key() == b"key"
+
+
+def test_leaving_removes_everything(trust: TrustStore) -> None:
+    trust.save(FILES)
+    assert set(trust.remove()) == {store.KEY, store.CERTIFICATE, store.CA, store.KEYS, store.DENY}
+    assert not trust.exists
+    assert not trust.folder.exists()
+    assert trust.remove() == []
+
+
+def test_secrets_are_never_shown() -> None:
+    assert "private" not in repr(FILES)
+    assert "keys" not in repr(FILES).replace("keys=", "")
