@@ -31,6 +31,8 @@ Address = tuple[str, int]
 MAGIC: Final = b"RMPA"
 VERSION: Final = 1
 
+RUN_AT: Final = (16, 32)
+"""Where the instance id stands in a beacon of any version 1: begin and end."""
 _PREFIX: Final = struct.Struct(">4sBBH")
 _FIXED: Final = struct.Struct(">4sBBHQ16sIIB")
 _GUID: Final = struct.Struct(">Q")
@@ -171,8 +173,13 @@ class Beacon:
         except ValueError as error:
             raise BeaconMalformed(str(error)) from error
 
-    def serialize(self) -> bytes:
-        """The packet; never longer than ``limits.BEACON_MAX_BYTES``."""
+    def serialize(self, *, extended: bool = False) -> bytes:
+        """The packet; never longer than ``limits.BEACON_MAX_BYTES``.
+
+        Args:
+            extended: Whether further bytes will follow, such as the trailer of a secured mesh: the count of observed
+                addresses then stands in front of them, even if it is 0.
+        """
         identity = self.identity
         name = identity.name.encode("ascii")
         return b"".join(
@@ -193,7 +200,7 @@ class Beacon:
                 *(address.packed for address in identity.addresses),
                 bytes((len(self.gossip),)),
                 *(_GUID.pack(guid.value) for guid in self.gossip),
-                bytes((len(self.observed),)) if self.observed else b"",
+                bytes((len(self.observed),)) if self.observed or extended else b"",
                 *(_ENDPOINT.pack(IPv4Address(host).packed, at) for host, at in self.observed),
             )
         )

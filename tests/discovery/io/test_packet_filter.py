@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from typing import TYPE_CHECKING
 
 from rmpa.core.counters import Counters
 from rmpa.core.guid import Guid
@@ -10,6 +11,11 @@ from rmpa.core.identity import Identity
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.io.packet_filter import PacketFilter
+from rmpa.trust.keyring import GroupKey, KeyPurpose, KeyRing
+from rmpa.trust.packets import PacketSigner, PacketVerifier
+
+if TYPE_CHECKING:
+    import pytest
 
 FRIEND = Identity(Guid.of("10.0.0.2", 4000), b"f" * 16, "friend")
 
@@ -80,3 +86,77 @@ def test_flooding_address_is_ignored_for_the_rest_of_the_second() -> None:
     ]
     assert sum(beacon is not None for beacon in taken) == limits.BEACONS_PER_SOURCE
     assert door.intake.parse(packet(FRIEND, 501), ("10.0.0.2", 4000), 11.0, multicast=True, interface=1) is not None
+
+
+WALL = 1_790_000_000.0
+RING = KeyRing([GroupKey(1, b"k" * 32)], 0.0)
+
+
+class SecuredDoor:
+    """An intake of a secured mesh, and a member that sends."""
+
+    def __init__(self) -> None:
+        self.counters = Counters()
+        self.intake = PacketFilter(0, self.counters, verifier=PacketVerifier(RING), wall=lambda: WALL)
+        self._signer = PacketSigner(RING)
+
+    def signed(self, sequence: int, wall: float = WALL) -> bytes:
+        beacon = Beacon(BeaconKind.HEARTBEAT, FRIEND, 16_000, sequence)
+        return self._signer.sign(beacon.serialize(extended=True), KeyPurpose.BEACON, 10.0, wall)
+
+    def hears(self, data: bytes, host: str = "10.0.0.2", now: float = 10.0) -> bool:
+        return self.intake.parse(data, (host, 4000), now, multicast=True, interface=1) is not None
+
+
+def test_a_secured_mesh_hears_its_members_once() -> None:
+    door = SecuredDoor()
+    first = door.signed(1)
+    assert door.hears(first)
+    assert not door.hears(first)
+    assert door.hears(door.signed(2))
+    assert door.counters["beacon.repeated"] == 1
+    assert door.counters["beacon.in"] == 2
+
+
+def test_a_secured_mesh_hears_nothing_else() -> None:
+    door = SecuredDoor()
+    foreign = PacketSigner(KeyRing([GroupKey(1, b"x" * 32)], 0.0))
+    body = Beacon(BeaconKind.ANNOUNCE, FRIEND, 16_000, 1).serialize(extended=True)
+    newer = PacketSigner(KeyRing([GroupKey(2, b"x" * 32)], 0.0))
+    for data, reason in (
+        (packet(FRIEND, 1), "untagged"),
+        (foreign.sign(body, KeyPurpose.BEACON, 10.0, WALL), "forged"),
+        (newer.sign(body, KeyPurpose.BEACON, 10.0, WALL), "unknown_key"),
+        (door.signed(1, WALL - 3600), "clock"),
+        (bytes(2000), "malformed"),
+    ):
+        assert not door.hears(data)
+        assert door.counters[f"beacon.{reason}"] == 1
+    assert door.counters["beacon.in"] == 0
+
+
+def test_a_flood_under_the_address_of_a_member_does_not_silence_it() -> None:
+    door = SecuredDoor()
+    forged_beacon = packet(FRIEND, 1) + bytes(32)
+    for _ in range(2 * limits.BEACONS_PER_SOURCE):
+        assert not door.hears(forged_beacon)
+    assert door.hears(door.signed(1))
+    assert door.counters["beacon.flood"] == 0
+
+
+def test_refused_packets_are_logged_with_what_to_do(caplog: pytest.LogCaptureFixture) -> None:
+    door = SecuredDoor()
+    door.hears(packet(FRIEND, 1))
+    door.hears(door.signed(1, WALL + 60))
+    texts = [record.getMessage() for record in caplog.records]
+    assert "rmpa trust join there" in texts[0]
+    assert "60 s ahead of our clock" in texts[1]
+
+
+def test_an_extended_beacon_has_room_for_the_trailer() -> None:
+    beacon = Beacon(BeaconKind.HEARTBEAT, FRIEND, 16_000, 1)
+    assert beacon.serialize(extended=True) == beacon.serialize() + b"\x00"
+    heard = Beacon(BeaconKind.HEARTBEAT, FRIEND, 16_000, 1, observed=(("10.0.0.9", 1),))
+    assert heard.serialize(extended=True) == heard.serialize()
+    assert Beacon.parse(heard.serialize() + b"trailer", 0) == heard
+    assert Beacon.parse(beacon.serialize(extended=True) + b"\x41railer", 0) == beacon

@@ -10,7 +10,9 @@ from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.discovery import limits
-from rmpa.discovery.beacon import Beacon, BeaconOtherDomain, BeaconOtherVersion, sender_of
+from rmpa.discovery.beacon import RUN_AT, Beacon, BeaconOtherDomain, BeaconOtherVersion, sender_of
+from rmpa.trust.keyring import KeyPurpose
+from rmpa.trust.packets import Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -18,10 +20,19 @@ if TYPE_CHECKING:
     from rmpa.core.counters import Counters
     from rmpa.core.guid import Guid
     from rmpa.discovery.beacon import Address
+    from rmpa.trust.packets import PacketVerifier, Verification
 
 _log = logging.getLogger(__name__)
 
 _INTERFACES: Final = 256
+_USABLE: Final = frozenset({Verdict.ACCEPTED, Verdict.OLD_KEY})
+_NOT_JOINED: Final = "it has not joined this mesh: rmpa trust invite at the authority, rmpa trust join there"
+_REFUSED: Final = {
+    Verdict.UNTAGGED: f"sends beacons without a proof; {_NOT_JOINED}",
+    Verdict.UNKNOWN_KEY: "has a group key that is unknown here: it is of another mesh, or one of us must renew",
+    Verdict.FORGED: "sends beacons with a wrong proof: it is of another mesh, or they are forged",
+}
+"""What is logged of packets that are refused; repeats are only counted."""
 
 
 class PacketFilter:
@@ -33,11 +44,22 @@ class PacketFilter:
             ``beacon.other_domain``, ``beacon.version``, ``beacon.malformed``.
         is_linked: Whether there is a link with a run of a peer: beacons of linked peers, and echoes of
             this agent's own, are not limited in rate.
+        verifier: Of a secured mesh: only packets whose trailer it accepts are parsed; ``beacon.untagged``,
+            ``beacon.forged`` and so on count the others.
+        wall: Seconds since 1970; ``None`` if this machine's clock is not set.
     """
 
     def __init__(
-        self, domain: int, counters: Counters, *, is_linked: Callable[[Guid, bytes], bool] = lambda *_: False
+        self,
+        domain: int,
+        counters: Counters,
+        *,
+        is_linked: Callable[[Guid, bytes], bool] = lambda *_: False,
+        verifier: PacketVerifier | None = None,
+        wall: Callable[[], float | None] = lambda: None,
     ) -> None:
+        self._verifier = verifier
+        self._wall = wall
         self._domain = domain
         self._counters = counters
         self._is_linked = is_linked
@@ -62,18 +84,16 @@ class PacketFilter:
             interface: The index of the interface it came in by: each has a limit of its own.
         """
         host, _ = source
+        # First, where there is a proof: packets with the forged source of a member must not count as its flood.
+        if self._verifier is not None and not self._is_proved(self._verifier, data, host, now):
+            return None
         if self._is_flood(host, now):
             self._refusals.refuse(
                 now, "beacon.flood", host, f"{host} sends too many packets to the discovery port; the rest is ignored"
             )
             return None
-        if data in self._recent:
-            self._counters.add("beacon.repeated")
+        if self._verifier is None and not self._is_new(data):
             return None
-        if len(data) <= limits.BEACON_MAX_BYTES:
-            self._recent[data] = None
-            if len(self._recent) > limits.BEACON_REPEATS:
-                self._recent.popitem(last=False)
         try:
             if not self._is_linked(*sender_of(data, self._domain)) and not self._within_limit(interface, now):
                 self._counters.add("beacon.unlinked_limited")
@@ -93,6 +113,35 @@ class PacketFilter:
             self._counters.add("beacon.in")
             return beacon
         return None
+
+    def _is_new(self, data: bytes) -> bool:
+        """Whether a packet did not come before, by another interface."""
+        if data in self._recent:
+            self._counters.add("beacon.repeated")
+            return False
+        if len(data) <= limits.BEACON_MAX_BYTES:
+            self._recent[data] = None
+            if len(self._recent) > limits.BEACON_REPEATS:
+                self._recent.popitem(last=False)
+        return True
+
+    def _is_proved(self, verifier: PacketVerifier, data: bytes, host: str, now: float) -> bool:
+        """Whether a member of the secured mesh sent a packet, just now and for the first time.
+
+        Nothing is remembered of other packets, so that forged ones cannot push out what is remembered of real ones.
+        """
+        if len(data) > limits.BEACON_MAX_BYTES:
+            self._counters.add("beacon.malformed")
+            return False
+        found = verifier.verify(data, KeyPurpose.BEACON, RUN_AT, now, self._wall())
+        if found.verdict in _USABLE:
+            return True
+        text = _refusal(found)
+        if text:
+            self._refusals.refuse(now, f"beacon.{found.verdict}", host, f"{host} {text}")
+        else:
+            self._counters.add(f"beacon.{found.verdict}")
+        return False
 
     def _within_limit(self, interface: int, now: float) -> bool:
         """Whether one more beacon of an unlinked peer is within the limit of this interface."""
@@ -114,3 +163,13 @@ class PacketFilter:
         if len(self._sources) > limits.BEACON_SOURCES_MAX:
             self._sources.popitem(last=False)
         return count >= limits.BEACONS_PER_SOURCE
+
+
+def _refusal(found: Verification) -> str:
+    """What is logged of a packet that is refused; empty: it is only counted."""
+    if found.verdict is Verdict.CLOCK:
+        ahead = "ahead of" if found.skew > 0 else "behind"
+        return (
+            f"sends beacons {abs(found.skew)} s {ahead} our clock: set both clocks, or they are sent again by another"
+        )
+    return _REFUSED.get(found.verdict, "")
