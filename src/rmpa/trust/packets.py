@@ -27,6 +27,8 @@ from rmpa.trust import limits
 from rmpa.trust.replay import Freshness, ReplayWindow
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rmpa.trust.keyring import KeyPurpose, KeyRing
 
 FORMAT: Final = 1
@@ -155,3 +157,18 @@ class PacketVerifier:
         if freshness is Freshness.STALE:
             return Verification(Verdict.REPLAYED)
         return Verification(Verdict.OLD_KEY if old else Verdict.ACCEPTED, size, skew)
+
+
+@dataclass(frozen=True, slots=True)
+class PacketTrust:
+    """What the senders and receivers of packets need in a secured mesh.
+
+    Args:
+        signer: Signs what this agent sends.
+        verifier: Judges what it receives.
+        wall: Seconds since 1970; ``None`` while this machine's clock is not set.
+    """
+
+    signer: PacketSigner
+    verifier: PacketVerifier
+    wall: Callable[[], float | None]

@@ -7,6 +7,7 @@ import contextlib
 import logging
 import os
 import socket
+import time
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -21,6 +22,8 @@ from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.events import Event, HeardBy, LossReason, PeerConflict, PeerFound, PeerLost, PeerRestarted
 from rmpa.discovery.io.discovery import Discovery
 from rmpa.discovery.io.interfaces import Interface, list_interfaces
+from rmpa.trust.keyring import GroupKey, KeyRing
+from rmpa.trust.packets import PacketSigner, PacketTrust, PacketVerifier
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -373,3 +376,22 @@ async def test_seeds_that_do_not_answer_and_another_domain_are_told(
     right = Agent("right", Settings(multicast=quiet, domain=1, seeds=seed))
     await start(agents, right)
     await until(lambda: right.discovery.notes() == ())
+
+
+def _trust(secret: bytes) -> PacketTrust:
+    ring = KeyRing([GroupKey(1, secret * 32)], 0.0)
+    return PacketTrust(PacketSigner(ring), PacketVerifier(ring), time.time)
+
+
+async def test_a_secured_mesh_hears_its_members_alone(agents: list[Agent], settings: Settings) -> None:
+    base, pc = (Agent(name, settings, trust=_trust(b"k")) for name in ("base", "pc"))
+    plain, foreign = Agent("plain", settings), Agent("foreign", settings, trust=_trust(b"x"))
+    await start(agents, plain, foreign, base, pc)
+    await until(lambda: base.names() == {"pc"} and pc.names() == {"base"})
+    # An agent without trust hears all: it ignores the proof.
+    await until(lambda: plain.names() == {"base", "pc", "foreign"})
+    for agent in (base, pc):
+        await until(partial(lambda each: each.discovery.counters["beacon.untagged"], agent))
+        await until(partial(lambda each: each.discovery.counters["beacon.forged"], agent))
+    assert base.names() == {"pc"}
+    assert foreign.names() == set()

@@ -12,7 +12,7 @@ from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.io.packet_filter import PacketFilter
 from rmpa.trust.keyring import GroupKey, KeyPurpose, KeyRing
-from rmpa.trust.packets import PacketSigner, PacketVerifier
+from rmpa.trust.packets import PacketSigner, PacketTrust, PacketVerifier
 
 if TYPE_CHECKING:
     import pytest
@@ -97,8 +97,10 @@ class SecuredDoor:
 
     def __init__(self) -> None:
         self.counters = Counters()
-        self.intake = PacketFilter(0, self.counters, verifier=PacketVerifier(RING), wall=lambda: WALL)
         self._signer = PacketSigner(RING)
+        self.intake = PacketFilter(
+            0, self.counters, trust=PacketTrust(self._signer, PacketVerifier(RING), lambda: WALL)
+        )
 
     def signed(self, sequence: int, wall: float = WALL) -> bytes:
         beacon = Beacon(BeaconKind.HEARTBEAT, FRIEND, 16_000, sequence)

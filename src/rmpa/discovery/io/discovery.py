@@ -26,6 +26,7 @@ from rmpa.discovery.membership import MembershipProtocol
 from rmpa.runtime.event_loop import yield_to_data
 from rmpa.runtime.machine_timer import MachineTimer
 from rmpa.runtime.system_clock import SystemClock
+from rmpa.trust.keyring import KeyPurpose
 
 if TYPE_CHECKING:
     import socket
@@ -36,8 +37,9 @@ if TYPE_CHECKING:
     from rmpa.core.clock import Clock
     from rmpa.core.guid import Guid
     from rmpa.core.identity import Identity
-    from rmpa.discovery.beacon import Address
+    from rmpa.discovery.beacon import Address, Beacon
     from rmpa.discovery.events import Event, Output, PeerView
+    from rmpa.trust.packets import PacketTrust
 
 _log = logging.getLogger(__name__)
 
@@ -58,6 +60,7 @@ class Discovery:
         clock: The source of monotonic seconds.
         look: Lists the interfaces.
         resolve: Looks up the host name of a seed; runs in a thread.
+        trust: Of a secured mesh: beacons are signed, and only those of members are heard.
     """
 
     def __init__(
@@ -71,7 +74,9 @@ class Discovery:
         clock: Clock | None = None,
         look: Callable[[], tuple[Interface, ...]] = list_interfaces,
         resolve: Callable[[str], list[str]] = resolve_ipv4,
+        trust: PacketTrust | None = None,
     ) -> None:
+        self._trust = trust
         self.counters = Counters()
         self._identity = identity
         self._settings = settings
@@ -82,7 +87,7 @@ class Discovery:
         self._membership = MembershipProtocol(
             identity, rng=random.random, multicast=settings.multicast.enabled, counters=self.counters
         )
-        self._filter = PacketFilter(settings.domain, self.counters, is_linked=self._membership.is_linked)
+        self._filter = PacketFilter(settings.domain, self.counters, is_linked=self._membership.is_linked, trust=trust)
         self._refusals = RefusalLog(_log, self.counters)
         self._group: Address = (settings.multicast.group, settings.discovery_port)
         self._sender = sockets.Sender(udp_socket, self._group, self.counters)
@@ -280,13 +285,21 @@ class Discovery:
     def _send(self, outputs: list[Output]) -> None:
         for output in outputs:
             yield_to_data()
-            data = output.beacon.serialize()
+            data = self._packet(output.beacon)
             if isinstance(output, SendMulticast):
                 _log.debug("> group: %s", output.beacon)
                 self._sender.multicast(data, self._interfaces)
             else:
                 _log.debug("> %s:%d: %s", *output.address, output.beacon)
                 self._sender.unicast(data, output.address)
+
+    def _packet(self, beacon: Beacon) -> bytes:
+        """The bytes of a beacon, signed in a secured mesh."""
+        trust = self._trust
+        if trust is None:
+            return beacon.serialize()
+        packet = beacon.serialize(extended=True)
+        return trust.signer.sign(packet, KeyPurpose.BEACON, self._clock.now(), trust.wall())
 
     def _deliver(self, event: Event) -> None:
         if isinstance(event, PeerConflict):

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rmpa.core.counters import Counters
     from rmpa.core.guid import Guid
     from rmpa.discovery.beacon import Address
-    from rmpa.trust.packets import PacketVerifier, Verification
+    from rmpa.trust.packets import PacketTrust, Verification
 
 _log = logging.getLogger(__name__)
 
@@ -44,9 +44,8 @@ class PacketFilter:
             ``beacon.other_domain``, ``beacon.version``, ``beacon.malformed``.
         is_linked: Whether there is a link with a run of a peer: beacons of linked peers, and echoes of
             this agent's own, are not limited in rate.
-        verifier: Of a secured mesh: only packets whose trailer it accepts are parsed; ``beacon.untagged``,
+        trust: Of a secured mesh: only packets whose trailer is accepted are parsed; ``beacon.untagged``,
             ``beacon.forged`` and so on count the others.
-        wall: Seconds since 1970; ``None`` if this machine's clock is not set.
     """
 
     def __init__(
@@ -55,11 +54,9 @@ class PacketFilter:
         counters: Counters,
         *,
         is_linked: Callable[[Guid, bytes], bool] = lambda *_: False,
-        verifier: PacketVerifier | None = None,
-        wall: Callable[[], float | None] = lambda: None,
+        trust: PacketTrust | None = None,
     ) -> None:
-        self._verifier = verifier
-        self._wall = wall
+        self._trust = trust
         self._domain = domain
         self._counters = counters
         self._is_linked = is_linked
@@ -85,14 +82,14 @@ class PacketFilter:
         """
         host, _ = source
         # First, where there is a proof: packets with the forged source of a member must not count as its flood.
-        if self._verifier is not None and not self._is_proved(self._verifier, data, host, now):
+        if self._trust is not None and not self._is_proved(self._trust, data, host, now):
             return None
         if self._is_flood(host, now):
             self._refusals.refuse(
                 now, "beacon.flood", host, f"{host} sends too many packets to the discovery port; the rest is ignored"
             )
             return None
-        if self._verifier is None and not self._is_new(data):
+        if self._trust is None and not self._is_new(data):
             return None
         try:
             if not self._is_linked(*sender_of(data, self._domain)) and not self._within_limit(interface, now):
@@ -125,7 +122,7 @@ class PacketFilter:
                 self._recent.popitem(last=False)
         return True
 
-    def _is_proved(self, verifier: PacketVerifier, data: bytes, host: str, now: float) -> bool:
+    def _is_proved(self, trust: PacketTrust, data: bytes, host: str, now: float) -> bool:
         """Whether a member of the secured mesh sent a packet, just now and for the first time.
 
         Nothing is remembered of other packets, so that forged ones cannot push out what is remembered of real ones.
@@ -133,7 +130,7 @@ class PacketFilter:
         if len(data) > limits.BEACON_MAX_BYTES:
             self._counters.add("beacon.malformed")
             return False
-        found = verifier.verify(data, KeyPurpose.BEACON, RUN_AT, now, self._wall())
+        found = trust.verifier.verify(data, KeyPurpose.BEACON, RUN_AT, now, trust.wall())
         if found.verdict in _USABLE:
             return True
         text = _refusal(found)
