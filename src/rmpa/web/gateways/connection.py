@@ -12,7 +12,7 @@ import socket
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from aiohttp import WSMsgType, web
+from aiohttp import WebSocketError, WSCloseCode, WSMsgType, web
 
 from rmpa.core.errors import RmpaError
 from rmpa.web import limits
@@ -80,6 +80,8 @@ class ClientConnection(ABC):
         self._timer: asyncio.TimerHandle | None = None
         self._transport: asyncio.Transport | None = None
         self._close: tuple[int, str] | None = None
+        self._close_timer: asyncio.TimerHandle | None = None
+        self._refused: Callable[[str, str], None] | None = None
         self._client: Client | None = None
         self._drops_shown = 0
         self._drops_at = 0.0
@@ -135,10 +137,21 @@ class ClientConnection(ABC):
             self.queue.end(request.handle)
         self.hub.ask(self.client, request)
 
-    def end(self, code: int, reason: str) -> None:
-        """Close the WebSocket."""
+    def end(self, code: int, reason: str, refusal: str) -> None:
+        """Close the WebSocket, because of what the client sent; what it still sends is ignored.
+
+        Args:
+            code: Of RFC 6455, section 7.4.
+            reason: For the client and the log.
+            refusal: For the counter, one of ``figures.REASONS``.
+        """
+        if self._close is not None:
+            return
         self._close = (code, reason)
         self._wake.set()
+        # A client that does not read would hold the close frame up for long.
+        self._close_timer = self._loop.call_later(2 * limits.CLOSE_TIMEOUT, self._abort)
+        self._refuse(refusal, reason)
 
     def arm(self) -> None:
         """Set the timer anew, after each call of the session."""
@@ -166,12 +179,23 @@ class ClientConnection(ABC):
 
     # --- the WebSocket ----------------------------------------------------------------------------------------
 
-    async def run(self, request: web.Request, socket_: web.WebSocketResponse) -> None:
+    async def run(
+        self,
+        request: web.Request,
+        socket_: web.WebSocketResponse,
+        refused: Callable[[str, str], None] | None = None,
+    ) -> None:
         """Serve the client until it has gone.
+
+        Args:
+            request: Asks for the WebSocket.
+            socket_: The WebSocket, not opened yet.
+            refused: ``(reason, text)``: told why the client is disconnected; one of ``figures.REASONS``.
 
         Raises:
             PeerRefused: There are too many clients.
         """
+        self._refused = refused
         self._client = self.hub.connect(
             f"{self.kind} {self.address}", self.rights, self.receive, unadvertise_delay=self._unadvertise_delay
         )
@@ -188,8 +212,9 @@ class ClientConnection(ABC):
             await self._read(socket_)
         finally:
             self.closing()
-            if self._timer is not None:
-                self._timer.cancel()
+            for timer in (self._timer, self._close_timer):
+                if timer is not None:
+                    timer.cancel()
             self.hub.disconnect(self._client)
             self.queue.clear()
             for task in tasks:
@@ -203,6 +228,8 @@ class ClientConnection(ABC):
             if message.type == WSMsgType.PING:
                 self._send(Opcode.PONG, (message.data,))
             elif message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
+                if self._close is not None:
+                    continue  # it is being disconnected
                 try:
                     self.received_frame(message.data)
                 except Exception:  # noqa: BLE001 - a fault of one client's session must not end the server
@@ -210,7 +237,18 @@ class ClientConnection(ABC):
                     await socket_.close(code=_INTERNAL_ERROR, message=b"the server failed; its log says why")
                     return
             elif message.type == WSMsgType.ERROR:
-                _log.debug("! %s: %s", self.client.name, socket_.exception())
+                self._failed(message.data)
+
+    def _failed(self, error: object) -> None:
+        """The WebSocket has ended by an error: of the connection, or a frame that breaks RFC 6455 or is too long."""
+        if isinstance(error, WebSocketError):
+            self._refuse("message_size" if error.code == WSCloseCode.MESSAGE_TOO_BIG else "message", str(error))
+        else:
+            _log.debug("! %s: %s", self.client.name, error)
+
+    def _refuse(self, reason: str, text: str) -> None:
+        if self._refused is not None:
+            self._refused(reason, text)
 
     async def _watch(self) -> None:
         """Disconnect a client without a sign of life: it sends nothing, answers no ping, and takes nothing.
