@@ -1,0 +1,37 @@
+"""Log and publish the texts that it is told (rospy).
+
+Reads lines of JSON: ``{"log": TEXT}`` is logged as a warning, ``{"data": TEXT}`` is published as std_msgs/String.
+Event: ``up``.
+"""
+
+import json
+import sys
+import threading
+
+import rospy
+from payload import parser, say
+from std_msgs.msg import String
+
+
+def main() -> None:
+    options = parser(__doc__)
+    options.add_argument("--latch", action="store_true")
+    args = options.parse_args(rospy.myargv(sys.argv)[1:])
+    rospy.init_node(args.name or "text_teller", anonymous=not args.name)
+    publisher = rospy.Publisher(args.topic, String, queue_size=10, latch=args.latch)
+
+    def obey() -> None:
+        for line in sys.stdin:
+            told = json.loads(line)
+            if "log" in told:
+                rospy.logwarn("%s", told["log"])
+            if "data" in told:
+                publisher.publish(String(told["data"]))
+
+    threading.Thread(target=obey, daemon=True).start()  # a read of standard input would outlast SIGTERM
+    say("up", node=rospy.get_name())
+    rospy.spin()
+
+
+if __name__ == "__main__":
+    main()
