@@ -40,7 +40,7 @@ class Web:
     """
 
     def __init__(self, agent: Agent, *flags: str, port: int = PORT) -> None:
-        argv = [RMPA, "web", "--listen", "0.0.0.0", "--port", str(port), "--agent", agent.name, *flags]
+        argv: list[str | Path] = [RMPA, "web", "--listen", "0.0.0.0", "--port", str(port), "--agent", agent.name, *flags]
         self.process = Process(agent.host.command(argv), env=agent.env, name=f"rmpa web {agent.name}")
         self.host = f"{agent.host.address}:{port}"
         self.token = ""

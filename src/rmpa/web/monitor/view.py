@@ -89,13 +89,20 @@ class StateBuilder:
         self._idle: dict[str, tuple[TopicInfo, Tree]] = {}
         self._sections: Tree = {}
 
-    def build(self, snapshot: Snapshot, resources: Sequence[ResourceFacts] = (), alarms: Sequence[Tree] = ()) -> Tree:
+    def build(
+        self,
+        snapshot: Snapshot,
+        resources: Sequence[ResourceFacts] = (),
+        alarms: Sequence[Tree] = (),
+        alarms_so_far: int = 0,
+    ) -> Tree:
         """The state of ``snapshot``.
 
         Args:
             snapshot: The newest.
             resources: The Smart Resources of all modules.
             alarms: The alarms that stand, each with ``id``, ``module``, ``resource``, ``level``, ``text`` and ``at``.
+            alarms_so_far: The number of alarms in the history, those included that are no longer kept.
         """
         taken = snapshot.taken
         peers = snapshot.peers[: limits.MODULES_SHOWN]
@@ -111,6 +118,7 @@ class StateBuilder:
             "services": {service_key(s): _service(s) for s in snapshot.services[: limits.SERVICES_SHOWN]},
             "resources": {one.key: resource_entry(one, self.own) for one in resources},
             "alarms": {str(alarm.get("id", index)): alarm for index, alarm in enumerate(alarms)},
+            "alarms_so_far": alarms_so_far,
             "notes": list(snapshot.notes[:100]),
             "unreachable": [str(each) for each in snapshot.unreachable[:100]],
         }

@@ -111,6 +111,7 @@ class MeshFeed:
             if self._builder is None or self._builder.own != reading.snapshot.agent.name:
                 self._builder = StateBuilder(reading.snapshot.agent.name)
             facts = tuple(self._resources.facts.values())
-            self._state = self._builder.build(reading.snapshot, facts, self._resources.alarms())
+            standing, so_far = self._resources.alarms(), self._resources.alarms_so_far
+            self._state = self._builder.build(reading.snapshot, facts, standing, so_far)
         for show in [*self._pages.values()]:
             show(self._state)

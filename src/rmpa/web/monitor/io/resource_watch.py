@@ -77,6 +77,8 @@ class ResourceWatch:
         """By ``ResourceFacts.key``."""
         self.history: deque[dict[str, Any]] = deque(maxlen=limits.ALARMS_KEPT)
         """Alarms since the server started, oldest first: ``at``, ``level``, ``resource``, ``text``."""
+        self.alarms_so_far = 0
+        """All of them, those included that are no longer kept."""
 
     def start(self) -> None:
         """Begin to follow the graph."""
@@ -193,6 +195,7 @@ class ResourceWatch:
 
     def _alarm(self, key: str, values: Any) -> None:
         for status in map(_status, values["status"]):
+            self.alarms_so_far += 1
             self.history.append(
                 {"at": round(self._now(), 3), "level": status["level"], "resource": key, "text": status["message"]}
             )
