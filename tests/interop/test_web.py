@@ -49,8 +49,7 @@ async def goes_on(page: Chromium, more: int = 10) -> None:
 
 def link_age(module: Module, peer: str) -> float:
     """Seconds since a link came up, by its agent."""
-    info = next(each for each in module.agent.snapshot().peers if each.name == peer)
-    return info.link.up_ago if info.link is not None else 0.0
+    return min(each.link.up_ago for each in module.agent.snapshot().peers if each.name == peer and each.link)
 
 
 @needs_browser

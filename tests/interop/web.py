@@ -40,8 +40,8 @@ class Web:
     """
 
     def __init__(self, agent: Agent, *flags: str, port: int = PORT) -> None:
-        argv: list[str | Path] = [RMPA, "web", "--listen", "0.0.0.0", "--port", str(port), "--agent", agent.name, *flags]
-        self.process = Process(agent.host.command(argv), env=agent.env, name=f"rmpa web {agent.name}")
+        argv = ["web", "--listen", "0.0.0.0", "--port", str(port), "--agent", agent.name, *flags]
+        self.process = Process(agent.host.command([RMPA, *argv]), env=agent.env, name=f"rmpa web {agent.name}")
         self.host = f"{agent.host.address}:{port}"
         self.token = ""
 
