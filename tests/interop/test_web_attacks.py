@@ -285,9 +285,9 @@ EVIL_NAME: Final = "/<img/src=x/onerror=alert(1)>"
 LINK: Final = "javascript:alert(1)"
 REGISTER: Final = """
 import os, sys, xmlrpc.client
-evil, name, link = sys.argv[1:]
+evil, name, link, here = sys.argv[1:]
 master = xmlrpc.client.ServerProxy(os.environ["ROS_MASTER_URI"])
-me, here = "/<svg/onload=alert(1)>", "http://127.0.0.1:9/"
+me = "/<svg/onload=alert(1)>"
 for done in (
     master.registerPublisher(me, name, evil + "/x", here),
     master.registerSubscriber(me, name, evil + "/x", here),
@@ -328,12 +328,12 @@ async def test_names_and_values_of_others_are_shown_as_text(
         for module, topic in ((base, "/silent"), (arm, "/words"), (arm, "/evil/descriptor"))
     ]
     switch = arm.ros.rospy("switch", name="switch", fail=f"{EVIL} {LINK}")
-    for node in (*tellers, switch):
-        await node.expect_event("up")
+    await asyncio.gather(*(node.expect_event("up") for node in (*tellers, switch)))
+    (up,) = clerk.events("up")
     clerk.tell(json.dumps({"log": f"{EVIL} {LINK}"}))
     words.tell(json.dumps({"data": f"{EVIL} {LINK}"}))
     resource.tell(json.dumps({"data": evil_resource()}))
-    await asyncio.to_thread(base.ros.tool, PYTHON, "-c", REGISTER, EVIL, EVIL_NAME, LINK)
+    await asyncio.to_thread(base.ros.tool, PYTHON, "-c", REGISTER, EVIL, EVIL_NAME, LINK, str(up["uri"]))
     async with Chromium(lab.host("tablet", 0)) as page:
         watch = (
             "document.addEventListener('securitypolicyviolation', (event) => console.error(event.violatedDirective))"

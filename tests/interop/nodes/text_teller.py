@@ -1,7 +1,7 @@
 """Log and publish the texts that it is told (rospy).
 
 Reads lines of JSON: ``{"log": TEXT}`` is logged as a warning, ``{"data": TEXT}`` is published as std_msgs/String.
-Event: ``up``.
+Event: ``up`` with the ``uri`` of its slave API.
 """
 
 import json
@@ -29,7 +29,7 @@ def main() -> None:
                 publisher.publish(String(told["data"]))
 
     threading.Thread(target=obey, daemon=True).start()  # a read of standard input would outlast SIGTERM
-    say("up", node=rospy.get_name())
+    say("up", node=rospy.get_name(), uri=rospy.get_node_uri())
     rospy.spin()
 
 
