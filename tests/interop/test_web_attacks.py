@@ -341,27 +341,28 @@ async def test_names_and_values_of_others_are_shown_as_text(
         await page.send("Page.addScriptToEvaluateOnNewDocument", source=watch)
         await served.open(page)
 
-        async def shows(address: str, *texts: str, click: str = "") -> None:
+        async def shows(address: str, title: str, *texts: str, click: str = "") -> None:
             await page.run(f"location.hash = {json.dumps('#/' + address)}")
+            await page.wait(f"document.querySelector('h1').textContent === {json.dumps(title)}")
             if click:
                 await page.click(click)
             for text in texts:
                 await page.wait_text(text)
             assert await page.run(f"document.querySelectorAll({json.dumps(MARKUP)}).length") == 0, address
 
-        await shows("topics", EVIL_NAME, f"{EVIL}/x")
+        await shows("topics", "Topics", EVIL_NAME, f"{EVIL}/x")
         await shows(f"topic/{quote(EVIL_NAME, safe='')}", EVIL_NAME, f"{EVIL}/x")
-        await shows(f"topic/{quote(EVIL_NAME, safe='')}", "is not a topic's name", click="On")
-        await shows("topic/%2Fwords", f"{EVIL} {LINK}", click="On")
-        await shows("services", f"{EVIL_NAME}/service")
-        await shows("service/arm%3A%2Fswitch", f"{EVIL} {LINK}", click="Call it")
-        await shows("params", EVIL, f'"{LINK}"')
-        await shows("resources", EVIL)
-        await shows("resource/arm%3A%2Fevil", EVIL, LINK)
-        await shows("log", f"{EVIL} {LINK}")
-        await shows("alarms", "History")
-        await shows("module/base", EVIL_NAME)
-        await shows("", "Modules")
+        await shows(f"topic/{quote(EVIL_NAME, safe='')}", EVIL_NAME, "is not a topic's name", click="On")
+        await shows("topic/%2Fwords", "/words", f"{EVIL} {LINK}", click="On")
+        await shows("services", "Services", f"{EVIL_NAME}/service")
+        await shows("service/arm%3A%2Fswitch", "/switch", f"{EVIL} {LINK}", click="Call it")
+        await shows("params", "Parameters", EVIL, f'"{LINK}"')
+        await shows("resources", "Smart Resources", EVIL)
+        await shows("resource/arm%3A%2Fevil", "/evil", EVIL, LINK)
+        await shows("log", "Log", f"{EVIL} {LINK}")
+        await shows("alarms", "Alarms", "History")
+        await shows("module/base", "base", EVIL_NAME)
+        await shows("", "Mesh", "Modules")
         await page.press("/")
         await page.wait("document.activeElement.type === 'search'")
         await page.send("Input.insertText", text="<img")
