@@ -12,6 +12,7 @@ import pytest
 
 from lab.bed.agents import RMPA, Agent
 from lab.bed.processes import DEADLINE, Process
+from rmpa.web.monitor.limits import DRIVE_SPEED
 from tests.interop.modules import Module
 from tests.interop.web import needs_browser
 from tests.web.browser.chromium import Chromium
@@ -29,6 +30,8 @@ SHOWN: Final = 1.5
 """Seconds within which a change shows."""
 STOPPED: Final = 1.0
 """Seconds within which a robot is stopped whose driver has gone."""
+HELD: Final = 0.6 * 0.15 * DRIVE_SPEED
+"""What an arrow key commands, m/s: its share of the stick, of what the page's slider says at first."""
 NUMBER: Final = "Number(/message (\\d+)/.exec(document.querySelector('.tree')?.innerText)?.[1])"
 """What a talker's live value counts."""
 
@@ -190,10 +193,10 @@ async def test_a_joystick_drives_a_robot_of_another_module_until_its_browser_is_
         await page.wait("document.querySelector('.stick:not(.off)')")
         await page.run("document.querySelector('.stick').focus()")
         await page.down("ArrowUp")
-        await wheels.expect_event("speed", where=lambda event: event["linear"] == pytest.approx(1.2))
+        await wheels.expect_event("speed", where=lambda event: event["linear"] == pytest.approx(HELD))
         held = wheels.mark_events()
         await wheels.expect_event("speed", since=held + 4)
-        assert all(event["linear"] == pytest.approx(1.2) for event in wheels.events("speed", since=held))
+        assert all(event["linear"] == pytest.approx(HELD) for event in wheels.events("speed", since=held))
         assert page.errors == []
 
         held = wheels.mark_events()

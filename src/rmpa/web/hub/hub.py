@@ -426,7 +426,9 @@ class Hub:
 
 def _check(right: bool, what: str) -> None:
     if not right:
-        raise PeerRefused("the web server", f"this client may not {what}", "ask for a role that may")
+        raise PeerRefused(
+            "the web server", f"this client may not {what}", "start rmpa web with --control, and give its token"
+        )
 
 
 def _fail(client: Client, handle: int, error: RmpaError) -> None:

@@ -38,6 +38,7 @@ QUESTIONS: Mapping[str, str] = {
     "delete_param": "param",
     "profile": "resource",
     "context": "resource",
+    "configure": "resource",
 }
 """All questions, with what a page must be allowed for each (``permissions``); empty: every page may ask it."""
 _PERMISSIONS = {
@@ -137,7 +138,8 @@ class MonitorSession:
 
     def open(self, agent: str) -> Iterator[Output]:
         """The first message, before any state; ``agent`` is the name of the agent's module."""
-        about = {"version": VERSION, "agent": agent, "period": limits.PATCH_PERIOD}
+        fastest = {"linear": limits.DRIVE_SPEED, "angular": limits.DRIVE_TURN}
+        about = {"version": VERSION, "agent": agent, "period": limits.PATCH_PERIOD, "fastest": fastest}
         yield _text({"op": "hello", **about, "may": permissions(self._rights)})
 
     def receive(self, text: str | bytes, now: float) -> Iterator[Output]:

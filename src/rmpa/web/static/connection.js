@@ -38,11 +38,15 @@ export class Connection {
     const url = new URL("monitor", document.baseURI);
     url.protocol = url.protocol.replace("http", "ws");
     url.hash = "";
+    if (this.socket) this.socket.close(); // one that is still connecting: its events are ignored from here on
     const socket = (this.socket = new WebSocket(url, "rmpa.monitor.v1"));
+    let opened = false;
     socket.binaryType = "arraybuffer";
-    socket.onmessage = (event) => this.receive(event.data);
-    socket.onclose = (event) => socket === this.socket && this.closed(event);
+    socket.onmessage = (event) => socket === this.socket && this.receive(event.data);
+    socket.onclose = (event) => socket === this.socket && this.closed(event, opened);
     socket.onopen = () => {
+      if (socket !== this.socket) return;
+      opened = true;
       this.phase = "open";
       this.wait = FIRST_WAIT;
       if (this.looks.length) this.send({ op: "look", at: this.looks });
@@ -52,15 +56,22 @@ export class Connection {
     };
   }
 
-  closed(event) {
+  closed(event, opened) {
     if (this.phase !== "lost") this.lostAt = Date.now();
     this.phase = "lost";
     this.reason = event.reason;
+    if (!opened) this.explain();
     for (const question of this.questions.values()) question.reject({ error: "the connection was lost", remedy: "" });
     this.questions.clear();
     this.timer = setTimeout(() => this.open(), this.wait * (0.75 + Math.random() / 2));
     this.wait = Math.min(LAST_WAIT, this.wait * 2);
     this.changed();
+  }
+
+  // A browser does not tell why a WebSocket was refused, as for a wrong token: the same question over HTTP does.
+  explain() {
+    fetch(new URL("api/v1/agent", document.baseURI)).then((response) => (response.ok || response.status === 503 ? null : response.json()))
+      .then((problem) => { if (problem && this.phase === "lost") { this.reason = problem.detail; this.changed(); } }, () => {});
   }
 
   send(message) {

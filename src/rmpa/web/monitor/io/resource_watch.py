@@ -196,6 +196,7 @@ class ResourceWatch:
     def _alarm(self, key: str, values: Any) -> None:
         for status in map(_status, values["status"]):
             self.alarms_so_far += 1
+            self._since[key] = status["level"], self._now()
             self.history.append(
                 {"at": round(self._now(), 3), "level": status["level"], "resource": key, "text": status["message"]}
             )
