@@ -56,6 +56,8 @@ class ClientConnection(ABC):
 
     kind = ""
     """The protocol's name, for logs and lists."""
+    timer_waits = True
+    """Whether the session's timer waits while the client takes nothing; else the session itself holds back."""
 
     def __init__(
         self,
@@ -137,13 +139,13 @@ class ClientConnection(ABC):
             self.queue.end(request.handle)
         self.hub.ask(self.client, request)
 
-    def end(self, code: int, reason: str, refusal: str) -> None:
-        """Close the WebSocket, because of what the client sent; what it still sends is ignored.
+    def end(self, code: int, reason: str, refusal: str = "") -> None:
+        """Close the WebSocket; what the client still sends is ignored.
 
         Args:
             code: Of RFC 6455, section 7.4.
             reason: For the client and the log.
-            refusal: For the counter, one of ``figures.REASONS``.
+            refusal: Which of ``figures.REASONS`` is counted, where the client is the cause.
         """
         if self._close is not None:
             return
@@ -151,7 +153,8 @@ class ClientConnection(ABC):
         self._wake.set()
         # A client that does not read would hold the close frame up for long.
         self._close_timer = self._loop.call_later(2 * limits.CLOSE_TIMEOUT, self._abort)
-        self._refuse(refusal, reason)
+        if refusal:
+            self._refuse(refusal, reason)
 
     def arm(self) -> None:
         """Set the timer anew, after each call of the session."""
@@ -183,14 +186,16 @@ class ClientConnection(ABC):
         self,
         request: web.Request,
         socket_: web.WebSocketResponse,
-        refused: Callable[[str, str], None] | None = None,
+        upgraded: Callable[[web.Request], None],
+        refused: Callable[[str, str], None],
     ) -> None:
         """Serve the client until it has gone.
 
         Args:
             request: Asks for the WebSocket.
-            socket_: The WebSocket, not opened yet.
-            refused: ``(reason, text)``: told why the client is disconnected; one of ``figures.REASONS``.
+            socket_: Not prepared yet.
+            upgraded: Called when the handshake is done.
+            refused: ``(reason, text)``: called if the client is disconnected for one of ``figures.REASONS``.
 
         Raises:
             PeerRefused: There are too many clients.
@@ -202,6 +207,7 @@ class ClientConnection(ABC):
         tasks: list[asyncio.Task[None]] = []
         try:
             writer = await socket_.prepare(request)
+            upgraded(request)
             self._transport = request.transport
             if self._transport is None:
                 return  # it went during the handshake
@@ -211,25 +217,32 @@ class ClientConnection(ABC):
                 tasks.append(self._loop.create_task(work, name=f"{name} {self.client.name}"))
             await self._read(socket_)
         finally:
-            self.closing()
-            for timer in (self._timer, self._close_timer):
-                if timer is not None:
-                    timer.cancel()
-            self.hub.disconnect(self._client)
-            self.queue.clear()
-            for task in tasks:
-                task.cancel()
-            if tasks:
-                await asyncio.wait(tasks)
+            try:
+                self.closing()
+            finally:
+                for timer in (self._timer, self._close_timer):
+                    if timer is not None:
+                        timer.cancel()
+                for task in tasks:
+                    task.cancel()
+                self.hub.disconnect(self._client)
+                self.queue.clear()
+                if tasks:
+                    await asyncio.wait(tasks)
 
     async def _read(self, socket_: web.WebSocketResponse) -> None:
         async for message in socket_:
             self._heard += 1
+            if self._heard % _TURN == 0:
+                await asyncio.sleep(0)  # frames that have arrived already do not suspend this task
+            if self._gone:
+                return
+            if self._close is not None:
+                continue  # the other task closes it
             if message.type == WSMsgType.PING:
-                self._send(Opcode.PONG, (message.data,))
+                if self.unsent <= limits.WRITE_BUFFER:  # a client that takes nothing is owed no pong
+                    self._send(Opcode.PONG, (message.data,))
             elif message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
-                if self._close is not None:
-                    continue  # it is being disconnected
                 try:
                     self.received_frame(message.data)
                 except Exception:  # noqa: BLE001 - a fault of one client's session must not end the server
@@ -314,6 +327,8 @@ class ClientConnection(ABC):
             transport.write(b"".join(small))
 
     def _queue(self, handle: int, entry: Received | OutFrame, size: int, topic: str) -> None:
+        if self._gone:
+            return
         priority = self._priority(topic) if handle else 0
         self.queue.push(handle, entry, size, priority)
         if self.queue.overflow:
@@ -331,7 +346,8 @@ class ClientConnection(ABC):
 
     def _due(self) -> None:
         self._timer = None
-        if self._transport is not None and self._transport.get_write_buffer_size() > limits.WRITE_BUFFER:
+        waiting = self._transport.get_write_buffer_size() if self._transport is not None else 0
+        if self.timer_waits and waiting > limits.WRITE_BUFFER:
             # The client cannot take what the session holds back: it stays there, within its bounds.
             self._timer = self._loop.call_later(limits.TIMER_RETRY, self._due)
             return

@@ -25,6 +25,8 @@ FORMATS: Final = {"jpeg": 1, "png": 2, "rgb8": 3, "mono8": 4}
 _CHANNELS: Final = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC1": 1, "8UC3": 3}
 _DEPTHS: Final = {"16UC1": ("H", 2), "mono16": ("H", 2), "32FC1": ("f", 4)}
 """Encodings of one channel, with the letter and bytes of its values; little-endian, as ROS machines are."""
+_EXACT: Final = 2**53
+"""The largest integer that a browser's numbers hold exactly; a larger one is sent as text."""
 _INDEX: Final = re.compile(r"\[(\d+)\]")
 
 
@@ -46,6 +48,8 @@ def _cut(value: Any, left: list[int]) -> Any:
         return f"{len(value)} bytes"
     if isinstance(value, float):
         return value if math.isfinite(value) else str(value)
+    if isinstance(value, int) and abs(value) > _EXACT:
+        return str(value)
     if value is None or isinstance(value, bool | int):
         return value
     if not hasattr(value, "__len__"):
@@ -73,7 +77,7 @@ def number_at(values: Any, path: tuple[str, ...]) -> float | None:
     for step in path:
         if isinstance(values, dict):
             values = values.get(step)
-        elif step.isdigit() and hasattr(values, "__len__") and not isinstance(values, str):
+        elif step.isascii() and step.isdecimal() and hasattr(values, "__len__") and not isinstance(values, str):
             values = values[int(step)] if int(step) < len(values) else None
         else:
             return None

@@ -137,7 +137,7 @@ class ControlReader:
 
     def _ask(self, client: ControlClient) -> Snapshot:
         try:
-            snapshot = client.call("snapshot", Snapshot, figures=True) if self.figures else client.snapshot()
+            snapshot = client.call("snapshot", Snapshot, figures="newest") if self.figures else client.snapshot()
         except RmpaError:
             self.close()
             raise

@@ -108,11 +108,12 @@ class GuardedConnection(asyncio.Protocol):
 
     def request_ends(self) -> None:
         """The response is made; the client has some time to read it and to send the next request."""
-        self.is_answering, self._received, self._upgraded = False, 0, False
-        self._limit(limits.WEB_IDLE_TIMEOUT, None, "")
+        self.is_answering, self._received = False, 0
+        if not self._upgraded:
+            self._limit(limits.WEB_IDLE_TIMEOUT, None, "")
 
     def upgrade(self) -> None:
-        """The connection is a WebSocket until its handler ends, which has limits of its own."""
+        """The connection is a WebSocket from now on, whose handler has limits of its own."""
         self._upgraded = True
         self._stop_timer()
 

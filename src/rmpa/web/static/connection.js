@@ -5,6 +5,7 @@ import { adopt, applyPatch } from "./state.js";
 const FIRST_WAIT = 300; // milliseconds until the next attempt, doubled up to LAST_WAIT
 const LAST_WAIT = 5000;
 const ANSWER_WAIT = 30000;
+const SILENT = 7000; // milliseconds without a word after which the connection is lost; the server says something every 2 s
 
 export class Connection {
   constructor(changed) {
@@ -21,7 +22,9 @@ export class Connection {
     this.counter = 0;
     this.wait = FIRST_WAIT;
     this.frames = { patches: 0, bytes: 0 };
+    this.heard = 0;
     this.open();
+    setInterval(() => this.phase === "open" && Date.now() - this.heard > SILENT && this.drop(), 1000);
     addEventListener("online", () => this.retry());
     document.addEventListener("visibilitychange", () => document.hidden || this.retry());
   }
@@ -47,6 +50,7 @@ export class Connection {
     socket.onopen = () => {
       if (socket !== this.socket) return;
       opened = true;
+      this.heard = Date.now();
       this.phase = "open";
       this.wait = FIRST_WAIT;
       if (this.looks.length) this.send({ op: "look", at: this.looks });
@@ -68,6 +72,14 @@ export class Connection {
     this.changed();
   }
 
+  // Nothing comes any more, as after the Wi-Fi has gone: the browser itself would notice much later.
+  drop() {
+    const socket = this.socket;
+    this.socket = null;
+    socket.close();
+    this.closed({ reason: "it has said nothing for some seconds" }, true);
+  }
+
   // A browser does not tell why a WebSocket was refused, as for a wrong token: the same question over HTTP does.
   explain() {
     fetch(new URL("api/v1/agent", document.baseURI)).then((response) => (response.ok || response.status === 503 ? null : response.json()))
@@ -75,10 +87,11 @@ export class Connection {
   }
 
   send(message) {
-    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
+    if (this.socket && this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
   }
 
   receive(data) {
+    this.heard = Date.now();
     if (typeof data !== "string") return this.receiveBinary(data);
     this.frames.bytes += data.length;
     const message = JSON.parse(data);

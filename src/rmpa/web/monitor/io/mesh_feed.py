@@ -103,7 +103,8 @@ class MeshFeed:
                 _log.exception("! the state of the mesh could not be built")
             # A snapshot of thousands of topics takes time at both ends: at most a fifth of it is spent here.
             took = time.monotonic() - began
-            await asyncio.sleep(max(limits.STATE_PERIOD - took, took * limits.STATE_SHARE))
+            pause = min(took * limits.STATE_SHARE, limits.STATE_PAUSE_MAX)
+            await asyncio.sleep(max(limits.STATE_PERIOD - took, pause))
 
     def _take(self, reading: Reading) -> None:
         if reading.number == self._number:

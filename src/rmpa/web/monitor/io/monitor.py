@@ -62,5 +62,6 @@ class Monitor:
     async def close(self) -> None:
         """End, before the hub ends."""
         await self.mesh.close()
+        self.answers.close()
         self.log.close()
         self.resources.close()

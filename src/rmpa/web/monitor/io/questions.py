@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import msgspec
@@ -16,6 +17,7 @@ from rmpa.observe import limits as observe_limits
 from rmpa.observe.io.control_client import ControlClient, choose_agent
 from rmpa.observe.io.peer_params import PeerParams, parameters_in
 from rmpa.resource.run.dynamic_reconfigure import SERVICE_TYPE
+from rmpa.web.monitor import limits
 from rmpa.web.values.codec import codec_for
 
 if TYPE_CHECKING:
@@ -53,6 +55,7 @@ class Answers:
         self._resources = resources
         self._environ = environ
         self._agent = agent
+        self._threads = ThreadPoolExecutor(limits.ANSWERS_AT_ONCE, "rmpa-answers")
         self._handlers: Mapping[str, Callable[[Args], Awaitable[Any]]] = {
             "why": self._why,
             "history": self._history,
@@ -74,6 +77,10 @@ class Answers:
         """
         return await self._handlers[question.what](question.args)
 
+    def close(self) -> None:
+        """End the threads, once what the agent was asked is answered or has timed out."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+
     # --- what only looks --------------------------------------------------------------------------------------
 
     async def _why(self, args: Args) -> Any:
@@ -86,7 +93,7 @@ class Answers:
             with self._control() as client:
                 return client.call("why", object, name=name, peer=peer or None, service=kind == "service")
 
-        return await asyncio.to_thread(ask)
+        return await asyncio.get_running_loop().run_in_executor(self._threads, ask)
 
     async def _history(self, _args: Args) -> Any:
         return list(self._resources.history)
@@ -147,7 +154,7 @@ class Answers:
             with self._control() as client:
                 return do(PeerParams(client, peer))
 
-        return await asyncio.to_thread(ask)
+        return await asyncio.get_running_loop().run_in_executor(self._threads, ask)
 
     def _control(self) -> ControlClient:
         agent = choose_agent(self._environ, self._agent() or None)

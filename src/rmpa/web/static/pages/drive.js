@@ -38,10 +38,12 @@ function Stick({ on, send, release }) {
     const far = Math.max(1, Math.hypot(x, y));
     const next = { x: x / far, y: y / far };
     setAt(next);
-    if (!held.current) held.current = { timer: setInterval(() => send(held.current.y, -held.current.x), PERIOD) };
-    Object.assign(held.current, next);
+    if (held.current) return void Object.assign(held.current, next); // the timer sends it: pointers move 60 times a second
+    held.current = { ...next, timer: setInterval(() => command.current(held.current.y, -held.current.x), PERIOD) };
     send(next.y, -next.x);
   };
+  const command = useRef(send); // the newest: the timer outlives a change of the fastest speed
+  command.current = send;
   const end = useRef(stop);
   end.current = stop;
   useEffect(() => {
