@@ -5,6 +5,7 @@ Event: ``up`` with the ``uri`` of its slave API.
 """
 
 import json
+import os
 import sys
 import threading
 
@@ -28,9 +29,10 @@ def main() -> None:
             if "data" in told:
                 publisher.publish(String(told["data"]))
 
-    threading.Thread(target=obey, daemon=True).start()  # a read of standard input would outlast SIGTERM
+    threading.Thread(target=obey, daemon=True).start()
     say("up", node=rospy.get_name(), uri=rospy.get_node_uri())
     rospy.spin()
+    os._exit(0)  # the thread that reads would hold the interpreter's end up
 
 
 if __name__ == "__main__":

@@ -235,6 +235,8 @@ class ClientConnection(ABC):
             self._heard += 1
             if self._heard % _TURN == 0:
                 await asyncio.sleep(0)  # frames that have arrived already do not suspend this task
+            if message.type == WSMsgType.ERROR:
+                self._failed(message.data)
             if self._gone:
                 return
             if self._close is not None:
@@ -249,8 +251,6 @@ class ClientConnection(ABC):
                     _log.exception("! a frame of %s failed", self.client.name)
                     await socket_.close(code=_INTERNAL_ERROR, message=b"the server failed; its log says why")
                     return
-            elif message.type == WSMsgType.ERROR:
-                self._failed(message.data)
 
     def _failed(self, error: object) -> None:
         """The WebSocket has ended by an error: of the connection, or a frame that breaks RFC 6455 or is too long."""

@@ -18,7 +18,15 @@ from rmpa.core.counters import Counters, RefusalLog
 from rmpa.web import limits, rest
 from rmpa.web.gateways.gateways import MONITOR_PATH, is_upgrade
 from rmpa.web.metrics import content_type, exposition
-from rmpa.web.server.auth import TOKEN_PARAMETER, AccessPolicy, MoveToken, Refused, RequestFacts
+from rmpa.web.server.auth import (
+    TOKEN_PARAMETER,
+    AccessPolicy,
+    MoveToken,
+    Refused,
+    RequestFacts,
+    host_name,
+    is_loopback,
+)
 from rmpa.web.server.connections import GuardedConnection
 from rmpa.web.server.figures import Figures, web_metrics
 
@@ -47,13 +55,14 @@ HEADERS: Final = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
     "Referrer-Policy": "no-referrer",
-    "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
     "Cache-Control": "no-store",
     "Server": "rmpa",
 }
 """Of every response."""
+OPENER_POLICY: Final = ("Cross-Origin-Opener-Policy", "same-origin")
+"""Of responses to loopback: in plain HTTP browsers ignore it from elsewhere, and report that as an error."""
 
 
 class Routes:
@@ -118,6 +127,8 @@ class Routes:
                     connection.request_ends()
             if not response.prepared:
                 response.headers.update(HEADERS)
+                if is_loopback(host_name(request.host) or ""):
+                    response.headers.update((OPENER_POLICY,))
             return response
 
         return middleware
