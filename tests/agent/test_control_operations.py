@@ -11,8 +11,10 @@ from rmpa.config.sources import Loaded
 from rmpa.core.errors import PeerRefused
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.observe.io.control_operations import OPERATIONS
+from rmpa.observe.snapshot import GraphRevision
 from rmpa.ros.node_info import PeerNodes
 from tests.agent.test_agent import running, settings, until
+from tests.ros.node.peers import DEADLINE
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -29,6 +31,7 @@ ARGS: Final[dict[str, dict[str, Any]]] = {
     "reload": {"check": True},
     "param": {"peer": "b", "what": "param.names", "args": {}},
     "followed": {},
+    "graph": {},
     "node": {"what": "node.list", "peer": "b"},
 }
 
@@ -58,6 +61,7 @@ async def test_each_operation_replies_with_its_type(settings: Callable[..., Sett
         ("why", {"name": "chatter"}, "is not a topic, nor a service"),
         ("param", {"peer": "b", "what": "param.nmes"}, r"did you mean param\.names\?"),
         ("param", {"peer": "b", "what": "param.names"}, "is no table"),
+        ("graph", {"wait": -1}, "is not between 0 and"),
         ("node", {"what": "node.lst"}, r"did you mean node\.list\?"),
         ("snapshots", {}, "did you mean snapshot?"),
     ],
@@ -82,3 +86,19 @@ async def test_nodes_of_all_peers_are_listed(settings: Callable[..., Settings]) 
         (nodes,) = await a.operations.node({"what": "node.list"})
     assert isinstance(nodes, PeerNodes)
     assert (nodes.peer, nodes.problem) == ("b", "")
+
+
+async def test_a_change_of_the_graph_ends_the_wait_for_it(settings: Callable[..., Settings], tmp_path: Path) -> None:
+    async with running(settings("a")) as (a,):
+
+        def ask(**args: object) -> int:
+            with ControlClient(tmp_path / "a.sock") as client:
+                return client.call("graph", GraphRevision, **args).revision
+
+        known = await asyncio.to_thread(ask)
+        assert await asyncio.to_thread(ask, after=known, wait=0.01) == known
+        waiting = asyncio.create_task(asyncio.to_thread(ask, after=known, wait=20.0))
+        a.core.call("registerPublisher", "/talker", "/chatter", "std_msgs/String", "http://127.0.0.1:9/")
+        changed = await asyncio.wait_for(waiting, DEADLINE)
+        assert changed != known
+        assert await asyncio.to_thread(ask, after=known, wait=20.0) == changed  # it has changed before: at once

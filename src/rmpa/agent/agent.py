@@ -30,6 +30,7 @@ from rmpa.core.open_files import remedy
 from rmpa.observe.io.control_operations import ControlOperations
 from rmpa.observe.io.control_server import ControlServer
 from rmpa.observe.io.diagnostics import Diagnostics
+from rmpa.observe.io.graph_revision import GraphRevisions
 from rmpa.observe.io.peer_clocks import PeerClocks
 from rmpa.observe.io.runtime_dir import runtime_dir
 from rmpa.observe.io.snapshot_builder import SnapshotBuilder, SnapshotSources
@@ -130,7 +131,13 @@ class Agent:
         self._nodes = NodeRequests(settings, self.core, self.bridge.rpc)
         self._why = WhyService(settings, self.core, self.bridge, self.services, self.snapshots)
         self.operations = ControlOperations(
-            settings.name, self.bridge, self.params, self.snapshots, self._why, self.reloader.reload
+            settings.name,
+            self.bridge,
+            self.params,
+            self.snapshots,
+            self._why,
+            self.reloader.reload,
+            GraphRevisions(self.core),
         )
         self._control = ControlServer(
             runtime_dir(os.environ, settings.runtime_dir),

@@ -28,6 +28,8 @@ CONTROL_PINGS_MAX: Final = 100
 """Pings of one call, which must end within its time-out. The command line asks for one at a time."""
 CONTROL_HANDLER_TIMEOUT: Final = 30.0
 """Time-out of an operation in the agent; ``rmpa why`` waits for peers."""
+CONTROL_WAIT_MAX: Final = 25.0
+"""The longest wait for a change of the graph in one request: it must end within ``CONTROL_HANDLER_TIMEOUT``."""
 CONTROL_PATH_MAX: Final = 107
 """Bytes in a UNIX socket's path: Linux's sun_path less its final zero."""
 CPU_INTERVAL: Final = 1.0

@@ -45,6 +45,10 @@ SERVED_TIMEOUT: Final = 60.0
 GRAPH_PERIOD: Final = 0.08
 """Shortest time from one look at the graph to the next while there are clients, so that a new topic shows within
 0.1 s."""
+GRAPH_TOLD_PERIOD: Final = 2.0
+"""The same while the agent tells each change: no look is needed then, and a lost word costs this long."""
+GRAPH_WAIT: Final = 20.0
+"""Time of one question to the agent for the next change of the graph."""
 GRAPH_IDLE_PERIOD: Final = 1.0
 """Time between two looks while no client follows the graph."""
 GRAPH_GATHER: Final = 0.01

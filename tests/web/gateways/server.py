@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import aiohttp
 from aiohttp import web
 
-from rmpa.web.gateways.gateways import Gateways
+from rmpa.web.gateways.gateways import MONITOR_PATH, Gateways
 from rmpa.web.hub.rights import FULL, Rights
+from rmpa.web.monitor.io.monitor import Monitor
 from tests.ros.node.peers import DEADLINE
 from tests.web.hub.client import running_hub
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from rmpa.ros.core.embedded import RosCore
+    from rmpa.web.server.agent_watch import AgentWatch
 
 
 class Client:
@@ -61,21 +63,31 @@ class Server:
         self.session = session
 
     @contextlib.asynccontextmanager
-    async def client(self, *protocols: str) -> AsyncIterator[Client]:
+    async def client(self, *protocols: str, path: str = "/") -> AsyncIterator[Client]:
         """A client that offers subprotocols."""
-        url = f"ws://127.0.0.1:{self.port}/"
+        url = f"ws://127.0.0.1:{self.port}{path}"
         async with self.session.ws_connect(url, protocols=protocols, max_msg_size=0) as socket:
             yield Client(socket)
 
 
 @contextlib.asynccontextmanager
 async def running_server(
-    core: RosCore, rights: Rights = FULL, priority: Callable[[str], int] = lambda _: 0, *, port: int = 0
+    core: RosCore,
+    rights: Rights = FULL,
+    priority: Callable[[str], int] = lambda _: 0,
+    *,
+    port: int = 0,
+    watch: AgentWatch | None = None,
 ) -> AsyncIterator[Server]:
+    """The gateways; with ``watch``, which asks an agent, also the monitor."""
     async with running_hub(core) as hub:
-        gateways = Gateways(hub, "test", lambda _: rights, priority)
+        monitor = Monitor(hub, watch, {}) if watch is not None else None
+        if monitor is not None:
+            monitor.start()
+        gateways = Gateways(hub, "test", lambda _: rights, priority, monitor)
         app = web.Application()
-        app.router.add_get("/", gateways.handle)
+        for path in ("/", MONITOR_PATH):
+            app.router.add_get(path, gateways.handle)
         runner = web.AppRunner(app, shutdown_timeout=1)
         await runner.setup()
         site = web.TCPSite(runner, "127.0.0.1", port)
@@ -87,3 +99,5 @@ async def running_server(
         finally:
             await gateways.close()
             await runner.cleanup()
+            if monitor is not None:
+                await monitor.close()

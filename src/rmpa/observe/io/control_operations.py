@@ -17,7 +17,7 @@ from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
 from rmpa.observe import limits
 from rmpa.observe.reload_reply import ReloadReply
-from rmpa.observe.snapshot import FollowedInfo, PingReply, Snapshot
+from rmpa.observe.snapshot import FollowedInfo, GraphRevision, PingReply, Snapshot
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.node_info import NodeLine, PeerNodes
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.params.io.part import Params
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.observe.io.control_server import Handler
+    from rmpa.observe.io.graph_revision import GraphRevisions
     from rmpa.observe.io.snapshot_builder import SnapshotBuilder
     from rmpa.observe.why.io.why import WhyService
 
@@ -44,6 +45,7 @@ class ControlOperations:
         snapshots: Builds its snapshots.
         why: Answers ``why``.
         reload: Reads the settings again; with ``check`` it changes nothing.
+        graph: Counts the changes of the local graph.
     """
 
     def __init__(
@@ -54,6 +56,7 @@ class ControlOperations:
         snapshots: SnapshotBuilder,
         why: WhyService,
         reload: Callable[..., Awaitable[ReloadReply]],
+        graph: GraphRevisions,
     ) -> None:
         self._name = name
         self._bridge = bridge
@@ -61,6 +64,7 @@ class ControlOperations:
         self._snapshots = snapshots
         self._why = why
         self._reload = reload
+        self._graph = graph
 
     def handlers(self) -> dict[str, Handler]:
         """The handler of each operation, for ``ControlServer``."""
@@ -141,6 +145,10 @@ class ControlOperations:
             nodes = tuple(NodeLine(name=node) for node, _ in session.proxies)
             return PeerNodes(peer=peer, nodes=nodes, problem=str(error))
 
+    async def graph(self, args: Args) -> GraphRevision:
+        """The arguments of ``GraphRevisions.after``."""
+        return await self._graph.after(args)
+
     def _session(self, name: object) -> PeerSession:
         """The linked peer of a name or GUID.
 
@@ -206,6 +214,7 @@ OPERATIONS: Final = (
     Operation("why", ControlOperations.why, tuple[Diagnosis, ...]),
     Operation("reload", ControlOperations.reload, ReloadReply),
     Operation("param", ControlOperations.param, object),  # the value that the peer replies
+    Operation("graph", ControlOperations.graph, GraphRevision),
     Operation("followed", ControlOperations.followed, tuple[FollowedInfo, ...]),
     Operation("node", ControlOperations.node, object),  # tuple[PeerNodes, ...] for lists, else as REPLIES says
 )

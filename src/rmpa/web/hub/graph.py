@@ -64,6 +64,8 @@ class GraphWatch:
         """Set once the graph is known."""
         self.active = False
         """Whether there are clients, for which it is read more often."""
+        self.told = False
+        """Whether each change is told by ``look``, so that it need not be searched for."""
         self.topics: Mapping[str, GraphTopic] = {}
         """By name, in order of names."""
         self.services: Mapping[str, GraphService] = {}
@@ -140,13 +142,18 @@ class GraphWatch:
             if changed or not self.loaded.is_set():
                 self._rebuild()
             took = loop.time() - began
-            period = limits.GRAPH_PERIOD if self.active else limits.GRAPH_IDLE_PERIOD
+            period = self._period()
             share = limits.GRAPH_CHANGED_SHARE if changed else limits.GRAPH_SHARE
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(max(period - took, took * share)):
                     await self._look.wait()
                 # Many changes at once, as when a page subscribes to all topics, are one look.
                 await asyncio.sleep(max(limits.GRAPH_GATHER, took))
+
+    def _period(self) -> float:
+        if self.told:
+            return limits.GRAPH_TOLD_PERIOD
+        return limits.GRAPH_PERIOD if self.active else limits.GRAPH_IDLE_PERIOD
 
     async def _read(self, node: Node) -> bool:
         """Read the graph; returns whether it differs from the last one."""

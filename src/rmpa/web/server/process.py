@@ -19,6 +19,7 @@ from rmpa.web.gateways.gateways import Gateways
 from rmpa.web.monitor.io.monitor import Monitor
 from rmpa.web.server import auth
 from rmpa.web.server.agent_watch import AgentWatch, ControlReader
+from rmpa.web.server.graph_signal import GraphSignal
 from rmpa.web.server.hub_setup import make_hub, priority_of, rights_of
 from rmpa.web.server.server import WebServer
 from rmpa.web.server.token_file import token_from
@@ -121,6 +122,7 @@ async def serve(
     hub = make_hub(watch, web.port)
     rights = rights_of(has_token=bool(access.token), control=web.control, drive=web.drive)
     monitor = Monitor(hub, watch, agent=agent)
+    changes = GraphSignal(os.environ, lambda: agent or monitor.mesh.agent or None, hub.graph)
     gateways = Gateways(
         hub,
         f"RMPA {agent or socket.gethostname()}",
@@ -133,12 +135,14 @@ async def serve(
         async with hub:
             await server.start()
             monitor.start()
+            changes.start()
             if with_agent:
                 _stop_at_end_of_input(loop, stop)
             announce(address_of(web, access, server.port))
             await stop.wait()
             _log.info("= ending")
             await gateways.close()
+            await changes.close()
             await monitor.close()
     finally:
         await server.close()

@@ -1,0 +1,65 @@
+"""The agent tells changes of the graph: they are seen at once, and without it by looking again and again."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import secrets
+from typing import TYPE_CHECKING, Any
+
+from rmpa.observe.io.control_server import ControlServer
+from rmpa.observe.io.graph_revision import GraphRevisions
+from rmpa.web.server.graph_signal import GraphSignal
+from tests.ros.node.peers import DEADLINE, LATCHED, until
+from tests.web.hub.client import local_core, node, running_hub
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from rmpa.web.hub.hub import Hub
+
+
+def _has_topic(hub: Hub, name: str) -> bool:
+    return name in hub.graph.topics
+
+
+async def test_a_new_topic_is_seen_by_the_agents_word_and_again_after_its_restart(tmp_path: Path) -> None:
+    environ = {"RMPA_RUNTIME_DIR": str(tmp_path)}
+    async with local_core() as core, running_hub(core) as hub, node(core, "talker") as talker:
+        changes = GraphSignal(environ, lambda: "base", hub.graph)
+        changes.start()
+        for name in ("/first", "/second"):
+            server = ControlServer(tmp_path, "base", {"graph": GraphRevisions(core).after})
+            await server.start()
+            await until(lambda: hub.graph.told)
+            reads = hub.graph.reads
+            async with asyncio.timeout(DEADLINE):
+                await talker.advertise(name, LATCHED)
+                await until(functools.partial(_has_topic, hub, name))
+            assert hub.graph.reads > reads
+            await server.close()
+            await until(lambda: not hub.graph.told)
+            await talker.advertise(f"{name}_{secrets.token_hex(2)}", LATCHED)
+            await until(lambda: len(hub.graph.topics) > 2)
+        await changes.close()
+
+
+async def test_an_agent_that_does_not_know_the_question_is_no_error(tmp_path: Path) -> None:
+    asked: list[Any] = []
+
+    def refuse(args: Any) -> str:
+        asked.append(args)
+        return "nothing"
+
+    async with local_core() as core, running_hub(core) as hub, node(core, "talker") as talker:
+        server = ControlServer(tmp_path, "base", {"graph": refuse})
+        await server.start()
+        changes = GraphSignal({"RMPA_RUNTIME_DIR": str(tmp_path)}, lambda: "base", hub.graph)
+        changes.start()
+        await until(lambda: asked)
+        await talker.advertise("/seen", LATCHED)
+        hub.graph.active = True
+        await until(lambda: "/seen" in hub.graph.topics)
+        assert not hub.graph.told
+        await changes.close()
+        await server.close()
