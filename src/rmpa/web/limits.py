@@ -172,8 +172,9 @@ WEB_BACKLOG: Final = 128
 """Connections that wait to be accepted."""
 WEB_SHUTDOWN_TIMEOUT: Final = 2.0
 """Seconds for responses under way when the server ends."""
-WEB_SNAPSHOT_AGE: Final = 0.2
-"""Seconds that a snapshot is shared before the agent is asked again: the monitor shows 5 changes a second."""
+WEB_SNAPSHOT_AGE: Final = 0.1
+"""Seconds that a snapshot is shared before the agent is asked again: less than ``STATE_PERIOD`` of the monitor, which
+would get every other snapshot twice."""
 WEB_AGENT_TIMEOUT: Final = 2.0
 """Seconds for the agent to answer; it takes milliseconds, and Prometheus waits for 10 s."""
 WEB_TOKEN_BYTES: Final = 32
