@@ -16,7 +16,7 @@ export function DrivePage({ state, connection }) {
   return html`<${Page} title="Drive" kind="A joystick for geometry_msgs/Twist"><div class="grid">
     <${Panel} title="What is driven"><div class="form"><label>Topic<input class="mono" list="twists" value=${topic} onInput=${(event) => { arm(false); setTopic(event.target.value); }} /></label><datalist id="twists">${topics.map((each) => html`<option key=${each} value=${each} />`)}</datalist>
       <label class="row"><span><input type="checkbox" checked=${armed} disabled=${!allowed} onChange=${(event) => arm(event.target.checked)} /> The robot may move: I see it</span></label>
-      <p class="muted">${allowed ? "It drives only while the stick is held. Let go, lose the connection or leave the page, and it is stopped within 0.3 s." : "Driving is not allowed for this page. It needs rmpa web with drive allowed, and a token whose role may."}</p></div><//>
+      <p class="muted">${allowed ? "It drives only while the stick is held. Let go, lose the connection or leave the page, and it is stopped within 0.3 s." : "Driving is not allowed for this page. Start rmpa web with --drive, and open this page with its token."}</p></div><//>
     <${Panel} title="Joystick"><${Stick} on=${allowed && armed} send=${(linear, angular) => connection.send({ op: "drive", topic, linear, angular })} release=${() => connection.send({ op: "release" })} /><//></div><//>`;
 }
 
