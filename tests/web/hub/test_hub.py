@@ -34,7 +34,7 @@ from rmpa.web.hub.requests import (
     Unadvertise,
     Unsubscribe,
 )
-from rmpa.web.hub.rights import CONTROL_REMEDY, READ_ONLY, TOKEN_REMEDY
+from rmpa.web.hub.rights import CONTROL_REMEDY, READ_ONLY, READ_REMEDY
 from tests.ros.node.peers import DEADLINE, LATCHED, STRING, until
 from tests.web.hub.client import FakeClient, node, running_hub
 
@@ -373,6 +373,6 @@ async def test_a_read_only_client_changes_nothing(core: RosCore) -> None:
             failed = client.of(type(await client.failure(request.handle)), request.handle)[0]
             assert "may not" in failed.error
             reads = isinstance(request, GetParams | FollowParams)
-            assert failed.remedy == (TOKEN_REMEDY if reads else CONTROL_REMEDY)
+            assert failed.remedy == (READ_REMEDY if reads else CONTROL_REMEDY)
         client.ask(Publish(1, ONE))
         assert not core.publishers("/t")

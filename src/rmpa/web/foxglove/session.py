@@ -21,7 +21,7 @@ from rmpa.web.foxglove.connection_graph import ConnectionGraph
 from rmpa.web.foxglove.parameters import ParameterRequests
 from rmpa.web.foxglove.protocol import BinaryFrame, Capability, Frame, StatusLevel
 from rmpa.web.hub import requests
-from rmpa.web.hub.rights import CONTROL_REMEDY, TOKEN_REMEDY
+from rmpa.web.hub.rights import CONTROL_REMEDY, READ_REMEDY
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -236,7 +236,7 @@ class FoxgloveSession:
         if isinstance(message, protocol.SetParameters):
             self._check(self._rights.set_parameters, "set parameters")
             return self._parameters.set(message)
-        self._check(self._rights.read_parameters, "read parameters", TOKEN_REMEDY)
+        self._check(self._rights.read_parameters, "read parameters", READ_REMEDY)
         if isinstance(message, protocol.GetParameters):
             return self._parameters.get(message)
         if isinstance(message, protocol.SubscribeParameterUpdates):
@@ -331,7 +331,7 @@ class FoxgloveSession:
         scheme, _, path = uri.partition("://")
         parts = path.split("/")
         if not self._rights.fetch_assets:
-            return f"this client may not fetch assets; {TOKEN_REMEDY}"
+            return f"this client may not fetch assets; {READ_REMEDY}"
         if scheme != "package" or len(parts) < 2 or not all(parts) or not uri.isprintable():
             return "only files of ROS packages can be fetched: package://NAME/PATH"
         if any(part in (".", "..") for part in parts) or "\\" in path or "%" in path:

@@ -43,5 +43,5 @@ FULL = Rights(
 """Everything but ``drive``, which has a setting of its own."""
 CONTROL_REMEDY = "start rmpa web with --control, and send its token"
 """For clients that want to change something."""
-TOKEN_REMEDY = "send the token of rmpa web; where it has none, start it with --token-file FILE or --control"
+READ_REMEDY = "send the token of rmpa web; where it has none, start it with --token-file FILE or --control"
 """For clients that want to read what only clients with the token may."""
