@@ -27,8 +27,9 @@ async def test_a_listed_app_reads_with_the_token_and_others_do_not() -> None:
         listed, unlisted = f"http://127.0.0.1:{port}", f"http://localhost:{port}"
         async with running(TOKEN, frozenset({listed})) as site, Chromium() as page:
             url = f"http://127.0.0.1:{site.server.port}/api/v1/peers"
+            headers = f"{{ Authorization: 'Bearer {TOKEN}' }}"
             read = (
-                f"fetch({url!r}, {{ headers: {{ Authorization: 'Bearer {TOKEN}' }} }}).then((answer) => answer.json())"
+                f"fetch({url!r}, {{ headers: {headers} }}).then((answer) => answer.json())"
                 ".then((peers) => peers.map((peer) => peer.name).join(), (error) => error.name)"
             )
             for origin, expected in (
