@@ -94,6 +94,7 @@ class Hub:
             requests.Publish: self._publish,
             requests.CallService: self._call,
             requests.FindService: self._find_service,
+            requests.FindServices: self._find_services,
             requests.CancelCall: self._cancel,
             requests.ServeService: self._serve,
             requests.EndService: self._end_service,
@@ -284,6 +285,20 @@ class Hub:
             if known is not None and known.type != found.type:
                 self.graph.found_service()
             client.receive(requests.ServiceFound(request.handle, found.type, found.uri))
+
+        self._run(client, request.handle, find())
+
+    def _find_services(self, client: Client, request: requests.FindServices) -> None:
+        async def find() -> None:
+            unknown = [each.name for each in self.graph.services.values() if not each.type]
+            searches = [asyncio.ensure_future(self.calls.find(name)) for name in unknown]
+            if searches:
+                _, pending = await asyncio.wait(searches, timeout=limits.FIND_ALL_TIMEOUT)
+                for search in pending:
+                    search.cancel()
+                await asyncio.gather(*searches, return_exceptions=True)  # a server that does not tell stays unknown
+                self.graph.found_service()
+            client.receive(requests.ServiceFound(request.handle, ""))
 
         self._run(client, request.handle, find())
 
