@@ -185,7 +185,7 @@ def test_unwatching_ends_the_subscription() -> None:
 
 def test_watches_and_questions_are_bounded() -> None:
     page = Page()
-    for number in range(limits.WATCHES_MAX + 1):
+    for number in range(1, limits.WATCHES_MAX + 2):
         page.send("watch", id=number, topic="/odom", how="value")
     assert "watched already" in page.frames[-1]["error"]
     for number in range(100, 101 + limits.ASKS_MAX):

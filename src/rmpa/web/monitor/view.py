@@ -102,7 +102,7 @@ class StateBuilder:
         snapshot: Snapshot,
         resources: Sequence[ResourceFacts] = (),
         alarms: Sequence[Tree] = (),
-        alarms_so_far: int = 0,
+        recorded: int = 0,
     ) -> Tree:
         """The state of ``snapshot``.
 
@@ -111,7 +111,7 @@ class StateBuilder:
             resources: The Smart Resources of all modules.
             alarms: The alarms that stand, each with ``id``, ``module`` (empty: this one), ``resource``, ``level``,
                 ``text`` and ``at``.
-            alarms_so_far: The number of alarms in the history, those included that are no longer kept.
+            recorded: How many entries the history has had.
         """
         taken = snapshot.taken
         peers = snapshot.peers[: limits.MODULES_SHOWN]
@@ -130,7 +130,7 @@ class StateBuilder:
                 str(alarm.get("id", index)): {**alarm, "module": alarm.get("module") or self.own}
                 for index, alarm in enumerate(alarms)
             },
-            "alarms_so_far": alarms_so_far,
+            "recorded": recorded,
             "notes": list(snapshot.notes[:100]),
             "unreachable": [str(each) for each in snapshot.unreachable[:100]],
         }
