@@ -328,7 +328,7 @@ def _show_rosapi(run: _Run, took: dict[str, dict[str, list[float]]]) -> None:
 def _page(run: _Run) -> None:
     """The monitor's page in a mesh of sixteen modules."""
     plan = run.plan
-    with page.served_mesh(run.bed, _MODULES) as (process, port):
+    with page.served_mesh(run.bed, run.bed.agent(), _MODULES) as (process, port):
         served = page.serve(process, port, plan.seconds)
         browsed = None
         if reason := page.why_no_browser():

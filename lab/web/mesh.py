@@ -1,8 +1,7 @@
-"""A mesh of many modules that one agent's control socket shows: real answers, but for a snapshot that is made here.
+"""A control socket that shows a mesh of many modules: a real agent's answers, with modules added to its snapshots.
 
 ``rmpa web`` then serves pages with so many modules and topics, whose figures move as those of a real mesh do, while
-one machine runs them. All other operations of the control socket are answered by a real agent behind it. With
-``--churn`` modules come and go, and topics are withdrawn for others with new names.
+one machine runs them. With ``--churn`` modules come and go, and topics are withdrawn for others with new names.
 Events: ``up`` when the socket is there.
 """
 
@@ -21,9 +20,7 @@ import msgspec
 
 from lab.nodes.node import say
 from rmpa.observe.control import ControlReply, ControlRequest
-from rmpa.observe.io.control_client import ControlClient
 from rmpa.observe.snapshot import (
-    AgentInfo,
     LatencyInfo,
     LinkInfo,
     PeerInfo,
@@ -45,37 +42,39 @@ _BYTES: Final = 712
 """Of a message: a nav_msgs/Odometry."""
 _ABSENT: Final = 8
 """With churn one module in so many is away, each time another one."""
-_VISIT: Final = 10
-"""With churn a module with a name of its own stays for so many changes."""
+_VISIT: Final = 30
+"""With churn a module with a new name stays for so many changes."""
 
 
 class Mesh:
     """The modules, by a clock.
 
     Args:
-        agent: The real agent, which stands for this module.
+        name: Of this module, which a real agent stands for.
         modules: With this one.
         churn: Seconds from one change of modules and topics to the next; 0: nothing but figures changes.
     """
 
-    def __init__(self, agent: AgentInfo, modules: int = 16, churn: float = 0.0) -> None:
-        self._agent = agent
+    def __init__(self, name: str, modules: int = 16, churn: float = 0.0) -> None:
+        self._name = name
         self._modules = modules
         self._churn = churn
-        self._began = time.time()
+        self.began = time.time()
+        """Seconds since the epoch; the figures move from there on."""
 
-    def snapshot(self, now: float) -> Snapshot:
-        """What the agent would say at this moment, in seconds since the epoch."""
-        age = now - self._began
+    def add(self, real: Snapshot) -> Snapshot:
+        """A real agent's snapshot with the modules, which it would say if they were there."""
+        age = real.taken - self.began
         turn = int(age / self._churn) if self._churn else 0
         names = [*self._names(turn)]
         topics = [topic for number, name in names for topic in _topics(number, name, turn, age)]
-        return Snapshot(
-            agent=msgspec.structs.replace(self._agent, cpu=11 + 2 * math.sin(age / 3), uptime=age),
-            taken=now,
+        services = [service for _, name in names for service in _services(name)]
+        return msgspec.structs.replace(
+            real,
+            agent=msgspec.structs.replace(real.agent, name=self._name),
             peers=tuple(_peer(number, name, age) for number, name in names),
-            topics=tuple(sorted(topics, key=lambda topic: topic.name)),
-            services=tuple(service for _, name in names for service in _services(name)),
+            topics=tuple(sorted((*real.topics, *topics), key=lambda topic: topic.name)),
+            services=(*real.services, *services),
         )
 
     def _names(self, turn: int) -> Iterator[tuple[int, str]]:
@@ -182,12 +181,12 @@ def _services(name: str) -> Iterator[ServiceInfo]:
 
 
 class ControlProxy(socketserver.ThreadingUnixStreamServer):
-    """A control socket that answers ``snapshot`` by the mesh, and passes all else to the agent.
+    """A control socket in front of an agent's, which adds a mesh to its snapshots.
 
     Args:
         path: Of the new socket.
         agent: Of the agent's.
-        mesh: Gives the snapshots.
+        mesh: Is added.
     """
 
     daemon_threads = True
@@ -206,12 +205,12 @@ class _Connection(socketserver.StreamRequestHandler):
             behind.connect(str(self.server.agent))
             answers = behind.makefile("rb")
             for line in self.rfile:
+                behind.sendall(line)
+                answer = answers.readline()
                 if ControlRequest.parse(line).op == "snapshot":
-                    snapshot = self.server.mesh.snapshot(time.time())
-                    self.wfile.write(ControlReply(ok=True, value=snapshot).serialize())
-                else:
-                    behind.sendall(line)
-                    self.wfile.write(answers.readline())
+                    real = msgspec.convert(ControlReply.parse(answer).value, Snapshot)
+                    answer = ControlReply(ok=True, value=self.server.mesh.add(real)).serialize()
+                self.wfile.write(answer)
 
 
 def main() -> None:
@@ -222,9 +221,8 @@ def main() -> None:
     parser.add_argument("--modules", type=int, default=16)
     parser.add_argument("--churn", type=float, default=0.0)
     given = parser.parse_args()
-    with ControlClient(given.agent) as client:
-        agent = msgspec.structs.replace(client.snapshot().agent, name=given.socket.stem)
-    with ControlProxy(given.socket, given.agent, Mesh(agent, given.modules, given.churn)) as server:
+    mesh = Mesh(given.socket.stem, given.modules, given.churn)
+    with ControlProxy(given.socket, given.agent, mesh) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         say("up")
         threading.Event().wait()

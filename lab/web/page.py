@@ -21,6 +21,7 @@ from rmpa.web.monitor.messages import SUBPROTOCOL
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from lab.bed.agents import Agent
     from lab.bed.bench import Bed
     from lab.bed.processes import Process
 
@@ -99,9 +100,8 @@ class Browsed:
 
 
 @contextmanager
-def served_mesh(bed: Bed, modules: int, churn: float = 0.0) -> Iterator[tuple[Process, int]]:
-    """``rmpa web`` and its port, in a mesh of so many modules; see ``lab.web.mesh``."""
-    agent = bed.agent()
+def served_mesh(bed: Bed, agent: Agent, modules: int, churn: float = 0.0) -> Iterator[tuple[Process, int]]:
+    """``rmpa web`` and its port, in a mesh of so many modules behind a real agent; see ``lab.web.mesh``."""
     place = bed.home / "mesh"
     place.mkdir(mode=0o700)
     assert agent.runtime_dir is not None
