@@ -278,7 +278,9 @@ def _rosapi(run: _Run) -> None:
     def ask(server: WebServer) -> None:
         crowds[server.key].grow(plan.topics)
         questions.wait_topics(server, plan.topics)
-        took[server.key] = questions.rosapi_times(server, plan.rosapi_calls)
+        took[server.key] = times = questions.rosapi_times(server, plan.rosapi_calls)
+        if server.key == "rmpa" and (silent := [name for name, found in times.items() if not found]):
+            raise BedError(f"rmpa web gives no answer to /rosapi/{silent[0]}")
 
     run.each("rosapi", _rosbridge(run), ask)
     _new_topics(run, crowds, "large", seen)

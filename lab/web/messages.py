@@ -28,6 +28,8 @@ _SETTLE: Final = 0.5
 _WARM_UP: Final = 5
 """Messages before a turn, until each client has had one."""
 _WARM_TURNS: Final = 20
+_STALLED_TURNS: Final = 3
+"""The same beside a client that does not read."""
 _WITHIN: Final = 60.0
 """Seconds behind the last message in which the slowest server has sent what it sends."""
 _SAMPLE: Final = 0.02
@@ -106,16 +108,18 @@ class Way:
     def measure(self, load: Load, clients: int, home: Path, *, stalled: int = 0) -> Turn:
         """One round with fresh clients, kept in ``turns``."""
         with self.server.readers(self.how, clients, stalled) as readers:
-            self._warm_up(readers, load, home)
+            self._warm_up(readers, load, home, stalled=stalled)
             turn = self._round(readers, load, home)
         self.turns.append(turn)
         return turn
 
-    def _warm_up(self, readers: Process, load: Load, home: Path) -> None:
+    def _warm_up(self, readers: Process, load: Load, home: Path, *, stalled: int) -> None:
         few = Load(load.size, load.rate, _WARM_UP)
-        for _ in range(_WARM_TURNS):
+        for _ in range(_STALLED_TURNS if stalled else _WARM_TURNS):
             if all(self._round(readers, few, home).received):
                 return
+        if stalled:
+            return  # that is a finding: the others get nothing
         raise BedError(f"{self.key}: not every client gets messages\n{readers.output[-2000:]}")
 
     def _round(self, readers: Process, load: Load, home: Path) -> Turn:

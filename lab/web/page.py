@@ -47,6 +47,7 @@ new MutationObserver((_, observer) => {
   }
 }).observe(document, { childList: true, subtree: true });
 """
+_PAINTED: Final = "performance.getEntriesByName('first-contentful-paint').length"
 _LOADED: Final = """
 [performance.getEntriesByName("first-contentful-paint")[0].startTime, window.shownAt,
  [...performance.getEntriesByType("navigation"), ...performance.getEntriesByType("resource")]
@@ -168,7 +169,7 @@ async def _browse(process: Process, port: int, modules: int, seconds: float, loa
         found = []
         for number in range(loads + 1):
             await page.goto(f"{url}?load={number}")
-            await page.wait(f"location.search === '?load={number}' && window.shownAt")
+            await page.wait(f"location.search === '?load={number}' && window.shownAt && {_PAINTED}")
             found.append(await page.run(_LOADED))
         await asyncio.sleep(_SETTLE)
         meter = Meter({"web": process.pid})
