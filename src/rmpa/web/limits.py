@@ -59,10 +59,16 @@ GRAPH_CHANGED_SHARE: Final = 1.0
 """The same after a look that found a change, which is parsed: that takes ten times as long as to compare."""
 PROBES_AT_ONCE: Final = 8
 """Servers that are asked for their service's type at one time."""
+FIND_ALL_TIMEOUT: Final = 3.0
+"""Time in which all servers that did not tell their service's type yet are asked, for one question of a client."""
 PROBE_RETRY: Final = 10.0
 """Time before a server that did not tell its service's type, or a type that was not found, is asked for again."""
 DESCRIBE_AT_ONCE: Final = 4
 """Types whose definition is looked for at one time."""
+SEARCH_RATE: Final = 10.0
+"""Types a second, in the long run, that are searched for in this machine's packages at once, on the event loop."""
+SEARCH_BURST: Final = 500.0
+"""Such searches at once: the types of a large robot, each searched for once."""
 SEEN_TYPES_MAX: Final = 16
 """Types of one topic's publishers that are listed."""
 SEEN_PUBLISHERS_MAX: Final = 256
@@ -172,8 +178,8 @@ WEB_BACKLOG: Final = 128
 """Connections that wait to be accepted."""
 WEB_SHUTDOWN_TIMEOUT: Final = 2.0
 """Seconds for responses under way when the server ends."""
-WEB_SNAPSHOT_AGE: Final = 0.2
-"""Seconds that a snapshot is shared before the agent is asked again: the monitor shows 5 changes a second."""
+WEB_SNAPSHOT_AGE: Final = 0.1
+"""Seconds that a snapshot is shared before the agent is asked again: less than the monitor's pause between two."""
 WEB_AGENT_TIMEOUT: Final = 2.0
 """Seconds for the agent to answer; it takes milliseconds, and Prometheus waits for 10 s."""
 WEB_TOKEN_BYTES: Final = 32

@@ -101,6 +101,11 @@ def exposition(snapshot: Snapshot | None, accept: str = "", further: Iterable[Me
     return encode(registry), content_type
 
 
+def content_type(accept: str) -> str:
+    """The content type of ``/metrics`` for a request's ``Accept`` header: one of few, whatever it is."""
+    return str(choose_encoder(accept)[1])
+
+
 def metrics(snapshot: Snapshot | None) -> Iterator[Metric]:
     """All metrics of a snapshot; ``rmpa_up`` alone where there is none."""
     up = _Family("rmpa_up", "Whether the agent answers on its control socket.", "gauge")

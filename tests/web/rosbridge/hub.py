@@ -38,6 +38,9 @@ class Graph:
 class Types:
     """The definitions that rmpa brings."""
 
+    def version(self, name: str, md5sum: str) -> MessageType:
+        return self.message(name)
+
     def message(self, name: str) -> MessageType:
         return MessageType(name)
 

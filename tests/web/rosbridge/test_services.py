@@ -18,6 +18,7 @@ from rmpa.web.hub.requests import (
     EndService,
     Failed,
     FindService,
+    FindServices,
     ParamsChanged,
     Respond,
     ServeService,
@@ -275,7 +276,6 @@ def test_topics() -> None:
 def test_services() -> None:
     client = _robot()
     assert _ask(client, "services") == {"services": ["/add", "/unknown"]}
-    assert _ask(client, "services_for_type", type=ADD) == {"services": ["/add"]}
     assert _ask(client, "service_type", service="/add") == {"type": ADD}
     assert _ask(client, "service_type", service="/none") == {"type": ""}
     assert _ask(client, "service_type", service="/rosapi/topics") == {"type": "rosapi/Topics"}
@@ -284,8 +284,26 @@ def test_services() -> None:
     assert _ask(client, "service_host", service="/add") == {"host": "robot"}
     assert _ask(client, "service_host", service="/unknown") == {"host": "::1"}
     assert _ask(client, "service_host", service="/none") == {"host": ""}
-    assert _ask(client, "service_providers", service=ADD) == {"providers": ["/server"]}
     assert _ask(client, "service_providers", service="/add") == {"providers": ["/server"]}
+
+
+@pytest.mark.parametrize(
+    ("service", "args", "values"),
+    [
+        ("services_for_type", {"type": ADD}, {"services": ["/add", "/late"]}),
+        ("service_providers", {"service": ADD}, {"providers": ["/server", "/slow"]}),
+    ],
+)
+def test_servers_that_did_not_tell_their_type_are_asked_before_services_are_listed_by_type(
+    service: str, args: dict[str, str], values: dict[str, list[str]]
+) -> None:
+    client = _robot()
+    client.graph.add_service("/late", "", "/slow")
+    find = client.one(FindServices, client.send("call_service", service=f"/rosapi/{service}", args=args))
+    assert client.received() == []
+    client.graph.add_service("/late", ADD, "/slow")
+    client.answer(ServiceFound(find.handle, ""))
+    assert client.received()[0]["values"] == values
 
 
 def test_the_type_of_a_service_that_the_graph_does_not_know_is_looked_up() -> None:

@@ -39,7 +39,11 @@ class ControlClient:
 
     def __init__(self, path: Path, timeout: float = limits.CONTROL_CALL_TIMEOUT) -> None:
         self.path = path
-        self._sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            self._sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        except OSError as error:
+            remedy = "close some programs, or raise the limit (ulimit -n)"
+            raise UnreachableError("agent", f"{path}: {error.strerror}", remedy) from None
         self._sock.settimeout(timeout)
         try:
             self._sock.connect(str(path))

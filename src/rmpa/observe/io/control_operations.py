@@ -75,7 +75,13 @@ class ControlOperations:
         return self._snapshots.build(_topics(args))
 
     def snapshot_or_figures(self, args: Args) -> Snapshot | Awaitable[Snapshot]:
-        """As ``snapshot``; ``figures``: whether to ask the nodes of direct connections for theirs before."""
+        """As ``snapshot``, with figures of direct connections, for which their nodes are asked.
+
+        ``figures``: true waits until there are some; ``"newest"`` takes what is there, and has the nodes asked for
+        the next snapshot.
+        """
+        if args.get("figures") == "newest":
+            self._snapshots.sampler.look(_topics(args))
         return self._with_figures(args) if args.get("figures") is True else self.snapshot(args)
 
     async def _with_figures(self, args: Args) -> Snapshot:

@@ -56,6 +56,8 @@ class ClientConnection(ABC):
 
     kind = ""
     """The protocol's name, for logs and lists."""
+    timer_waits = True
+    """Whether the session's timer waits while the client takes nothing; else the session itself holds back."""
 
     def __init__(
         self,
@@ -166,8 +168,15 @@ class ClientConnection(ABC):
 
     # --- the WebSocket ----------------------------------------------------------------------------------------
 
-    async def run(self, request: web.Request, socket_: web.WebSocketResponse) -> None:
+    async def run(
+        self, request: web.Request, socket_: web.WebSocketResponse, upgraded: Callable[[web.Request], None]
+    ) -> None:
         """Serve the client until it has gone.
+
+        Args:
+            request: Asks for the WebSocket.
+            socket_: Not prepared yet.
+            upgraded: Called when the handshake is done.
 
         Raises:
             PeerRefused: There are too many clients.
@@ -178,6 +187,7 @@ class ClientConnection(ABC):
         tasks: list[asyncio.Task[None]] = []
         try:
             writer = await socket_.prepare(request)
+            upgraded(request)
             self._transport = request.transport
             if self._transport is None:
                 return  # it went during the handshake
@@ -187,21 +197,30 @@ class ClientConnection(ABC):
                 tasks.append(self._loop.create_task(work, name=f"{name} {self.client.name}"))
             await self._read(socket_)
         finally:
-            self.closing()
-            if self._timer is not None:
-                self._timer.cancel()
-            self.hub.disconnect(self._client)
-            self.queue.clear()
-            for task in tasks:
-                task.cancel()
-            if tasks:
-                await asyncio.wait(tasks)
+            try:
+                self.closing()
+            finally:
+                if self._timer is not None:
+                    self._timer.cancel()
+                for task in tasks:
+                    task.cancel()
+                self.hub.disconnect(self._client)
+                self.queue.clear()
+                if tasks:
+                    await asyncio.wait(tasks)
 
     async def _read(self, socket_: web.WebSocketResponse) -> None:
         async for message in socket_:
             self._heard += 1
+            if self._heard % _TURN == 0:
+                await asyncio.sleep(0)  # frames that have arrived already do not suspend this task
+            if self._gone:
+                return
+            if self._close is not None:
+                continue  # the other task closes it
             if message.type == WSMsgType.PING:
-                self._send(Opcode.PONG, (message.data,))
+                if self.unsent <= limits.WRITE_BUFFER:  # a client that takes nothing is owed no pong
+                    self._send(Opcode.PONG, (message.data,))
             elif message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
                 try:
                     self.received_frame(message.data)
@@ -276,6 +295,8 @@ class ClientConnection(ABC):
             transport.write(b"".join(small))
 
     def _queue(self, handle: int, entry: Received | OutFrame, size: int, topic: str) -> None:
+        if self._gone:
+            return
         priority = self._priority(topic) if handle else 0
         self.queue.push(handle, entry, size, priority)
         if self.queue.overflow:
@@ -293,7 +314,8 @@ class ClientConnection(ABC):
 
     def _due(self) -> None:
         self._timer = None
-        if self._transport is not None and self._transport.get_write_buffer_size() > limits.WRITE_BUFFER:
+        waiting = self._transport.get_write_buffer_size() if self._transport is not None else 0
+        if self.timer_waits and waiting > limits.WRITE_BUFFER:
             # The client cannot take what the session holds back: it stays there, within its bounds.
             self._timer = self._loop.call_later(limits.TIMER_RETRY, self._due)
             return

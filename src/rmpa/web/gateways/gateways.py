@@ -58,6 +58,8 @@ class Gateways:
         priority: Callable[[str], int] = lambda _: 0,
         monitor: Monitor | None = None,
     ) -> None:
+        self.upgraded: Callable[[web.Request], None] = lambda _: None
+        """Called when the handshake of a WebSocket is done."""
         self._monitor = monitor
         self._hub = hub
         self._name = name
@@ -105,10 +107,10 @@ class Gateways:
             connection = FoxgloveConnection(
                 self._hub, rights, self._priority, address, name=self._name, session_id=self._session_id
             )
-            most = limits.FOXGLOVE_BINARY_MAX
+            most = limits.FOXGLOVE_BINARY_MAX if _sends_data(rights) else limits.FOXGLOVE_TEXT_MAX
         else:
             connection = RosbridgeConnection(self._hub, rights, self._priority, address, frames=self._frames)
-            most = rosbridge_limits.FRAME_MAX
+            most = rosbridge_limits.FRAME_MAX if _sends_data(rights) else limits.FOXGLOVE_TEXT_MAX
         return await self._serve(request, connection, most)
 
     async def _serve(self, request: web.Request, connection: ClientConnection, most: int) -> web.StreamResponse:
@@ -121,7 +123,7 @@ class Gateways:
         )
         self._open[connection] = response
         try:
-            await connection.run(request, response)
+            await connection.run(request, response, self.upgraded)
         except PeerRefused as error:
             _log.warning("! %s: %s", connection.address, error)
             return web.Response(status=503, text=f"{error}\n")
@@ -139,3 +141,8 @@ class Gateways:
             if response.prepared
         ]
         await asyncio.gather(*closing, return_exceptions=True)
+
+
+def _sends_data(rights: Rights) -> bool:
+    """Whether a client has a use for large messages: what aiohttp gathers of one is kept until its end."""
+    return rights.publish or rights.call_services or rights.serve_services

@@ -33,6 +33,10 @@ _SPEEDS: Final = struct.Struct("<6d")
 """A geometry_msgs/Twist: linear x, y, z in m/s, then angular x, y, z in rad/s."""
 
 
+_INTERNAL_ERROR: Final = 1011
+"""A WebSocket's close code, RFC 6455, section 7.4.1."""
+
+
 class MonitorConnection(ClientConnection):
     """One page; the arguments are those of ``ClientConnection``.
 
@@ -41,6 +45,7 @@ class MonitorConnection(ClientConnection):
     """
 
     kind = "monitor"
+    timer_waits = False  # the robot is stopped in time, whatever waits for the page
 
     def __init__(
         self,
@@ -117,7 +122,15 @@ class MonitorConnection(ClientConnection):
 
     def _act(self, outputs: Iterator[Output]) -> None:
         # What is done here may have the hub deliver at once, which comes back to the session: it must be done first.
-        for output in list(outputs):
+        # Of a session that fails, what it said before is done all the same: that may be the robot's stop.
+        said: list[Output] = []
+        try:
+            for output in outputs:
+                said.append(output)  # noqa: PERF402 - extend() would lose what came before an error
+        except Exception:  # noqa: BLE001 - a fault of one page's session must not end the server
+            _log.exception("! the session of %s failed", self.client.name)
+            self.end(_INTERNAL_ERROR, "the server failed; its log says why")
+        for output in said:
             match output:
                 case str():
                     self.push((Opcode.TEXT, (output.encode(),)))

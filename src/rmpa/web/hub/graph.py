@@ -187,7 +187,10 @@ class GraphWatch:
         self.changes += 1
         self.loaded.set()
         for changed in [*self._followers.values()]:
-            changed()
+            try:
+                changed()
+            except Exception:  # noqa: BLE001 - a fault of one client must not end the watch for all
+                _log.exception("! a client could not be told of the graph")
 
     def _types_of(self, topic: str) -> tuple[str, ...]:
         first = self._types.get(topic, ANY)

@@ -93,6 +93,7 @@ class Hub:
             requests.Publish: self._publish,
             requests.CallService: self._call,
             requests.FindService: self._find_service,
+            requests.FindServices: self._find_services,
             requests.CancelCall: self._cancel,
             requests.ServeService: self._serve,
             requests.EndService: self._end_service,
@@ -286,6 +287,20 @@ class Hub:
 
         self._run(client, request.handle, find())
 
+    def _find_services(self, client: Client, request: requests.FindServices) -> None:
+        async def find() -> None:
+            unknown = [each.name for each in self.graph.services.values() if not each.type]
+            searches = [asyncio.ensure_future(self.calls.find(name)) for name in unknown]
+            if searches:
+                _, pending = await asyncio.wait(searches, timeout=limits.FIND_ALL_TIMEOUT)
+                for search in pending:
+                    search.cancel()
+                await asyncio.gather(*searches, return_exceptions=True)  # a server that does not tell stays unknown
+                self.graph.found_service()
+            client.receive(requests.ServiceFound(request.handle, ""))
+
+        self._run(client, request.handle, find())
+
     def _cancel(self, client: Client, request: requests.CancelCall) -> None:
         task = self._tasks.get((client.number, request.handle))
         if task is not None:
@@ -426,7 +441,9 @@ class Hub:
 
 def _check(right: bool, what: str) -> None:
     if not right:
-        raise PeerRefused("the web server", f"this client may not {what}", "ask for a role that may")
+        raise PeerRefused(
+            "the web server", f"this client may not {what}", "start rmpa web with --control, and give its token"
+        )
 
 
 def _fail(client: Client, handle: int, error: RmpaError) -> None:

@@ -77,7 +77,7 @@ class NodeLink:
         node = self.node
         try:
             uri = await self._where()
-        except RmpaError as error:
+        except (RmpaError, OSError) as error:
             _log.debug("! %s", error)
             return
         if node is not None and uri != node.master_uri:
@@ -110,6 +110,9 @@ class NodeLink:
                 if str(error) != self.problem:
                     _log.warning("! %s", error)
                 self.problem = str(error)
+            except Exception as error:  # noqa: BLE001 - a task's top: without it the server has no node until it ends
+                _log.exception("! the node of the web server failed")
+                self.problem = f"it failed: {error}"
             await asyncio.sleep(limits.NODE_RETRY)
 
     def _began(self, node: Node) -> None:

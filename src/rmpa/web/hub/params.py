@@ -43,6 +43,7 @@ class ParamMirror:
         self._followers: dict[Key, _Follower] = {}
         self._loading: asyncio.Task[None] | None = None
         self._meanwhile: list[tuple[str, XmlRpcValue]] | None = None
+        self._told = 0
         self.loaded = asyncio.Event()
         """Set once the parameters are known."""
         link.on_node.append(self._load_from)
@@ -68,6 +69,7 @@ class ParamMirror:
 
     def updated(self, key: str, value: XmlRpcValue) -> None:
         """The master tells a change; ``{}`` for a parameter that was deleted."""
+        self._told += 1
         if self._meanwhile is not None:
             self._meanwhile.append((key, value))
             return
@@ -79,9 +81,10 @@ class ParamMirror:
         Raises:
             RmpaError: The master does not answer, or refuses.
         """
+        told = self._told
         await self._link.need().set_param(name, cast("XmlRpcValue", value))
         # The master does not tell the node that set it.
-        self._change(lambda: self._parameters.set(name, cast("XmlRpcValue", value)))
+        self._own_change(told, lambda: self._parameters.set(name, cast("XmlRpcValue", value)))
 
     async def delete(self, name: str) -> None:
         """Delete a parameter.
@@ -89,8 +92,9 @@ class ParamMirror:
         Raises:
             RmpaError: The master does not answer, or the parameter does not exist.
         """
+        told = self._told
         await self._link.need().delete_param(name)
-        self._change(lambda: self._remove(name))
+        self._own_change(told, lambda: self._remove(name))
 
     def follow(self, key: Key, names: tuple[str, ...], changed: Callable[[Mapping[str, ParamValue]], None]) -> None:
         """Call ``changed`` with each change of ``names``, or of all; ``None`` is a parameter that was deleted."""
@@ -117,6 +121,12 @@ class ParamMirror:
             await asyncio.wait([self._loading])
 
     # --- inside -----------------------------------------------------------------------------------------------
+
+    def _own_change(self, told: int, apply: Callable[[], None]) -> None:
+        """Apply a change that the master has taken, unless it told of others meanwhile: their order is not known."""
+        self._change(apply)
+        if told != self._told or self._meanwhile is not None:
+            self.reload()
 
     def _load_from(self, node: Node) -> None:
         if self._loading is not None:

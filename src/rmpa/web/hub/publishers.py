@@ -124,6 +124,9 @@ class Publishers:
         view = memoryview(payload)
         if shared.latch:
             shared.latched = (view, self._now_ns())
+        if shared.early is None and (shared.registration is None or shared.registration.value is None):
+            shared.early = deque()  # the node is made anew: the newest messages wait for it
+            shared.early_bytes = 0
         if shared.early is not None:
             shared.early.append(payload)
             shared.early_bytes += len(payload)

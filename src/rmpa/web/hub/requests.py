@@ -86,6 +86,16 @@ class FindService:
 
 
 @dataclass(frozen=True, slots=True)
+class FindServices:
+    """Asks for the types of all services whose types the graph does not say.
+
+    Answered by `ServiceFound` without a type once the graph has them; some may stay unknown.
+    """
+
+    handle: int
+
+
+@dataclass(frozen=True, slots=True)
 class CancelCall:
     """The answer of the call `handle` is no longer wanted."""
 
@@ -205,6 +215,7 @@ Request: TypeAlias = (
     | Publish
     | CallService
     | FindService
+    | FindServices
     | CancelCall
     | ServeService
     | EndService
@@ -228,7 +239,8 @@ Request: TypeAlias = (
 class Received:
     """One message for the subscription `handle`. `stamp_ns` is its time of receipt (UTC, nanoseconds).
 
-    `source` is the node that published it in this module's graph; "" for a client of the hub.
+    `source` is the node that published it in this module's graph; "" for a client of the hub. `md5sum` is that of
+    the publisher's version of the type; "" where it is not told.
     `payload` stays valid and unchanged for as long as it is referenced; all sessions share it.
     """
 
@@ -239,6 +251,7 @@ class Received:
     stamp_ns: int
     latched: bool = False
     source: str = ""
+    md5sum: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,7 +266,7 @@ class ServiceResult:
 
 @dataclass(frozen=True, slots=True)
 class ServiceFound:
-    """The answer to `FindService`."""
+    """The answer to `FindService`; without a type that to `FindServices`."""
 
     handle: int
     type: str

@@ -87,6 +87,8 @@ class ServiceCalls:
             raise ServiceFailed(service, f"no answer within {seconds:g} s") from None
         finally:
             server.users -= 1
+            if not server.users and not server.idle and self._servers.get(key) is server:
+                del self._servers[key]
         if not ok:
             raise PeerRefused(f"service {service}", str(bytes(body), "utf-8", "replace"))
         return body

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import logging
 import time
 from collections import OrderedDict
 from dataclasses import dataclass, field
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from rmpa.web.hub.clients import Key
     from rmpa.web.hub.node_link import NodeLink
 
+_log = logging.getLogger(__name__)
 OWN: Final = ""
 """The source of what clients of this hub publish: the node has no connection to itself."""
 
@@ -188,6 +190,8 @@ class Topics:
             self._ending[there.name] = there.registration
 
     def _take(self, there: _Topic, message: RosReceived) -> None:
+        if self._topics.get(there.name) is not there:
+            return  # it has ended, and is being withdrawn
         header = message.header
         source = header.get("callerid", "?")
         if there.headers.get(source) is not header:
@@ -228,7 +232,12 @@ class Topics:
                 if sink in had:
                     continue
                 had.add(sink)
-            sink.deliver(Received(sink.handle, there.name, type_, payload, stamp_ns, source=source))
+            _deliver_to(
+                sink,
+                Received(
+                    sink.handle, there.name, type_, payload, stamp_ns, source=source, md5sum=header.get("md5sum", "")
+                ),
+            )
 
     def _keep(self, there: _Topic, source: str, latched: _Latched) -> _Latched:
         self._forget_latched(there.name, source, there)
@@ -241,9 +250,9 @@ class Topics:
 
     def _forget_latched(self, topic: str, source: str, there: _Topic | None = None) -> None:
         there = there or self._topics.get(topic)
+        self._latched_order.pop((topic, source), None)
         latched = there.latched.pop(source, None) if there is not None else None
         if latched is not None:
-            self._latched_order.pop((topic, source), None)
             self._latched_bytes -= len(latched.payload)
 
     def _replay(self, there: _Topic, sink: _Sink) -> None:
@@ -252,7 +261,8 @@ class Topics:
         for source, latched in there.latched.items():
             if (source == OWN or source in connected) and sink.type in (None, latched.type):
                 latched.had.add(sink)
-                sink.deliver(
+                _deliver_to(
+                    sink,
                     Received(
                         sink.handle,
                         there.name,
@@ -261,8 +271,16 @@ class Topics:
                         latched.stamp_ns,
                         latched=True,
                         source=source,
-                    )
+                        md5sum=latched.header.get("md5sum", ""),
+                    ),
                 )
+
+
+def _deliver_to(sink: _Sink, message: Received) -> None:
+    try:
+        sink.deliver(message)
+    except Exception:  # noqa: BLE001 - a fault of one client must not cost the others their messages
+        _log.exception("! a message of %s could not be delivered", message.topic)
 
 
 async def _withdraw(subscriber: Subscriber) -> None:

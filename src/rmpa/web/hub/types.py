@@ -8,6 +8,7 @@ from collections import OrderedDict
 from typing import TYPE_CHECKING
 
 from rmpa.core.errors import RmpaError
+from rmpa.core.token_bucket import TokenBucket
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.node.fetch_type import fetch_type
 from rmpa.ros.types.definitions import UnknownTypeError, known_text
@@ -38,11 +39,13 @@ class TypeLibrary:
     def __init__(self, link: NodeLink) -> None:
         self._link = link
         self._messages: OrderedDict[str, MessageType] = OrderedDict()
+        self._versions: OrderedDict[tuple[str, str], MessageType] = OrderedDict()
         self._services: OrderedDict[str, ServiceType] = OrderedDict()
         self._missing: OrderedDict[tuple[str, bool], tuple[float, RmpaError]] = OrderedDict()
         self._finding: dict[str, asyncio.Future[MessageType]] = {}
         self._wanted: dict[str, dict[Key, Callable[[MessageType], None]]] = {}
         self._asked = asyncio.Semaphore(limits.DESCRIBE_AT_ONCE)
+        self._searches = TokenBucket(limits.SEARCH_RATE, limits.SEARCH_BURST)
 
     # --- at once: TypeSource of the sessions ------------------------------------------------------------------
 
@@ -55,18 +58,34 @@ class TypeLibrary:
         kind = self._messages.get(name)
         if kind is None:
             self._check_missing(name, service=False)
+            if known_text(name) is None:
+                self._search()
             try:
                 kind = MessageType(name) if known_text(name) is not None else find_message_type(name)
             except RmpaError as error:
+                if isinstance(error, UnknownTypeError) and error.fetchable:
+                    self._start_finding(name)  # a publisher may tell it, for the next question
                 raise self._remember(name, error, service=False) from None
             self._keep(name, kind)
         return kind
+
+    def version(self, name: str, md5sum: str) -> MessageType:
+        """The version of a message type that a publisher has; that of ``message`` where its md5 sum is not known.
+
+        Modules may have been built with different versions of one type.
+
+        Raises:
+            DefinitionError: As for ``message``.
+        """
+        return self._versions.get((name, md5sum)) or self.message(name)
 
     def service(self, name: str) -> ServiceType:
         """A service type; as ``message``."""
         kind = self._services.get(name)
         if kind is None:
             self._check_missing(name, service=True)
+            if name not in known_services():
+                self._search()
             try:
                 kind = ServiceType(name) if name in known_services() else find_service_type(name)
             except RmpaError as error:
@@ -88,11 +107,7 @@ class TypeLibrary:
         kind = self._messages.get(name)
         if kind is not None:
             return kind
-        finding = self._finding.get(name)
-        if finding is None:
-            finding = self._finding[name] = asyncio.ensure_future(self._find(name))
-            finding.add_done_callback(lambda _: self._finding.pop(name, None))
-        return await asyncio.shield(finding)
+        return await asyncio.shield(self._start_finding(name))
 
     async def find_service(self, name: str) -> ServiceType:
         """A service type that is known or on this machine.
@@ -112,7 +127,8 @@ class TypeLibrary:
         """Take the definition of a publisher's header."""
         name = header.get("type", "")
         known = self._messages.get(name)
-        if not name or (known is not None and known.md5sum == header.get("md5sum")):
+        md5sum = header.get("md5sum", "")
+        if not name or (known is not None and known.md5sum == md5sum) or (name, md5sum) in self._versions:
             return
         if not header.get("message_definition"):
             return
@@ -149,6 +165,19 @@ class TypeLibrary:
 
     # --- inside -----------------------------------------------------------------------------------------------
 
+    def _start_finding(self, name: str) -> asyncio.Future[MessageType]:
+        finding = self._finding.get(name)
+        if finding is None:
+            finding = self._finding[name] = asyncio.ensure_future(self._find(name))
+
+            def found(finding: asyncio.Future[MessageType]) -> None:
+                del self._finding[name]
+                if not finding.cancelled():
+                    finding.exception()  # nothing may wait for it
+
+            finding.add_done_callback(found)
+        return finding
+
     async def _find(self, name: str) -> MessageType:
         async with self._asked:
             try:
@@ -163,12 +192,24 @@ class TypeLibrary:
 
     def _keep(self, name: str, kind: MessageType) -> MessageType:
         self._messages[name] = kind
+        self._versions[name, kind.md5sum] = kind
+        while len(self._versions) > ros_limits.TYPES_FOUND_MAX:
+            self._versions.popitem(last=False)
         self._missing.pop((name, False), None)
         while len(self._messages) > ros_limits.TYPES_FOUND_MAX:
             self._messages.popitem(last=False)
         for known in self._wanted.pop(name, {}).values():
             known(kind)
         return kind
+
+    def _search(self) -> None:
+        """Count a search on this machine, which reads files, and walks through all packages for an unknown type.
+
+        Raises:
+            RmpaError: There were too many at once; the event loop serves robots too.
+        """
+        if not self._searches.take(asyncio.get_running_loop().time()):
+            raise RmpaError("too many types were searched for at once; ask again in a second")
 
     def _check_missing(self, name: str, *, service: bool) -> None:
         when, error = self._missing.get((name, service), (0.0, None))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.core.sizes import KIB
+from rmpa.core.sizes import KIB, MIB
 
 PATCH_PERIOD: Final = 0.15
 """Between two patches of one client: some 7 a second, which looks live and is read at leisure."""
@@ -81,3 +81,15 @@ RESOURCES_MAX: Final = 256
 """Paths of Smart Resources that are followed; each is up to nine subscriptions."""
 LOOK_KEPT: Final = 10.0
 """Time for which the details of a Smart Resource are followed after a page has shown it."""
+TICK_PERIOD: Final = 2.0
+"""Time between two signs of life to a page, which takes its connection for lost after three without any."""
+UNSENT_RETRY: Final = 0.1
+"""Pause before it is looked again whether a page has taken what was sent."""
+ANSWERS_AT_ONCE: Final = 4
+"""Questions of all pages together that wait for the agent, each in a thread: `why` takes seconds."""
+VALUES_BYTES: Final = 4 * MIB
+"""Bytes of the messages whose decoded values are kept for further pages; values take some ten times as much."""
+DECISION_DEPTH: Final = 32
+"""Objects and arrays within each other in what a Smart Resource says of its decision; a deeper one is not shown."""
+STATE_PAUSE_MAX: Final = 0.5
+"""The longest pause between two snapshots."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import struct
+from array import array
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -22,6 +23,10 @@ IMAGE: Final = 1
 FORMATS: Final = {"jpeg": 1, "png": 2, "rgb8": 3, "mono8": 4}
 """Formats of an image's bytes; rgb8 and mono8 are rows of pixels without padding."""
 _CHANNELS: Final = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC1": 1, "8UC3": 3}
+_DEPTHS: Final = {"16UC1": ("H", 2), "mono16": ("H", 2), "32FC1": ("f", 4)}
+"""Encodings of one channel, with the letter and bytes of its values; little-endian, as ROS machines are."""
+_EXACT: Final = 2**53
+"""The largest integer that a browser's numbers hold exactly; a larger one is sent as text."""
 _INDEX: Final = re.compile(r"\[(\d+)\]")
 
 
@@ -43,6 +48,8 @@ def _cut(value: Any, left: list[int]) -> Any:
         return f"{len(value)} bytes"
     if isinstance(value, float):
         return value if math.isfinite(value) else str(value)
+    if isinstance(value, int) and abs(value) > _EXACT:
+        return str(value)
     if value is None or isinstance(value, bool | int):
         return value
     if not hasattr(value, "__len__"):
@@ -70,7 +77,7 @@ def number_at(values: Any, path: tuple[str, ...]) -> float | None:
     for step in path:
         if isinstance(values, dict):
             values = values.get(step)
-        elif step.isdigit() and hasattr(values, "__len__") and not isinstance(values, str):
+        elif step.isascii() and step.isdecimal() and hasattr(values, "__len__") and not isinstance(values, str):
             values = values[int(step)] if int(step) < len(values) else None
         else:
             return None
@@ -143,11 +150,12 @@ def raw_picture(width: int, height: int, encoding: str, step: int, data: Payload
     Raises:
         RemoteProtocolError: The encoding cannot be shown, or the sizes do not fit together.
     """
+    if encoding in _DEPTHS:
+        return _depth_picture(width, height, encoding, step, data)
     channels = _CHANNELS.get(encoding)
     if channels is None:
-        raise RemoteProtocolError(
-            f"images of the encoding {encoding[:40]!a} are not shown; these are: {', '.join(_CHANNELS)}"
-        )
+        shown = ", ".join((*_CHANNELS, *_DEPTHS))
+        raise RemoteProtocolError(f"images of the encoding {encoding[:40]!a} are not shown; these are: {shown}")
     if width <= 0 or height <= 0 or step < width * channels or len(data) < step * (height - 1) + width * channels:
         raise RemoteProtocolError(f"{len(data)} bytes are no image of {width} x {height} {encoding}")
     every = max(1, math.ceil(math.sqrt(width * height / limits.IMAGE_PIXELS)))
@@ -164,3 +172,22 @@ def raw_picture(width: int, height: int, encoding: str, step: int, data: Payload
         for colour, channel in enumerate(order):
             out[at * columns * 3 + colour : (at + 1) * columns * 3 : 3] = bytes(line[channel :: channels * every])
     return Picture("rgb8", columns, len(rows), bytes(out), every)
+
+
+def _depth_picture(width: int, height: int, encoding: str, step: int, data: Payload) -> Picture:
+    """Of one channel of 16 or 32 bits, as depth cameras have it: from black for the least value to white."""
+    letter, size = _DEPTHS[encoding]
+    if width <= 0 or height <= 0 or step < width * size or len(data) < step * (height - 1) + width * size:
+        raise RemoteProtocolError(f"{len(data)} bytes are no image of {width} x {height} {encoding}")
+    every = max(1, math.ceil(math.sqrt(width * height / limits.IMAGE_PIXELS)))
+    source = memoryview(data).cast("B")
+    rows = range(0, height, every)
+    values: list[float] = []
+    for row in rows:
+        line = source[row * step : row * step + width * size]
+        values += array(letter, bytes(line))[::every]
+    measured = [value for value in values if value > 0 and value < math.inf]  # 0 and NaN: nothing was measured
+    least, most = (min(measured), max(measured)) if measured else (0.0, 1.0)
+    scale = 254 / (most - least) if most > least else 254.0
+    pixels = bytes(1 + int((value - least) * scale) if 0 < value < math.inf else 0 for value in values)
+    return Picture("mono8", -(-width // every), len(rows), pixels, every)

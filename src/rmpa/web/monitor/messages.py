@@ -99,6 +99,8 @@ def _check(message: ClientMessage) -> None:
         raise RemoteProtocolError(f"a page looks at {len(message.at)} things; {limits.LOOKS_MAX} is the most")
     if isinstance(message, Watch | Drive) and not is_global_name(message.topic):
         raise RemoteProtocolError(f"{message.topic[:80]!a} is not a topic's name")
+    if isinstance(message, Watch | Unwatch | Ask) and not 0 < message.id < 2**32:
+        raise RemoteProtocolError(f"the id {message.id} is not between 1 and 4294967295")
     if isinstance(message, Watch):
         if not 0 < message.rate <= limits.WATCH_RATE_MAX:
             raise RemoteProtocolError(

@@ -37,6 +37,7 @@ QUESTIONS: Mapping[str, str] = {
     "delete_param": "param",
     "profile": "resource",
     "context": "resource",
+    "configure": "resource",
 }
 """All questions, with what a page must be allowed for each (``permissions``); empty: every page may ask it."""
 _PERMISSIONS = {
@@ -49,6 +50,10 @@ _PERMISSIONS = {
 
 _NO_TOKEN = "this page may not read parameters", "open it with a token: rmpa web --token-file FILE, or --control"
 _NO_CONTROL = "this page may only look", "start rmpa web with --control"
+
+
+_TICK = '{"op":"tick"}'
+"""A page that hears nothing for some ticks takes its connection for lost: scripts do not see WebSocket's pings."""
 
 
 def permissions(rights: Rights) -> tuple[str, ...]:
@@ -122,6 +127,8 @@ class MonitorSession:
         self._number = self._acknowledged = 0
         self._patched = now - limits.PATCH_PERIOD
         self._stale = False
+        self._looked = now
+        self._tick = now + limits.TICK_PERIOD
         self._watches: dict[int, WatchState] = {}
         self._questions: set[int] = set()
         self._driven: str = ""
@@ -132,7 +139,8 @@ class MonitorSession:
 
     def open(self, agent: str) -> Iterator[Output]:
         """The first message, before any state; ``agent`` is the name of the agent's module."""
-        about = {"version": VERSION, "agent": agent, "period": limits.PATCH_PERIOD}
+        fastest = {"linear": limits.DRIVE_SPEED, "angular": limits.DRIVE_TURN}
+        about = {"version": VERSION, "agent": agent, "period": limits.PATCH_PERIOD, "fastest": fastest}
         yield _text({"op": "hello", **about, "may": permissions(self._rights)})
 
     def receive(self, text: str | bytes, now: float) -> Iterator[Output]:
@@ -260,15 +268,20 @@ class MonitorSession:
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is to be called; ``None`` for not before something else happens."""
-        dues = [watch.due(0.0) for watch in self._watches.values()]
+        dues: list[float | None] = [self._tick]
+        if self._unsent() == 0:
+            dues += [watch.due(0.0) for watch in self._watches.values()]
+        elif self._watches:
+            dues.append(self._looked + limits.UNSENT_RETRY)
         if self._driven:
             dues.append(self._drive_until)
-        if self._stale and self._number - self._acknowledged < limits.UNACKNOWLEDGED_MAX:
+        if self._stale and self._state is not None and self._number - self._acknowledged < limits.UNACKNOWLEDGED_MAX:
             dues.append(self._patched + limits.PATCH_PERIOD)
         return min((due for due in dues if due is not None), default=None)
 
     def handle_timer(self, now: float) -> Iterator[Output]:
         """Send what is due, and stop a robot that nobody commands any more."""
+        self._looked = now
         if self._driven and now >= self._drive_until:
             yield from self._stop()
         if (
@@ -278,6 +291,10 @@ class MonitorSession:
         ):
             yield from self._send_state(now)
         yield from self._flush(now)
+        if now >= self._tick:
+            self._tick = now + limits.TICK_PERIOD
+            if self._unsent() == 0:
+                yield _TICK
 
     def _send_state(self, now: float) -> Iterator[Output]:
         if self._state is None:

@@ -21,7 +21,15 @@ from rmpa.web.monitor.steady import Steady
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from rmpa.observe.snapshot import LinkInfo, PeerInfo, RouteInfo, ServiceInfo, Snapshot, TopicInfo
+    from rmpa.observe.snapshot import (
+        LinkInfo,
+        PeerInfo,
+        RouteInfo,
+        ServiceInfo,
+        Snapshot,
+        SubscriberTransport,
+        TopicInfo,
+    )
     from rmpa.web.monitor.resources import ResourceFacts
 
 _STATES = {"refused": "refused", "conflict": "refused", "relayed": "relayed"}
@@ -95,7 +103,8 @@ class StateBuilder:
         Args:
             snapshot: The newest.
             resources: The Smart Resources of all modules.
-            alarms: The alarms that stand, each with ``id``, ``module``, ``resource``, ``level``, ``text`` and ``at``.
+            alarms: The alarms that stand, each with ``id``, ``module`` (empty: this one), ``resource``, ``level``,
+                ``text`` and ``at``.
         """
         taken = snapshot.taken
         peers = snapshot.peers[: limits.MODULES_SHOWN]
@@ -110,7 +119,10 @@ class StateBuilder:
             "topics": self._topics(snapshot.topics[: limits.TOPICS_SHOWN]),
             "services": {service_key(s): _service(s) for s in snapshot.services[: limits.SERVICES_SHOWN]},
             "resources": {one.key: resource_entry(one, self.own) for one in resources},
-            "alarms": {str(alarm.get("id", index)): alarm for index, alarm in enumerate(alarms)},
+            "alarms": {
+                str(alarm.get("id", index)): {**alarm, "module": alarm.get("module") or self.own}
+                for index, alarm in enumerate(alarms)
+            },
             "notes": list(snapshot.notes[:100]),
             "unreachable": [str(each) for each in snapshot.unreachable[:100]],
         }
@@ -208,9 +220,10 @@ class StateBuilder:
         sums: dict[str, list[tuple[float, float, str]]] = {}
         for topic in topics:
             for route in topic.routes:
-                if route.rate:
+                rate, bandwidth = _figures(route)
+                if rate:
                     ends = (route.peer, self.own) if route.direction == "in" else (self.own, route.peer)
-                    sums.setdefault(">".join(ends), []).append((route.rate, route.bandwidth or 0.0, topic.name))
+                    sums.setdefault(">".join(ends), []).append((rate, bandwidth, topic.name))
         found: dict[str, Tree] = {}
         for key, parts in sums.items():
             parts.sort(key=lambda part: (-part[0], part[2]))
@@ -238,17 +251,20 @@ class StateBuilder:
 
     def _topic(self, topic: TopicInfo) -> Tree:
         incoming = [route for route in topic.routes if route.direction == "in"]
-        active = [route for route in topic.routes if route.rate]
+        figures = [_figures(route) for route in topic.routes]
+        bandwidth = sum(one[1] for one in figures)
         sources = {route.peer for route in incoming}
-        targets = {route.peer for route in topic.routes if route.direction == "out" and route.state == "open"}
+        targets = {
+            route.peer
+            for route in topic.routes
+            if route.direction == "out" and (route.state == "open" or any(map(_is_direct, route.subscribers)))
+        }
         entry = {
             "type": topic.type,
             "from": sorted(sources | {self.own} if topic.publishers else sources),
             "to": sorted(targets | {self.own} if topic.subscribers else targets),
-            "rate": self._steady.figure(f"{topic.name} rate", max((r.rate or 0.0 for r in active), default=None)),
-            "bandwidth": self._steady.figure(
-                f"{topic.name} bandwidth", sum(r.bandwidth or 0.0 for r in active) or None, share=0.1
-            ),
+            "rate": self._steady.figure(f"{topic.name} rate", max((one[0] for one in figures), default=0.0) or None),
+            "bandwidth": self._steady.figure(f"{topic.name} bandwidth", bandwidth or None, share=0.1),
             "latency": self._steady.figure(
                 f"{topic.name} latency",
                 max((r.latency.p50 for r in incoming if r.latency), default=None),
@@ -261,6 +277,21 @@ class StateBuilder:
             "crosses": topic.crosses,
         }
         return _said(entry)
+
+
+def _is_direct(subscriber: SubscriberTransport) -> bool:
+    return subscriber.transport == "direct"
+
+
+def _figures(route: RouteInfo) -> tuple[float, float]:
+    """Messages and bytes a second of a route: relayed, or of its direct connections, whichever has more messages.
+
+    Each direct subscriber has a copy of its own, which is so many bytes more.
+    """
+    direct = [subscriber.figures for subscriber in route.subscribers if subscriber.figures is not None]
+    rate = max((figures.rate or 0.0 for figures in direct), default=0.0)
+    bandwidth = sum(figures.bandwidth or 0.0 for figures in direct)
+    return max(route.rate or 0.0, rate), (route.bandwidth or 0.0) + bandwidth
 
 
 def _said(entry: Mapping[str, object]) -> Tree:
@@ -321,12 +352,22 @@ def details(snapshot: Snapshot, resources: Mapping[str, ResourceFacts], kind: st
     made = _tree(msgspec.to_builtins(found))
     if kind == "topic":
         routes = made.get("routes")
+        for route in routes if isinstance(routes, list) else ():
+            _date_events(route, snapshot.taken)
         made["routes"] = (
             {_route_key(route): route for route in routes if isinstance(route, dict)}
             if isinstance(routes, list)
             else {}
         )
     return made
+
+
+def _date_events(route: Value, taken: float) -> None:
+    """Give the last events of a route their moments in place of their ages, which change all the time."""
+    events = route.get("recent") if isinstance(route, dict) else None
+    for event in events if isinstance(events, list) else ():
+        if isinstance(event, dict) and isinstance(ago := event.pop("ago", None), float | int):
+            event["at"] = round(taken - ago, 1)
 
 
 def _route_key(route: Mapping[str, Value] | RouteInfo) -> str:

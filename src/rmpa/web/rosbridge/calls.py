@@ -11,6 +11,7 @@ from rmpa.web.hub.requests import (
     CancelCall,
     DeleteParam,
     FindService,
+    FindServices,
     ParamsChanged,
     ServiceFound,
     ServiceResult,
@@ -20,7 +21,7 @@ from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.context import Style, check_count
 from rmpa.web.rosbridge.encodings import Compression
 from rmpa.web.rosbridge.protocol import Id, OpError, graph_name, type_name
-from rmpa.web.rosbridge.rosapi import DeleteParameter, FindType, Rosapi, SetParameter, Todo
+from rmpa.web.rosbridge.rosapi import DeleteParameter, FindType, FindTypes, Rosapi, SetParameter, Todo
 from rmpa.web.values.codec import MessageCodec, codec_for
 
 if TYPE_CHECKING:
@@ -87,8 +88,10 @@ class Calls:
             self._context.ask(SetParam(handle, answer.name, answer.value))
         elif isinstance(answer, DeleteParameter):
             self._context.ask(DeleteParam(handle, answer.name))
-        else:
+        elif isinstance(answer, FindType):
             self._context.ask(FindService(handle, answer.service))
+        else:
+            self._context.ask(FindServices(handle))
 
     def _type_of(self, name: str) -> str:
         service = self._context.graph.services.get(name)
@@ -144,7 +147,7 @@ class Calls:
         call = self._open.pop(failed.handle, None)
         if call is None:
             return False
-        if isinstance(call.todo, FindType):
+        if isinstance(call.todo, FindType | FindTypes):
             self._answer(call, self._rosapi.finish(call.todo))  # rosapi's answer for an unknown service
         else:
             self._fail(call, str(OpError(failed.error, failed.remedy)))

@@ -52,6 +52,10 @@ class GraphView(Protocol):
 class TypeSource(Protocol):
     """Finds definitions: those that rmpa brings, this machine's, and those that peers described."""
 
+    def version(self, name: str, md5sum: str) -> MessageType:
+        """The version that a publisher has; errors as for ``message``."""
+        ...
+
     def message(self, name: str) -> MessageType:
         """A message type; raises `DefinitionError` if none is known."""
 
@@ -81,7 +85,14 @@ class FindType:
     service: str
 
 
-Todo: TypeAlias = SetParameter | DeleteParameter | FindType
+@dataclass(frozen=True, slots=True)
+class FindTypes:
+    """The answer needs the types of all services, some of which the graph does not know."""
+
+    answer: Callable[[], Values]
+
+
+Todo: TypeAlias = SetParameter | DeleteParameter | FindType | FindTypes
 
 
 class Rosapi:
@@ -166,6 +177,8 @@ class Rosapi:
     @staticmethod
     def finish(todo: Todo, found: str = "") -> Values:
         """The response after the hub has done what was to do; `found` is the type of a service."""
+        if isinstance(todo, FindTypes):
+            return todo.answer()
         return {"type": found} if isinstance(todo, FindType) else {}
 
     # --- topics ---------------------------------------------------------------------------------------------------
@@ -213,9 +226,17 @@ class Rosapi:
 
     # --- services -------------------------------------------------------------------------------------------------
 
-    def _services_for_type(self, request: Any) -> Values:
+    def _services_for_type(self, request: Any) -> Values | Todo:
         kind = type_name(request["type"])
-        return {"services": [each.name for each in self._graph.services.values() if each.type == kind]}
+
+        def answer() -> Values:
+            return {"services": [each.name for each in self._graph.services.values() if each.type == kind]}
+
+        return self._with_types(answer)
+
+    def _with_types(self, answer: Callable[[], Values]) -> Values | Todo:
+        unknown = any(not each.type for each in self._graph.services.values())
+        return FindTypes(answer) if unknown else answer()
 
     def _service(self, request: Any) -> GraphService | None:
         return self._graph.services.get(graph_name(request["service"]))
@@ -240,13 +261,17 @@ class Rosapi:
         except ValueError:
             return {"host": ""}
 
-    def _service_providers(self, request: Any) -> Values:
+    def _service_providers(self, request: Any) -> Values | Todo:
         # rosapi's own answer compares types, though its field is named service: both are understood.
         asked = request["service"]
-        found = [
-            each for each in self._graph.services.values() if each.type == asked or each.name == graph_name(asked)
-        ]
-        return {"providers": [node for each in found for node in each.providers]}
+
+        def answer() -> Values:
+            found = [
+                each for each in self._graph.services.values() if each.type == asked or each.name == graph_name(asked)
+            ]
+            return {"providers": [node for each in found for node in each.providers]}
+
+        return answer() if graph_name(asked) in self._graph.services else self._with_types(answer)
 
     # --- types ----------------------------------------------------------------------------------------------------
 

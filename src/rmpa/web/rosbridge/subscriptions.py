@@ -47,7 +47,7 @@ class _Topic:
     wishes: dict[Id, _Wish] = field(default_factory=dict)
     compression: Compression = Compression.NONE
     fragment_size: int | None = None
-    codecs: dict[str, MessageCodec] = field(default_factory=dict)
+    codecs: dict[tuple[str, str], MessageCodec] = field(default_factory=dict)
     problem: str = ""
 
     def choose(self) -> None:
@@ -191,7 +191,8 @@ class Subscriptions:
     def _encode(self, topic: _Topic, message: Received) -> Frame:
         if topic.compression is Compression.CBOR_RAW:
             return encode_cbor_raw(topic.name, message.payload, message.stamp_ns)
-        codec = topic.codecs.get(message.type)
+        version = message.type, message.md5sum
+        codec = topic.codecs.get(version)
         if codec is None:
-            codec = topic.codecs[message.type] = codec_for(self._context.types.message(message.type))
+            codec = topic.codecs[version] = codec_for(self._context.types.version(*version))
         return self._frames.encode(topic.name, message.payload, topic.compression, codec)

@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING
 from rmpa.core.errors import RmpaError, UnreachableError
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.io.control_client import ControlClient, choose_agent
+from rmpa.observe.snapshot import Snapshot
 from rmpa.web import limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
-
-    from rmpa.observe.snapshot import Snapshot
 
 _log = logging.getLogger(__name__)
 
@@ -113,6 +112,8 @@ class ControlReader:
         self._name = name
         self._client: ControlClient | None = None
         self._used = 0.0
+        self.figures = False
+        """Whether the agent is to ask nodes for the figures of their direct connections."""
 
     def __call__(self) -> Snapshot:
         """Ask for a snapshot.
@@ -136,7 +137,7 @@ class ControlReader:
 
     def _ask(self, client: ControlClient) -> Snapshot:
         try:
-            snapshot = client.snapshot()
+            snapshot = client.call("snapshot", Snapshot, figures="newest") if self.figures else client.snapshot()
         except RmpaError:
             self.close()
             raise

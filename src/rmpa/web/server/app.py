@@ -17,7 +17,7 @@ from aiohttp.abc import AbstractAccessLogger
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.web import limits, rest
 from rmpa.web.gateways.gateways import MONITOR_PATH, is_upgrade
-from rmpa.web.metrics import exposition
+from rmpa.web.metrics import content_type, exposition
 from rmpa.web.server.auth import TOKEN_PARAMETER, AccessPolicy, MoveToken, Refused, RequestFacts
 from rmpa.web.server.connections import GuardedConnection
 from rmpa.web.server.figures import Figures, web_metrics
@@ -84,6 +84,8 @@ class Routes:
         self._refusals = RefusalLog(_log, counters)
         self.responses = Counters()
         """Responses by status."""
+        if gateways is not None:
+            gateways.upgraded = _upgraded
         self._encoding = asyncio.Lock()
         self._encoded: dict[str, tuple[int, bytes, str]] = {}
 
@@ -130,9 +132,6 @@ class Routes:
         if isinstance(verdict, MoveToken):
             return self._move_token(request)
         if self._gateways is not None and is_upgrade(request) and request.path in WEBSOCKET_PATHS:
-            connection = _connection(request)
-            if connection is not None:
-                connection.upgrade()
             handler = self._gateways.handle
         try:
             return await handler(request)
@@ -200,14 +199,15 @@ class Routes:
         accept = request.headers.get("Accept", "")
         reading = await self._watch.reading()
         async with self._encoding:  # thousands of time series take a tenth of a second: once for all, in a thread
-            made = self._encoded.get(accept)
+            form = content_type(accept)
+            made = self._encoded.get(form)
             if made is None or made[0] != reading.number:
                 figures = tuple(web_metrics(self._figures()))
                 body, kind = await asyncio.to_thread(exposition, reading.snapshot, accept, figures)
                 made = (reading.number, body, kind)
                 self._encoded = {key: each for key, each in self._encoded.items() if each[0] == reading.number}
                 if len(self._encoded) < limits.METRIC_FORMATS:
-                    self._encoded[accept] = made
+                    self._encoded[form] = made
         return web.Response(body=made[1], headers={"Content-Type": made[2]})
 
     def _figures(self) -> Figures:
@@ -247,6 +247,13 @@ def _connection(request: web.Request) -> GuardedConnection | None:
     transport = request.transport
     protocol = transport.get_protocol() if transport is not None else None
     return protocol if isinstance(protocol, GuardedConnection) else None
+
+
+def _upgraded(request: web.Request) -> None:
+    """The limits of requests do not hold for the connection any more."""
+    connection = _connection(request)
+    if connection is not None:
+        connection.upgrade()
 
 
 def _response(made: rest.Response) -> web.Response:

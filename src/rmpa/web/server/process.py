@@ -121,7 +121,11 @@ async def serve(
     watch = AgentWatch(reader)
     hub = make_hub(watch, web.port)
     rights = rights_of(has_token=bool(access.token), control=web.control, drive=web.drive)
-    monitor = Monitor(hub, watch, agent=agent)
+
+    def watched(is_open: bool) -> None:
+        reader.figures = is_open
+
+    monitor = Monitor(hub, watch, agent=agent, watched=watched)
     changes = GraphSignal(os.environ, lambda: agent or monitor.mesh.agent or None, hub.graph)
     gateways = Gateways(
         hub,

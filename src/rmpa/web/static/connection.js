@@ -5,6 +5,7 @@ import { adopt, applyPatch } from "./state.js";
 const FIRST_WAIT = 300; // milliseconds until the next attempt, doubled up to LAST_WAIT
 const LAST_WAIT = 5000;
 const ANSWER_WAIT = 30000;
+const SILENT = 7000; // milliseconds without a word after which the connection is lost; the server says something every 2 s
 
 export class Connection {
   constructor(changed) {
@@ -21,7 +22,9 @@ export class Connection {
     this.counter = 0;
     this.wait = FIRST_WAIT;
     this.frames = { patches: 0, bytes: 0 };
+    this.heard = 0;
     this.open();
+    setInterval(() => this.phase === "open" && Date.now() - this.heard > SILENT && this.drop(), 1000);
     addEventListener("online", () => this.retry());
     document.addEventListener("visibilitychange", () => document.hidden || this.retry());
   }
@@ -38,11 +41,16 @@ export class Connection {
     const url = new URL("monitor", document.baseURI);
     url.protocol = url.protocol.replace("http", "ws");
     url.hash = "";
+    if (this.socket) this.socket.close(); // one that is still connecting: its events are ignored from here on
     const socket = (this.socket = new WebSocket(url, "rmpa.monitor.v1"));
+    let opened = false;
     socket.binaryType = "arraybuffer";
-    socket.onmessage = (event) => this.receive(event.data);
-    socket.onclose = (event) => socket === this.socket && this.closed(event);
+    socket.onmessage = (event) => socket === this.socket && this.receive(event.data);
+    socket.onclose = (event) => socket === this.socket && this.closed(event, opened);
     socket.onopen = () => {
+      if (socket !== this.socket) return;
+      opened = true;
+      this.heard = Date.now();
       this.phase = "open";
       this.wait = FIRST_WAIT;
       if (this.looks.length) this.send({ op: "look", at: this.looks });
@@ -52,10 +60,11 @@ export class Connection {
     };
   }
 
-  closed(event) {
+  closed(event, opened) {
     if (this.phase !== "lost") this.lostAt = Date.now();
     this.phase = "lost";
     this.reason = event.reason;
+    if (!opened) this.explain();
     for (const question of this.questions.values()) question.reject({ error: "the connection was lost", remedy: "" });
     this.questions.clear();
     this.timer = setTimeout(() => this.open(), this.wait * (0.75 + Math.random() / 2));
@@ -63,11 +72,26 @@ export class Connection {
     this.changed();
   }
 
+  // Nothing comes any more, as after the Wi-Fi has gone: the browser itself would notice much later.
+  drop() {
+    const socket = this.socket;
+    this.socket = null;
+    socket.close();
+    this.closed({ reason: "it has said nothing for some seconds" }, true);
+  }
+
+  // A browser does not tell why a WebSocket was refused, as for a wrong token: the same question over HTTP does.
+  explain() {
+    fetch(new URL("api/v1/agent", document.baseURI)).then((response) => (response.ok || response.status === 503 ? null : response.json()))
+      .then((problem) => { if (problem && this.phase === "lost") { this.reason = problem.detail; this.changed(); } }, () => {});
+  }
+
   send(message) {
-    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
+    if (this.socket && this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
   }
 
   receive(data) {
+    this.heard = Date.now();
     if (typeof data !== "string") return this.receiveBinary(data);
     this.frames.bytes += data.length;
     const message = JSON.parse(data);

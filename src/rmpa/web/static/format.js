@@ -36,5 +36,8 @@ export function duration(value) {
 }
 
 export const ago = (moment) => (known(moment) ? duration(Date.now() / 1000 - moment) : NONE);
-export const clock = (moment) => new Date(moment * 1000).toLocaleTimeString("en-GB");
+export function clock(moment) {
+  const at = new Date(moment * 1000), time = at.toLocaleTimeString("en-GB");
+  return at.toDateString() === new Date().toDateString() ? time : `${at.toLocaleDateString("en-GB", { day: "numeric", month: "short" })} ${time}`;
+}
 export const bounded = (value, error) => (known(value) ? `${seconds(value)} ± ${seconds(error)}` : NONE);

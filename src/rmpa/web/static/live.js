@@ -99,6 +99,12 @@ function pixels(view, { width, height, format, bytes: raw }) {
 
 const ink = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
+// Multiples of `step` within `far` of `centre`, at most a hundred.
+function lines(centre, far, step) {
+  const first = Math.ceil((centre - far) / step);
+  return Array.from({ length: Math.max(0, Math.min(100, Math.floor((2 * far) / step) + 1)) || 0 }, (_, at) => (first + at) * step);
+}
+
 // A grid with the origin in the middle, x to the right and y up (REP 103); returns metres to pixels.
 function field(canvas, reach, centre = { x: 0, y: 0 }) {
   const context = canvas.getContext("2d"), { width, height } = canvas;
@@ -108,8 +114,8 @@ function field(canvas, reach, centre = { x: 0, y: 0 }) {
   context.clearRect(0, 0, width, height);
   context.strokeStyle = ink("--line"); context.lineWidth = 1; context.beginPath();
   const wide = width / 2 / scale, high = height / 2 / scale;
-  for (let x = Math.ceil((centre.x - wide) / step) * step; x <= centre.x + wide; x += step) { const [px] = to(x, 0); context.moveTo(px, 0); context.lineTo(px, height); }
-  for (let y = Math.ceil((centre.y - high) / step) * step; y <= centre.y + high; y += step) { const [, py] = to(0, y); context.moveTo(0, py); context.lineTo(width, py); }
+  for (const at of lines(centre.x, wide, step)) { const [px] = to(at, 0); context.moveTo(px, 0); context.lineTo(px, height); }
+  for (const at of lines(centre.y, high, step)) { const [, py] = to(0, at); context.moveTo(0, py); context.lineTo(width, py); }
   context.stroke();
   context.fillStyle = ink("--muted"); context.font = "20px system-ui";
   context.fillText(`${Number(step.toPrecision(3))} m`, 14, height - 16);
@@ -144,12 +150,14 @@ function Scan({ connection, topic }) {
   return html`<div><${Failure} failure=${failure} /><${Canvas} draw=${draw} version=${message} label=${`Laser scan: ${seen.length} of ${scan?.ranges.length || 0} ranges, the nearest ${Math.min(...seen).toFixed(2)} m`} /></div>`;
 }
 
+const FAR = 1e7; // metres: beyond it no grid can be drawn, and no robot stands
+
 function Pose({ connection, topic, path }) {
   const trail = useRef([]);
   const [message, set] = useState(null);
   const failure = useWatch(connection, { topic, how: "value", rate: 10 }, (next) => {
     const pose = path.split(".").filter(Boolean).reduce((value, key) => value?.[key], next.value);
-    if (!Number.isFinite(pose?.position?.x)) return;
+    if (![pose?.position?.x, pose?.position?.y].every((each) => Number.isFinite(each) && Math.abs(each) < FAR)) return;
     const { x, y, z, w } = pose.orientation;
     const last = trail.current[trail.current.length - 1];
     if (last && Math.hypot(pose.position.x - last.x, pose.position.y - last.y) > JUMP) trail.current = []; // it was put elsewhere

@@ -36,6 +36,7 @@ export function Search({ state, onClose }) {
   const [at, setAt] = useState(0);
   const found = find(state, text);
   const chosen = Math.min(at, found.length - 1);
+  useEffect(() => document.getElementById(`found-${chosen}`)?.scrollIntoView({ block: "nearest" }), [chosen]);
   const go = (one) => { if (one) { location.hash = one.to; onClose(); } };
   const key = (event) => {
     const by = { ArrowDown: 1, ArrowUp: -1 }[event.key];

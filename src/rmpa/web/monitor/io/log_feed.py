@@ -42,6 +42,7 @@ class LogFeed:
         self._fresh: list[dict[str, Any]] = []
         self._followers: dict[object, Callable[[list[dict[str, Any]]], None]] = {}
         self._timer: asyncio.TimerHandle | None = None
+        self._count = 0
 
     def start(self) -> None:
         """Begin to keep lines."""
@@ -71,7 +72,9 @@ class LogFeed:
             return  # not a message of the log; there is nothing to show
         stamp = values["header"]["stamp"]
         at = stamp["secs"] + stamp["nsecs"] * 1e-9
+        self._count += 1
         line = {
+            "n": self._count,
             "at": at or message.stamp_ns * 1e-9 or time.time(),
             "level": _LEVELS.get(values["level"], "INFO"),
             "node": values["name"][: limits.LOG_CHARACTERS],

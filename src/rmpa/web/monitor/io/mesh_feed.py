@@ -27,10 +27,18 @@ class MeshFeed:
     Args:
         watch: Asks the agent.
         resources: Knows the Smart Resources.
+        watched: Called with whether pages are open.
         clock: Seconds since the epoch.
     """
 
-    def __init__(self, watch: AgentWatch, resources: ResourceWatch, clock: Callable[[], float] = time.time) -> None:
+    def __init__(
+        self,
+        watch: AgentWatch,
+        resources: ResourceWatch,
+        watched: Callable[[bool], None],
+        clock: Callable[[], float] = time.time,
+    ) -> None:
+        self._watched = watched
         self._watch = watch
         self._resources = resources
         self._clock = clock
@@ -54,6 +62,7 @@ class MeshFeed:
     def follow(self, page: object, show: Callable[[Tree], None]) -> None:
         """Give a page each new state, beginning with the last one."""
         self._pages[page] = show
+        self._watched(True)
         self._resources.show_all(wanted=True)
         if self._state is not None:
             show(self._state)
@@ -64,6 +73,7 @@ class MeshFeed:
         """End a ``follow``; after the last one nothing more is read."""
         self._pages.pop(page, None)
         if not self._pages:
+            self._watched(False)
             self._resources.show_all(wanted=False)
             if self._task is not None:
                 self._task.cancel()
@@ -93,7 +103,8 @@ class MeshFeed:
                 _log.exception("! the state of the mesh could not be built")
             # A snapshot of thousands of topics takes time at both ends: at most a fifth of it is spent here.
             took = time.monotonic() - began
-            await asyncio.sleep(max(limits.STATE_PERIOD - took, took * limits.STATE_SHARE))
+            pause = min(took * limits.STATE_SHARE, limits.STATE_PAUSE_MAX)
+            await asyncio.sleep(max(limits.STATE_PERIOD - took, pause))
 
     def _take(self, reading: Reading) -> None:
         if reading.number == self._number:

@@ -5,17 +5,19 @@ from __future__ import annotations
 import asyncio
 import math
 import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import msgspec
 
 from rmpa.bridge.proxy_names import proxied_node
-from rmpa.core.errors import ConfigError, RmpaError
+from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.names import is_global_name
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.io.control_client import ControlClient, choose_agent
 from rmpa.observe.io.peer_params import PeerParams, parameters_in
 from rmpa.resource.run.dynamic_reconfigure import SERVICE_TYPE
+from rmpa.web.monitor import limits
 from rmpa.web.values.codec import codec_for
 
 if TYPE_CHECKING:
@@ -30,7 +32,10 @@ if TYPE_CHECKING:
 
 Args = dict[str, Any]
 _CALL_TIMEOUT: Final = 30.0
+_READ_TIMEOUT: Final = 5.0
 _KINDS: Final = ("topic", "service")
+_LISTS: Final = {"bool": "bools", "int": "ints", "double": "doubles", "str": "strs"}
+"""The lists of a ``dynamic_reconfigure/Config`` by the types of parameters."""
 
 
 class Answers:
@@ -50,6 +55,7 @@ class Answers:
         self._resources = resources
         self._environ = environ
         self._agent = agent
+        self._threads = ThreadPoolExecutor(limits.ANSWERS_AT_ONCE, "rmpa-answers")
         self._handlers: Mapping[str, Callable[[Args], Awaitable[Any]]] = {
             "why": self._why,
             "history": self._history,
@@ -60,6 +66,7 @@ class Answers:
             "delete_param": self._delete_param,
             "profile": self._profile,
             "context": self._context,
+            "configure": self._configure,
         }
 
     async def answer(self, question: Question) -> Any:
@@ -69,6 +76,10 @@ class Answers:
             RmpaError: There is none; the text says why.
         """
         return await self._handlers[question.what](question.args)
+
+    def close(self) -> None:
+        """End the threads, once what the agent was asked is answered or has timed out."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
 
     # --- what only looks --------------------------------------------------------------------------------------
 
@@ -82,7 +93,7 @@ class Answers:
             with self._control() as client:
                 return client.call("why", object, name=name, peer=peer or None, service=kind == "service")
 
-        return await asyncio.to_thread(ask)
+        return await asyncio.get_running_loop().run_in_executor(self._threads, ask)
 
     async def _history(self, _args: Args) -> Any:
         return list(self._resources.history)
@@ -102,8 +113,12 @@ class Answers:
     async def _params(self, args: Args) -> Any:
         peer = _text(args, "peer")
         if not peer:
-            if not self._hub.params.loaded.is_set():
-                self._hub.link.need()
+            self._hub.link.need()
+            try:
+                async with asyncio.timeout(_READ_TIMEOUT):
+                    await self._hub.params.loaded.wait()
+            except TimeoutError:
+                raise UnreachableError("parameters of the core", "its API", "is it busy? ask again") from None
             return {"values": _plain(self._hub.params.tree)}
         return {"values": _plain(await self._of_peer(peer, lambda params: params.get("/")))}
 
@@ -112,10 +127,16 @@ class Answers:
         if value is None:
             raise ConfigError("value", "a parameter cannot be null", "delete it instead")
         if peer:
-            await self._of_peer(peer, lambda params: params.set(name, cast("XmlRpcValue", value)))
+
+            def change(params: PeerParams) -> None:
+                present = params.get(name) if name in params.names() else None
+                params.set(name, cast("XmlRpcValue", _as_before(name, present, value)))
+
+            await self._of_peer(peer, change)
         else:
-            parameters_in(name, cast("XmlRpcValue", value))
-            await self._hub.params.set(name, cast("ParamValue", value))
+            kept = _as_before(name, self._hub.params.value(name), value)
+            parameters_in(name, cast("XmlRpcValue", kept))
+            await self._hub.params.set(name, cast("ParamValue", kept))
         return await self._params(args)
 
     async def _delete_param(self, args: Args) -> Any:
@@ -133,7 +154,7 @@ class Answers:
             with self._control() as client:
                 return do(PeerParams(client, peer))
 
-        return await asyncio.to_thread(ask)
+        return await asyncio.get_running_loop().run_in_executor(self._threads, ask)
 
     def _control(self) -> ControlClient:
         agent = choose_agent(self._environ, self._agent() or None)
@@ -158,13 +179,31 @@ class Answers:
     async def _context(self, args: Args) -> Any:
         return await self._choose(args, "context")
 
-    async def _choose(self, args: Args, what: str) -> Any:
-        resource, choice = _name(args, "resource"), _text(args, "choice")
+    async def _configure(self, args: Args) -> Any:
+        resource, peer, name, value = (
+            _name(args, "resource"),
+            _text(args, "peer"),
+            _text(args, "name"),
+            args.get("value"),
+        )
+        facts = self._resources.facts.get(f"{peer}:{resource}" if peer else resource)
+        known = facts.descriptor.get("parameters", ()) if facts is not None else ()
+        kind = next((each["type"] for each in known if each.get("name") == name), None)
+        if kind not in _LISTS:
+            raise ConfigError("name", f"{resource} has no parameter {name[:80]!r}")
+        await self._reconfigure(args, {_LISTS[kind]: [{"name": name, "value": value}]})
+        return {"text": f"{name} is set"}
+
+    async def _reconfigure(self, args: Args, config: Args) -> None:
+        resource = _name(args, "resource")
         service = self._service({"service": f"{resource}/set_parameters", "peer": args.get("peer", "")})
         kind = self._hub.types.service(SERVICE_TYPE)
-        wanted = {"config": {"strs": [{"name": what, "value": choice}]}}
-        body = codec_for(kind.request).write(wanted, time.time_ns()).payload
+        body = codec_for(kind.request).write({"config": config}, time.time_ns()).payload
         await self._hub.calls.call(service, kind.md5sum, body, _CALL_TIMEOUT)
+
+    async def _choose(self, args: Args, what: str) -> Any:
+        choice = _text(args, "choice")
+        await self._reconfigure(args, {"strs": [{"name": what, "value": choice}]})
         return {"text": f"{what} {choice} is chosen" if choice else f"the resource chooses its {what}"}
 
     def _service(self, args: Args) -> str:
@@ -187,6 +226,18 @@ class Answers:
     async def _type_of(self, service: str) -> ServiceType:
         found = await self._hub.calls.find(service)
         return await self._hub.types.find_service(found.type)
+
+
+def _as_before(name: str, present: object, value: object) -> object:
+    """A new value of a parameter, a float where it was one: a page writes 1.0 as 1.
+
+    Raises:
+        ConfigError: The present value is binary data, of which a page shows only the length.
+    """
+    if isinstance(present, bytes | bytearray | memoryview):
+        raise ConfigError(name, "it holds binary data", "set it with `rmpa param set -b FILE`")
+    is_whole = isinstance(value, int) and not isinstance(value, bool)
+    return float(cast("int", value)) if isinstance(present, float) and is_whole else value
 
 
 def _text(args: Args, key: str) -> str:

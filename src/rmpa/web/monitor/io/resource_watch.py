@@ -45,6 +45,8 @@ class _Path:
     """The subscriptions below one path; several modules may have a resource of that path."""
 
     handles: dict[str, int] = field(default_factory=dict)
+    publishers: frozenset[str] = frozenset()
+    """The nodes that publish the descriptor."""
     looked: float = -1e9
 
 
@@ -139,7 +141,14 @@ class ResourceWatch:
         self._follow_all()
 
     def _keep_publishers(self, path: str, topic: GraphTopic) -> None:
-        peers = {_peer_of(node) for node in topic.publishers}
+        there, publishers = self._paths.get(path), frozenset(topic.publishers)
+        if there is None or there.publishers == publishers:
+            return
+        if there.publishers and publishers - there.publishers:
+            # A source that is back sends the same latched messages, which a subscription has had: begin anew.
+            self._unsubscribe(path, there)
+        there.publishers = publishers
+        peers = {_peer_of(node) for node in publishers}
         for key, facts in [*self.facts.items()]:
             if facts.name == path and facts.peer not in peers:
                 del self.facts[key]
@@ -167,10 +176,13 @@ class ResourceWatch:
                 (OWN_CLIENT, handle), f"{name}/{topic}", wanted[topic], take, lambda _error: None
             )
 
-    def _forget(self, name: str) -> None:
-        path = self._paths.pop(name)
+    def _unsubscribe(self, name: str, path: _Path) -> None:
         for topic, handle in path.handles.items():
             self._hub.topics.unsubscribe((OWN_CLIENT, handle), f"{name}/{topic}")
+        path.handles.clear()
+
+    def _forget(self, name: str) -> None:
+        self._unsubscribe(name, self._paths.pop(name))
         for key in [key for key, facts in self.facts.items() if facts.name == name]:
             del self.facts[key]
             self._since.pop(key, None)
@@ -188,11 +200,12 @@ class ResourceWatch:
             elif key in self.facts:
                 facts = self.facts[key]
                 self.facts[key] = msgspec.structs.replace(facts, **_said(facts, topic, values))
-        except (RmpaError, msgspec.DecodeError, KeyError, TypeError):
+        except (RmpaError, msgspec.DecodeError, KeyError, TypeError, RecursionError):
             return  # another program's topic of that name
 
     def _alarm(self, key: str, values: Any) -> None:
         for status in map(_status, values["status"]):
+            self._since[key] = status["level"], self._now()
             self.history.append(
                 {"at": round(self._now(), 3), "level": status["level"], "resource": key, "text": status["message"]}
             )
@@ -213,7 +226,8 @@ def _said(facts: ResourceFacts, topic: str, values: Any) -> dict[str, Any]:
         return {topic: str(values["data"])}
     if topic == "decision":
         decision = msgspec.json.decode(values["data"] or "{}")
-        return {"decision": decision if isinstance(decision, dict) else facts.decision}
+        is_shown = isinstance(decision, dict) and _depth(decision, limits.DECISION_DEPTH) <= limits.DECISION_DEPTH
+        return {"decision": decision if is_shown else facts.decision}
     if topic == "responses":
         return {"clients": tuple(map(_status, values["status"]))}
     if topic == "parameter_updates":
@@ -221,6 +235,14 @@ def _said(facts: ResourceFacts, topic: str, values: Any) -> dict[str, Any]:
         return {"parameters": {pair["name"]: pair["value"] for pair in pairs}}
     statuses = [*map(_status, values["status"]), facts.health]
     return {"health": statuses[0]}
+
+
+def _depth(value: Any, most: int) -> int:
+    """How many objects and arrays are within each other, counted up to one more than ``most``."""
+    if most < 0 or not isinstance(value, dict | list):
+        return 0
+    inner = value.values() if isinstance(value, dict) else value
+    return 1 + max((_depth(each, most - 1) for each in inner), default=0)
 
 
 def _status(values: Any) -> dict[str, Any]:

@@ -12,12 +12,15 @@ export function DrivePage({ state, connection }) {
   const topics = entries(state, "topics").filter(([, one]) => one.type === TYPE).map(([name]) => name);
   const [topic, setTopic] = useState("/cmd_vel");
   const [armed, arm] = useState(false);
+  const [share, setShare] = useState(0.15);
+  const fastest = connection.hello.fastest || { linear: 0, angular: 0 };
   const allowed = connection.may("drive");
   return html`<${Page} title="Drive" kind="A joystick for geometry_msgs/Twist"><div class="grid">
     <${Panel} title="What is driven"><div class="form"><label>Topic<input class="mono" list="twists" value=${topic} onInput=${(event) => { arm(false); setTopic(event.target.value); }} /></label><datalist id="twists">${topics.map((each) => html`<option key=${each} value=${each} />`)}</datalist>
+      <label>Fastest: ${(share * fastest.linear).toFixed(2)} m/s, ${(share * fastest.angular).toFixed(2)} rad/s<input type="range" min="0.05" max="1" step="0.05" value=${share} onInput=${(event) => setShare(Number(event.target.value))} /></label>
       <label class="row"><span><input type="checkbox" checked=${armed} disabled=${!allowed} onChange=${(event) => arm(event.target.checked)} /> The robot may move: I see it</span></label>
-      <p class="muted">${allowed ? "It drives only while the stick is held. Let go, lose the connection or leave the page, and it is stopped within 0.3 s." : "Driving is not allowed for this page. It needs rmpa web with drive allowed, and a token whose role may."}</p></div><//>
-    <${Panel} title="Joystick"><${Stick} on=${allowed && armed} send=${(linear, angular) => connection.send({ op: "drive", topic, linear, angular })} release=${() => connection.send({ op: "release" })} /><//></div><//>`;
+      <p class="muted">${allowed ? "It drives only while the stick is held. Let go, lose the connection or leave the page, and it is stopped within 0.3 s." : "This page may not drive. Start rmpa web with --drive, and open the address that it prints."}</p></div><//>
+    <${Panel} title="Joystick"><${Stick} on=${allowed && armed} send=${(linear, angular) => connection.send({ op: "drive", topic, linear: linear * share, angular: angular * share })} release=${() => connection.send({ op: "release" })} /><//></div><//>`;
 }
 
 function Stick({ on, send, release }) {
@@ -35,10 +38,12 @@ function Stick({ on, send, release }) {
     const far = Math.max(1, Math.hypot(x, y));
     const next = { x: x / far, y: y / far };
     setAt(next);
-    if (!held.current) held.current = { timer: setInterval(() => send(held.current.y, -held.current.x), PERIOD) };
-    Object.assign(held.current, next);
+    if (held.current) return void Object.assign(held.current, next); // the timer sends it: pointers move 60 times a second
+    held.current = { ...next, timer: setInterval(() => command.current(held.current.y, -held.current.x), PERIOD) };
     send(next.y, -next.x);
   };
+  const command = useRef(send); // the newest: the timer outlives a change of the fastest speed
+  command.current = send;
   const end = useRef(stop);
   end.current = stop;
   useEffect(() => {

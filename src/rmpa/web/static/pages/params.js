@@ -23,7 +23,7 @@ export function Params({ state, connection }) {
   const [failure, setFailure] = useState(null);
   const [text, setText] = useState("");
   const peer = module === own ? "" : module;
-  const ask = (what, args = {}) => connection.ask(what, { peer, ...args }).then((answer) => { setValues(answer.values); setFailure(null); }, setFailure);
+  const ask = (what, args = {}) => connection.ask(what, { peer, ...args }).then((answer) => { setValues(answer.values); setFailure(null); return true; }, (failure) => { setFailure(failure); return false; });
   useEffect(() => { setValues(null); ask("params"); }, [module, connection.phase]);
   const choices = entries(state, "modules").filter(([, one]) => one.state === "up" || one.state === "here").map(([name]) => [name, name]);
   return html`<${Page} title="Parameters" kind=${`Of the core of ${module}`} aside=${html`<button type="button" onClick=${() => ask("params")}>Read again</button>`}>
@@ -47,12 +47,13 @@ function Namespace({ tree, path, text, may, ask }) {
 
 function Leaf({ name, short, value, may, ask }) {
   const [draft, setDraft] = useState(null);
+  const [sure, setSure] = useState(false);
   const written = JSON.stringify(value);
-  const save = (event) => { event.preventDefault(); ask("set_param", { name, value: parse(draft) }).then(() => setDraft(null)); };
+  const save = (event) => { event.preventDefault(); ask("set_param", { name, value: parse(draft) }).then((done) => done && setDraft(null)); };
   if (draft === null)
     return html`<span class="key">${short}:</span> ${may ? html`<button type="button" class="field" aria-label=${`Change ${name}, now ${written}`} onClick=${() => setDraft(written)}>${written}</button>` : written}`;
   return html`<form class="row" onSubmit=${save}><label><span>${name}</span><input autofocus value=${draft} onInput=${(event) => setDraft(event.target.value)} onKeyDown=${(event) => event.key === "Escape" && setDraft(null)} /></label>
-    <button class="primary">Set</button><button type="button" onClick=${() => ask("delete_param", { name })}>Delete</button><button type="button" onClick=${() => setDraft(null)}>Leave</button></form>`;
+    <button class="primary">Set</button><button type="button" onClick=${() => { setDraft(null); setSure(false); }}>Leave</button><button type="button" onClick=${() => (sure ? ask("delete_param", { name }) : setSure(true))}>${sure ? "Really delete it" : "Delete"}</button></form>`;
 }
 
 // JSON where it is some, else the text itself.

@@ -19,7 +19,8 @@ export function ResourcePage({ name, state, connection }) {
   if (!one) return html`<${Page} title=${name} kind="Smart Resource"><${Gone} kind="resource" name=${name} /><//>`;
   const detail = section(section(state, "detail"), `resource:${name}`);
   const descriptor = section(detail, "descriptor"), decision = section(detail, "decision"), values = section(section(detail, "health"), "values");
-  const choose = (what, choice) => connection.ask(what, { resource: one.name, peer: one.module === section(state, "agent").name ? "" : one.module, choice }).then(() => setFailure(null), setFailure);
+  const whose = { resource: one.name, peer: one.module === section(state, "agent").name ? "" : one.module };
+  const choose = (what, choice) => connection.ask(what, { ...whose, choice }).then(() => setFailure(null), setFailure);
   return html`<${Page} title=${one.name} kind=${`Smart Resource of ${one.module} · ${one.role || ""}${one.physical ? "" : ", simulated"}`} aside=${html`<${Mark} state=${one.level} word=${one.message || undefined} />`}><div class="grid">
     <${Panel} title="State"><p>${one.description}</p><${Facts} rows=${[["State", one.state], ["Profile", one.profile || "none runs"], ["Context", one.context || "none"], ["Chosen", decision.chosen ? `${decision.chosen}, by hand` : "by the resource"], ["Being applied", decision.applying], ["Last reaction", seconds(decision.reaction)], ["Alarm", decision.alarm]]} /><${Failure} failure=${failure} />
       ${(decision.conflicts || []).length > 0 && html`<p class="failure">${decision.conflicts.map((each) => (typeof each === "string" ? each : JSON.stringify(each))).join("; ")}</p>`}<//>
@@ -30,10 +31,22 @@ export function ResourcePage({ name, state, connection }) {
     <${Panel} title="Who asked what"><${Table} caption="Clients" columns=${["Client", "Is told", "Asks"]} empty="No client asks for anything.">${(detail.clients || []).map((client) => html`<tr key=${client.name}><th scope="row">${client.name}</th><td><${Mark} state=${client.level} word=${client.message} /></td><td>${Object.entries(client.values || {}).map(([key, value]) => html`<div key=${key}>${key} ${value}</div>`)}</td></tr>`)}<//><//>
     <${Panel} title="Contexts"><${Table} caption="Contexts" columns=${["Context", "When", "Requires", "Profiles", ""]} empty="It has no contexts.">${(detail.contexts || descriptor.contexts || []).map((each) => html`<tr key=${each.name}><th scope="row">${each.name === one.context ? html`<${Mark} state="up" word=${each.name} />` : each.name}</th><td>${each.when || "by hand"}</td><td>${Object.entries(each.requires || {}).map(([key, value]) => `${key} ${value}`).join(", ") || "–"}</td><td>${(each.profiles || []).join(", ") || "all"}</td>
       <td class="number">${connection.may("resource") && html`<button type="button" onClick=${() => choose("context", each.name === one.context ? "" : each.name)}>${each.name === one.context ? "Leave" : "Enter"}</button>`}</td></tr>`)}<//><//>
-    <${Panel} title="Configuration"><${Table} caption="Parameters" columns=${["Parameter", "#Value", "Range", "Description"]} empty="It has no parameters.">${(descriptor.parameters || []).map((each) => html`<tr key=${each.name}><th scope="row">${each.name}</th><td class="number">${JSON.stringify(section(detail, "parameters")[each.name] ?? each.default)} ${each.unit}</td><td>${each.choices?.length ? each.choices.join(" | ") : each.low !== undefined || each.high !== undefined ? `${each.low ?? ""} … ${each.high ?? ""}` : each.type}</td><td>${each.description}</td></tr>`)}<//><//>
+    <${Panel} title="Configuration"><${Table} caption="Parameters" columns=${["Parameter", "#Value", "Range", "Description"]} empty="It has no parameters.">${(descriptor.parameters || []).map((each) => html`<tr key=${each.name}><th scope="row">${each.name}</th><td class="number"><${Setting} value=${section(detail, "parameters")[each.name] ?? each.default} about=${each} set=${connection.may("resource") ? (value) => connection.ask("configure", { ...whose, name: each.name, value }).then(() => setFailure(null), setFailure) : null} /></td><td>${each.choices?.length ? each.choices.join(" | ") : each.low !== undefined || each.high !== undefined ? `${each.low ?? ""} … ${each.high ?? ""}` : each.type}</td><td>${each.description}</td></tr>`)}<//><//>
     <${Panel} title="Topics"><${Table} caption="Topics" columns=${["Topic", "Way", "Type", "Contract"]}>${[["outputs", "out"], ["inputs", "in"]].flatMap(([list, way]) => (descriptor[list] || []).map((each) => html`<tr key=${way + each.topic}><th scope="row"><${Link} page="topic" name=${each.topic} /></th><td>${way}</td><td>${each.type}</td><td>${Object.entries(each.contract || {}).map(([key, value]) => `${key} ${value}`).join(", ") || "–"}</td></tr>`))}<//><//>
   </div><//>`;
 }
+
+// A parameter's value; with the right to, it can be changed.
+function Setting({ value, about, set }) {
+  const [draft, setDraft] = useState(null);
+  const written = typeof value === "string" ? value : JSON.stringify(value);
+  if (!set) return html`${written} ${about.unit}`;
+  if (draft === null) return html`<button type="button" class="field" aria-label=${`Change ${about.name}, now ${written}`} onClick=${() => setDraft(written)}>${written || "–"} ${about.unit}</button>`;
+  const save = (event) => { event.preventDefault(); set(typed(draft, about.type)); setDraft(null); };
+  return html`<form class="row" onSubmit=${save}><label><span class="unseen">${about.name}</span><input autofocus value=${draft} onInput=${(event) => setDraft(event.target.value)} onKeyDown=${(event) => event.key === "Escape" && setDraft(null)} /></label><button class="primary">Set</button></form>`;
+}
+
+const typed = (text, type) => (type === "str" ? text : type === "bool" ? text.trim() === "true" : Number(text));
 
 // "0.000797688 m/s²" with four digits.
 function quantity(text) {

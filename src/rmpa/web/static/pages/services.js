@@ -14,7 +14,8 @@ export function Services({ state }) {
   const shown = all.filter(([name, one]) => `${name} ${one.type || ""}`.toLowerCase().includes(text.toLowerCase()));
   return html`<${Page} title="Services" kind=${`${all.length} in all modules`}>
     <input class="filter" type="search" placeholder="Filter by name or type" aria-label="Filter by name or type" value=${text} onInput=${(event) => setText(event.target.value)} />
-    <${Panel}><${Table} caption="Services" columns=${["Service", "Module", "Node", "Type", "State", "#Calls", "#Failed"]} empty="No service is like that.">${shown.slice(0, 300).map(([key, one]) => html`<${Row} key=${key} name=${key} service=${one} own=${section(state, "agent").name} />`)}<//><//><//>`;
+    <${Panel}><${Table} caption="Services" columns=${["Service", "Module", "Node", "Type", "State", "#Calls", "#Failed"]} empty="No service is like that.">${shown.slice(0, 300).map(([key, one]) => html`<${Row} key=${key} name=${key} service=${one} own=${section(state, "agent").name} />`)}<//>
+    ${shown.length > 300 && html`<p class="empty">${shown.length - 300} more: filter by name.</p>`}<//><//>`;
 }
 
 export function ServicePage({ name, state, connection }) {
@@ -44,6 +45,6 @@ function Call({ connection, service, about }) {
   };
   return html`<div class="grid"><div><h3>${about.type}</h3><pre class="tree">${about.text}</pre></div>
     <form class="form" onSubmit=${call}><label>Request as JSON<textarea spellcheck="false" value=${text} onInput=${(event) => setText(event.target.value)} disabled=${!allowed}></textarea></label>
-    <div class="row"><button class="primary" disabled=${!allowed || state.waits}>${state.waits ? "Waiting for the response …" : "Call it"}</button>${!allowed && html`<span class="muted">This page may only look.</span>`}</div>
+    <div class="row"><button class="primary" disabled=${!allowed || state.waits}>${state.waits ? "Waiting for the response …" : "Call it"}</button>${!allowed && html`<span class="muted">This page may only look: start rmpa web with --control.</span>`}</div>
     <div aria-live="polite"><${Failure} failure=${state.failure} />${state.answer && html`<p class="muted">Response after ${seconds(state.answer.seconds)}</p><pre class="tree">${JSON.stringify(state.answer.response, null, 2)}</pre>`}</div></form></div>`;
 }

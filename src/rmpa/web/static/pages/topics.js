@@ -33,8 +33,9 @@ export function Topics({ state }) {
     ${(shown.length > MOST || hidden) && html`<p class="empty">${shown.length > MOST ? `${shown.length - MOST} more: filter by name. ` : ""}${hidden ? `The server leaves out ${hidden} further topics.` : ""}</p>`}<//><//>`;
 }
 
-const FIGURES = [["rate", "Rate", hertz], ["latency", "Latency", seconds], ["jitter", "Jitter", seconds], ["bandwidth", "Bytes", bandwidth]];
-const figureOf = (route, key) => (key === "latency" ? section(route, "latency").p50 : route[key]);
+const FIGURES = [["rate", "Rate", hertz], ["p50", "Latency, median", seconds], ["p99", "Latency, 99th percentile", seconds], ["jitter", "Jitter", seconds], ["bandwidth", "Bytes", bandwidth], ["lost", "Lost", count]];
+const LOSSES = ["lost", "expired", "dropped", "oversized", "late"];
+const figureOf = (route, key) => (key === "p50" || key === "p99" ? section(route, "latency")[key] : key === "lost" ? LOSSES.reduce((sum, each) => sum + (route[each] || 0), 0) : route[key]);
 
 export function TopicPage({ name, state, connection }) {
   const [figure, setFigure] = useState("rate");
@@ -66,11 +67,20 @@ const Route = memo(({ route, own }) => {
     <td>${route.state}${route.problem && html`<div class="muted">${route.problem}</div>`}</td><td class="number">${hertz(route.rate)}<div class="muted">${bandwidth(route.bandwidth)}</div></td><td class="number">${seconds(route.jitter)}</td>
     <td class="number">${seconds(latency.p50)}, ${seconds(latency.p99)}<div class="muted">± ${seconds(latency.error)}</div></td>
     <td class="number">${count((route.lost || 0) + (route.expired || 0))}</td><td class="number">${count((route.dropped || 0) + (route.oversized || 0))}</td>
-    <td>${route.transport || "–"}${route.lane && html`<div class="muted">${route.lane} lane</div>`}${route.condition_text && html`<div class="muted">${route.condition_text}</div>`}</td><td>${contract || "default"}</td></tr>`;
+    <td>${route.transport || "–"}${route.lane && html`<div class="muted">${route.lane} lane</div>`}${route.condition_text && html`<div class="muted">${route.condition_text}</div>`}</td><td>${contract || "default"}${Object.entries(route.events || {}).map(([kind, times]) => html`<div class="muted" key=${kind}>${kind.replaceAll("_", " ")}: ${count(times)}</div>`)}</td></tr>
+    ${(route.subscribers || []).map((one) => html`<${Subscriber} key=${one.node} one=${one} />`)}`;
 });
+
+// A subscriber of a route where its transport is known: direct ones do not pass the agents, and their nodes tell the figures.
+const Subscriber = ({ one }) => {
+  const figures = section(one, "figures");
+  const said = [one.condition && one.text, one.stuck && `cannot be moved: ${one.stuck}`, one.unmeasured, one.missed && `${count(one.missed)} missed while it was moved`].filter(Boolean).join("; ");
+  return html`<tr><th scope="row" class="inner"><span class="mono">→ ${one.node}</span></th><td>${one.state}${said && html`<div class="muted">${said}</div>`}</td><td class="number">${hertz(figures.rate)}<div class="muted">${bandwidth(figures.bandwidth)}</div></td>
+    <td class="number">–</td><td class="number">–</td><td class="number">–</td><td class="number">${figures.dropped === undefined ? "–" : count(figures.dropped)}</td><td>${one.transport || "–"}${one.endpoint && html`<div class="muted">${one.endpoint}</div>`}</td><td>${one.wanted || ""}</td></tr>`;
+};
 
 const Events = ({ routes }) => {
   const events = routes.flatMap(([, route]) => (route.recent || []).map((event) => ({ ...event, from: `${route.peer} ${route.node}` })));
-  return events.length > 0 && html`<${Panel} title="Events of its contract" wide><${Table} caption="Events" columns=${["Time", "Event", "Source", "Text"]}>${events.sort((a, b) => a.ago - b.ago).map((event) => html`<tr key=${event.from + event.ago}><th scope="row">${clock(Date.now() / 1000 - event.ago)}</th><td>${event.kind.replaceAll("_", " ")}</td><td>${event.from}</td><td>${event.text}</td></tr>`)}<//><//>`;
+  return events.length > 0 && html`<${Panel} title="Events of its contract" wide><${Table} caption="Events" columns=${["Time", "Event", "Source", "Text"]}>${events.sort((a, b) => b.at - a.at).map((event) => html`<tr key=${event.from + event.kind + event.at}><th scope="row">${clock(event.at)}</th><td>${event.kind.replaceAll("_", " ")}</td><td>${event.from}</td><td>${event.text}</td></tr>`)}<//><//>`;
 };
 
