@@ -197,7 +197,7 @@ async def test_parameters_are_read_and_set(core: RosCore) -> None:
     async with page_of(core) as (page, _):
         assert (await page.ask(1, "set_param", peer="", name="/speed", value=0.4))["value"]["values"]["speed"] == 0.4
         assert core.call("getParam", "/test", "/speed").value == 0.4
-        assert (await page.ask(2, "delete_param", peer="", name="/speed"))["value"]["values"] == {}
+        assert "speed" not in (await page.ask(2, "delete_param", peer="", name="/speed"))["value"]["values"]
         assert "cannot be null" in (await page.ask(3, "set_param", peer="", name="/speed", value=None))["error"]
         assert "no agent" in (await page.ask(4, "params", peer="arm"))["error"]
 

@@ -7,6 +7,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from rmpa.core.errors import RmpaError
+from rmpa.ros.types.definitions import parse_definition
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.types.service_types import ServiceType
 from rmpa.web.hub.requests import (
@@ -34,11 +35,13 @@ from rmpa.web.hub.requests import (
     Unadvertise,
     Unsubscribe,
 )
-from rmpa.web.hub.rights import READ_ONLY
+from rmpa.web.hub.rights import CONTROL_REMEDY, FULL, READ_ONLY, READ_REMEDY
 from tests.ros.node.peers import DEADLINE, LATCHED, STRING, until
 from tests.web.hub.client import FakeClient, node, running_hub
 
 if TYPE_CHECKING:
+    import pytest
+
     from rmpa.ros.core.embedded import RosCore
 
 ONE, TWO = b"\x03\0\0\0one", b"\x03\0\0\0two"
@@ -111,6 +114,53 @@ async def test_a_latched_message_that_comes_again_after_a_reconnection_is_not_de
         publisher.publish_raw(TWO)  # the same again, over the same connection, is news
         await until(lambda: len(client.payloads(1)) == 3)
         assert client.payloads(1) == [ONE, TWO, TWO]
+
+
+async def test_a_client_that_fails_costs_the_others_no_message(core: RosCore) -> None:
+    async with running_hub(core) as hub, node(core, "a") as a:
+        publisher = await a.advertise("/t", STRING)
+
+        def fail(_answer: Any) -> None:
+            raise ValueError("a fault of a session")
+
+        broken = hub.connect("broken", FULL, fail)
+        hub.ask(broken, Subscribe(1, "/t"))
+        client = FakeClient(hub)
+        client.ask(Subscribe(1, "/t"))
+        await publisher.wait_for_subscriber()
+        publisher.publish_raw(ONE)
+        await until(lambda: client.payloads(1) == [ONE])
+        hub.disconnect(broken)
+
+
+async def test_what_is_published_while_the_node_is_made_anew_is_sent_then(
+    core: RosCore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rmpa.web.limits.NODE_RETRY", 0.05)
+    async with running_hub(core) as hub, node(core, "base") as base:
+        heard: list[bytes] = []
+        await base.subscribe("/cmd_vel", callback=lambda message: heard.append(message.raw))
+        client = FakeClient(hub)
+        client.ask(Advertise(1, "/cmd_vel", "std_msgs/String"))
+        client.ask(Publish(1, ONE))
+        await until(lambda: heard == [ONE])
+        present = hub.link.node
+        assert present is not None
+        await present.close()
+        await until(lambda: hub.link.node is None or hub.link.node is not present)
+        client.ask(Publish(1, TWO))  # such as the stop of a robot
+        await until(lambda: heard[-1] == TWO)
+
+
+async def test_two_versions_of_a_type_are_kept_apart(core: RosCore) -> None:
+    async with running_hub(core) as hub:
+        for text in ("float64 a", "int32 b"):
+            kind = MessageType("my_msgs/Pair", parse_definition("my_msgs/Pair", text))
+            header = {"type": kind.name, "md5sum": kind.md5sum, "message_definition": kind.definition}
+            hub.types.learn(header)
+            assert hub.types.version(kind.name, kind.md5sum).definition == kind.definition
+        first = MessageType("my_msgs/Pair", parse_definition("my_msgs/Pair", "float64 a"))
+        assert hub.types.version(first.name, first.md5sum).md5sum == first.md5sum
 
 
 async def test_a_publisher_that_has_gone_leaves_no_latched_message(core: RosCore) -> None:
@@ -353,7 +403,7 @@ async def test_clock_gives_the_time_where_the_parameter_says_so(core: RosCore) -
         await until(lambda: hub.time.now_ns() > 10**18)
 
 
-# --- roles ---
+# --- rights ---
 
 
 async def test_a_read_only_client_changes_nothing(core: RosCore) -> None:
@@ -372,6 +422,7 @@ async def test_a_read_only_client_changes_nothing(core: RosCore) -> None:
             client.ask(request)
             failed = client.of(type(await client.failure(request.handle)), request.handle)[0]
             assert "may not" in failed.error
-            assert failed.remedy == "ask for a role that may"
+            reads = isinstance(request, GetParams | FollowParams)
+            assert failed.remedy == (READ_REMEDY if reads else CONTROL_REMEDY)
         client.ask(Publish(1, ONE))
         assert not core.publishers("/t")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from typing import Any
 
 import pytest
@@ -32,7 +33,7 @@ def test_a_value_with_many_parts_is_bounded() -> None:
     ("path", "number"),
     [
         ("pose.x", 1.5), ("axes.1", -1.0), ("axes[1]", -1.0), ("axes[9]", None), ("on", 1.0), ("name", None),
-        ("stamp", 2.5), ("pose", None), ("pose.y.z", None), ("axes.x", None),
+        ("stamp", 2.5), ("axes.²", None), ("pose", None), ("pose.y.z", None), ("axes.x", None),
     ],
 )  # fmt: skip
 def test_a_number_is_found_by_its_path(path: str, number: float | None) -> None:
@@ -92,7 +93,7 @@ def test_a_large_image_is_thinned() -> None:
         (2, 2, "rgb8", 6, 11),
         (2, 2, "rgb8", 5, 99),
         (0, 2, "mono8", 0, 0),
-        (2, 2, "32FC1", 8, 16),
+        (2, 2, "bayer_rggb8", 8, 16),
         (9**9, 9**9, "mono8", 9**9, 10),
     ],
 )
@@ -108,3 +109,24 @@ def test_a_compressed_image_is_passed_on_as_it_is() -> None:
     assert frame[IMAGE_HEADER.size :] == jpeg
     with pytest.raises(RemoteProtocolError, match="neither JPEG nor PNG"):
         compressed_picture("tiff", b"II*\0")
+
+
+def test_an_integer_that_a_browser_would_round_is_sent_as_text() -> None:
+    assert cut({"id": 2**53 + 1, "small": 2**53}) == {"id": str(2**53 + 1), "small": 2**53}
+
+
+@pytest.mark.parametrize(
+    ("encoding", "letter", "nothing"), [("16UC1", "H", 0), ("mono16", "H", 0), ("32FC1", "f", float("nan"))]
+)
+def test_a_depth_image_is_shown_from_near_to_far(encoding: str, letter: str, nothing: float) -> None:
+    rows: list[list[float]] = [[nothing, 1000, 2000], [3000, 1000, 3000]]
+    packed = [struct.pack(f"<3{letter}", *row) for row in rows]
+    step = len(packed[0]) + 4
+    picture = raw_picture(3, 2, encoding, step, b"".join(row + b"pad!" for row in packed))
+    assert (picture.format, picture.width, picture.height) == ("mono8", 3, 2)
+    assert list(picture.data) == [0, 1, 128, 255, 1, 255]
+
+
+def test_a_depth_image_that_is_too_short_is_refused() -> None:
+    with pytest.raises(RemoteProtocolError):
+        raw_picture(10, 10, "16UC1", 20, bytes(199))

@@ -28,6 +28,7 @@ class Page:
         self.unsent = 0
         self.details: Any = {("topic", "/odom"): {"rate": 50.0}}
         self.decoded = 0
+        self.ticks = 0
         self.session = MonitorSession(
             lambda kind, name: self.details.get((kind, name)), self._decode, rights, self.now, lambda: self.unsent
         )
@@ -48,6 +49,9 @@ class Page:
                 self.others.append(output)
                 continue
             message = json.loads(output)
+            if message["op"] == "tick":
+                self.ticks += 1
+                continue
             new.append(message)
             if message["op"] == "state":
                 self.state = message["state"]
@@ -56,6 +60,12 @@ class Page:
             self.number = message.get("n", self.number)
         self.frames += new
         return new
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing but the next sign of life is due."""
+        due = self.session.next_timer()
+        return due is not None and due == self.session._tick
 
     def send(self, op: str, **args: Any) -> list[Any]:
         return self.take(self.session.receive(json.dumps({"op": op, **args}), self.now))
@@ -96,10 +106,10 @@ def test_patches_keep_their_distance_and_the_last_change_is_not_lost() -> None:
         page.update(a=value)
         page.send("ack", n=page.number)
     assert len(page.frames) <= 5
-    assert page.session.next_timer() is not None
+    assert not page.idle
     page.after(limits.PATCH_PERIOD)
     assert page.state["a"] == 49
-    assert page.session.next_timer() is None
+    assert page.idle
 
 
 def test_a_page_that_does_not_acknowledge_gets_no_more_and_catches_up_with_one_patch() -> None:
@@ -108,7 +118,7 @@ def test_a_page_that_does_not_acknowledge_gets_no_more_and_catches_up_with_one_p
         page.now += 1
         page.update(a=value)
     assert len(page.frames) == limits.UNACKNOWLEDGED_MAX
-    assert page.session.next_timer() is None
+    assert page.idle
     assert len(page.send("ack", n=page.number)) == 1
     assert page.state["a"] == 19
 
@@ -175,7 +185,7 @@ def test_unwatching_ends_the_subscription() -> None:
 
 def test_watches_and_questions_are_bounded() -> None:
     page = Page()
-    for number in range(limits.WATCHES_MAX + 1):
+    for number in range(1, limits.WATCHES_MAX + 2):
         page.send("watch", id=number, topic="/odom", how="value")
     assert "watched already" in page.frames[-1]["error"]
     for number in range(100, 101 + limits.ASKS_MAX):
@@ -282,3 +292,46 @@ def test_the_log_is_left_out_for_a_slow_page() -> None:
 def test_the_first_message_says_what_the_page_may_do() -> None:
     page = Page(Rights(call_services=True))
     assert page.take(page.session.open("pc"))[0]["may"] == ["call"]
+
+
+def test_a_page_gets_signs_of_life_while_nothing_changes() -> None:
+    page = Page()
+    page.update(a=1)
+    for _ in range(3):
+        due = page.session.next_timer()
+        assert due is not None
+        page.now = due
+        page.after(0)
+    assert page.ticks == 3
+    assert len(page.frames) == 1
+
+
+def test_a_page_that_takes_nothing_costs_no_processor_time() -> None:
+    page = Page()
+    page.send("watch", id=1, topic="/odom", how="value", rate=10)
+    page.unsent = 1000
+    page.message(1, 5)
+    page.after(1)
+    due = page.session.next_timer()
+    assert due is not None
+    assert due >= page.now + limits.UNSENT_RETRY
+    page.unsent = 0
+    assert page.after(limits.UNSENT_RETRY)[0]["op"] == "value"
+
+
+@pytest.mark.parametrize("id_", [0, -1, 2**32])
+def test_an_id_that_no_picture_can_carry_closes_the_connection(id_: int) -> None:
+    page = Page()
+    page.send("watch", id=id_, topic="/image", how="image")
+    assert isinstance(page.others[-1], Close)
+
+
+def test_a_robot_is_stopped_while_the_page_takes_nothing() -> None:
+    page = Page()
+    page.send("drive", topic="/cmd_vel", linear=1, angular=0)
+    page.unsent = 10_000_000
+    due = page.session.next_timer()
+    assert due is not None
+    assert due <= page.now + limits.DRIVE_TIMEOUT
+    page.after(limits.DRIVE_TIMEOUT)
+    assert page.others[-1] == Speed("/cmd_vel", 0.0, 0.0)

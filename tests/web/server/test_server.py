@@ -31,11 +31,11 @@ TOKEN = "secret-" * 6
 class Site:
     """The server under test, its agent, and a client."""
 
-    def __init__(self, token: str = "") -> None:
+    def __init__(self, token: str = "", origins: frozenset[str] = frozenset()) -> None:
         self.up = True
         self.now = 0.0
         watch = AgentWatch(self._read, self._later)
-        self.server = WebServer(watch, AccessPolicy(0, own_names(("base",)), token), "127.0.0.1")
+        self.server = WebServer(watch, AccessPolicy(0, own_names(("base",)), token, origins), "127.0.0.1")
 
     def _read(self) -> Snapshot:
         if not self.up:
@@ -84,8 +84,8 @@ async def response(reader: asyncio.StreamReader) -> tuple[int, dict[str, str], b
 
 
 @asynccontextmanager
-async def running(token: str = "") -> AsyncIterator[Site]:
-    site = Site(token)
+async def running(token: str = "", origins: frozenset[str] = frozenset()) -> AsyncIterator[Site]:
+    site = Site(token, origins)
     await site.server.start()
     try:
         yield site

@@ -127,6 +127,10 @@ class Gateways:
         except PeerRefused as error:
             _log.warning("! %s: %s", connection.address, error)
             return web.Response(status=503, text=f"{error}\n")
+        except Exception:
+            if not response.prepared:
+                raise
+            _log.exception("! serving %s failed", connection.address)  # a response in HTTP cannot be sent any more
         finally:
             del self._open[connection]
             self._sent[connection.kind] += connection.sent

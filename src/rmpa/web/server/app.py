@@ -18,7 +18,7 @@ from rmpa.core.counters import Counters, RefusalLog
 from rmpa.web import limits, rest
 from rmpa.web.gateways.gateways import MONITOR_PATH, is_upgrade
 from rmpa.web.metrics import content_type, exposition
-from rmpa.web.server.auth import TOKEN_PARAMETER, AccessPolicy, MoveToken, Refused, RequestFacts
+from rmpa.web.server.auth import TOKEN_PARAMETER, AccessPolicy, MoveToken, Preflight, Refused, RequestFacts
 from rmpa.web.server.connections import GuardedConnection
 from rmpa.web.server.figures import Figures, web_metrics
 
@@ -52,6 +52,13 @@ HEADERS: Final = {
     "Server": "rmpa",
 }
 """Of every response."""
+PREFLIGHT: Final = {
+    "Access-Control-Allow-Methods": ", ".join(_METHODS),
+    "Access-Control-Allow-Headers": "Authorization",
+    "Access-Control-Max-Age": "600",
+}
+"""Of the response to a browser's question what a page of a listed site may send (Fetch standard, "CORS protocol").
+Cookies are not allowed: such a page sends the token itself."""
 
 
 class Routes:
@@ -116,6 +123,7 @@ class Routes:
                     connection.request_ends()
             if not response.prepared:
                 response.headers.update(HEADERS)
+                response.headers.update(self._sharing(request))
             return response
 
         return middleware
@@ -124,11 +132,13 @@ class Routes:
         verdict = self._policy.judge(self._facts(request))
         if isinstance(verdict, Refused):
             return self._refused(request, verdict.reason, rest.problem(verdict.status, verdict.detail))
-        if request.method not in _METHODS:
+        if request.method not in _METHODS and not isinstance(verdict, Preflight):
             text = f"{request.method[:20]} is not supported; this server only shows, and is read with GET"
             return self._refused(request, "method", rest.problem(405, text, (("Allow", ", ".join(_METHODS)),)))
         if request.body_exists:
             return self._refused(request, "body", rest.problem(413, "a request with a body; send none with GET"))
+        if isinstance(verdict, Preflight):
+            return web.Response(status=204, headers=PREFLIGHT)
         if isinstance(verdict, MoveToken):
             return self._move_token(request)
         if self._gateways is not None and is_upgrade(request) and request.path in WEBSOCKET_PATHS:
@@ -154,7 +164,18 @@ class Routes:
             token=request.query.get(TOKEN_PARAMETER),
             is_page=page is not None and page.is_html,
             is_open=request.path in _OPEN,
+            is_preflight=request.method == "OPTIONS"
+            and "Access-Control-Request-Method" in headers
+            and request.path not in self._pages,
         )
+
+    def _sharing(self, request: web.Request) -> dict[str, str]:
+        """Headers that let pages of listed sites read a response; those of the pages' own files are not shared."""
+        if not self._policy.origins or request.path in self._pages:
+            return {}
+        origin = request.headers.get("Origin")
+        allowed = {"Access-Control-Allow-Origin": origin} if origin is not None and self._policy.lists(origin) else {}
+        return {"Vary": "Origin", **allowed}
 
     def _refused(self, request: web.Request, reason: str, problem: rest.Response) -> web.Response:
         address = request.remote or "?"

@@ -75,10 +75,15 @@ class ResourceWatch:
         self._paths: dict[str, _Path] = {}
         self._wanted = False
         self._since: dict[str, tuple[str, float]] = {}
-        self.facts: dict[str, ResourceFacts] = {}
-        """By ``ResourceFacts.key``."""
+        self._heard: dict[str, ResourceFacts] = {}
+        """By key, those included whose descriptor has not come yet."""
         self.history: deque[dict[str, Any]] = deque(maxlen=limits.ALARMS_KEPT)
         """Alarms since the server started, oldest first: ``at``, ``level``, ``resource``, ``text``."""
+
+    @property
+    def facts(self) -> dict[str, ResourceFacts]:
+        """The resources, by ``ResourceFacts.key``."""
+        return {key: facts for key, facts in self._heard.items() if facts.descriptor}
 
     def start(self) -> None:
         """Begin to follow the graph."""
@@ -149,9 +154,9 @@ class ResourceWatch:
             self._unsubscribe(path, there)
         there.publishers = publishers
         peers = {_peer_of(node) for node in publishers}
-        for key, facts in [*self.facts.items()]:
+        for key, facts in [*self._heard.items()]:
             if facts.name == path and facts.peer not in peers:
-                del self.facts[key]
+                del self._heard[key]
                 self._since.pop(key, None)
 
     def _follow_all(self) -> None:
@@ -183,8 +188,8 @@ class ResourceWatch:
 
     def _forget(self, name: str) -> None:
         self._unsubscribe(name, self._paths.pop(name))
-        for key in [key for key, facts in self.facts.items() if facts.name == name]:
-            del self.facts[key]
+        for key in [key for key, facts in self._heard.items() if facts.name == name]:
+            del self._heard[key]
             self._since.pop(key, None)
 
     def _take(self, name: str, topic: str, message: Received) -> None:
@@ -192,14 +197,13 @@ class ResourceWatch:
         key = f"{peer}:{name}" if peer else name
         try:
             values = self._values.of(message)
+            facts = self._heard.get(key) or ResourceFacts(name=name, peer=peer)
             if topic == DESCRIPTOR:
-                known = self.facts.get(key) or ResourceFacts(name=name, peer=peer)
-                self.facts[key] = msgspec.structs.replace(known, **_described(values["data"]))
+                self._heard[key] = msgspec.structs.replace(facts, **_described(values["data"]))
             elif topic == "alarms":
                 self._alarm(key, values)
-            elif key in self.facts:
-                facts = self.facts[key]
-                self.facts[key] = msgspec.structs.replace(facts, **_said(facts, topic, values))
+            else:  # latched ones may come before the descriptor
+                self._heard[key] = msgspec.structs.replace(facts, **_said(facts, topic, values))
         except (RmpaError, msgspec.DecodeError, KeyError, TypeError, RecursionError):
             return  # another program's topic of that name
 
