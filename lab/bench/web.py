@@ -216,7 +216,7 @@ def _calls(run: _Run) -> None:
     for _ in range(run.plan.rounds):
         run.each("service calls", _rosbridge(run), turn)
     table = table_of(
-        "roscpp/GetLoggers of a roscpp node through rosbridge, ms", ("server",), ("p50", "p99", "max", "calls")
+        "std_srvs/SetBool of a roscpp node through rosbridge, ms", ("server",), ("p50", "p99", "max", "calls")
     )
     rows = {}
     for server in [server for server in _rosbridge(run) if server.key in took]:

@@ -83,8 +83,8 @@ def call_times(server: WebServer, calls: int) -> list[float]:
     """Milliseconds of calls of one service through rosbridge, one after the other."""
     with RosbridgeClient(server.port, server.path) as client:
         for _ in range(_WARM_UP):
-            client.call(server.service)
-        return [client.call(server.service)[0] for _ in range(calls)]
+            client.call(server.service, {"data": True})
+        return [client.call(server.service, {"data": True})[0] for _ in range(calls)]
 
 
 def rosapi_times(server: WebServer, calls: int) -> dict[str, list[float]]:

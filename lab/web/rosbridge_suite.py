@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 VARIABLE: Final = "RMPA_ROSBRIDGE_SUITE"
 _BRANCHES: Final = ("ros1", "origin/ros1")
-_LIBRARIES: Final = ("autobahn", "pillow", "pymongo", "tornado", "twisted")
-"""What the package.xml files name beside ROS."""
+_LIBRARIES: Final = ("autobahn", "pillow", "pymongo", "tornado", "twisted[tls]")
+"""What the package.xml files name beside ROS. The server imports twisted.internet.ssl with or without certificates."""
 _PACKAGES: Final = ("rosapi", "rosbridge_library", "rosbridge_msgs", "rosbridge_server")
 _GENERATED: Final = ("rosapi", "rosbridge_msgs")
 """Those with messages or services that the servers need."""
@@ -164,6 +164,6 @@ def _versions(folder: Path) -> dict[str, str]:
     found = {}
     for path in folder.glob("*.dist-info"):
         name, _, version = path.name.removesuffix(".dist-info").partition("-")
-        if name.lower() in _LIBRARIES:
+        if name.lower() in {library.partition("[")[0] for library in _LIBRARIES}:
             found[name.lower()] = version
     return dict(sorted(found.items()))

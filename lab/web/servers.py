@@ -33,7 +33,7 @@ _URL_WITHIN: Final = 30.0
 
 @dataclass(frozen=True, slots=True)
 class WebServer:
-    """One server, and a publisher that it serves.
+    """One server, and a publisher and a service that it serves.
 
     Args:
         key: For results.
@@ -65,8 +65,8 @@ class WebServer:
 
     @property
     def service(self) -> str:
-        """A service of its publisher: roscpp's own, roscpp/GetLoggers."""
-        return f"/{self.topic.strip('/')}_source/get_loggers"
+        """A std_srvs/SetBool of a roscpp node (``lab/nodes/switch.cpp``)."""
+        return f"{self.topic}/switch"
 
 
 def program(module: str, *words: str) -> Process:
@@ -150,6 +150,7 @@ def start_suite(bed: Bed, suite: RosbridgeSuite) -> WebServer:
 
 def _source(ros: Ros, topic: str) -> Process:
     name = f"{topic.strip('/')}_source"
+    ros.roscpp("switch", name=f"{name}_switch", service=f"{topic}/switch").wait_event("up")
     source = ros.roscpp("source", name=name, topic=topic, queue=_QUEUE, commands=True)
     source.wait_event("up")
     return source

