@@ -42,6 +42,8 @@ _BUDGET: Final = 20.0
 _WARM_UP: Final = 3
 _CROWD_WITHIN: Final = 120.0
 _SEEN_WITHIN: Final = 10.0
+_POLL: Final = 0.01
+"""Seconds between two questions: answers with thousands of topics must not be all that the server does."""
 _PAUSES: Final = (0.31, 0.44, 0.53, 0.67)
 """Seconds between two new topics: at any moment between two looks of a server."""
 
@@ -129,6 +131,7 @@ def seen_by_rosapi(server: WebServer, crowd: Crowd, changes: int) -> list[float]
             while topic not in client.call("/rosapi/topics")[1]["topics"]:
                 if time.monotonic() > deadline:
                     raise BedError(f"{server.title}: rosapi does not list {topic}")
+                time.sleep(_POLL)
             seen = time.monotonic_ns()
             delays.append(max(0.0, (seen - crowd.registered_ns()) / 1e6))
     return delays
