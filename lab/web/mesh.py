@@ -197,7 +197,7 @@ class ControlProxy(socketserver.ThreadingUnixStreamServer):
     def __init__(self, path: Path, agent: Path, mesh: Mesh) -> None:
         self.agent = agent
         self.snapshot = b""
-        """The newest reply, made beforehand: a real agent needs a millisecond for it, this program ten times as much."""
+        """The newest reply, made beforehand: a real agent needs a millisecond for it, this program ten."""
         self._mesh = mesh
         self._make()
         threading.Thread(target=self._keep_fresh, name="snapshots", daemon=True).start()

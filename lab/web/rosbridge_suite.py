@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 VARIABLE: Final = "RMPA_ROSBRIDGE_SUITE"
 _BRANCHES: Final = ("ros1", "origin/ros1")
 _LIBRARIES: Final = ("autobahn", "pillow", "pymongo", "tornado", "twisted[tls]")
-"""What the package.xml files name beside ROS. The server imports twisted.internet.ssl with or without certificates."""
+"""What the package.xml files name beside ROS. The server imports twisted.internet.ssl, with certificates or not."""
 _PACKAGES: Final = ("rosapi", "rosbridge_library", "rosbridge_msgs", "rosbridge_server")
 _GENERATED: Final = ("rosapi", "rosbridge_msgs")
 """Those with messages or services that the servers need."""
