@@ -261,10 +261,11 @@ class Supervisor:
         self._over.set()
         if self._server is not None:
             self._server.close()
-        # The pc's node first: it prints the summary, of all four.
-        for child in self._modules["pc"].children[1:]:
+        # The pc's node first: it prints the summary, of all four. The page leaves the pc's core while that is there.
+        first = [*self._modules["pc"].children[1:], *([self._page.child] if self._page.child else [])]
+        for child in first:
             child.send(signal.SIGTERM)
-            await child.ended(FAREWELL)
+        await asyncio.gather(*(child.ended(FAREWELL) for child in first))
         children = self._children()
         for child in children:
             child.send(signal.SIGTERM)

@@ -108,7 +108,7 @@ def status_of(url: str) -> int:
 
 
 def test_the_paper_s_set_up_runs_and_leaves_nothing(tidy: dict[str, str]) -> None:
-    with Process([sys.executable, DEMO, "--seconds", "16", "--json"], env=tidy, name="demo") as demo:
+    with Process([sys.executable, DEMO, "--seconds", "24", "--json"], env=tidy, name="demo") as demo:
         wait_for_view(demo, lambda view: all_linked(view) and flows(view), "messages of all four modules")
         processes = family(demo)
         ports = open_ports(processes)

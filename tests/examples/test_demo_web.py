@@ -96,7 +96,7 @@ def test_another_port_is_taken_where_8480_is_in_use(tidy: dict[str, str]) -> Non
             other.listen()
         with Process([sys.executable, DEMO, "--seconds", "0.1"], env=tidy, name="demo") as demo:
             assert demo.wait(60) == 0, demo.output
-    told = re.match(r"In a browser: http://127\.0\.0\.1:(\d+)/\?token=[\w-]+\n", demo.output)
+    told = re.fullmatch(r"In a browser: http://127\.0\.0\.1:(\d+)/\?token=[\w-]+", demo.output.splitlines()[0])
     assert told, demo.output
     assert int(told[1]) != 8480
 

@@ -191,7 +191,9 @@ class Routes:
         query = {name: value for name, value in request.query.items() if name != TOKEN_PARAMETER}
         response = web.Response(status=303, headers={"Location": str(request.rel_url.with_query(query))})
         token = request.query[TOKEN_PARAMETER]
-        response.set_cookie(self._policy.cookie, token, httponly=True, samesite="Strict", path="/")
+        response.set_cookie(
+            self._policy.cookie, token, httponly=True, secure=request.secure, samesite="Strict", path="/"
+        )
         return response
 
     # --- the paths ---

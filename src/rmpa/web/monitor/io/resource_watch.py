@@ -78,7 +78,8 @@ class ResourceWatch:
         self._heard: dict[str, ResourceFacts] = {}
         """By key, those included whose descriptor has not come yet."""
         self.history: deque[dict[str, Any]] = deque(maxlen=limits.ALARMS_KEPT)
-        """Alarms since the server started, oldest first: ``at``, ``level``, ``resource``, ``text``."""
+        """Alarms and changes of links since the server started, oldest first: ``at``, ``level``, ``text``, and the
+        key of a ``resource`` or the name of a ``module``."""
 
     @property
     def facts(self) -> dict[str, ResourceFacts]:
@@ -127,6 +128,10 @@ class ResourceWatch:
                     "at": round(before[1], 1),
                 })  # fmt: skip
         return standing
+
+    def record(self, level: str, text: str, **whose: str) -> None:
+        """Add to the history: of a ``resource``, by its key, or of a ``module``, by its name."""
+        self.history.append({"at": round(self._now(), 3), "level": level, "text": text, **whose})
 
     # --- inside -----------------------------------------------------------------------------------------------
 
@@ -210,9 +215,7 @@ class ResourceWatch:
     def _alarm(self, key: str, values: Any) -> None:
         for status in map(_status, values["status"]):
             self._since[key] = status["level"], self._now()
-            self.history.append(
-                {"at": round(self._now(), 3), "level": status["level"], "resource": key, "text": status["message"]}
-            )
+            self.record(status["level"], status["message"], resource=key)
 
 
 def _described(text: str) -> dict[str, Any]:
