@@ -33,10 +33,18 @@ class Child:
         """The last lines that it wrote to its standard error."""
         self.ours = False
         """Whether we ended it; else its end is news."""
+        self._listening: list[asyncio.Task[None]] = []
 
     @classmethod
     async def start(
-        cls, name: str, argv: Sequence[str], env: Mapping[str, str], heard: Callable[[str], None], *, piped: bool
+        cls,
+        name: str,
+        argv: Sequence[str],
+        env: Mapping[str, str],
+        heard: Callable[[str], None],
+        *,
+        piped: bool,
+        said: Callable[[str], None] | None = None,
     ) -> Child:
         """Start it; ``heard`` is called with each line of its standard error.
 
@@ -46,22 +54,24 @@ class Child:
             env: All of its variables.
             heard: Told its standard error, line by line.
             piped: Whether it reads from us, and writes to our standard output.
+            said: Told its standard output, line by line, which is thrown away otherwise.
         """
         us = os.getpid()
+        unheard = asyncio.subprocess.DEVNULL if said is None else asyncio.subprocess.PIPE
         process = await asyncio.create_subprocess_exec(
             *argv,
             env=env,
             stdin=asyncio.subprocess.PIPE if piped else asyncio.subprocess.DEVNULL,
-            stdout=None if piped else asyncio.subprocess.DEVNULL,
+            stdout=None if piped else unheard,
             stderr=asyncio.subprocess.PIPE,
             process_group=0,
             preexec_fn=lambda: _die_with(us),
         )
         child = cls(name, process)
-        child._listening = asyncio.create_task(child._listen(heard), name=f"listen to {name}")
+        for stream, told in ((process.stderr, child._hear(heard)), (process.stdout, said)):
+            if stream is not None and told is not None:
+                child._listening.append(asyncio.create_task(_listen(stream, told), name=f"listen to {name}"))
         return child
-
-    _listening: asyncio.Task[None]
 
     @property
     def pid(self) -> int:
@@ -112,21 +122,26 @@ class Child:
         """Wait for its end, at most so many seconds; its exit status, or ``None`` while it runs."""
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self.process.wait(), within)
-            await self._listening
+            await asyncio.gather(*self._listening)
         return self.process.returncode
 
-    async def _listen(self, heard: Callable[[str], None]) -> None:
-        assert self.process.stderr is not None
-        while True:
-            try:
-                line = await self.process.stderr.readline()
-            except ValueError:
-                continue  # a line beyond asyncio's limit: dropped
-            if not line:
-                return
-            text = line.decode(errors="replace").rstrip()
+    def _hear(self, heard: Callable[[str], None]) -> Callable[[str], None]:
+        def keep(text: str) -> None:
             self.tail.append(text)
             heard(text)
+
+        return keep
+
+
+async def _listen(stream: asyncio.StreamReader, told: Callable[[str], None]) -> None:
+    while True:
+        try:
+            line = await stream.readline()
+        except ValueError:
+            continue  # a line beyond asyncio's limit: dropped
+        if not line:
+            return
+        told(line.decode(errors="replace").rstrip())
 
 
 def adopt() -> None:

@@ -46,6 +46,11 @@ class Home:
         return self.path / "rmpa.toml"
 
     @property
+    def token(self) -> Path:
+        """The web page's token."""
+        return self.path / "web-token"
+
+    @property
     def socket(self) -> Path:
         """Where the supervisor takes commands."""
         return self.path / "demo.sock"

@@ -36,6 +36,21 @@ def free_port(kind: socket.SocketKind, taken: set[int]) -> int:
     raise OSError(f"no free port between {LOWEST} and {_first_ephemeral()} in {ATTEMPTS} attempts")
 
 
+def port_or_another(port: int, taken: set[int]) -> int:
+    """A TCP port if a server can listen at it on loopback now, else a free one, which is added to ``taken``.
+
+    Raises:
+        OSError: None was found.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # old connections do not matter, as to a server
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError:
+            return free_port(socket.SOCK_STREAM, taken)
+    return port
+
+
 def _first_ephemeral() -> int:
     try:
         first = int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text(encoding="ascii").split()[0])

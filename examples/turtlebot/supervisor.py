@@ -1,4 +1,4 @@
-"""Runs the four modules, each with an agent and a core of its own, as children of ours.
+"""Runs the four modules, each with an agent and a core of its own, as children of ours; beside them a web page.
 
 Three are Smart Resources: ``rmpa run`` starts their agents. The pc is an agent (``rmpa up``) and an ordinary node.
 """
@@ -20,9 +20,10 @@ from typing import TYPE_CHECKING
 
 from child import Child, adopt
 from ports import free_port
+from web_page import NoPage, WebPage
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Coroutine, Mapping
 
     from home import Home
 
@@ -79,6 +80,7 @@ class Supervisor:
         self._server: asyncio.Server | None = None
         self._killing: list[asyncio.Future[None]] = []
         self._over = asyncio.Event()
+        self._page = WebPage(rmpa_program(), home.settings, home.token, self._taken)
         self.failures: list[str] = []
         """What ended by itself, with its last words."""
 
@@ -87,6 +89,7 @@ class Supervisor:
         adopt()
         try:
             self._server = await asyncio.start_unix_server(self._serve, self._home.socket, limit=LINE_MAX)
+            await self._open_page()
             await asyncio.gather(*(self._start(module) for module in self._modules.values()))
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._over.wait(), seconds)
@@ -99,6 +102,29 @@ class Supervisor:
             self._killing = [asyncio.ensure_future(child.kill()) for child in self._children()]
         self._over.set()
 
+    # --- the web page -------------------------------------------------------------------------------------------
+
+    async def _open_page(self) -> None:
+        """Print the address of the web page, before anything else is shown."""
+        told: dict[str, str | None]
+        try:
+            url = await self._page.start(self._environment("pc"), self._over)
+        except NoPage as reason:
+            told, text = {"web": None, "problem": str(reason)}, f"No web page: {reason}"
+            if reason.is_failure:
+                self.failures.append(text)
+        else:
+            told, text = {"web": url}, f"In a browser: {url}"
+        if self._page.child is not None and self._page.child.runs:
+            self._follow(self._watch_page(self._page.child), "watch the web page")
+        if not self._over.is_set():
+            print(json.dumps(told) if self._as_json else text, flush=True)
+
+    async def _watch_page(self, page: Child) -> None:
+        status = await page.ended()
+        if not page.ours and not self._over.is_set():
+            self._failed(page, status, "pc")
+
     # --- modules ------------------------------------------------------------------------------------------------
 
     async def _start(self, module: Module) -> None:
@@ -108,7 +134,7 @@ class Supervisor:
         started: dict[str, object] = {"event": "started", "module": module.name, "at": module.started}
         if module.name != "pc":
             self._news(started)
-        env = self._environment(module)
+        env = self._environment(module.name)
         for name, argv in self._programs(module):
             watched = name == "node of pc"
             child = await Child.start(name, argv, env, self._hearing(module), piped=watched)
@@ -116,9 +142,7 @@ class Supervisor:
             if watched:
                 self._tell_early_news(child)
                 self._news(started)
-            task = asyncio.create_task(self._watch(module, child), name=f"watch {name}")
-            self._watching.add(task)
-            task.add_done_callback(self._watching.discard)
+            self._follow(self._watch(module, child), f"watch {name}")
 
     def _programs(self, module: Module) -> list[tuple[str, list[str]]]:
         options = [
@@ -138,10 +162,15 @@ class Supervisor:
             run += ["--set", f"device={self._joystick}"]
         return [(f"module {module.name}", [*run, "--", *options, "--log-level", "error"])]
 
-    def _environment(self, module: Module) -> Mapping[str, str]:
+    def _follow(self, work: Coroutine[object, object, None], name: str) -> None:
+        task = asyncio.create_task(work, name=name)
+        self._watching.add(task)
+        task.add_done_callback(self._watching.discard)
+
+    def _environment(self, agent: str) -> Mapping[str, str]:
         foreign = ("ROS_", "RMPA_", "NOTIFY_SOCKET")
         kept = {name: value for name, value in os.environ.items() if not name.startswith(foreign)}
-        return {**kept, **self._home.variables, "RMPA_AGENT": module.name}
+        return {**kept, **self._home.variables, "RMPA_AGENT": agent}
 
     def _hearing(self, module: Module) -> Callable[[str], None]:
         if module.name == "pc":
@@ -152,17 +181,20 @@ class Supervisor:
         status = await child.ended()
         if child.ours or self._over.is_set():
             return
-        tail = "\n".join(f"    {line}" for line in child.tail)
         young = time.monotonic() - module.started < STARTING
-        if young and "in use" in tail and module.starts < STARTS_MAX:
+        if young and any("in use" in line for line in child.tail) and module.starts < STARTS_MAX:
             await self._kill(module)
             module.core_port = free_port(socket.SOCK_STREAM, self._taken)
             await self._start(module)
             return
-        self.failures.append(f"the {child.name} ended with status {status}\n{tail}")
-        self._news({"event": "note", "module": module.name, "text": f"the {child.name} ended with status {status}"})
+        self._failed(child, status, module.name)
         if child.process.stdin is not None:
             self._over.set()  # without the pc's node nothing is shown
+
+    def _failed(self, child: Child, status: int | None, module: str) -> None:
+        tail = "\n".join(f"    {line}" for line in child.tail)
+        self.failures.append(f"the {child.name} ended with status {status}\n{tail}")
+        self._news({"event": "note", "module": module, "text": f"the {child.name} ended with status {status}"})
 
     async def _kill(self, module: Module) -> None:
         await asyncio.gather(*(child.kill() for child in module.children))
@@ -221,16 +253,19 @@ class Supervisor:
     # --- the end ------------------------------------------------------------------------------------------------
 
     def _children(self) -> list[Child]:
-        return [child for module in self._modules.values() for child in module.children if child.runs]
+        page = [self._page.child] if self._page.child is not None else []
+        modules = [child for module in self._modules.values() for child in module.children]
+        return [child for child in (*modules, *page) if child.runs]
 
     async def _end(self) -> None:
         self._over.set()
         if self._server is not None:
             self._server.close()
-        # The pc's node first: it prints the summary, of all four.
-        for child in self._modules["pc"].children[1:]:
+        # The pc's node first: it prints the summary, of all four. The page leaves the pc's core while that is there.
+        first = [*self._modules["pc"].children[1:], *([self._page.child] if self._page.child else [])]
+        for child in first:
             child.send(signal.SIGTERM)
-            await child.ended(FAREWELL)
+        await asyncio.gather(*(child.ended(FAREWELL) for child in first))
         children = self._children()
         for child in children:
             child.send(signal.SIGTERM)

@@ -6,10 +6,11 @@ import asyncio
 import json
 import os
 import re
-import shutil
 import signal
 import socket
 import sys
+import urllib.error
+import urllib.request
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -23,25 +24,12 @@ from rmpa.ros.node.node import Node
 from stick import AXIS, BUTTON, EVENT
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
 ROOT: Final = Path(__file__).parents[2]
 DEMO: Final = ROOT / "examples" / "turtlebot" / "demo.py"
 MODULES: Final = ("joystick", "velocity", "base", "pc")
 pytestmark = pytest.mark.timeout(120)
-
-
-@pytest.fixture
-def tidy(tmp_path: Path) -> Iterator[dict[str, str]]:
-    """The demo's environment, its temporary files in a directory that must be empty in the end."""
-    place = tmp_path / "t" if len(str(tmp_path)) < 50 else Path(f"/tmp/rmpa-demo-test-{os.getpid()}")
-    place.mkdir()
-    env = {key: value for key, value in os.environ.items() if not key.startswith(("ROS_", "RMPA_"))}
-    try:
-        yield {**env, "TMPDIR": str(place)}
-        assert not list(place.iterdir()), "files are left"
-    finally:
-        shutil.rmtree(place, ignore_errors=True)
 
 
 def family(demo: Process) -> list[psutil.Process]:
@@ -103,12 +91,28 @@ def all_linked(view: dict[str, Any]) -> bool:
     return states(view) == {"joystick": "linked", "velocity": "linked", "base": "linked", "pc": "here"}
 
 
+def web_address(demo: Process) -> str:
+    """The address of the web page, without its token: the first line of ``--json`` has it."""
+    address: str = json.loads(demo.wait_for(r'^\{"web": ').string)["web"]
+    return address.partition("?")[0]
+
+
+def status_of(url: str) -> int:
+    try:
+        with urllib.request.urlopen(url, timeout=30) as response:
+            status: int = response.status
+    except urllib.error.HTTPError as error:
+        with error:
+            status = error.code
+    return status
+
+
 def test_the_paper_s_set_up_runs_and_leaves_nothing(tidy: dict[str, str]) -> None:
-    with Process([sys.executable, DEMO, "--seconds", "16", "--json"], env=tidy, name="demo") as demo:
+    with Process([sys.executable, DEMO, "--seconds", "24", "--json"], env=tidy, name="demo") as demo:
         wait_for_view(demo, lambda view: all_linked(view) and flows(view), "messages of all four modules")
         processes = family(demo)
         ports = open_ports(processes)
-        assert len(processes) == 9, "the supervisor; an agent and a node for each module"
+        assert len(processes) == 10, "the supervisor, the web page; an agent and a node for each module"
         assert demo.wait(30) == 0, demo.output
     assert_gone(processes, ports)
     summary = summary_of(demo)
@@ -276,6 +280,7 @@ def test_two_demos_on_one_machine_do_not_meet(tidy: dict[str, str]) -> None:
     ):
         for demo in (first, second):
             wait_for_view(demo, lambda view: all_linked(view) and flows(view), "messages of all modules")
+        assert web_address(first) != web_address(second)
         with Process([sys.executable, DEMO, "kill", "base"], env=tidy) as kill:
             assert kill.wait() == 1
             assert "several demos run here; name one with --demo PID" in kill.output
@@ -306,13 +311,17 @@ def test_a_real_joystick_steers_and_may_be_unplugged(tidy: dict[str, str], tmp_p
 def test_the_pc_itself_can_be_killed(tidy: dict[str, str]) -> None:
     with Process([sys.executable, DEMO, "--json"], env=tidy, name="demo") as demo:
         wait_for_view(demo, flows, "messages")
+        page = web_address(demo)
+        assert status_of(f"{page}healthz") == 200
         with Process([sys.executable, DEMO, "kill", "pc"], env=tidy) as kill:
             assert kill.wait() == 0, kill.output
+        assert status_of(f"{page}healthz") == 503, "the web page outlives the pc, and says that its agent is gone"
         demo.wait_for("the pc is killed, the others go on")
         count = len(views(demo))
         with Process([sys.executable, DEMO, "start", "pc"], env=tidy) as start:
             assert start.wait() == 0, start.output
         eventually(lambda: len(views(demo)) > count and flows(views(demo)[-1]), 30, what="a table again")
+        eventually(lambda: status_of(f"{page}healthz") == 200, 30, what="the web page with its agent")
         assert demo.interrupt() == 0, demo.output
     assert summary_of(demo)["modules"]["pc"]["first_message"] > 0
 

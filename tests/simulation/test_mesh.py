@@ -16,7 +16,7 @@ from tests.simulation.network import Weather
 
 FACTOR = int(os.environ.get("RMPA_SIMULATION_SEEDS", "1"))
 BLOCK = 25
-BLOCKS = [(count, block) for count, blocks in ((2, 16), (3, 6), (4, 2), (5, 1)) for block in range(blocks * FACTOR)]
+BLOCKS = [(count, block) for count, blocks in ((2, 10), (3, 4), (4, 2), (5, 1)) for block in range(blocks * FACTOR)]
 
 
 @pytest.mark.parametrize(("count", "block"), BLOCKS)

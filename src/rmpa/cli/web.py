@@ -59,6 +59,8 @@ Examples:
     is_flag=True,
     help="Let clients publish, call and offer services, and set parameters; they then need the token.",
 )
+@click.option("--cert", metavar="FILE", help="Serve HTTPS with this certificate (PEM).")
+@click.option("--key", metavar="FILE", help="Its private key (PEM). [default: in the certificate's file]")
 @click.option("--drive", is_flag=True, help="Let the joystick of its pages command a robot; they need the token.")
 @click.option("--config", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]")
 @click.option("--with-agent", is_flag=True, hidden=True, help="End when standard input ends.")
@@ -70,6 +72,8 @@ def web(
     token_file: str | None,
     hosts: tuple[str, ...],
     control: bool,
+    cert: str | None,
+    key: str | None,
     drive: bool,
     config: str | None,
     with_agent: bool,
@@ -92,6 +96,8 @@ def web(
         listen=given.listen if listen is None else _host("--listen", listen),
         token_file=given.token_file if token_file is None else token_file,
         control=given.control or control,
+        cert=given.cert if cert is None else cert,
+        key=given.key if key is None else key,
         drive=given.drive or drive,
         hosts=(*given.hosts, *(_host("--host", name) for name in hosts)),
     )

@@ -278,6 +278,18 @@ class WebSettings:
         "Let clients publish, call and offer services, and set parameters; they then need the token.",
         env="RMPA_WEB_CONTROL",
     )
+    cert: str = setting(
+        "",
+        TEXT,
+        "Serve HTTPS with this certificate: a PEM file, the intermediate certificates behind it.",
+        env="RMPA_WEB_CERT",
+    )
+    key: str = setting(
+        "",
+        TEXT,
+        "The certificate's private key: a PEM file; empty: it is in the certificate's file.",
+        env="RMPA_WEB_KEY",
+    )
     drive: bool = setting(
         False,
         BOOL,

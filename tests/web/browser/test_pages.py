@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.web.hub.rights import Rights
+from rmpa.web.monitor import limits
 
 if TYPE_CHECKING:
-    from tests.web.browser.chromium import Chromium
+    from lab.bed.chromium import Chromium
     from tests.web.browser.conftest import Site
 
 AXE = Path(__file__).with_name("vendor") / "axe.min.js"
@@ -281,7 +282,7 @@ async def test_a_parameter_is_changed(site: Site) -> None:
 
 
 async def test_who_may_only_look_sees_no_way_to_change_anything(site: Site) -> None:
-    site.server.rights = Rights()
+    site.server.rights = Rights(read_parameters=True)
     page = await site.open("params")
     await page.wait_text("noetic")
     assert await page.run("document.querySelectorAll('main button.field, main button.primary').length") == 0
@@ -306,5 +307,5 @@ async def test_a_robot_moves_only_while_the_stick_is_held(site: Site) -> None:
     deadline = time.monotonic() + 10
     while not (site.server.speeds and site.server.speeds[-1].linear == 0) and time.monotonic() < deadline:
         await page.run("new Promise((done) => setTimeout(done, 50))")
-    assert site.server.speeds[0].linear == pytest.approx(1.2)
+    assert site.server.speeds[0].linear == pytest.approx(0.6 * 0.15 * limits.DRIVE_SPEED)
     assert site.server.speeds[-1].linear == 0

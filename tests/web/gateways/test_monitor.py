@@ -148,6 +148,9 @@ async def test_a_page_is_greeted_and_gets_the_state_then_its_changes(core: RosCo
         assert peer.name in page.state["modules"]
         agent.snapshot = msgspec.structs.replace(agent.snapshot, peers=())
         await page.sees(lambda: page.state["modules"][peer.name]["state"] == "away")
+        [*_, last] = (await page.ask(1, "history"))["value"]
+        assert (last["module"], last["level"]) == (peer.name, "WARN")
+        assert "is away" in last["text"]
 
 
 async def test_a_page_is_told_when_the_agent_is_silent_and_when_it_is_back(core: RosCore) -> None:
@@ -197,7 +200,7 @@ async def test_parameters_are_read_and_set(core: RosCore) -> None:
     async with page_of(core) as (page, _):
         assert (await page.ask(1, "set_param", peer="", name="/speed", value=0.4))["value"]["values"]["speed"] == 0.4
         assert core.call("getParam", "/test", "/speed").value == 0.4
-        assert (await page.ask(2, "delete_param", peer="", name="/speed"))["value"]["values"] == {}
+        assert "speed" not in (await page.ask(2, "delete_param", peer="", name="/speed"))["value"]["values"]
         assert "cannot be null" in (await page.ask(3, "set_param", peer="", name="/speed", value=None))["error"]
         assert "no agent" in (await page.ask(4, "params", peer="arm"))["error"]
 
@@ -314,7 +317,10 @@ async def test_a_broken_descriptor_is_no_resource(core: RosCore) -> None:
         assert set(page.state["resources"]) == {"/arm"}
 
 
-async def test_pages_share_what_is_asked_of_the_agent_and_nothing_is_asked_without_pages(core: RosCore) -> None:
+async def test_pages_share_what_is_asked_of_the_agent_and_little_is_asked_without_pages(
+    core: RosCore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rmpa.web.monitor.limits.HISTORY_PERIOD", DEADLINE)
     agent = Agent(core.uri)
     watch = AgentWatch(agent.read)
     async with running_server(core, watch=watch) as server:
@@ -325,8 +331,9 @@ async def test_pages_share_what_is_asked_of_the_agent_and_nothing_is_asked_witho
             for page in (Page(one.socket), Page(other.socket)):
                 await page.sees(lambda page=page: page.state.get("modules"))
         await until(lambda: not server.gateways.connections)
+        await asyncio.sleep(2 * limits.STATE_PERIOD)  # what was under way
         reads = watch.reads
-        await asyncio.sleep(3 * limits.STATE_PERIOD)
+        await asyncio.sleep(4 * limits.STATE_PERIOD)
         assert watch.reads == reads
     await watch.close()
 

@@ -35,7 +35,7 @@ from rmpa.web.hub.requests import (
     Unadvertise,
     Unsubscribe,
 )
-from rmpa.web.hub.rights import FULL, READ_ONLY
+from rmpa.web.hub.rights import CONTROL_REMEDY, FULL, READ_ONLY, READ_REMEDY
 from tests.ros.node.peers import DEADLINE, LATCHED, STRING, until
 from tests.web.hub.client import FakeClient, node, running_hub
 
@@ -403,7 +403,7 @@ async def test_clock_gives_the_time_where_the_parameter_says_so(core: RosCore) -
         await until(lambda: hub.time.now_ns() > 10**18)
 
 
-# --- roles ---
+# --- rights ---
 
 
 async def test_a_read_only_client_changes_nothing(core: RosCore) -> None:
@@ -422,6 +422,7 @@ async def test_a_read_only_client_changes_nothing(core: RosCore) -> None:
             client.ask(request)
             failed = client.of(type(await client.failure(request.handle)), request.handle)[0]
             assert "may not" in failed.error
-            assert failed.remedy == "ask for a role that may"
+            reads = isinstance(request, GetParams | FollowParams)
+            assert failed.remedy == (READ_REMEDY if reads else CONTROL_REMEDY)
         client.ask(Publish(1, ONE))
         assert not core.publishers("/t")

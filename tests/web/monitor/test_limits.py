@@ -3,24 +3,34 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 from rmpa.core.sizes import KIB
+from rmpa.web import limits as web_limits
+from rmpa.web.hub.rights import FULL
 from rmpa.web.monitor import limits, messages, session
 
 PAGE = (Path(__file__).parents[3] / "docs" / "design" / "monitor-protocol.md").read_text(encoding="utf-8")
 
 
 def test_the_page_says_the_bounds_of_the_code() -> None:
-    rows = re.findall(r"\| ([\d,]+)( KiB)? \| `([A-Z_]+)` \|", PAGE)
-    assert {name for name in vars(limits) if name.endswith("_MAX")} <= {name for _, _, name in rows}
+    rows = re.findall(r"\| ([\d,.]+)( KiB| s)? \| `([A-Z_]+)` \|", PAGE)
+    needed = {name for name in vars(limits) if name.endswith(("_MAX", "_KEPT", "_PERIOD"))}
+    assert needed <= {name for _, _, name in rows}
     for figure, unit, name in rows:
-        assert getattr(limits, name) == int(figure.replace(",", "")) * (KIB if unit else 1), name
+        assert getattr(limits, name) == float(figure.replace(",", "")) * (KIB if unit == " KiB" else 1), name
+
+
+def test_each_state_is_of_a_new_snapshot() -> None:
+    assert web_limits.WEB_SNAPSHOT_AGE < limits.STATE_PERIOD
 
 
 def test_the_page_has_each_question_and_message() -> None:
     for what in session.QUESTIONS:
         assert f"`{what}`" in PAGE
+    for permission in session.permissions(replace(FULL, drive=True)):
+        assert f"`{permission}`" in PAGE
     for kind in (messages.Ack, messages.Look, messages.Watch, messages.Unwatch, messages.Ask, messages.Log):
         assert f"`{kind.__struct_config__.tag}`" in PAGE
     assert f"`{messages.SUBPROTOCOL}`" in PAGE

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 import pytest
 
-from rmpa.web.server.auth import AccessPolicy, Granted, MoveToken, Refused, RequestFacts, is_loopback, own_names
+from rmpa.web.server.auth import (
+    AccessPolicy,
+    Granted,
+    MoveToken,
+    Preflight,
+    Refused,
+    RequestFacts,
+    is_loopback,
+    own_names,
+)
 
 TOKEN = "t" * 43
 HOSTS = own_names(("base",))
@@ -13,7 +22,7 @@ CLOSED = AccessPolicy(8480, HOSTS, TOKEN)
 HERE = ("base.local:8480",)
 
 
-def reason(verdict: Granted | MoveToken | Refused) -> str:
+def reason(verdict: Granted | MoveToken | Preflight | Refused) -> str:
     return verdict.reason if isinstance(verdict, Refused) else type(verdict).__name__
 
 
@@ -64,6 +73,30 @@ def test_a_name_that_is_not_ours_is_a_rebound_one(host: tuple[str, ...], expecte
 def test_only_our_own_pages_may_read(origin: str, expected: str) -> None:
     assert reason(OPEN.judge(RequestFacts(HERE, origin=origin))) == expected
     assert reason(CLOSED.judge(RequestFacts(HERE, origin=origin, cookie=TOKEN))) == expected
+
+
+@pytest.mark.parametrize(
+    ("origin", "is_preflight", "expected"),
+    [
+        ("https://app.example", True, "Preflight"),
+        ("https://APP.example", True, "Preflight"),
+        ("https://app.example", False, "token"),
+        ("http://app.example", True, "origin"),  # another scheme is another origin
+        ("https://app.example:8443", True, "origin"),
+        ("https://app.example.evil.example", True, "origin"),
+        ("*", True, "origin"),
+        ("null", True, "origin"),
+        ("http://base.local:8480", True, "token"),  # our own pages ask nothing before
+        (None, True, "token"),
+    ],
+)
+def test_only_listed_sites_are_told_what_their_pages_may_send(
+    origin: str | None, is_preflight: bool, expected: str
+) -> None:
+    policy = AccessPolicy(8480, HOSTS, TOKEN, frozenset({"https://app.example", "*"}))
+    assert reason(policy.judge(RequestFacts(HERE, origin=origin, is_preflight=is_preflight))) == expected
+    rebound = RequestFacts(("evil.example",), origin=origin, is_preflight=is_preflight)
+    assert reason(policy.judge(rebound)) == "host"
 
 
 @pytest.mark.parametrize(

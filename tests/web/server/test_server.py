@@ -14,7 +14,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.web import limits
 from rmpa.web.server.agent_watch import AgentWatch
-from rmpa.web.server.app import HEADERS
+from rmpa.web.server.app import HEADERS, OPENER_POLICY
 from rmpa.web.server.auth import AccessPolicy, own_names
 from rmpa.web.server.server import WebServer
 from tests.web.snapshots import FULL
@@ -31,11 +31,11 @@ TOKEN = "secret-" * 6
 class Site:
     """The server under test, its agent, and a client."""
 
-    def __init__(self, token: str = "") -> None:
+    def __init__(self, token: str = "", origins: frozenset[str] = frozenset()) -> None:
         self.up = True
         self.now = 0.0
         watch = AgentWatch(self._read, self._later)
-        self.server = WebServer(watch, AccessPolicy(0, own_names(("base",)), token), "127.0.0.1")
+        self.server = WebServer(watch, AccessPolicy(0, own_names(("base",)), token, origins), "127.0.0.1")
 
     def _read(self) -> Snapshot:
         if not self.up:
@@ -84,8 +84,8 @@ async def response(reader: asyncio.StreamReader) -> tuple[int, dict[str, str], b
 
 
 @asynccontextmanager
-async def running(token: str = "") -> AsyncIterator[Site]:
-    site = Site(token)
+async def running(token: str = "", origins: frozenset[str] = frozenset()) -> AsyncIterator[Site]:
+    site = Site(token, origins)
     await site.server.start()
     try:
         yield site
@@ -118,7 +118,7 @@ async def test_each_path_gives_what_it_says() -> None:
             status, headers, body = await site.get(path)
             assert (status, headers["Content-Type"]) == (200, kind), path
             assert part in body, path
-            assert HEADERS.items() <= headers.items(), path
+            assert {**HEADERS, **dict([OPENER_POLICY])}.items() <= headers.items(), path
         assert (await site.get("/metrics", Accept="application/openmetrics-text; version=1.0.0"))[2].endswith(
             b"# EOF\n"
         )

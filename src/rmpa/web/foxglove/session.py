@@ -21,6 +21,7 @@ from rmpa.web.foxglove.connection_graph import ConnectionGraph
 from rmpa.web.foxglove.parameters import ParameterRequests
 from rmpa.web.foxglove.protocol import BinaryFrame, Capability, Frame, StatusLevel
 from rmpa.web.hub import requests
+from rmpa.web.hub.rights import CONTROL_REMEDY, READ_REMEDY
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -235,7 +236,7 @@ class FoxgloveSession:
         if isinstance(message, protocol.SetParameters):
             self._check(self._rights.set_parameters, "set parameters")
             return self._parameters.set(message)
-        self._check(self._rights.read_parameters, "read parameters")
+        self._check(self._rights.read_parameters, "read parameters", READ_REMEDY)
         if isinstance(message, protocol.GetParameters):
             return self._parameters.get(message)
         if isinstance(message, protocol.SubscribeParameterUpdates):
@@ -307,7 +308,7 @@ class FoxgloveSession:
         call = _Call(message.service_id, message.call_id)
         service = self._channels.services.get(message.service_id)
         if not self._rights.call_services:
-            return _call_failure(call, "this client may not call services; ask for a role that may")
+            return _call_failure(call, f"this client may not call services; {CONTROL_REMEDY}")
         if service is None:
             return _call_failure(call, f"there is no service {message.service_id}; it may be gone")
         if message.encoding != protocol.ENCODING:
@@ -330,7 +331,7 @@ class FoxgloveSession:
         scheme, _, path = uri.partition("://")
         parts = path.split("/")
         if not self._rights.fetch_assets:
-            return "this client may not fetch assets; ask for a role that may"
+            return f"this client may not fetch assets; {READ_REMEDY}"
         if scheme != "package" or len(parts) < 2 or not all(parts) or not uri.isprintable():
             return "only files of ROS packages can be fetched: package://NAME/PATH"
         if any(part in (".", "..") for part in parts) or "\\" in path or "%" in path:
@@ -404,9 +405,9 @@ class FoxgloveSession:
     def _next_handle(self) -> int:
         return next(self._handles)
 
-    def _check(self, right: bool, what: str) -> None:
+    def _check(self, right: bool, what: str, remedy: str = CONTROL_REMEDY) -> None:
         if not right:
-            raise SessionError(f"this client may not {what}; ask for a role that may")
+            raise SessionError(f"this client may not {what}; {remedy}")
 
     def _refuse(self, error: RmpaError, now: float) -> list[Output]:
         if self._errors.take(now):

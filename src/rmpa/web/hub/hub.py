@@ -21,6 +21,7 @@ from rmpa.web.hub.graph import GraphWatch
 from rmpa.web.hub.node_link import NodeLink
 from rmpa.web.hub.params import ParamMirror
 from rmpa.web.hub.publishers import Publishers
+from rmpa.web.hub.rights import CONTROL_REMEDY, READ_REMEDY
 from rmpa.web.hub.ros_time import RosTime
 from rmpa.web.hub.served import ServedServices
 from rmpa.web.hub.services import ServiceCalls
@@ -341,7 +342,7 @@ class Hub:
         self.params.updated(key, value)
 
     def _get_params(self, client: Client, request: requests.GetParams) -> None:
-        _check(client.rights.read_parameters, "read parameters")
+        _check(client.rights.read_parameters, "read parameters", READ_REMEDY)
 
         async def get() -> None:
             await self.params.loaded.wait()
@@ -369,7 +370,7 @@ class Hub:
         self._run(client, request.handle, delete())
 
     def _follow_params(self, client: Client, request: requests.FollowParams) -> None:
-        _check(client.rights.read_parameters, "read parameters")
+        _check(client.rights.read_parameters, "read parameters", READ_REMEDY)
 
         def changed(values: Mapping[str, requests.ParamValue]) -> None:
             client.receive(requests.ParamsChanged(request.handle, values))
@@ -407,7 +408,7 @@ class Hub:
         self._run(client, request.handle, describe())
 
     def _fetch_asset(self, client: Client, request: requests.FetchAsset) -> None:
-        _check(client.rights.fetch_assets, "fetch assets")
+        _check(client.rights.fetch_assets, "fetch assets", READ_REMEDY)
 
         async def fetch() -> None:
             data = await asyncio.to_thread(read_asset, request.uri, request.most, self._environ)
@@ -439,11 +440,9 @@ class Hub:
         task.add_done_callback(ended)
 
 
-def _check(right: bool, what: str) -> None:
+def _check(right: bool, what: str, remedy: str = CONTROL_REMEDY) -> None:
     if not right:
-        raise PeerRefused(
-            "the web server", f"this client may not {what}", "start rmpa web with --control, and give its token"
-        )
+        raise PeerRefused("the web server", f"this client may not {what}", remedy)
 
 
 def _fail(client: Client, handle: int, error: RmpaError) -> None:

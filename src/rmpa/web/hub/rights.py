@@ -41,3 +41,7 @@ FULL = Rights(
     configure_resources=True,
 )
 """Everything but ``drive``, which has a setting of its own."""
+CONTROL_REMEDY = "start rmpa web with --control, and give its token"
+"""For clients that want to change something."""
+READ_REMEDY = "send the token of rmpa web; where it has none, start it with --token-file FILE or --control"
+"""For clients that want to read what only clients with the token may."""

@@ -93,3 +93,5 @@ DECISION_DEPTH: Final = 32
 """Objects and arrays within each other in what a Smart Resource says of its decision; a deeper one is not shown."""
 STATE_PAUSE_MAX: Final = 0.5
 """The longest pause between two snapshots."""
+HISTORY_PERIOD: Final = 2.0
+"""Time between two snapshots while no page is open: the history tells the changes of links."""

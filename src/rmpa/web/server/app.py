@@ -18,7 +18,16 @@ from rmpa.core.counters import Counters, RefusalLog
 from rmpa.web import limits, rest
 from rmpa.web.gateways.gateways import MONITOR_PATH, is_upgrade
 from rmpa.web.metrics import content_type, exposition
-from rmpa.web.server.auth import TOKEN_PARAMETER, AccessPolicy, MoveToken, Refused, RequestFacts
+from rmpa.web.server.auth import (
+    TOKEN_PARAMETER,
+    AccessPolicy,
+    MoveToken,
+    Preflight,
+    Refused,
+    RequestFacts,
+    host_name,
+    is_loopback,
+)
 from rmpa.web.server.connections import GuardedConnection
 from rmpa.web.server.figures import Figures, web_metrics
 
@@ -37,6 +46,8 @@ _OPEN: Final = ("/healthz",)
 WEBSOCKET_PATHS: Final = ("/", "/rosbridge", "/foxglove", MONITOR_PATH)
 """Where WebSocket clients connect. The pages have their own path; else the subprotocol chooses the gateway."""
 _METHODS: Final = ("GET", "HEAD")
+_SHOWN: Final = 120
+"""Characters of a faulty header that are told."""
 _JUDGED: Final = web.RequestKey("rmpa.judged", bool)
 """Marks requests that reached the middleware; aiohttp answers malformed ones before."""
 HEADERS: Final = {
@@ -45,13 +56,21 @@ HEADERS: Final = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
     "Referrer-Policy": "no-referrer",
-    "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
     "Cache-Control": "no-store",
     "Server": "rmpa",
 }
 """Of every response."""
+OPENER_POLICY: Final = ("Cross-Origin-Opener-Policy", "same-origin")
+"""Of responses to loopback: in plain HTTP browsers ignore it from elsewhere, and report that as an error."""
+PREFLIGHT: Final = {
+    "Access-Control-Allow-Methods": ", ".join(_METHODS),
+    "Access-Control-Allow-Headers": "Authorization",
+    "Access-Control-Max-Age": "600",
+}
+"""Of the response to a browser's question what a page of a listed site may send (Fetch standard, "CORS protocol").
+Cookies are not allowed: such a page sends the token itself."""
 
 
 class Routes:
@@ -116,6 +135,9 @@ class Routes:
                     connection.request_ends()
             if not response.prepared:
                 response.headers.update(HEADERS)
+                response.headers.update(self._sharing(request))
+                if is_loopback(host_name(request.host) or ""):
+                    response.headers.update((OPENER_POLICY,))
             return response
 
         return middleware
@@ -124,21 +146,35 @@ class Routes:
         verdict = self._policy.judge(self._facts(request))
         if isinstance(verdict, Refused):
             return self._refused(request, verdict.reason, rest.problem(verdict.status, verdict.detail))
-        if request.method not in _METHODS:
+        if request.method not in _METHODS and not isinstance(verdict, Preflight):
             text = f"{request.method[:20]} is not supported; this server only shows, and is read with GET"
             return self._refused(request, "method", rest.problem(405, text, (("Allow", ", ".join(_METHODS)),)))
         if request.body_exists:
             return self._refused(request, "body", rest.problem(413, "a request with a body; send none with GET"))
+        if isinstance(verdict, Preflight):
+            return web.Response(status=204, headers=PREFLIGHT)
         if isinstance(verdict, MoveToken):
             return self._move_token(request)
         if self._gateways is not None and is_upgrade(request) and request.path in WEBSOCKET_PATHS:
-            handler = self._gateways.handle
+            return await self._upgrade(request, self._gateways)
         try:
             return await handler(request)
         except web.HTTPException:  # of aiohttp's router: no such path
             return _response(rest.problem(404, f"there is no {request.path[:80]!a}; / lists what there is"))
         except Exception:  # noqa: BLE001 - the top of the request: a fault in one path must not end the connection's task
             _log.exception("! %s failed", request.path)
+            return _response(rest.problem(500, "the server failed; its log says why"))
+
+    async def _upgrade(self, request: web.Request, gateways: Gateways) -> web.StreamResponse:
+        """Serve a WebSocket until it has ended."""
+        try:
+            return await gateways.handle(request)
+        except web.HTTPBadRequest as error:  # of aiohttp's handshake
+            text = (error.text or "").partition("\n")[0][:_SHOWN]
+            gateways.refuse(request.remote or "?", "handshake", text)
+            return _response(rest.problem(400, f"not the handshake of a WebSocket: {text}"))
+        except Exception:  # noqa: BLE001 - as above
+            _log.exception("! the WebSocket at %s failed", request.path)
             return _response(rest.problem(500, "the server failed; its log says why"))
 
     def _facts(self, request: web.Request) -> RequestFacts:
@@ -154,7 +190,18 @@ class Routes:
             token=request.query.get(TOKEN_PARAMETER),
             is_page=page is not None and page.is_html,
             is_open=request.path in _OPEN,
+            is_preflight=request.method == "OPTIONS"
+            and "Access-Control-Request-Method" in headers
+            and request.path not in self._pages,
         )
+
+    def _sharing(self, request: web.Request) -> dict[str, str]:
+        """Headers that let pages of listed sites read a response; those of the pages' own files are not shared."""
+        if not self._policy.origins or request.path in self._pages:
+            return {}
+        origin = request.headers.get("Origin")
+        allowed = {"Access-Control-Allow-Origin": origin} if origin is not None and self._policy.lists(origin) else {}
+        return {"Vary": "Origin", **allowed}
 
     def _refused(self, request: web.Request, reason: str, problem: rest.Response) -> web.Response:
         address = request.remote or "?"
@@ -170,7 +217,9 @@ class Routes:
         query = {name: value for name, value in request.query.items() if name != TOKEN_PARAMETER}
         response = web.Response(status=303, headers={"Location": str(request.rel_url.with_query(query))})
         token = request.query[TOKEN_PARAMETER]
-        response.set_cookie(self._policy.cookie, token, httponly=True, samesite="Strict", path="/")
+        response.set_cookie(
+            self._policy.cookie, token, httponly=True, secure=request.secure, samesite="Strict", path="/"
+        )
         return response
 
     # --- the paths ---
@@ -216,7 +265,7 @@ class Routes:
             connections,
             accepted,
             self.responses.as_dict(),
-            self._counters.as_dict(),
+            self._counters.as_dict() | (self._gateways.counters.as_dict() if self._gateways is not None else {}),
             self._watch.reads,
             self._watch.seconds,
             self._gateways.figures() if self._gateways is not None else {},

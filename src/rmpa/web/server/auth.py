@@ -4,7 +4,8 @@ Three checks, in this order:
 
 * ``Host`` is an address or one of the server's names. A page of another site that lets its own name point to this
   machine (DNS rebinding) sends its own name here.
-* ``Origin``, where the browser sends one, is this server; ``Sec-Fetch-Site`` says the same of requests without one.
+* ``Origin``, where the browser sends one, is this server or a listed site; ``Sec-Fetch-Site`` says the same of
+  requests without one. A browser asks before it sends a listed site's token (CORS preflight): that has no token yet.
 * The token, where there is one: ``Authorization: Bearer`` (programs), a cookie (browsers), or ``?token=`` (clients
   that know only a URL). A page's ``?token=`` is moved into the cookie by a redirect, so that it leaves the address
   bar and the history. The cookie's name has the port, since browsers share cookies between the ports of a host.
@@ -42,6 +43,7 @@ class RequestFacts:
         token: The query's ``token``.
         is_page: Whether the path is a page for people, for which a cookie is set.
         is_open: Whether the path needs no token.
+        is_preflight: Whether a browser asks what a page of another site may send (Fetch standard, "CORS-preflight").
     """
 
     host: tuple[str, ...]
@@ -53,6 +55,7 @@ class RequestFacts:
     token: str | None = None
     is_page: bool = False
     is_open: bool = False
+    is_preflight: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +66,11 @@ class Granted:
 @dataclass(frozen=True, slots=True)
 class MoveToken:
     """The page is served at the same URL without its token, which becomes a cookie."""
+
+
+@dataclass(frozen=True, slots=True)
+class Preflight:
+    """The browser is told what pages of a listed site may send."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,9 +109,18 @@ class AccessPolicy:
         """The name of the token's cookie."""
         return f"rmpa_token_{self.port}"
 
-    def judge(self, request: RequestFacts) -> Granted | MoveToken | Refused:
+    def judge(self, request: RequestFacts) -> Granted | MoveToken | Preflight | Refused:
         """The decision about a request."""
-        return self._wrong_host(request) or self._wrong_origin(request) or self._by_token(request)
+        refused = self._wrong_host(request) or self._wrong_origin(request)
+        if refused is not None:
+            return refused
+        if request.is_preflight and self.lists(request.origin):
+            return Preflight()
+        return self._by_token(request)
+
+    def lists(self, origin: str | None) -> bool:
+        """Whether an ``Origin`` is one of ``origins``; ``*`` never is."""
+        return origin is not None and origin != "*" and origin.lower() in self.origins
 
     def _wrong_host(self, request: RequestFacts) -> Refused | None:
         if len(request.host) != 1:
@@ -120,7 +137,7 @@ class AccessPolicy:
             scheme, _, rest = request.origin.partition("://")
             if scheme in ("http", "https") and rest.lower() == request.host[0].lower():
                 return None
-            if request.origin.lower() in self.origins:
+            if self.lists(request.origin):
                 return None
             return _foreign(_short(request.origin))
         elsewhere = request.fetch_site in ("cross-site", "same-site")

@@ -22,6 +22,7 @@ from rmpa.web.server.agent_watch import AgentWatch, ControlReader
 from rmpa.web.server.graph_signal import GraphSignal
 from rmpa.web.server.hub_setup import make_hub, priority_of, rights_of
 from rmpa.web.server.server import WebServer
+from rmpa.web.server.tls import tls_context
 from rmpa.web.server.token_file import token_from
 
 if TYPE_CHECKING:
@@ -85,7 +86,8 @@ def address_of(web: WebSettings, access: Access, port: int) -> Address:
     """Where a server is, for the user."""
     host = socket.gethostname() if web.listen == "0.0.0.0" else web.listen  # noqa: S104 - compared
     query = f"?{auth.TOKEN_PARAMETER}={access.token}" if access.is_new else ""
-    return Address(f"http://{host}:{port}/{query}", str(access.file or ""), access.is_new)
+    scheme = "https" if web.cert else "http"
+    return Address(f"{scheme}://{host}:{port}/{query}", str(access.file or ""), access.is_new)
 
 
 async def serve(
@@ -134,7 +136,7 @@ async def serve(
         priority_of(hub, contracts or Contracts()),
         monitor,
     )
-    server = WebServer(watch, policy, web.listen, gateways, web.ports)
+    server = WebServer(watch, policy, web.listen, gateways, web.ports, tls_context(web.cert, web.key))
     try:
         async with hub:
             await server.start()

@@ -16,6 +16,7 @@ from rmpa.web.server.connections import ConnectionTable
 from rmpa.web.server.pages import read_pages
 
 if TYPE_CHECKING:
+    import ssl
     from collections.abc import Sequence
 
     from rmpa.web.gateways.gateways import Gateways
@@ -37,6 +38,7 @@ class WebServer:
         host: The address to listen at.
         gateways: Serve WebSocket clients.
         ports: Further ports to listen at.
+        tls: Serves HTTPS with its certificate; ``None``: HTTP.
     """
 
     def __init__(
@@ -46,7 +48,9 @@ class WebServer:
         host: str,
         gateways: Gateways | None = None,
         ports: Sequence[int] = (),
+        tls: ssl.SSLContext | None = None,
     ) -> None:
+        self._tls = tls
         self._gateways = gateways
         self._ports = ports
         self._watch = watch
@@ -92,7 +96,13 @@ class WebServer:
         for port in dict.fromkeys((self._policy.port, *self._ports)):
             try:
                 server = await loop.create_server(
-                    self._table.make, self._host, port, backlog=limits.WEB_BACKLOG, reuse_address=True
+                    self._table.make,
+                    self._host,
+                    port,
+                    backlog=limits.WEB_BACKLOG,
+                    reuse_address=True,
+                    ssl=self._tls,
+                    ssl_handshake_timeout=limits.WEB_REQUEST_TIMEOUT if self._tls is not None else None,
                 )
             except OSError as error:
                 for server in self._servers:

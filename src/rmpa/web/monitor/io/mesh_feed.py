@@ -1,11 +1,12 @@
-"""The state of the mesh for all pages: snapshots of the agent are read while pages are open, and not otherwise."""
+"""The state of the mesh for all pages, and the history of its links: snapshots of the agent are read all the time."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.view import StateBuilder, details
@@ -19,6 +20,16 @@ if TYPE_CHECKING:
     from rmpa.web.server.agent_watch import AgentWatch, Reading
 
 _log = logging.getLogger(__name__)
+_LEVELS: Final = {"here": "OK", "up": "OK", "relayed": "OK", "refused": "ERROR"}
+"""Levels of the history by the state of a link; all others are warnings."""
+WORDS: Final = {
+    "up": "linked",
+    "linking": "no link",
+    "away": "is away",
+    "silent": "is silent",
+    "refused": "is refused",
+}
+"""What the history says of a link's state."""
 
 
 class MeshFeed:
@@ -49,11 +60,17 @@ class MeshFeed:
         self._state: Tree | None = None
         self._pages: dict[object, Callable[[Tree], None]] = {}
         self._task: asyncio.Task[None] | None = None
+        self._wake = asyncio.Event()
+        self._links: dict[str, str] = {}
 
     @property
     def agent(self) -> str:
         """The name of the agent's module; empty until it has answered once."""
         return self._snapshot.agent.name if self._snapshot is not None else ""
+
+    def start(self) -> None:
+        """Begin to read snapshots."""
+        self._task = asyncio.get_running_loop().create_task(self._run(), name="monitor's state")
 
     async def first(self) -> None:
         """Ask the agent once, so that its name is known."""
@@ -66,18 +83,14 @@ class MeshFeed:
         self._resources.show_all(wanted=True)
         if self._state is not None:
             show(self._state)
-        if self._task is None:
-            self._task = asyncio.get_running_loop().create_task(self._run(), name="monitor's state")
+        self._wake.set()
 
     def unfollow(self, page: object) -> None:
-        """End a ``follow``; after the last one nothing more is read."""
+        """End a ``follow``; after the last one snapshots are read for the history alone."""
         self._pages.pop(page, None)
         if not self._pages:
             self._watched(False)
             self._resources.show_all(wanted=False)
-            if self._task is not None:
-                self._task.cancel()
-                self._task = None
 
     async def close(self) -> None:
         """End."""
@@ -103,8 +116,14 @@ class MeshFeed:
                 _log.exception("! the state of the mesh could not be built")
             # A snapshot of thousands of topics takes time at both ends: at most a fifth of it is spent here.
             took = time.monotonic() - began
-            pause = min(took * limits.STATE_SHARE, limits.STATE_PAUSE_MAX)
-            await asyncio.sleep(max(limits.STATE_PERIOD - took, pause))
+            pause = max(limits.STATE_PERIOD - took, min(took * limits.STATE_SHARE, limits.STATE_PAUSE_MAX))
+            if self._pages:
+                await asyncio.sleep(pause)
+                continue
+            self._wake.clear()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(limits.HISTORY_PERIOD):
+                    await self._wake.wait()
 
     def _take(self, reading: Reading) -> None:
         if reading.number == self._number:
@@ -122,6 +141,23 @@ class MeshFeed:
             if self._builder is None or self._builder.own != reading.snapshot.agent.name:
                 self._builder = StateBuilder(reading.snapshot.agent.name)
             facts = tuple(self._resources.facts.values())
-            self._state = self._builder.build(reading.snapshot, facts, self._resources.alarms())
+            standing, recorded = self._resources.alarms(), self._resources.recorded
+            self._state = self._builder.build(reading.snapshot, facts, standing, recorded)
+        self._record_links(self._state)
         for show in [*self._pages.values()]:
             show(self._state)
+
+    def _record_links(self, state: Tree) -> None:
+        """Note in the history which links were lost, and which are back."""
+        modules = state.get("modules")
+        for name, module in modules.items() if isinstance(modules, dict) else ():
+            if not isinstance(module, dict):
+                continue
+            now, before = str(module.get("state", "")), self._links.get(name)
+            self._links[name] = now
+            if before not in (None, now):
+                error = str(module.get("error") or "")
+                text = f"{name}: {WORDS.get(now, now)}" + (f": {error}" if error else "")
+                self._resources.record(_LEVELS.get(now, "WARN"), text, module=name)
+        if isinstance(modules, dict):
+            self._links = {name: state for name, state in self._links.items() if name in modules}

@@ -54,6 +54,7 @@ class Monitor:
         self._hub.start()
         self.resources.start()
         self.log.start()
+        self.mesh.start()
 
     async def ready(self) -> None:
         """Wait until the agent was asked once, so that a page is told its name."""

@@ -75,10 +75,18 @@ class ResourceWatch:
         self._paths: dict[str, _Path] = {}
         self._wanted = False
         self._since: dict[str, tuple[str, float]] = {}
-        self.facts: dict[str, ResourceFacts] = {}
-        """By ``ResourceFacts.key``."""
+        self._heard: dict[str, ResourceFacts] = {}
+        """By key, those included whose descriptor has not come yet."""
         self.history: deque[dict[str, Any]] = deque(maxlen=limits.ALARMS_KEPT)
-        """Alarms since the server started, oldest first: ``at``, ``level``, ``resource``, ``text``."""
+        """Alarms and changes of links since the server started, oldest first: ``at``, ``level``, ``text``, and the
+        key of a ``resource`` or the name of a ``module``."""
+        self.recorded = 0
+        """How many the history has had, those included that are no longer kept."""
+
+    @property
+    def facts(self) -> dict[str, ResourceFacts]:
+        """The resources, by ``ResourceFacts.key``."""
+        return {key: facts for key, facts in self._heard.items() if facts.descriptor}
 
     def start(self) -> None:
         """Begin to follow the graph."""
@@ -123,6 +131,11 @@ class ResourceWatch:
                 })  # fmt: skip
         return standing
 
+    def record(self, level: str, text: str, **whose: str) -> None:
+        """Add to the history: of a ``resource``, by its key, or of a ``module``, by its name."""
+        self.recorded += 1
+        self.history.append({"at": round(self._now(), 3), "level": level, "text": text, **whose})
+
     # --- inside -----------------------------------------------------------------------------------------------
 
     def _graph_changed(self) -> None:
@@ -149,9 +162,9 @@ class ResourceWatch:
             self._unsubscribe(path, there)
         there.publishers = publishers
         peers = {_peer_of(node) for node in publishers}
-        for key, facts in [*self.facts.items()]:
+        for key, facts in [*self._heard.items()]:
             if facts.name == path and facts.peer not in peers:
-                del self.facts[key]
+                del self._heard[key]
                 self._since.pop(key, None)
 
     def _follow_all(self) -> None:
@@ -183,8 +196,8 @@ class ResourceWatch:
 
     def _forget(self, name: str) -> None:
         self._unsubscribe(name, self._paths.pop(name))
-        for key in [key for key, facts in self.facts.items() if facts.name == name]:
-            del self.facts[key]
+        for key in [key for key, facts in self._heard.items() if facts.name == name]:
+            del self._heard[key]
             self._since.pop(key, None)
 
     def _take(self, name: str, topic: str, message: Received) -> None:
@@ -192,23 +205,20 @@ class ResourceWatch:
         key = f"{peer}:{name}" if peer else name
         try:
             values = self._values.of(message)
+            facts = self._heard.get(key) or ResourceFacts(name=name, peer=peer)
             if topic == DESCRIPTOR:
-                known = self.facts.get(key) or ResourceFacts(name=name, peer=peer)
-                self.facts[key] = msgspec.structs.replace(known, **_described(values["data"]))
+                self._heard[key] = msgspec.structs.replace(facts, **_described(values["data"]))
             elif topic == "alarms":
                 self._alarm(key, values)
-            elif key in self.facts:
-                facts = self.facts[key]
-                self.facts[key] = msgspec.structs.replace(facts, **_said(facts, topic, values))
+            else:  # latched ones may come before the descriptor
+                self._heard[key] = msgspec.structs.replace(facts, **_said(facts, topic, values))
         except (RmpaError, msgspec.DecodeError, KeyError, TypeError, RecursionError):
             return  # another program's topic of that name
 
     def _alarm(self, key: str, values: Any) -> None:
         for status in map(_status, values["status"]):
             self._since[key] = status["level"], self._now()
-            self.history.append(
-                {"at": round(self._now(), 3), "level": status["level"], "resource": key, "text": status["message"]}
-            )
+            self.record(status["level"], status["message"], resource=key)
 
 
 def _described(text: str) -> dict[str, Any]:

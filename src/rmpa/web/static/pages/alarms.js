@@ -10,9 +10,9 @@ export function Alarms({ state, connection }) {
   const alarms = entries(state, "alarms");
   const [history, setHistory] = useState(null);
   const [failure, setFailure] = useState(null);
-  useEffect(() => { connection.ask("history").then((value) => { setHistory(value); setFailure(null); }, setFailure); }, [alarms.map(([id, each]) => id + each.level).join(), connection.phase]);
+  useEffect(() => { connection.ask("history").then((value) => { setHistory(value); setFailure(null); }, setFailure); }, [alarms.map(([id, each]) => id + each.level).join(), state.recorded, connection.phase]);
   return html`<${Page} title="Alarms" kind=${alarms.length ? `${alarms.length} stand` : "None stands"}>
     <div class="grid"><${Panel} title="Alarms of Smart Resources" wide><${Table} caption="Alarms" columns=${["Resource", "Level", "Says", "Stands for"]} empty="No alarm stands.">${alarms.map(([id, alarm]) => html`<tr key=${id}><th scope="row"><${Link} page="resource" name=${alarm.resource} /></th><td><${Mark} state=${alarm.level} /></td><td>${alarm.text}</td><td><${Since} moment=${alarm.at} /></td></tr>`)}<//><//>
     <${Panel} title="All that is wrong"><${Concerns} state=${state} connection=${connection} /><//>
-    <${Panel} title="History"><${Failure} failure=${failure} />${history && html`<${Table} caption="History of alarms" columns=${["Time", "Level", "Resource", "Says"]} empty="Nothing has happened since rmpa web started.">${[...history].reverse().map((each, at) => html`<tr key=${at}><th scope="row">${clock(each.at)}</th><td><${Mark} state=${each.level} /></td><td><${Link} page="resource" name=${each.resource} /></td><td>${each.text}</td></tr>`)}<//>`}<//></div><//>`;
+    <${Panel} title="History"><${Failure} failure=${failure} />${history && html`<${Table} caption="History of alarms" columns=${["Time", "Level", "Resource or module", "Says"]} empty="Nothing has happened since rmpa web started.">${[...history].reverse().map((each, at) => html`<tr key=${at}><th scope="row">${clock(each.at)}</th><td><${Mark} state=${each.level} /></td><td><${Link} page=${each.resource ? "resource" : "module"} name=${each.resource || each.module} /></td><td>${each.text}</td></tr>`)}<//>`}<//></div><//>`;
 }
