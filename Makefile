@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := venv
-.PHONY: venv demo demo-kill demo-start test test-bare tests style format types imports reference fuzz soak bench experiment wheel ros chromium clean
+.PHONY: venv demo demo-kill demo-start test test-bare tests style format types imports reference fuzz soak soak-web bench experiment wheel ros chromium clean
 
 $(STAMP): pyproject.toml constraints.txt scripts/bootstrap
 	scripts/bootstrap $(PYTHON) $(VENV)
@@ -56,8 +56,11 @@ fuzz: $(STAMP)  ## every fuzz target for longer: make fuzz [SECONDS=60]
 soak: $(STAMP) ros  ## disturb three modules for long and see that nothing leaks: make soak [SECONDS=600] [SEED=N]
 	$(BIN)/python -m tests.soak --seconds $(or $(SECONDS),600) $(if $(SEED),--seed $(SEED))
 
+soak-web: $(STAMP) chromium  ## modules, topics, clients and pages of rmpa web come and go for an hour; nothing may leak: make soak-web [SECONDS=3600] [SEED=N]
+	$(BIN)/python -m tests.soak.web --seconds $(or $(SECONDS),3600) $(if $(SEED),--seed $(SEED))
+
 bench: $(STAMP) ros  ## the measurements, as ratios in one run; results in lab/results
-	-$(BIN)/pip install -q -c constraints.txt -e '.[lab-peers]'  # a peer that cannot be installed is left out
+	-$(BIN)/pip install -q -c constraints.txt -e '.[lab-peers,web-peers]'  # a peer that cannot be installed is left out
 	$(BIN)/python -m lab bench $(ARGS)
 
 experiment: $(STAMP) ros  ## classic ROS beside RMPA, with a report: make experiment [ARGS="--short"]; docs/experiments.md

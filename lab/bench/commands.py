@@ -30,13 +30,16 @@ from lab.bench import (
     storm,
     tasks,
     throughput,
+    web,
 )
 from lab.bench.contenders import ENTRIES
+from lab.web.servers import why_no_web
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Collection
 
     Measure = Callable[[bool, Console, Path | None], object]
+    MeasureParts = Callable[[bool, Console, Path | None, tuple[str, ...]], object]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,17 +51,21 @@ class Measurement:
         measure: Takes whether few samples will do, where to print, and a file for the result.
         needs: Each says why it cannot run here, or an empty string.
         realtime: Takes the same, and measures with nodes and agents under SCHED_FIFO.
+        parts: What ``--only`` can choose of it.
+        only: Takes the same and the parts that were chosen.
     """
 
     about: str
     measure: Measure
     needs: tuple[Callable[[], str], ...] = (why_no_ros, why_no_hosts)
     realtime: Measure | None = None
+    parts: Collection[str] = ()
+    only: MeasureParts | None = None
 
 
 MEASUREMENTS: Final[dict[str, Measurement]] = {
     "path": Measurement(
-        "how late a message is, on every path", roundtrips.path, needs=()
+        "how late a message is, on every path", roundtrips.path, needs=(), parts=ENTRIES, only=roundtrips.path
     ),  # leaves out what cannot start
     "period": Measurement(
         "how evenly messages arrive", period.measure, realtime=partial(period.measure, realtime=True)
@@ -97,6 +104,13 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
     ),
     "decision": Measurement("how long a resource takes to decide", decision.measure, needs=()),
     "bookkeeping": Measurement("what measuring quality costs, and how soon a resource adapts", bookkeeping.measure),
+    "web": Measurement(
+        "rmpa web beside rosbridge_suite's server and foxglove-sdk's",
+        web.measure,
+        (why_no_ros, why_no_web),
+        parts=web.PARTS,
+        only=web.measure,
+    ),
 }
 
 
@@ -108,7 +122,8 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
     "--only",
     default="",
     metavar="KEYS",
-    help="path: these contenders, comma-separated (lab/bench/contenders.py has them).",
+    help="path: these contenders, comma-separated (lab/bench/contenders.py has them); "
+    f"web: of {', '.join(web.PARTS)}.",
 )
 @click.option(
     "--realtime",
@@ -125,10 +140,10 @@ def bench(names: tuple[str, ...], quick: bool, file: Path | None, only: str, rea
         row = MEASUREMENTS[name]
         if reason := next(filter(None, (why() for why in row.needs)), ""):
             console.print(f"{name} is left out: {reason}", style="yellow")
-        elif name == "path" and only:
-            if unknown := sorted({*only.split(",")} - {*ENTRIES}):
-                raise click.BadParameter(f"no {unknown[0]}; there are {', '.join(ENTRIES)}", param_hint="--only")
-            roundtrips.path(quick, console, file, tuple(only.split(",")))
+        elif only and row.only:
+            if unknown := sorted({*only.split(",")} - {*row.parts}):
+                raise click.BadParameter(f"no {unknown[0]}; there are {', '.join(row.parts)}", param_hint="--only")
+            row.only(quick, console, file, tuple(only.split(",")))
         else:
             measure = (realtime and row.realtime) or row.measure
             measure(quick, console, file)

@@ -3,7 +3,8 @@
 Reads lines with a number: registers publishers until there are so many, ``--per-node`` on each node, and for each
 node ``--services`` services. All nodes share one slave API and one TCPROS server, which answers a subscriber's header
 and keeps quiet. Needs nothing but Python.
-Options: --per-node, --services. Events: up; registered with the count.
+Options: --per-node, --services. Events: up; registered with the count, and the ns at which
+the last one was.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import socketserver
 import struct
 import sys
 import threading
+import time
 import xmlrpc.client
 from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
 
@@ -96,7 +98,7 @@ def main() -> None:
                     service, port = f"{node}/service{number}", publications.server_address[1]
                     master.registerService(node, service, f"rosrpc://{_HOST}:{port}", api)
             registered += 1
-        say("registered", count=registered)
+        say("registered", count=registered, at_ns=time.monotonic_ns())
 
 
 if __name__ == "__main__":

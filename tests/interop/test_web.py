@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from lab.bed.agents import RMPA, Agent
+from lab.bed.chromium import Chromium
 from lab.bed.processes import DEADLINE, Process
 from rmpa.web.monitor.limits import DRIVE_SPEED
 from tests.interop.modules import Module
 from tests.interop.web import needs_browser
-from tests.web.browser.chromium import Chromium
 from tests.web.http_client import http_client
 
 if TYPE_CHECKING:

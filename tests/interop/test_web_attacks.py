@@ -14,6 +14,7 @@ import aiohttp
 import msgspec
 import pytest
 
+from lab.bed.chromium import Chromium
 from lab.bed.processes import DEADLINE
 from rmpa.resource.run.descriptor import Descriptor, ParameterDescriptor, ProfileDescriptor
 from rmpa.web import limits
@@ -21,7 +22,6 @@ from rmpa.web.monitor import limits as monitor_limits
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from tests.interop.ros import PYTHON
 from tests.interop.web import REFUSED, needs_browser
-from tests.web.browser.chromium import Chromium
 from tests.web.http_client import http_client
 
 if TYPE_CHECKING:

@@ -14,16 +14,16 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from lab.bed.agents import RMPA
+from lab.bed.chromium import BINARY
 from lab.bed.processes import DEADLINE, Process
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from rmpa.web.monitor.patch import apply
-from tests.web.browser.chromium import BINARY
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from lab.bed.agents import Agent
-    from tests.web.browser.chromium import Chromium
+    from lab.bed.chromium import Chromium
 
 PORT: Final = 8480
 REFUSED: Final = "rmpa_web_refused_total"

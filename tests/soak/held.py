@@ -10,7 +10,7 @@ import time
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 import psutil
 
@@ -34,6 +34,18 @@ FLOOR_SPAN: Final = 5
 GROWTH_MAX: Final = 3 * MB
 """That the floor of the resident memory may rise by in the second half, and by no more than a twentieth: an
 allocator's holes are worth a megabyte."""
+
+
+class Memory(Protocol):
+    """A sample of a process's memory: seconds since the soak began, and bytes."""
+
+    @property
+    def at(self) -> float:
+        """Seconds since the soak began."""
+
+    @property
+    def rss(self) -> int:
+        """Bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +167,7 @@ def left(before: Held, after: Held) -> list[str]:
     return problems + [f"tasks: {count} more of {name}" for name, count in sorted(more.items())]
 
 
-def floors(samples: Sequence[Held]) -> list[tuple[float, int]]:
+def floors(samples: Sequence[Memory]) -> list[tuple[float, int]]:
     """Start and least resident memory of each ``FLOOR_SPAN`` samples."""
     spans = [samples[begin : begin + FLOOR_SPAN] for begin in range(0, len(samples), FLOOR_SPAN)]
     return [(span[0].at, min(held.rss for held in span)) for span in spans if len(span) == FLOOR_SPAN]
@@ -171,7 +183,7 @@ def slope(points: Sequence[tuple[float, float]]) -> float:
     return sum((x - mean_x) * (y - mean_y) for x, y in points) / square if square else 0.0
 
 
-def growth(samples: Sequence[Held]) -> float | None:
+def growth(samples: Sequence[Memory]) -> float | None:
     """Bytes by which the floor of the resident memory rose in the second half; ``None``: too few samples to tell."""
     points = floors(samples[len(samples) // 2 :])
     if len(points) < 3:
@@ -179,10 +191,15 @@ def growth(samples: Sequence[Held]) -> float | None:
     return slope([(at, float(rss)) for at, rss in points]) * (points[-1][0] - points[0][0])
 
 
-def too_much(samples: Sequence[Held]) -> str:
-    """Why the resident memory is not flat, or an empty string."""
+def too_much(samples: Sequence[Memory], most: float | None = None) -> str:
+    """Why the memory is not flat, or an empty string.
+
+    Args:
+        samples: Of one process.
+        most: Bytes that it may rise by in the second half; else ``GROWTH_MAX`` or a twentieth.
+    """
     rose = growth(samples)
-    if rose is None or rose <= min(GROWTH_MAX, samples[-1].rss / 20):
+    if rose is None or rose <= (min(GROWTH_MAX, samples[-1].rss / 20) if most is None else most):
         return ""
     shown = ", ".join(f"{rss / MB:.1f}" for _, rss in floors(samples))
     return f"memory rose by {rose / MB:.1f} MB in the second half: {shown}"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 from aiohttp import web
 
-from tests.web.browser.chromium import BINARY, Chromium
+from lab.bed.chromium import BINARY, Chromium
 from tests.web.monitor.fake_server import FakeServer
 
 if TYPE_CHECKING:

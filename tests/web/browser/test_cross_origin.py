@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from aiohttp import web
 
-from tests.web.browser.chromium import BINARY, Chromium
+from lab.bed.chromium import BINARY, Chromium
 from tests.web.server.test_server import TOKEN, running
 from tests.web.snapshots import FULL
 

@@ -13,7 +13,7 @@ from rmpa.web.hub.rights import Rights
 from rmpa.web.monitor import limits
 
 if TYPE_CHECKING:
-    from tests.web.browser.chromium import Chromium
+    from lab.bed.chromium import Chromium
     from tests.web.browser.conftest import Site
 
 AXE = Path(__file__).with_name("vendor") / "axe.min.js"

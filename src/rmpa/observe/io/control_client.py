@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import socket
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self, TypeVar
+from typing import TYPE_CHECKING, Generic, Self, TypeVar, cast
 from urllib.parse import urlsplit
 
 import msgspec
@@ -24,6 +25,19 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 _START_ONE = "start one with `rmpa up`"
+
+
+class _TypedReply(msgspec.Struct, Generic[_T], frozen=True):
+    """A ``ControlReply`` whose value has a known type."""
+
+    ok: bool
+    value: _T | msgspec.UnsetType = msgspec.UNSET
+
+
+@functools.cache
+def _decoder(value: object) -> msgspec.json.Decoder[_TypedReply[object]]:
+    """The decoder of replies whose value has this type."""
+    return msgspec.json.Decoder(_TypedReply[value])  # type: ignore[valid-type]
 
 
 class ControlClient:
@@ -89,6 +103,11 @@ class ControlClient:
             raise UnreachableError("agent", f"{self.path} in time", "is it stopped? its log may tell") from None
         except OSError as error:
             raise UnreachableError("agent", f"{self.path} ({error.strerror})", _START_ONE) from None
+        with contextlib.suppress(msgspec.DecodeError, RecursionError, UnicodeDecodeError):
+            # Straight to its type takes half the time: the monitor asks for all of a large mesh six times a second.
+            typed = _decoder(type).decode(line)  # type: ignore[arg-type]  # types are hashable
+            if typed.ok and typed.value is not msgspec.UNSET:
+                return cast("_T", typed.value)
         reply = ControlReply.parse(line)
         if not reply.ok:
             raise PeerRefused(f"agent {self.name}", reply.error, reply.remedy)

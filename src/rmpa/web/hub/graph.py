@@ -141,14 +141,17 @@ class GraphWatch:
                 self._master_back()
             if changed or not self.loaded.is_set():
                 self._rebuild()
-            took = loop.time() - began
+            ended = loop.time()
+            took = ended - began
             period = self._period()
             share = limits.GRAPH_CHANGED_SHARE if changed else limits.GRAPH_SHARE
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(max(period - took, took * share)):
                     await self._look.wait()
-                # Many changes at once, as when a page subscribes to all topics, are one look.
-                await asyncio.sleep(max(limits.GRAPH_GATHER, took))
+                # Many changes at once, as when a page subscribes to all topics, are one look. The first change after
+                # a rest does not wait for a large graph's sake: the rest has been as long as a look.
+                rested = loop.time() - ended
+                await asyncio.sleep(max(limits.GRAPH_GATHER, took - rested))
 
     def _period(self) -> float:
         if self.told:

@@ -95,6 +95,7 @@ class StateBuilder:
         self._steady = Steady()
         self._bytes = _ByteRates()
         self._idle: dict[str, tuple[TopicInfo, Tree]] = {}
+        self._served: dict[str, tuple[ServiceInfo, Tree]] = {}
         self._sections: Tree = {}
 
     def build(
@@ -124,7 +125,7 @@ class StateBuilder:
             "modules": dict(self._modules(snapshot, peers)),
             "flows": {**self._flows(snapshot.topics), **resource_flows(resources, self.own, self._steady)},
             "topics": self._topics(snapshot.topics[: limits.TOPICS_SHOWN]),
-            "services": {service_key(s): _service(s) for s in snapshot.services[: limits.SERVICES_SHOWN]},
+            "services": self._services(snapshot.services[: limits.SERVICES_SHOWN]),
             "resources": {one.key: resource_entry(one, self.own) for one in resources},
             "alarms": {
                 str(alarm.get("id", index)): {**alarm, "module": alarm.get("module") or self.own}
@@ -257,6 +258,16 @@ class StateBuilder:
         self._idle = idle
         return found
 
+    def _services(self, services: Sequence[ServiceInfo]) -> Tree:
+        """By ``service_key``; entries are kept until they change."""
+        served: dict[str, tuple[ServiceInfo, Tree]] = {}
+        for service in services:
+            key = service_key(service)
+            before = self._served.get(key)
+            served[key] = before if before is not None and before[0] == service else (service, _service(service))
+        self._served = served
+        return {key: entry for key, (_, entry) in served.items()}
+
     def _topic(self, topic: TopicInfo) -> Tree:
         incoming = [route for route in topic.routes if route.direction == "in"]
         figures = [_figures(route) for route in topic.routes]
@@ -296,6 +307,8 @@ def _figures(route: RouteInfo) -> tuple[float, float]:
 
     Each direct subscriber has a copy of its own, which is so many bytes more.
     """
+    if not route.subscribers:
+        return route.rate or 0.0, route.bandwidth or 0.0
     direct = [subscriber.figures for subscriber in route.subscribers if subscriber.figures is not None]
     rate = max((figures.rate or 0.0 for figures in direct), default=0.0)
     bandwidth = sum(figures.bandwidth or 0.0 for figures in direct)
