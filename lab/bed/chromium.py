@@ -8,14 +8,18 @@ import contextlib
 import itertools
 import os
 import shutil
+import signal
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-import aiohttp
+from lab.bed.namespaces import MACHINE
+from tests.web.http_client import http_client
 
 if TYPE_CHECKING:
     from types import TracebackType
+
+    from lab.bed.namespaces import Host
 
 BINARY = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 """The program, or ``None``: then the tests of the pages are skipped."""
@@ -39,12 +43,16 @@ class PageError(AssertionError):
 class Chromium:
     """One browser with one page; an asynchronous context manager.
 
+    Args:
+        host: Where it runs.
+
     Attributes:
-        errors: What the page's console says of errors, also of what the CSP blocked.
+        errors: What the page's console says of errors, also of what the CSP blocked, and dialogs that it opened.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, host: Host = MACHINE) -> None:
         self.errors: list[str] = []
+        self._host = host
         self._numbers = itertools.count(1)
         self._replies: dict[int, asyncio.Future[Any]] = {}
 
@@ -56,12 +64,15 @@ class Chromium:
         if os.geteuid() == 0:
             flags.append("--no-sandbox")
         self._process = await asyncio.create_subprocess_exec(
-            BINARY, *flags, "about:blank", stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.DEVNULL
+            *self._host.command([BINARY, *flags, "about:blank"]),
+            stdout=asyncio.subprocess.DEVNULL,
+            stderr=asyncio.subprocess.DEVNULL,
+            process_group=0,
         )
         self._stack.push_async_callback(self._end)
         try:
             port = await self._port()
-            http = await self._stack.enter_async_context(aiohttp.ClientSession())
+            http = await self._stack.enter_async_context(http_client(self._host))
             async with http.get(f"http://127.0.0.1:{port}/json") as response:
                 target = next(each for each in await response.json() if each["type"] == "page")
             self._socket = await self._stack.enter_async_context(
@@ -80,6 +91,11 @@ class Chromium:
     ) -> None:
         self._reader.cancel()
         await self._stack.aclose()
+
+    async def kill(self) -> None:
+        """``kill -9``: the browser and its processes."""
+        os.killpg(self._process.pid, signal.SIGKILL)
+        await self._process.wait()
 
     async def _end(self) -> None:
         if self._process.returncode is None:
@@ -111,6 +127,12 @@ class Chromium:
                 self.errors.append(str(details.get("exception", {}).get("description", details["text"])))
             elif message["method"] == "Log.entryAdded" and message["params"]["entry"]["level"] == "error":
                 self.errors.append(str(message["params"]["entry"]["text"]))
+            elif message["method"] == "Runtime.consoleAPICalled" and message["params"]["type"] == "error":
+                self.errors.append(str(message["params"]["args"]))
+            elif message["method"] == "Page.javascriptDialogOpening":
+                self.errors.append(f"a dialog: {message['params']['message']}")
+                answer = {"method": "Page.handleJavaScriptDialog", "params": {"accept": True}}
+                await self._socket.send_json({"id": next(self._numbers), **answer})
 
     async def send(self, method: str, **params: Any) -> dict[str, Any]:
         """A command of the DevTools protocol, and its result."""
@@ -164,6 +186,16 @@ class Chromium:
     async def wait_text(self, text: str) -> None:
         """Wait until the page shows a text."""
         await self.wait(f"document.body.innerText.includes({text!r})")
+
+    async def click(self, text: str, within: str = "document") -> None:
+        """Press the button of that text as soon as it is there.
+
+        Args:
+            text: The whole text of the button.
+            within: An expression for the element that has it.
+        """
+        button = f"[...{within}.querySelectorAll('button')].find((b) => b.textContent === {text!r} && !b.disabled)"
+        await self.wait(f"({button})?.click() ?? !!({button})")
 
     async def press(self, key: str) -> None:
         """Press and release one key."""

@@ -15,14 +15,17 @@ runs cannot meet. Names carry our process id; those of dead processes are remove
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import functools
 import itertools
 import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
@@ -33,6 +36,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 _PREFIX: Final = "rmpa"
+_PLACES: Final = Path("/run/netns")
+"""Where ``ip`` keeps its namespaces (ip-netns(8))."""
+_CLONE_NEWNET: Final = 0x40000000
+_libc = ctypes.CDLL(None, use_errno=True)
 _labs = itertools.count(1)
 
 
@@ -103,6 +110,20 @@ class Host:
         """The command line that runs ``argv`` on this host; the process becomes ``argv``, its id stays."""
         inside = [str(part) for part in argv]
         return ["ip", "netns", "exec", self.namespace, *inside] if self.namespace else inside
+
+    def open_socket(self, family: int = socket.AF_INET, kind: int = socket.SOCK_STREAM) -> socket.socket:
+        """A new socket in this host's network, for a program that itself runs on the real machine."""
+        if not self.namespace:
+            return socket.socket(family, kind)
+        with ThreadPoolExecutor(1) as pool:  # setns(2) moves one thread, which ends here
+            return pool.submit(self._socket_within, family, kind).result()
+
+    def _socket_within(self, family: int, kind: int) -> socket.socket:
+        with (_PLACES / self.namespace).open("rb") as place:
+            if _libc.setns(place.fileno(), _CLONE_NEWNET):
+                number = ctypes.get_errno()
+                raise OSError(number, f"{self.namespace} cannot be entered: {os.strerror(number)}")
+        return socket.socket(family, kind)
 
     def ip(self, *args: str) -> str:
         """Run ``ip`` in this host."""

@@ -13,6 +13,7 @@ from lab.bed.agents import Agent
 from lab.bed.namespaces import MACHINE, Host, Lab
 from tests.interop.modules import Module
 from tests.interop.ros import Ros, free_port
+from tests.interop.web import Web
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 ShellFactory = Callable[..., Ros]
 AgentFactory = Callable[..., Agent]
 ModuleFactory = Callable[..., list[Module]]
+WebFactory = Callable[..., Web]
 
 
 @pytest.fixture(scope="session")
@@ -74,3 +76,14 @@ def modules(lab: Lab, shell: ShellFactory, agent: AgentFactory) -> ModuleFactory
         return made
 
     return make
+
+
+@pytest.fixture
+def web() -> Iterator[WebFactory]:
+    """Start ``rmpa web`` beside agents of a lab: ``web(agent, "--control")`` returns when it listens."""
+    with ExitStack() as stack:
+
+        def make(agent: Agent, *flags: str, **options: int) -> Web:
+            return stack.enter_context(Web(agent, *flags, **options))
+
+        yield make

@@ -258,7 +258,6 @@ DRIVE = {"op": "drive", "topic": "/cmd_vel", "linear": 0, "angular": 0}
         "\ud800",
         '{"op": "shutdown"}',
         '{"op": "ack"}',
-        json.dumps(WATCH | {"topic": "odom"}),
         json.dumps(WATCH | {"how": "plot"}),
         json.dumps(WATCH | {"rate": 1000}),
         json.dumps(DRIVE | {"linear": 9}),
@@ -271,6 +270,17 @@ def test_what_is_no_request_closes_the_connection(text: str) -> None:
     outputs = list(Page().session.receive(text.encode("utf-8", "surrogatepass"), 100.0))
     assert isinstance(outputs[-1], Close)
     assert len(outputs[-1].reason.encode()) <= 123
+    assert outputs[-1].refusal == ("message_size" if len(text) > limits.REQUEST_MAX else "message")
+
+
+@pytest.mark.parametrize("topic", ["odom", "", "/<b>", "/a//b"])
+def test_a_name_that_is_none_fails_and_the_page_stays(topic: str) -> None:
+    page = Page(Rights(drive=True))
+    (failed,) = page.send("watch", id=1, topic=topic, how="value")
+    assert (failed["op"], failed["id"]) == ("failed", 1)
+    (failed,) = page.send("drive", topic=topic, linear=0, angular=0)
+    assert (failed["op"], failed["id"]) == ("failed", 0)
+    assert page.others == []
 
 
 def test_a_flood_closes_the_connection() -> None:
@@ -278,6 +288,7 @@ def test_a_flood_closes_the_connection() -> None:
     for _ in range(int(limits.REQUEST_BURST) + 1):
         page.send("ack", n=0)
     assert isinstance(page.others[-1], Close)
+    assert page.others[-1].refusal == "message_rate"
 
 
 def test_the_log_is_left_out_for_a_slow_page() -> None:

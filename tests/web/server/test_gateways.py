@@ -12,6 +12,7 @@ import msgspec
 import pytest
 
 from rmpa.core.contract import ContractRule, Contracts, Priority
+from rmpa.web import limits
 from rmpa.web.gateways.gateways import Gateways
 from rmpa.web.hub.rights import FULL, READ_ONLY
 from rmpa.web.server.agent_watch import AgentWatch
@@ -100,6 +101,25 @@ async def test_pages_of_other_sites_connect_only_where_they_are_listed() -> None
         connect(session, server, Origin=origin),
     ):
         pass
+
+
+async def test_a_failed_handshake_is_counted_and_its_connection_keeps_its_limits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with running() as (server, _), aiohttp.ClientSession() as session:
+        reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+        request = "GET / HTTP/1.1", "Host: localhost", "Upgrade: websocket", "Connection: Upgrade"
+        writer.write("\r\n".join([*request, "Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: x", "", ""]).encode())
+        async with asyncio.timeout(DEADLINE):
+            assert (await reader.readuntil(b"\r\n\r\n")).startswith(b"HTTP/1.1 400")
+            monkeypatch.setattr(limits, "WEB_REQUEST_TIMEOUT", 0.1)
+            writer.write(b"GET /heal")
+            assert b"handshake" in await reader.read()  # and then it is closed
+        writer.close()
+        async with session.get(f"http://127.0.0.1:{server.port}/metrics") as response:
+            metrics = await response.text()
+        for reason in ("handshake", "slow_request"):
+            assert f'rmpa_web_refused_total{{reason="{reason}"}} 1.0' in metrics
 
 
 async def test_the_server_ends_while_clients_are_connected() -> None:

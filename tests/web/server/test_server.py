@@ -14,7 +14,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.web import limits
 from rmpa.web.server.agent_watch import AgentWatch
-from rmpa.web.server.app import HEADERS
+from rmpa.web.server.app import HEADERS, OPENER_POLICY
 from rmpa.web.server.auth import AccessPolicy, own_names
 from rmpa.web.server.server import WebServer
 from tests.web.snapshots import FULL
@@ -118,7 +118,7 @@ async def test_each_path_gives_what_it_says() -> None:
             status, headers, body = await site.get(path)
             assert (status, headers["Content-Type"]) == (200, kind), path
             assert part in body, path
-            assert HEADERS.items() <= headers.items(), path
+            assert {**HEADERS, **dict([OPENER_POLICY])}.items() <= headers.items(), path
         assert (await site.get("/metrics", Accept="application/openmetrics-text; version=1.0.0"))[2].endswith(
             b"# EOF\n"
         )

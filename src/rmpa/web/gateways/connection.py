@@ -12,7 +12,7 @@ import socket
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from aiohttp import WSMsgType, web
+from aiohttp import WebSocketError, WSCloseCode, WSMsgType, web
 
 from rmpa.core.errors import RmpaError
 from rmpa.web import limits
@@ -82,6 +82,8 @@ class ClientConnection(ABC):
         self._timer: asyncio.TimerHandle | None = None
         self._transport: asyncio.Transport | None = None
         self._close: tuple[int, str] | None = None
+        self._close_timer: asyncio.TimerHandle | None = None
+        self._refused: Callable[[str, str], None] | None = None
         self._client: Client | None = None
         self._drops_shown = 0
         self._drops_at = 0.0
@@ -137,10 +139,22 @@ class ClientConnection(ABC):
             self.queue.end(request.handle)
         self.hub.ask(self.client, request)
 
-    def end(self, code: int, reason: str) -> None:
-        """Close the WebSocket."""
+    def end(self, code: int, reason: str, refusal: str = "") -> None:
+        """Close the WebSocket; what the client still sends is ignored.
+
+        Args:
+            code: Of RFC 6455, section 7.4.
+            reason: For the client and the log.
+            refusal: Which of ``figures.REASONS`` is counted, where the client is the cause.
+        """
+        if self._close is not None:
+            return
         self._close = (code, reason)
         self._wake.set()
+        # A client that does not read would hold the close frame up for long.
+        self._close_timer = self._loop.call_later(2 * limits.CLOSE_TIMEOUT, self._abort)
+        if refusal:
+            self._refuse(refusal, reason)
 
     def arm(self) -> None:
         """Set the timer anew, after each call of the session."""
@@ -169,7 +183,11 @@ class ClientConnection(ABC):
     # --- the WebSocket ----------------------------------------------------------------------------------------
 
     async def run(
-        self, request: web.Request, socket_: web.WebSocketResponse, upgraded: Callable[[web.Request], None]
+        self,
+        request: web.Request,
+        socket_: web.WebSocketResponse,
+        upgraded: Callable[[web.Request], None],
+        refused: Callable[[str, str], None],
     ) -> None:
         """Serve the client until it has gone.
 
@@ -177,10 +195,12 @@ class ClientConnection(ABC):
             request: Asks for the WebSocket.
             socket_: Not prepared yet.
             upgraded: Called when the handshake is done.
+            refused: ``(reason, text)``: called if the client is disconnected for one of ``figures.REASONS``.
 
         Raises:
             PeerRefused: There are too many clients.
         """
+        self._refused = refused
         self._client = self.hub.connect(
             f"{self.kind} {self.address}", self.rights, self.receive, unadvertise_delay=self._unadvertise_delay
         )
@@ -200,8 +220,9 @@ class ClientConnection(ABC):
             try:
                 self.closing()
             finally:
-                if self._timer is not None:
-                    self._timer.cancel()
+                for timer in (self._timer, self._close_timer):
+                    if timer is not None:
+                        timer.cancel()
                 for task in tasks:
                     task.cancel()
                 self.hub.disconnect(self._client)
@@ -214,6 +235,8 @@ class ClientConnection(ABC):
             self._heard += 1
             if self._heard % _TURN == 0:
                 await asyncio.sleep(0)  # frames that have arrived already do not suspend this task
+            if message.type == WSMsgType.ERROR:
+                self._failed(message.data)
             if self._gone:
                 return
             if self._close is not None:
@@ -228,8 +251,17 @@ class ClientConnection(ABC):
                     _log.exception("! a frame of %s failed", self.client.name)
                     await socket_.close(code=_INTERNAL_ERROR, message=b"the server failed; its log says why")
                     return
-            elif message.type == WSMsgType.ERROR:
-                _log.debug("! %s: %s", self.client.name, socket_.exception())
+
+    def _failed(self, error: object) -> None:
+        """The WebSocket has ended by an error: of the connection, or a frame that breaks RFC 6455 or is too long."""
+        if isinstance(error, WebSocketError):
+            self._refuse("message_size" if error.code == WSCloseCode.MESSAGE_TOO_BIG else "message", str(error))
+        else:
+            _log.debug("! %s: %s", self.client.name, error)
+
+    def _refuse(self, reason: str, text: str) -> None:
+        if self._refused is not None:
+            self._refused(reason, text)
 
     async def _watch(self) -> None:
         """Disconnect a client without a sign of life: it sends nothing, answers no ping, and takes nothing.

@@ -70,7 +70,7 @@ class FoxgloveConnection(ClientConnection):
             if isinstance(output, TextFrame | BinaryFrame):
                 self.push(_out(output))
             elif isinstance(output, Close):
-                self.end(output.code, output.reason)
+                self.end(output.code, output.reason, "message")
             else:
                 self.ask(output)
 

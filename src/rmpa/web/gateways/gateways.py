@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 import secrets
+import time
 from collections import Counter
 from typing import TYPE_CHECKING, Final
 
 from aiohttp import web
 
+from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import PeerRefused
 from rmpa.web import limits
 from rmpa.web.foxglove.protocol import SUBPROTOCOLS, choose_subprotocol
@@ -58,6 +61,9 @@ class Gateways:
         priority: Callable[[str], int] = lambda _: 0,
         monitor: Monitor | None = None,
     ) -> None:
+        self.counters = Counters()
+        """Clients that were refused or disconnected, by the words of ``figures.REASONS``."""
+        self._refusals = RefusalLog(_log, self.counters)
         self.upgraded: Callable[[web.Request], None] = lambda _: None
         """Called when the handshake of a WebSocket is done."""
         self._monitor = monitor
@@ -98,7 +104,9 @@ class Gateways:
         connection: ClientConnection
         if request.path == MONITOR_PATH:
             if self._monitor is None or SUBPROTOCOL not in offered:
-                return web.Response(status=400, text=f"pages speak {SUBPROTOCOL} here; see /rosbridge\n")
+                text = f"pages speak {SUBPROTOCOL} here; see /rosbridge"
+                self.refuse(address, "handshake", text)
+                return web.Response(status=400, text=f"{text}\n")
             await self._monitor.ready()
             connection = MonitorConnection(self._hub, rights, self._priority, address, monitor=self._monitor)
             return await self._serve(request, connection, monitor_limits.REQUEST_MAX + 1)
@@ -123,9 +131,10 @@ class Gateways:
         )
         self._open[connection] = response
         try:
-            await connection.run(request, response, self.upgraded)
+            refused = functools.partial(self._refuse_client, connection)
+            await connection.run(request, response, self.upgraded, refused)
         except PeerRefused as error:
-            _log.warning("! %s: %s", connection.address, error)
+            self.refuse(connection.address, "clients", str(error))
             return web.Response(status=503, text=f"{error}\n")
         except Exception:
             if not response.prepared:
@@ -136,6 +145,19 @@ class Gateways:
             self._sent[connection.kind] += connection.sent
             self._dropped[connection.kind] += connection.queue.dropped_total
         return response
+
+    def refuse(self, address: str, reason: str, text: str) -> None:
+        """Count and log why a client is refused or disconnected.
+
+        Args:
+            address: The client's.
+            reason: One of ``figures.REASONS``.
+            text: What happened, for the log.
+        """
+        self._refusals.refuse(time.monotonic(), reason, address, f"{address}: {text}")
+
+    def _refuse_client(self, connection: ClientConnection, reason: str, text: str) -> None:
+        self.refuse(connection.address, reason, f"a client of {connection.kind} is disconnected: {text}")
 
     async def close(self) -> None:
         """Tell all clients that the server ends."""

@@ -145,7 +145,7 @@ class MonitorConnection(ClientConnection):
                 case FollowLog():
                     self._monitor.log.unfollow(self)
                 case Close():
-                    self.end(output.code, output.reason)
+                    self.end(output.code, output.reason, output.refusal)
                 case _:
                     self.ask(output)
         self.arm()

@@ -81,7 +81,7 @@ class RosbridgeConnection(ClientConnection):
         self._session.receive_frame(data, self._loop.time())
         self._flush()
         if self._session.refused:
-            self.end(1008, "not authenticated")
+            self.end(1008, "not authenticated", "message")
 
     def answered(self, answer: Answer) -> None:
         """An answer of the hub."""

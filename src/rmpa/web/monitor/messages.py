@@ -7,7 +7,6 @@ from typing import Any, Final, Literal, TypeAlias
 import msgspec
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.core.names import is_global_name
 from rmpa.web.monitor import limits
 
 VERSION: Final = 1
@@ -97,8 +96,6 @@ def parse(text: str | bytes) -> ClientMessage:
 def _check(message: ClientMessage) -> None:
     if isinstance(message, Look) and len(message.at) > limits.LOOKS_MAX:
         raise RemoteProtocolError(f"a page looks at {len(message.at)} things; {limits.LOOKS_MAX} is the most")
-    if isinstance(message, Watch | Drive) and not is_global_name(message.topic):
-        raise RemoteProtocolError(f"{message.topic[:80]!a} is not a topic's name")
     if isinstance(message, Watch | Unwatch | Ask) and not 0 < message.id < 2**32:
         raise RemoteProtocolError(f"the id {message.id} is not between 1 and 4294967295")
     if isinstance(message, Watch):

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import msgspec
 
-from rmpa.core.errors import RemoteProtocolError, RmpaError
+from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
+from rmpa.core.names import is_global_name
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.web.hub import requests
 from rmpa.web.monitor import limits
@@ -88,10 +89,14 @@ class FollowLog:
 
 @dataclass(frozen=True, slots=True)
 class Close:
-    """The client is to be disconnected, with this close code of RFC 6455 and reason."""
+    """The client is to be disconnected, with this close code of RFC 6455 and reason.
+
+    ``refusal`` is counted: ``message``, ``message_size`` or ``message_rate``.
+    """
 
     code: int
     reason: str
+    refusal: str
 
 
 Output: TypeAlias = str | bytes | requests.Request | Question | Speed | FollowLog | Close
@@ -146,12 +151,13 @@ class MonitorSession:
     def receive(self, text: str | bytes, now: float) -> Iterator[Output]:
         """A message of the client."""
         if not self._bucket.take(now):
-            yield Close(1008, f"more than {limits.REQUEST_RATE:g} messages a second")
+            yield Close(1008, f"more than {limits.REQUEST_RATE:g} messages a second", "message_rate")
             return
         try:
             message = parse(text)
         except RmpaError as error:
-            yield Close(1008, ascii(str(error))[1:-1][:100])
+            refusal = "message_size" if isinstance(error, LimitExceeded) else "message"
+            yield Close(1008, ascii(str(error))[1:-1][:100], refusal)
             return
         try:
             yield from self._act(message, now)
@@ -179,6 +185,7 @@ class MonitorSession:
         yield from self.handle_timer(now)
 
     def _watch(self, message: Watch) -> Iterator[Output]:
+        _check_topic(message.topic)
         if message.id in self._watches:
             raise RemoteProtocolError(f"watch {message.id} is in use")
         if len(self._watches) >= limits.WATCHES_MAX:
@@ -202,6 +209,7 @@ class MonitorSession:
         if not self._rights.drive:
             yield self._failed(0, "this page may not drive", "start rmpa web with --drive")
             return
+        _check_topic(message.topic)
         if self._driven and self._driven != message.topic:
             yield from self._stop()
         self._driven, self._drive_until = message.topic, now + limits.DRIVE_TIMEOUT
@@ -325,6 +333,16 @@ class MonitorSession:
 
     def _failed(self, id_: int, error: str, remedy: str = "") -> str:
         return _text({"op": "failed", "id": id_, "error": error, "remedy": remedy})
+
+
+def _check_topic(topic: str) -> None:
+    """A user may have typed it, and a master accepts names that are none: it is no fault of the page.
+
+    Raises:
+        RemoteProtocolError: It is not a topic's name.
+    """
+    if not is_global_name(topic):
+        raise RemoteProtocolError(f"{topic[:80]!a} is not a topic's name; write it as /name")
 
 
 def _text(message: dict[str, Any]) -> str:

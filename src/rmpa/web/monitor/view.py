@@ -98,7 +98,13 @@ class StateBuilder:
         self._served: dict[str, tuple[ServiceInfo, Tree]] = {}
         self._sections: Tree = {}
 
-    def build(self, snapshot: Snapshot, resources: Sequence[ResourceFacts] = (), alarms: Sequence[Tree] = ()) -> Tree:
+    def build(
+        self,
+        snapshot: Snapshot,
+        resources: Sequence[ResourceFacts] = (),
+        alarms: Sequence[Tree] = (),
+        recorded: int = 0,
+    ) -> Tree:
         """The state of ``snapshot``.
 
         Args:
@@ -106,6 +112,7 @@ class StateBuilder:
             resources: The Smart Resources of all modules.
             alarms: The alarms that stand, each with ``id``, ``module`` (empty: this one), ``resource``, ``level``,
                 ``text`` and ``at``.
+            recorded: How many entries the history has had.
         """
         taken = snapshot.taken
         peers = snapshot.peers[: limits.MODULES_SHOWN]
@@ -124,6 +131,7 @@ class StateBuilder:
                 str(alarm.get("id", index)): {**alarm, "module": alarm.get("module") or self.own}
                 for index, alarm in enumerate(alarms)
             },
+            "recorded": recorded,
             "notes": list(snapshot.notes[:100]),
             "unreachable": [str(each) for each in snapshot.unreachable[:100]],
         }

@@ -18,7 +18,16 @@ from rmpa.core.counters import Counters, RefusalLog
 from rmpa.web import limits, rest
 from rmpa.web.gateways.gateways import MONITOR_PATH, is_upgrade
 from rmpa.web.metrics import content_type, exposition
-from rmpa.web.server.auth import TOKEN_PARAMETER, AccessPolicy, MoveToken, Preflight, Refused, RequestFacts
+from rmpa.web.server.auth import (
+    TOKEN_PARAMETER,
+    AccessPolicy,
+    MoveToken,
+    Preflight,
+    Refused,
+    RequestFacts,
+    host_name,
+    is_loopback,
+)
 from rmpa.web.server.connections import GuardedConnection
 from rmpa.web.server.figures import Figures, web_metrics
 
@@ -37,6 +46,8 @@ _OPEN: Final = ("/healthz",)
 WEBSOCKET_PATHS: Final = ("/", "/rosbridge", "/foxglove", MONITOR_PATH)
 """Where WebSocket clients connect. The pages have their own path; else the subprotocol chooses the gateway."""
 _METHODS: Final = ("GET", "HEAD")
+_SHOWN: Final = 120
+"""Characters of a faulty header that are told."""
 _JUDGED: Final = web.RequestKey("rmpa.judged", bool)
 """Marks requests that reached the middleware; aiohttp answers malformed ones before."""
 HEADERS: Final = {
@@ -45,13 +56,14 @@ HEADERS: Final = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
     "Referrer-Policy": "no-referrer",
-    "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
     "Cache-Control": "no-store",
     "Server": "rmpa",
 }
 """Of every response."""
+OPENER_POLICY: Final = ("Cross-Origin-Opener-Policy", "same-origin")
+"""Of responses to loopback: in plain HTTP browsers ignore it from elsewhere, and report that as an error."""
 PREFLIGHT: Final = {
     "Access-Control-Allow-Methods": ", ".join(_METHODS),
     "Access-Control-Allow-Headers": "Authorization",
@@ -124,6 +136,8 @@ class Routes:
             if not response.prepared:
                 response.headers.update(HEADERS)
                 response.headers.update(self._sharing(request))
+                if is_loopback(host_name(request.host) or ""):
+                    response.headers.update((OPENER_POLICY,))
             return response
 
         return middleware
@@ -142,13 +156,25 @@ class Routes:
         if isinstance(verdict, MoveToken):
             return self._move_token(request)
         if self._gateways is not None and is_upgrade(request) and request.path in WEBSOCKET_PATHS:
-            handler = self._gateways.handle
+            return await self._upgrade(request, self._gateways)
         try:
             return await handler(request)
         except web.HTTPException:  # of aiohttp's router: no such path
             return _response(rest.problem(404, f"there is no {request.path[:80]!a}; / lists what there is"))
         except Exception:  # noqa: BLE001 - the top of the request: a fault in one path must not end the connection's task
             _log.exception("! %s failed", request.path)
+            return _response(rest.problem(500, "the server failed; its log says why"))
+
+    async def _upgrade(self, request: web.Request, gateways: Gateways) -> web.StreamResponse:
+        """Serve a WebSocket until it has ended."""
+        try:
+            return await gateways.handle(request)
+        except web.HTTPBadRequest as error:  # of aiohttp's handshake
+            text = (error.text or "").partition("\n")[0][:_SHOWN]
+            gateways.refuse(request.remote or "?", "handshake", text)
+            return _response(rest.problem(400, f"not the handshake of a WebSocket: {text}"))
+        except Exception:  # noqa: BLE001 - as above
+            _log.exception("! the WebSocket at %s failed", request.path)
             return _response(rest.problem(500, "the server failed; its log says why"))
 
     def _facts(self, request: web.Request) -> RequestFacts:
@@ -239,7 +265,7 @@ class Routes:
             connections,
             accepted,
             self.responses.as_dict(),
-            self._counters.as_dict(),
+            self._counters.as_dict() | (self._gateways.counters.as_dict() if self._gateways is not None else {}),
             self._watch.reads,
             self._watch.seconds,
             self._gateways.figures() if self._gateways is not None else {},

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, SummaryMetricFamily
 
 from rmpa.web.gateways.figures import PROTOCOLS, GatewayFigures
+from rmpa.web.gateways.figures import REASONS as GATEWAY_REASONS
 from rmpa.web.server import auth
 
 if TYPE_CHECKING:
@@ -24,8 +25,9 @@ REASONS: Final = (
     "slow_request",
     "slow_response",
     "oversized",
+    *GATEWAY_REASONS,
 )
-"""Why requests and connections are refused; all are shown from 0 on, so that an alarm sees the first."""
+"""Why requests, connections and clients are refused; all are shown from 0 on, so that an alarm sees the first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +62,7 @@ def web_metrics(figures: Figures) -> Iterator[Metric]:
         responses.add_metric((status,), count)
     yield responses
     refused = CounterMetricFamily(
-        "rmpa_web_refused", "Requests and connections refused, by reason.", labels=("reason",)
+        "rmpa_web_refused", "Requests, connections and WebSocket clients refused, by reason.", labels=("reason",)
     )
     for reason in REASONS:
         refused.add_metric((reason,), figures.refused.get(reason, 0))

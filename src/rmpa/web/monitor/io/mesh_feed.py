@@ -141,7 +141,8 @@ class MeshFeed:
             if self._builder is None or self._builder.own != reading.snapshot.agent.name:
                 self._builder = StateBuilder(reading.snapshot.agent.name)
             facts = tuple(self._resources.facts.values())
-            self._state = self._builder.build(reading.snapshot, facts, self._resources.alarms())
+            standing, recorded = self._resources.alarms(), self._resources.recorded
+            self._state = self._builder.build(reading.snapshot, facts, standing, recorded)
         self._record_links(self._state)
         for show in [*self._pages.values()]:
             show(self._state)

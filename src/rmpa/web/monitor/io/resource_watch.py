@@ -80,6 +80,8 @@ class ResourceWatch:
         self.history: deque[dict[str, Any]] = deque(maxlen=limits.ALARMS_KEPT)
         """Alarms and changes of links since the server started, oldest first: ``at``, ``level``, ``text``, and the
         key of a ``resource`` or the name of a ``module``."""
+        self.recorded = 0
+        """How many the history has had, those included that are no longer kept."""
 
     @property
     def facts(self) -> dict[str, ResourceFacts]:
@@ -131,6 +133,7 @@ class ResourceWatch:
 
     def record(self, level: str, text: str, **whose: str) -> None:
         """Add to the history: of a ``resource``, by its key, or of a ``module``, by its name."""
+        self.recorded += 1
         self.history.append({"at": round(self._now(), 3), "level": level, "text": text, **whose})
 
     # --- inside -----------------------------------------------------------------------------------------------

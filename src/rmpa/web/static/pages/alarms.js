@@ -10,7 +10,7 @@ export function Alarms({ state, connection }) {
   const alarms = entries(state, "alarms");
   const [history, setHistory] = useState(null);
   const [failure, setFailure] = useState(null);
-  useEffect(() => { connection.ask("history").then((value) => { setHistory(value); setFailure(null); }, setFailure); }, [alarms.map(([id, each]) => id + each.level).join(), entries(state, "modules").map(([name, each]) => name + each.state).join(), connection.phase]);
+  useEffect(() => { connection.ask("history").then((value) => { setHistory(value); setFailure(null); }, setFailure); }, [alarms.map(([id, each]) => id + each.level).join(), state.recorded, connection.phase]);
   return html`<${Page} title="Alarms" kind=${alarms.length ? `${alarms.length} stand` : "None stands"}>
     <div class="grid"><${Panel} title="Alarms of Smart Resources" wide><${Table} caption="Alarms" columns=${["Resource", "Level", "Says", "Stands for"]} empty="No alarm stands.">${alarms.map(([id, alarm]) => html`<tr key=${id}><th scope="row"><${Link} page="resource" name=${alarm.resource} /></th><td><${Mark} state=${alarm.level} /></td><td>${alarm.text}</td><td><${Since} moment=${alarm.at} /></td></tr>`)}<//><//>
     <${Panel} title="All that is wrong"><${Concerns} state=${state} connection=${connection} /><//>

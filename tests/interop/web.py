@@ -1,0 +1,186 @@
+"""``rmpa web`` of a module as its user starts it, and what its clients see: WebSockets, pages, metrics."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Self
+
+import aiohttp
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from lab.bed.agents import RMPA
+from lab.bed.chromium import BINARY
+from lab.bed.processes import DEADLINE, Process
+from rmpa.web.monitor.messages import SUBPROTOCOL
+from rmpa.web.monitor.patch import apply
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    from lab.bed.agents import Agent
+    from lab.bed.chromium import Chromium
+
+PORT: Final = 8480
+REFUSED: Final = "rmpa_web_refused_total"
+needs_browser = pytest.mark.skipif(BINARY is None, reason="Chromium is not installed: apt install chromium")
+
+
+class Web:
+    """One ``rmpa web`` that other hosts reach, and so with a token; it ends with the context.
+
+    Args:
+        agent: Of its module; on a host of a lab.
+        flags: Further arguments.
+        port: Its port.
+    """
+
+    def __init__(self, agent: Agent, *flags: str, port: int = PORT) -> None:
+        argv = ["web", "--listen", "0.0.0.0", "--port", str(port), "--agent", agent.name, *flags]
+        self.process = Process(agent.host.command([RMPA, *argv]), env=agent.env, name=f"rmpa web {agent.name}")
+        self.host = f"{agent.host.address}:{port}"
+        self.token = ""
+
+    def __enter__(self) -> Self:
+        try:
+            file = self.process.wait_for(r"(?:is kept in|need the token of) ([^;]+)")[1]
+            self.token = Path(file).read_text(encoding="ascii").strip()
+        except BaseException:
+            self.process.end()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.end()
+        print(self.process.output[-8000:])  # of a test that fails
+
+    @property
+    def url(self) -> str:
+        """Without a path."""
+        return f"http://{self.host}"
+
+    @property
+    def bearer(self) -> dict[str, str]:
+        """The header that shows the token."""
+        return {"Authorization": f"Bearer {self.token}"}
+
+    async def open(self, page: Chromium, address: str = "") -> None:
+        """Follow the URL with the token, as a user does, to one of the pages, such as ``topic/%2Fodom``."""
+        await page.goto(f"{self.url}/?token={self.token}#/{address}")
+        await page.wait("document.querySelector('h1') && window.rmpa?.state && !location.search")
+
+    @contextlib.asynccontextmanager
+    async def monitor(self, http: aiohttp.ClientSession) -> AsyncIterator[Monitor]:
+        """A WebSocket as a page has one, that has its first state."""
+        async with http.ws_connect(
+            f"ws://{self.host}/monitor", protocols=(SUBPROTOCOL,), headers=self.bearer
+        ) as made:
+            monitor = Monitor(made)
+            await monitor.next("state")
+            yield monitor
+
+    @contextlib.asynccontextmanager
+    async def rosbridge(self, http: aiohttp.ClientSession) -> AsyncIterator[Socket]:
+        """A rosbridge client."""
+        async with http.ws_connect(f"ws://{self.host}/rosbridge", headers=self.bearer) as made:
+            yield Socket(made)
+
+    async def counts(self, http: aiohttp.ClientSession, name: str, label: str) -> dict[str, float]:
+        """The samples of a metric that are not 0, by one label."""
+        async with http.get(f"{self.url}/metrics", headers=self.bearer) as response:
+            assert response.status == 200, await response.text()
+            text = await response.text()
+        families = text_string_to_metric_families(text)
+        found = (sample for family in families for sample in family.samples if sample.name == name)
+        return {sample.labels[label]: sample.value for sample in found if sample.value}
+
+    async def wait_counts(
+        self, http: aiohttp.ClientSession, name: str, label: str, fit: Callable[[dict[str, float]], bool]
+    ) -> None:
+        """Wait until a metric has certain samples."""
+        found: dict[str, float] = {}
+        try:
+            async with asyncio.timeout(DEADLINE):
+                while not fit(found := await self.counts(http, name, label)):
+                    await asyncio.sleep(0.1)
+        except TimeoutError:
+            raise AssertionError(f"{name}: {found}") from None
+
+
+class Socket:
+    """A WebSocket with messages of JSON that say by ``op`` what they are."""
+
+    def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
+        self._socket = socket
+
+    async def send(self, op: str, **values: Any) -> None:
+        """Send a message."""
+        await self._socket.send_json({"op": op, **values})
+
+    async def next(self, *ops: str) -> dict[str, Any]:
+        """The next message that is one of these."""
+        async with asyncio.timeout(DEADLINE):
+            while True:
+                frame = await self._socket.receive()
+                assert frame.type is aiohttp.WSMsgType.TEXT, frame
+                message: dict[str, Any] = json.loads(frame.data)
+                await self._take(message)
+                if message["op"] in ops:
+                    return message
+
+    async def _take(self, message: dict[str, Any]) -> None:
+        """Act on any message."""
+
+
+class Monitor(Socket):
+    """What a page has: the state, kept up to date, and questions.
+
+    Attributes:
+        hello: The first message.
+        state: The newest.
+    """
+
+    def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
+        super().__init__(socket)
+        self.hello: dict[str, Any] = {}
+        self.state: Any = None
+        self._numbers = itertools.count(1)
+
+    async def ask(self, what: str, **args: Any) -> dict[str, Any]:
+        """The server's ``answer``, or its ``failed``."""
+        number = next(self._numbers)
+        await self.send("ask", id=number, what=what, args=args)
+        while True:
+            message = await self.next("answer", "failed")
+            if message["id"] == number:
+                return message
+
+    async def until(self, what: str, fits: Callable[[Any], bool], **args: Any) -> Any:
+        """The answer's value, asked again until it fits: what it is about may not be there yet."""
+        message: dict[str, Any] = {}
+        try:
+            async with asyncio.timeout(DEADLINE):
+                while "value" not in (message := await self.ask(what, **args)) or not fits(message["value"]):
+                    await asyncio.sleep(0.1)
+        except TimeoutError:
+            raise AssertionError(f"{what} {args}: {message}") from None
+        return message["value"]
+
+    async def answered(self, what: str, **args: Any) -> Any:
+        """The answer's value, asked again until there is one."""
+        return await self.until(what, lambda _: True, **args)
+
+    async def _take(self, message: dict[str, Any]) -> None:
+        match message["op"]:
+            case "hello":
+                self.hello = message
+            case "state":
+                self.state = message["state"]
+            case "patch":
+                self.state = apply(self.state, message["patch"])
+        if "n" in message:
+            await self.send("ack", n=message["n"])
