@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.web.hub.hub import Hub
-    from rmpa.web.hub.requests import GraphTopic, Received
+    from rmpa.web.hub.requests import GraphTopic, ReceivedMessage
     from rmpa.web.monitor.io.values import MessageValues
     from rmpa.web.monitor.patch import Tree
 
@@ -182,7 +182,7 @@ class ResourceWatch:
         for topic in wanted.keys() - path.handles.keys():
             handle = path.handles[topic] = next(self._numbers)
 
-            def take(message: Received, topic: str = topic) -> None:
+            def take(message: ReceivedMessage, topic: str = topic) -> None:
                 self._take(name, topic, message)
 
             self._hub.topics.subscribe(
@@ -200,7 +200,7 @@ class ResourceWatch:
             del self._heard[key]
             self._since.pop(key, None)
 
-    def _take(self, name: str, topic: str, message: Received) -> None:
+    def _take(self, name: str, topic: str, message: ReceivedMessage) -> None:
         peer = _peer_of(message.source)
         key = f"{peer}:{name}" if peer else name
         try:
