@@ -303,7 +303,7 @@ async def test_calls_share_a_connection_and_errors_are_told(core: RosCore) -> No
         assert "/gone" in (await client.answer(ServiceResult, 5)).error
         client.ask(FindService(6, "/set"))
         assert (await client.answer(ServiceFound, 6)).type == SET_BOOL
-        await until(lambda: hub.graph.services["/set"].type == SET_BOOL)
+        await until(lambda: "/set" in hub.graph.services and hub.graph.services["/set"].type == SET_BOOL)
 
 
 async def test_a_call_ends_in_time(core: RosCore) -> None:
