@@ -225,6 +225,7 @@ class HubTopics:
             else:
                 latched = self._keep(there, source, _Latched(header, type_, payload, stamp_ns))
             had = latched.had
+        md5sum = header.get("md5sum", "")
         for sink in [*there.sinks.values()]:
             if sink.type not in (None, type_):
                 continue
@@ -234,9 +235,7 @@ class HubTopics:
                 had.add(sink)
             _deliver_to(
                 sink,
-                ReceivedMessage(
-                    sink.handle, there.name, type_, payload, stamp_ns, source=source, md5sum=header.get("md5sum", "")
-                ),
+                ReceivedMessage(sink.handle, there.name, type_, payload, stamp_ns, source=source, md5sum=md5sum),
             )
 
     def _keep(self, there: _Topic, source: str, latched: _Latched) -> _Latched:
