@@ -29,16 +29,16 @@ def main() -> int:
             return _command(options.command, options.module, options.demo)
         if options.joystick:
             _check_joystick(options.joystick)
-        return asyncio.run(_run(options.seconds, options.joystick, as_json=options.json))
+        return asyncio.run(_run(options.seconds, options.joystick, as_json=options.json, web=options.web))
     except (Refused, OSError) as error:
         print(f"demo: {error}", file=sys.stderr)
         return 1
 
 
-async def _run(seconds: float | None, joystick: str, *, as_json: bool) -> int:
+async def _run(seconds: float | None, joystick: str, *, as_json: bool, web: bool) -> int:
     home = Home()
     try:
-        supervisor = Supervisor(home, joystick=joystick, as_json=as_json)
+        supervisor = Supervisor(home, joystick=joystick, as_json=as_json, web=web)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             asyncio.get_running_loop().add_signal_handler(number, supervisor.stop)
         await supervisor.run(seconds)
@@ -80,6 +80,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seconds", type=_positive, help="end after so many seconds [default: at Ctrl-C]")
     parser.add_argument("--joystick", metavar="DEVICE", default="", help="such as /dev/input/js0 [a recorded drive]")
     parser.add_argument("--json", action="store_true", help="one JSON object a second, and the summary as the last")
+    parser.add_argument("--no-web", dest="web", action="store_false", help="without the web page")
     parser.set_defaults(command="")
     commands = parser.add_subparsers(title="from a second terminal", metavar="COMMAND")
     for verb, text in (("kill", "kill -9 a module's agent and node"), ("start", "start a killed module again")):

@@ -66,9 +66,11 @@ class Supervisor:
         home: Where sockets live.
         joystick: A joystick device for the module joystick, or empty.
         as_json: Whether the pc prints JSON.
+        web: Whether there is a web page.
     """
 
-    def __init__(self, home: Home, *, joystick: str = "", as_json: bool = False) -> None:
+    def __init__(self, home: Home, *, joystick: str = "", as_json: bool = False, web: bool = True) -> None:
+        self._web = web
         self._home = home
         self._joystick = joystick
         self._as_json = as_json
@@ -89,7 +91,8 @@ class Supervisor:
         adopt()
         try:
             self._server = await asyncio.start_unix_server(self._serve, self._home.socket, limit=LINE_MAX)
-            await self._open_page()
+            if self._web:
+                await self._open_page()
             await asyncio.gather(*(self._start(module) for module in self._modules.values()))
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._over.wait(), seconds)

@@ -13,8 +13,8 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
+from lab.bed.http_client import http_client
 from lab.bed.namespaces import MACHINE
-from tests.web.http_client import http_client
 
 if TYPE_CHECKING:
     from types import TracebackType

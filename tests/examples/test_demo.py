@@ -108,11 +108,11 @@ def status_of(url: str) -> int:
 
 
 def test_the_paper_s_set_up_runs_and_leaves_nothing(tidy: dict[str, str]) -> None:
-    with Process([sys.executable, DEMO, "--seconds", "24", "--json"], env=tidy, name="demo") as demo:
+    with Process([sys.executable, DEMO, "--no-web", "--seconds", "24", "--json"], env=tidy, name="demo") as demo:
         wait_for_view(demo, lambda view: all_linked(view) and flows(view), "messages of all four modules")
         processes = family(demo)
         ports = open_ports(processes)
-        assert len(processes) == 10, "the supervisor, the web page; an agent and a node for each module"
+        assert len(processes) == 9, "the supervisor; an agent and a node for each module"
         assert demo.wait(30) == 0, demo.output
     assert_gone(processes, ports)
     summary = summary_of(demo)
@@ -153,7 +153,7 @@ async def test_the_demos_modules_are_smart_resources(tidy: dict[str, str]) -> No
         await subscriber.close()
         return (stamps[-1] - stamps[1]) / 10
 
-    with Process([sys.executable, DEMO, "--json"], env=tidy, name="demo") as demo:
+    with Process([sys.executable, DEMO, "--no-web", "--json"], env=tidy, name="demo") as demo:
         before = await asyncio.to_thread(
             wait_for_view, demo, lambda view: all_linked(view) and flows(view), "messages"
         )
@@ -187,7 +187,7 @@ def test_a_killed_module_is_shown_gone_and_comes_back(tidy: dict[str, str]) -> N
     def command(*words: str) -> Process:
         return Process([sys.executable, DEMO, *words], env=tidy, name=" ".join(words))
 
-    with Process([sys.executable, DEMO, "--json"], env=tidy, name="demo") as demo:
+    with Process([sys.executable, DEMO, "--no-web", "--json"], env=tidy, name="demo") as demo:
         before = wait_for_view(demo, lambda view: all_linked(view) and flows(view), "messages of all modules")
         with command("kill", "base") as kill:
             assert kill.wait() == 0, kill.output
@@ -235,7 +235,7 @@ def test_a_killed_module_is_shown_gone_and_comes_back(tidy: dict[str, str]) -> N
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_it_ends_in_order_when_it_is_told_to(tidy: dict[str, str], number: signal.Signals) -> None:
-    with Process([sys.executable, DEMO], env=tidy, name="demo") as demo:
+    with Process([sys.executable, DEMO, "--no-web"], env=tidy, name="demo") as demo:
         demo.wait_for(r"base:linked.* ODOM [1-9]", 30)
         processes = family(demo)
         ports = open_ports(processes)
@@ -247,7 +247,7 @@ def test_it_ends_in_order_when_it_is_told_to(tidy: dict[str, str], number: signa
 
 
 def test_it_can_be_interrupted_while_it_starts(tidy: dict[str, str]) -> None:
-    with Process([sys.executable, DEMO], env=tidy, name="demo") as demo:
+    with Process([sys.executable, DEMO, "--no-web"], env=tidy, name="demo") as demo:
         eventually(lambda: len(family(demo)) > 3, 20, what="some children")
         processes = family(demo)
         os.kill(demo.pid, signal.SIGINT)
@@ -258,7 +258,7 @@ def test_it_can_be_interrupted_while_it_starts(tidy: dict[str, str]) -> None:
 
 
 def test_a_killed_demo_leaves_no_children_and_no_files(tidy: dict[str, str]) -> None:
-    with Process([sys.executable, DEMO], env=tidy, name="demo") as demo:
+    with Process([sys.executable, DEMO, "--no-web"], env=tidy, name="demo") as demo:
         demo.wait_for(r"base:linked", 30)
         processes = family(demo)
         ports = open_ports(processes)
@@ -269,18 +269,17 @@ def test_a_killed_demo_leaves_no_children_and_no_files(tidy: dict[str, str]) -> 
     with Process([sys.executable, DEMO, "kill", "base"], env=tidy) as kill:
         assert kill.wait() == 1
         assert "no demo runs here" in kill.output
-    with Process([sys.executable, DEMO, "--seconds", "0.1"], env=tidy) as following:
+    with Process([sys.executable, DEMO, "--no-web", "--seconds", "0.1"], env=tidy) as following:
         assert following.wait(30) == 0, following.output
 
 
 def test_two_demos_on_one_machine_do_not_meet(tidy: dict[str, str]) -> None:
     with (
-        Process([sys.executable, DEMO, "--json"], env=tidy, name="first") as first,
-        Process([sys.executable, DEMO, "--json"], env=tidy, name="second") as second,
+        Process([sys.executable, DEMO, "--no-web", "--json"], env=tidy, name="first") as first,
+        Process([sys.executable, DEMO, "--no-web", "--json"], env=tidy, name="second") as second,
     ):
         for demo in (first, second):
             wait_for_view(demo, lambda view: all_linked(view) and flows(view), "messages of all modules")
-        assert web_address(first) != web_address(second)
         with Process([sys.executable, DEMO, "kill", "base"], env=tidy) as kill:
             assert kill.wait() == 1
             assert "several demos run here; name one with --demo PID" in kill.output
@@ -295,7 +294,7 @@ def test_a_real_joystick_steers_and_may_be_unplugged(tidy: dict[str, str], tmp_p
     device = tmp_path / "js0"
     os.mkfifo(device)
     plug = os.open(device, os.O_RDWR)
-    with Process([sys.executable, DEMO, "--json", "--joystick", device], env=tidy, name="demo") as demo:
+    with Process([sys.executable, DEMO, "--no-web", "--json", "--joystick", device], env=tidy, name="demo") as demo:
         os.write(plug, EVENT.pack(0, 1, BUTTON, 0) + EVENT.pack(0, -32767, AXIS, 1))
         wait_for_view(demo, lambda view: bool(view["pose"]) and view["pose"]["speed"] == 0.65, "full speed ahead")
         os.close(plug)

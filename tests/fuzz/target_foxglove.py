@@ -61,7 +61,7 @@ def _hub(session: FoxgloveSession, outputs: list[Output]) -> None:
             case protocol.BinaryFrame():
                 bytes(output)
                 continue
-            case requests.Describe():
+            case requests.DescribeType():
                 answer = requests.Described(output.handle, output.type, "string data", "")
             case requests.SetParam():
                 answer = requests.ParamsChanged(output.handle, {output.name: output.value})
@@ -70,8 +70,8 @@ def _hub(session: FoxgloveSession, outputs: list[Output]) -> None:
             case requests.CallService():
                 answer = requests.ServiceResult(output.handle, ok=True, payload=output.request)
             case requests.Subscribe():
-                answer = requests.Received(output.handle, output.topic, "std_msgs/String", memoryview(b"1"), 1)
-            case requests.Publish() | requests.FetchAsset():
+                answer = requests.ReceivedMessage(output.handle, output.topic, "std_msgs/String", memoryview(b"1"), 1)
+            case requests.PublishMessage() | requests.FetchAsset():
                 answer = requests.Failed(output.handle, "cannot", "try")
             case _:
                 continue

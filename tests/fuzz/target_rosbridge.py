@@ -9,7 +9,7 @@ from typing import Any
 import cbor2
 
 from rmpa.ros.types.messages import MessageError, MessageType
-from rmpa.web.hub.requests import Received, ServeService, ServiceRequest, Subscribe
+from rmpa.web.hub.requests import ReceivedMessage, ServeService, ServiceRequest, Subscribe
 from rmpa.web.rosbridge.encodings import encode_png
 from rmpa.web.values.codec import codec_for
 from tests.web.rosbridge.hub import Client, decoded
@@ -75,7 +75,7 @@ def fuzz(data: bytes) -> None:
             frame = rest if kind == b"B" else rest.decode(errors="surrogateescape")
         for request in client.send_raw(frame):
             if isinstance(request, Subscribe):
-                client.answer(Received(request.handle, request.topic, "std_msgs/String", memoryview(rest), 0))
+                client.answer(ReceivedMessage(request.handle, request.topic, "std_msgs/String", memoryview(rest), 0))
             if isinstance(request, ServeService):
                 client.answer(ServiceRequest(request.handle, 1, rest[:16]))
         client.advance(0.01)

@@ -15,6 +15,7 @@ import msgspec
 import pytest
 
 from lab.bed.chromium import Chromium
+from lab.bed.http_client import http_client
 from lab.bed.processes import DEADLINE
 from rmpa.resource.run.descriptor import Descriptor, ParameterDescriptor, ProfileDescriptor
 from rmpa.web import limits
@@ -22,7 +23,6 @@ from rmpa.web.monitor import limits as monitor_limits
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from tests.interop.ros import PYTHON
 from tests.interop.web import REFUSED, needs_browser
-from tests.web.http_client import http_client
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
 from rmpa.bridge.direct.direct_route import Ask, Decided, DirectKey, HangUp, Move, Path, ProbeNode, Release
-from rmpa.bridge.direct.publisher_side import DirectGrants, EndConnections, Granted, Retry, Withdraw
+from rmpa.bridge.direct.publisher_side import DirectGrants, EndConnections, Granted, Retry, WithdrawGrant
 from rmpa.bridge.direct.subscriber_side import DirectSubscriptions
 from rmpa.core.contract import Contract, Transport
 
@@ -127,7 +127,7 @@ class PublisherModule:
             match action:
                 case EndConnections(port=port):
                     module.end_all(port)
-                case Withdraw(source=source, subscriber=name, unmet=unmet):
+                case WithdrawGrant(source=source, subscriber=name, unmet=unmet):
                     module.tell(lambda m=module, s=source, n=name, u=unmet: m.withdrawn(s, n, u))  # type: ignore[misc]
                 case Retry(source=source):
                     module.tell(lambda m=module, s=source: m.retried(s))  # type: ignore[misc]

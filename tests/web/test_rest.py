@@ -18,11 +18,11 @@ DOCUMENT: dict[str, Any] = msgspec.json.decode(rest.openapi_json())
 API = "/api/v1"
 
 
-def get(path: str, snapshot: Snapshot | None = FULL) -> rest.Response:
+def get(path: str, snapshot: Snapshot | None = FULL) -> rest.RestResponse:
     return rest.respond("GET", API + path, snapshot)
 
 
-def problem(response: rest.Response) -> str:
+def problem(response: rest.RestResponse) -> str:
     assert response.content_type == "application/problem+json"
     body = msgspec.json.decode(response.body, type=rest.Problem)
     assert body.status == response.status
@@ -147,7 +147,7 @@ NAMES = {"/peers/{name}": "arm", "/topics/{name}": "%2Fimage", "/services/{name}
 
 
 @pytest.mark.parametrize("resource", rest.RESOURCES, ids=lambda resource: resource.path)
-def test_what_comes_fits_the_schema_that_the_document_gives(resource: rest.Resource) -> None:
+def test_what_comes_fits_the_schema_that_the_document_gives(resource: rest.RestResource) -> None:
     content = DOCUMENT["paths"][API + resource.path]["get"]["responses"]["200"]["content"]["application/json"]
     validate = fastjsonschema.compile({**content["schema"], "components": DOCUMENT["components"]})
     response = get(resource.path.replace("{name}", NAMES.get(resource.path, "")))

@@ -38,3 +38,9 @@ def proxied_node(name: str) -> tuple[str, str] | None:
         return None
     peer, slash, node = name[len(OWN_NODE) + 1 :].partition("/")
     return (peer, slash + node) if node else None
+
+
+def proxied_peer(name: str) -> str | None:
+    """The peer whose node a proxy stands for; ``None`` for a node of this module."""
+    proxy = proxied_node(name)
+    return proxy[0] if proxy is not None else None

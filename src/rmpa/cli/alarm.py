@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from rmpa.cli.graph import GraphName, peer_of, read_graph
+from rmpa.bridge.proxy_names import proxied_peer
+from rmpa.cli.graph import GraphName, read_graph
 from rmpa.cli.options import GraphOptions, graph_options
 from rmpa.cli.output import Column, print_json, print_line, print_table, printable, warn
 from rmpa.cli.resource_graph import run_with_resources, with_resources
@@ -144,7 +145,7 @@ class _AlarmPrinter:
         """Print the alarms of one message of a resource."""
         if self.only is not None and received.caller_id != self.only.caller:
             return
-        peer = peer_of(received.caller_id)
+        peer = proxied_peer(received.caller_id)
         for status in received.message.status:
             if self._left == 0:
                 return

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.bridge.proxy_names import proxied_node
+from rmpa.bridge.proxy_names import proxied_node, proxied_peer
 from rmpa.cli.output import printable
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
@@ -28,7 +28,7 @@ class GraphName:
 
     def matches(self, node: str) -> bool:
         """Whether what this local node (perhaps a proxy) offers is meant."""
-        return self.peer is None or peer_of(node) == self.peer
+        return self.peer is None or proxied_peer(node) == self.peer
 
     def contains(self, name: str, peers: Iterable[str | None]) -> bool:
         """Whether a name is in this namespace, and from the peer if one is named.
@@ -74,12 +74,6 @@ def read_namespace(text: str, what: str) -> GraphName:
     return read_name(text, what) if text else EVERYTHING
 
 
-def peer_of(node: str) -> str | None:
-    """The peer whose node a proxy stands for; ``None`` for a node of this module."""
-    proxy = proxied_node(node)
-    return proxy[0] if proxy is not None else None
-
-
 def origin_json(node: str) -> dict[str, str]:
     """A node for JSON: a proxy with the peer and the node that it stands for."""
     proxy = proxied_node(node)
@@ -111,7 +105,7 @@ def peers_mark(nodes: Iterable[str]) -> str:
 
 def peers_of(nodes: Iterable[str]) -> list[str]:
     """The peers of the proxies among some nodes, in order."""
-    return sorted({peer for node in nodes if (peer := peer_of(node)) is not None})
+    return sorted({peer for node in nodes if (peer := proxied_peer(node)) is not None})
 
 
 def unknown_name(what: str, name: str, known: Iterable[str]) -> RmpaError:

@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rmpa.cli.graph import peer_of
+from rmpa.bridge.proxy_names import proxied_peer
 from rmpa.cli.output import duration, warn
 from rmpa.cli.resource_graph import SeenResource
 from rmpa.resource.run.registry_writer import FILE
@@ -75,7 +75,7 @@ def _read(path: Path) -> list[KnownResource]:
         return []
     latest: dict[tuple[str, str | None], KnownResource] = {}
     for each in ResourceRegistry(rows).all:  # the latest first
-        peer = peer_of(each.caller)
+        peer = proxied_peer(each.caller)
         one = KnownResource(
             path.parent.name,
             SeenResource(each.path, peer, each.caller, each.descriptor),

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.cli.graph import GraphName, peer_of, read_graph, read_namespace
+from rmpa.bridge.proxy_names import proxied_peer
+from rmpa.cli.graph import GraphName, read_graph, read_namespace
 from rmpa.cli.node_names import ask_peer, find_uri, module_of, peers_nodes, read_node, unreachable_nodes, uris_of
 from rmpa.cli.options import GraphOptions, graph_options
 from rmpa.cli.output import Column, print_json, print_line, print_table, warn
@@ -68,11 +69,11 @@ def list_(namespace: str, verbose: bool, options: GraphOptions) -> None:
 def _own(master: Master, graph: Graph, *, with_uris: bool) -> list[NodeLine]:
     """The nodes of the graph without the proxies; the master is asked for addresses only where they are shown."""
     problems = {info.node: info.problem for info in unreachable_nodes(master)}
-    names = [node for node in graph.nodes if peer_of(node) is None]
+    names = [node for node in graph.nodes if proxied_peer(node) is None]
     asked = names if with_uris else [name for name in names if name in problems]
     uris = asyncio.run(uris_of(master, asked)) if asked else {}
     lines = list_nodes(graph.publishers, graph.subscribers, graph.services, uris, problems)
-    return [line for line in lines if peer_of(line.name) is None]
+    return [line for line in lines if proxied_peer(line.name) is None]
 
 
 def _line_json(peer: str | None, line: NodeLine, here: str | None) -> dict[str, object]:

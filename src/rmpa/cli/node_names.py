@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from rmpa.bridge.proxy_names import proxied_node
-from rmpa.cli.graph import GraphName, peer_of, read_name, unknown_name
+from rmpa.bridge.proxy_names import proxied_node, proxied_peer
+from rmpa.cli.graph import GraphName, read_name, unknown_name
 from rmpa.cli.output import warn
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.observe import limits
@@ -45,7 +45,7 @@ async def find_uri(master: Master, graph: Graph, name: str) -> str:
     reply = await call_api(master.uri, "lookupNode", _CALLER_ID, name)
     if reply.code == 1 and isinstance(reply.value, str):
         return reply.value
-    raise unknown_name("node", name, [node for node in graph.nodes if peer_of(node) is None])
+    raise unknown_name("node", name, [node for node in graph.nodes if proxied_peer(node) is None])
 
 
 async def uris_of(master: Master, names: Sequence[str]) -> dict[str, str]:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from rmpa.cli.graph import GraphName, peer_of, read_graph, read_name
+from rmpa.bridge.proxy_names import proxied_peer
+from rmpa.cli.graph import GraphName, read_graph, read_name
 from rmpa.cli.output import printable
 from rmpa.cli.stream import with_node
 from rmpa.config.values import did_you_mean
@@ -133,7 +134,7 @@ class ResourceGraph:
 
         service = GraphName(f"{one.path}/set_parameters", one.peer)
         server = self.graph.require_service(service)
-        if one.peer is None and peer_of(server) is not None:
+        if one.peer is None and proxied_peer(server) is not None:
             raise RmpaError(f"service {service} is another module's; {one} does not offer it")
         pairs: Any = [{"name": name, "value": value} for name, value in values.items()]
         kind = ServiceType(SERVICE_TYPE)
@@ -180,7 +181,7 @@ async def find_resources(node: Node, graph: Graph) -> tuple[SeenResource, ...]:
             descriptor = Descriptor.parse(str(received.message.data))
         except RmpaError:
             continue  # another program's topic of that name
-        found.append(SeenResource(topic.removesuffix(ending), peer_of(caller), caller, descriptor))
+        found.append(SeenResource(topic.removesuffix(ending), proxied_peer(caller), caller, descriptor))
     return tuple(sorted(found, key=lambda each: (each.peer or "", each.path)))
 
 

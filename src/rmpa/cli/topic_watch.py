@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.graph import peer_of, read_name
+from rmpa.bridge.proxy_names import proxied_peer
+from rmpa.cli.graph import read_name
 from rmpa.cli.options import GraphOptions, graph_options
 from rmpa.cli.output import print_json, size
 from rmpa.cli.stream import Enough, StreamWatch, run_stream, watch_topic
@@ -144,7 +145,7 @@ class _Delay(_Figures):
         if _has_header(received.kind):
             stamp = received.message.header.stamp
             self._delays.add((received.stamp_ns - stamp.sec * 1_000_000_000 - stamp.nanosec) / 1e9)
-        elif not self._by_link or peer_of(received.caller_id) is None:
+        elif not self._by_link or proxied_peer(received.caller_id) is None:
             raise RmpaError(f"{received.kind.name} has no header, and so no stamp to tell its age by")
 
     def values(self, routes: tuple[RouteInfo, ...]) -> dict[str, object]:

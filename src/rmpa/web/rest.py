@@ -47,7 +47,7 @@ class Problem(msgspec.Struct, kw_only=True, frozen=True):
 
 
 @dataclass(frozen=True, slots=True)
-class Response:
+class RestResponse:
     """An HTTP response: status, body, its type, and further headers."""
 
     status: int
@@ -65,7 +65,7 @@ class _Missing(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Resource:
+class RestResource:
     """One path of the API.
 
     Attributes:
@@ -109,17 +109,17 @@ def _global(name: str) -> str:
 
 
 RESOURCES: Final = (
-    Resource("/snapshot", "The whole state of the agent.", Snapshot, lambda s, _: s),
-    Resource("/agent", "The agent itself.", AgentInfo, lambda s, _: s.agent),
-    Resource("/peers", "All peers.", tuple[PeerInfo, ...], lambda s, _: s.peers),
-    Resource("/peers/{name}", "One peer, by its name.", PeerInfo, _peer),
-    Resource("/topics", "All topics, with their routes.", tuple[TopicInfo, ...], lambda s, _: s.topics),
-    Resource("/topics/{name}", "One topic, by its global name.", TopicInfo, _topic),
-    Resource("/services", "All services.", tuple[ServiceInfo, ...], lambda s, _: s.services),
-    Resource("/services/{name}", "All services of a global name.", tuple[ServiceInfo, ...], _service),
-    Resource("/counters", "What was refused or dropped, by its reason.", dict[str, int], lambda s, _: s.counters),
-    Resource("/notes", "What the user should know.", tuple[str, ...], lambda s, _: s.notes),
-    Resource(
+    RestResource("/snapshot", "The whole state of the agent.", Snapshot, lambda s, _: s),
+    RestResource("/agent", "The agent itself.", AgentInfo, lambda s, _: s.agent),
+    RestResource("/peers", "All peers.", tuple[PeerInfo, ...], lambda s, _: s.peers),
+    RestResource("/peers/{name}", "One peer, by its name.", PeerInfo, _peer),
+    RestResource("/topics", "All topics, with their routes.", tuple[TopicInfo, ...], lambda s, _: s.topics),
+    RestResource("/topics/{name}", "One topic, by its global name.", TopicInfo, _topic),
+    RestResource("/services", "All services.", tuple[ServiceInfo, ...], lambda s, _: s.services),
+    RestResource("/services/{name}", "All services of a global name.", tuple[ServiceInfo, ...], _service),
+    RestResource("/counters", "What was refused or dropped, by its reason.", dict[str, int], lambda s, _: s.counters),
+    RestResource("/notes", "What the user should know.", tuple[str, ...], lambda s, _: s.notes),
+    RestResource(
         "/unreachable",
         "Nodes to which no connection can be made.",
         tuple[UnreachableInfo, ...],
@@ -129,7 +129,7 @@ RESOURCES: Final = (
 _BY_PATH: Final = {resource.path: resource for resource in RESOURCES}
 
 
-def respond(method: str, path: str, snapshot: Snapshot | None, why: str = "") -> Response:
+def respond(method: str, path: str, snapshot: Snapshot | None, why: str = "") -> RestResponse:
     """The response to a request.
 
     Args:
@@ -142,7 +142,7 @@ def respond(method: str, path: str, snapshot: Snapshot | None, why: str = "") ->
         allowed = ", ".join(_METHODS)
         return problem(405, f"{method[:20]} is not supported; this API is read with GET", (("Allow", allowed),))
     if path == OPENAPI_PATH:
-        return Response(200, openapi_json())
+        return RestResponse(200, openapi_json())
     resource, name = _find(path)
     if resource is None:
         return problem(404, f"there is no {_short(path)}; {OPENAPI_PATH} lists all paths")
@@ -151,10 +151,10 @@ def respond(method: str, path: str, snapshot: Snapshot | None, why: str = "") ->
     result = resource.read(snapshot, name)
     if isinstance(result, _Missing):
         return problem(404, _missing(result))
-    return Response(200, msgspec.json.encode(result))
+    return RestResponse(200, msgspec.json.encode(result))
 
 
-def _find(path: str) -> tuple[Resource | None, str]:
+def _find(path: str) -> tuple[RestResource | None, str]:
     below = path.removeprefix(PREFIX)
     if below == path or len(path) > limits.REST_PATH_MAX:
         return None, ""
@@ -191,15 +191,15 @@ _TITLES: Final = {
 }
 
 
-def detail_of(response: Response) -> str:
+def detail_of(response: RestResponse) -> str:
     """The text of a response that ``problem`` made."""
     return msgspec.json.decode(response.body, type=Problem).detail
 
 
-def problem(status: int, detail: str, headers: tuple[tuple[str, str], ...] = ()) -> Response:
+def problem(status: int, detail: str, headers: tuple[tuple[str, str], ...] = ()) -> RestResponse:
     """The problem details of a status, as a response."""
     body = msgspec.json.encode(Problem(title=_TITLES[status], status=status, detail=detail))
-    return Response(status, body, _PROBLEM_JSON, headers)
+    return RestResponse(status, body, _PROBLEM_JSON, headers)
 
 
 # --- the document ---
@@ -250,7 +250,7 @@ def openapi() -> dict[str, object]:
     }
 
 
-def _operation(resource: Resource, schema: Mapping[str, Any]) -> dict[str, object]:
+def _operation(resource: RestResource, schema: Mapping[str, Any]) -> dict[str, object]:
     problem = {"$ref": "#/components/responses/Problem"}
     operation: dict[str, object] = {
         "operationId": resource.identity,

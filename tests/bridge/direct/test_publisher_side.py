@@ -6,7 +6,7 @@ import pytest
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import Condition, Unmet
-from rmpa.bridge.direct.publisher_side import DirectGrants, EndConnections, Granted, Retry, Withdraw
+from rmpa.bridge.direct.publisher_side import DirectGrants, EndConnections, Granted, Retry, WithdrawGrant
 from rmpa.bridge.messages import Source
 from rmpa.core.contract import Contract
 
@@ -42,7 +42,7 @@ def test_a_name_is_granted_once_for_a_source(sut: DirectGrants) -> None:
 def test_a_local_subscriber_of_that_name_goes_first(sut: DirectGrants) -> None:
     assert condition(sut.judge(2, SOURCE, "/logger", ["/logger"])) is Condition.CALLER_ID
     (withdrawn,) = sut.local_subscriber("/chatter", "/viewer")
-    assert isinstance(withdrawn, Withdraw)
+    assert isinstance(withdrawn, WithdrawGrant)
     assert (withdrawn.peer, withdrawn.subscriber, withdrawn.unmet.condition) == (1, "/viewer", Condition.CALLER_ID)
     assert list(sut) == []
     assert set(sut.local_subscriber_gone("/chatter")) == {Retry(1, SOURCE), Retry(2, SOURCE)}
@@ -80,7 +80,7 @@ def test_a_publisher_that_restarts_is_withdrawn_so_that_its_peers_ask_again(sut:
     sut.grant(1, SOURCE, "/logger", GRANTED)
     assert sut.published(SOURCE, URI) == [], "it registers once more"
     (withdrawn,) = sut.published(SOURCE, "http://10.0.0.1:9999/")
-    assert isinstance(withdrawn, Withdraw)
+    assert isinstance(withdrawn, WithdrawGrant)
     assert (withdrawn.peer, withdrawn.subscriber, withdrawn.unmet.condition) == (1, "", Condition.NODE)
     assert list(sut) == []
 
@@ -90,7 +90,7 @@ def test_one_that_left_first_is_withdrawn_when_it_is_back(sut: DirectGrants) -> 
     sut.gone(SOURCE)
     assert list(sut) == []
     withdrawn, retry = sut.published(SOURCE, "http://10.0.0.1:9999/")
-    assert isinstance(withdrawn, Withdraw)
+    assert isinstance(withdrawn, WithdrawGrant)
     assert withdrawn.unmet.condition is Condition.NODE
     assert retry == Retry(2, SOURCE)
     assert sut.published(SOURCE, "http://10.0.0.1:9999/") == []
@@ -108,7 +108,7 @@ def test_new_rules_withdraw_what_they_do_not_allow(sut: DirectGrants) -> None:
     other = Source("/other", "/talker")
     sut.grant(1, other, "/viewer", GRANTED)
     assert sut.judge_again(lambda source, *_: WHY if source == other else None) == [
-        Withdraw(1, other, "/viewer", WHY)
+        WithdrawGrant(1, other, "/viewer", WHY)
     ]
     assert [source for source, *_ in sut] == [SOURCE]
     assert sut.retry_all() == [Retry(1, other)]

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import threading
+import time
 from array import array
 from typing import TYPE_CHECKING, Any
 from xmlrpc.client import ServerProxy
@@ -99,9 +100,12 @@ def test_a_crowd_registers_its_publishers_and_answers_for_them(
 
         assert say() == {"event": "up"}
         for count in (3, 5):
+            before = time.monotonic_ns()
             crowd.stdin.write(f"{count}\n")
             crowd.stdin.flush()
-            assert say() == {"event": "registered", "count": count}
+            told = say()
+            assert before < int(str(told.pop("at_ns"))) < time.monotonic_ns()
+            assert told == {"event": "registered", "count": count}
         assert [call[:2] for call in calls] == [(f"/crowd{n // 2}", f"/crowd/topic{n}") for n in range(5)]
         with ServerProxy(calls[0][3]) as slave:
             answer: Any = slave.requestTopic("/me", "/crowd/topic0", [["TCPROS"]])

@@ -9,7 +9,7 @@ import msgspec
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.types.service_types import ServiceType
 from rmpa.web.foxglove import protocol
-from rmpa.web.foxglove.session import Close, FoxgloveSession, Output
+from rmpa.web.foxglove.session import FoxgloveClose, FoxgloveSession, Output
 from rmpa.web.hub import requests
 from rmpa.web.hub.requests import GraphService, GraphTopic
 from rmpa.web.hub.rights import Rights
@@ -28,7 +28,7 @@ class Client:
         self.json: list[dict[str, Any]] = []
         self.frames: list[protocol.BinaryFrame] = []
         self.asked: list[requests.Request] = []
-        self.closed: list[Close] = []
+        self.closed: list[FoxgloveClose] = []
         self.do(self.session.open())
 
     def do(self, outputs: list[Output]) -> None:
@@ -37,11 +37,11 @@ class Client:
                 self.json.append(msgspec.json.decode(output.data))
             elif isinstance(output, protocol.BinaryFrame):
                 self.frames.append(output)
-            elif isinstance(output, Close):
+            elif isinstance(output, FoxgloveClose):
                 self.closed.append(output)
             else:
                 self.asked.append(output)
-                if isinstance(output, requests.Describe) and self.knows:
+                if isinstance(output, requests.DescribeType) and self.knows:
                     self.hub(described(output))
 
     def hub(self, answer: requests.Answer) -> None:
@@ -73,12 +73,12 @@ class Client:
         return handle
 
 
-def described(asked: requests.Describe) -> requests.Answer:
+def described(asked: requests.DescribeType) -> requests.Answer:
     if asked.service:
         service = ServiceType(asked.type)
         return requests.Described(asked.handle, asked.type, service.request.definition, service.response.definition)
     return requests.Described(asked.handle, asked.type, MessageType(asked.type).definition)
 
 
-def message(subscription: int, topic: str, payload: bytes, stamp: int = 5) -> requests.Received:
-    return requests.Received(subscription, topic, "std_msgs/String", memoryview(payload), stamp)
+def message(subscription: int, topic: str, payload: bytes, stamp: int = 5) -> requests.ReceivedMessage:
+    return requests.ReceivedMessage(subscription, topic, "std_msgs/String", memoryview(payload), stamp)

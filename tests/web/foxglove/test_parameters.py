@@ -29,7 +29,7 @@ def params() -> ParameterRequests:
 )
 def test_a_value_comes_back_as_it_went(value: requests.ParamValue) -> None:
     sent = protocol.encode_json(to_parameter("/p", value))
-    received = msgspec.json.decode(sent, type=protocol.Parameter)
+    received = msgspec.json.decode(sent, type=protocol.FoxgloveParameter)
     back = from_parameter(received)
     assert back == value
     assert type(back) is type(value)
@@ -48,11 +48,11 @@ json_values = st.recursive(
 @given(json_values)
 def test_any_value_comes_back(value: requests.ParamValue) -> None:
     sent = protocol.encode_json(to_parameter("/p", value))
-    assert from_parameter(msgspec.json.decode(sent, type=protocol.Parameter)) == value
+    assert from_parameter(msgspec.json.decode(sent, type=protocol.FoxgloveParameter)) == value
 
 
 def test_numbers_that_json_lacks_become_texts() -> None:
-    assert to_parameter("/p", float("nan")) == protocol.Parameter(name="/p", value="nan")
+    assert to_parameter("/p", float("nan")) == protocol.FoxgloveParameter(name="/p", value="nan")
     assert to_parameter("/p", [1.0, float("-inf")]).value == [1.0, "-inf"]
     assert to_parameter("/p", [1.0, float("-inf")]).type is UNSET
 
@@ -65,9 +65,9 @@ def test_floating_point_numbers_say_so_as_javascript_writes_whole_ones_without_a
 
 
 def test_a_whole_number_of_type_float64_is_a_double() -> None:
-    value = from_parameter(protocol.Parameter(name="/p", type="float64", value=3))
+    value = from_parameter(protocol.FoxgloveParameter(name="/p", type="float64", value=3))
     assert isinstance(value, float)
-    listed = from_parameter(protocol.Parameter(name="/p", type="float64_array", value=[1, 2.5]))
+    listed = from_parameter(protocol.FoxgloveParameter(name="/p", type="float64_array", value=[1, 2.5]))
     assert isinstance(listed, list)
     assert [type(each) for each in listed] == [float, float]
 
@@ -82,23 +82,23 @@ def nested(depth: int) -> object:
 @pytest.mark.parametrize(
     "parameter",
     [
-        protocol.Parameter(name="relative", value=1),
-        protocol.Parameter(name="", value=1),
-        protocol.Parameter(name="/a//b", value=1),
-        protocol.Parameter(name="/p", value=1 << 31),
-        protocol.Parameter(name="/p", value=[None]),
-        protocol.Parameter(name="/p", value=nested(40)),
-        protocol.Parameter(name="/p", type="float64", value="3"),
-        protocol.Parameter(name="/p", type="float64", value=True),
-        protocol.Parameter(name="/p", type="float64", value=10**400),
-        protocol.Parameter(name="/p", type="float64_array", value=3),
-        protocol.Parameter(name="/p", type="float64_array", value=[1, "x"]),
-        protocol.Parameter(name="/p", type="byte_array", value="?"),
-        protocol.Parameter(name="/p", type="byte_array", value=[1]),
+        protocol.FoxgloveParameter(name="relative", value=1),
+        protocol.FoxgloveParameter(name="", value=1),
+        protocol.FoxgloveParameter(name="/a//b", value=1),
+        protocol.FoxgloveParameter(name="/p", value=1 << 31),
+        protocol.FoxgloveParameter(name="/p", value=[None]),
+        protocol.FoxgloveParameter(name="/p", value=nested(40)),
+        protocol.FoxgloveParameter(name="/p", type="float64", value="3"),
+        protocol.FoxgloveParameter(name="/p", type="float64", value=True),
+        protocol.FoxgloveParameter(name="/p", type="float64", value=10**400),
+        protocol.FoxgloveParameter(name="/p", type="float64_array", value=3),
+        protocol.FoxgloveParameter(name="/p", type="float64_array", value=[1, "x"]),
+        protocol.FoxgloveParameter(name="/p", type="byte_array", value="?"),
+        protocol.FoxgloveParameter(name="/p", type="byte_array", value=[1]),
     ],
     ids=lambda parameter: f"{parameter.name} {parameter.value!r:.20}",
 )
-def test_what_ros_cannot_hold_is_refused(parameter: protocol.Parameter) -> None:
+def test_what_ros_cannot_hold_is_refused(parameter: protocol.FoxgloveParameter) -> None:
     with pytest.raises(ParameterError):
         from_parameter(parameter)
 
@@ -107,28 +107,30 @@ def test_parameters_are_got_by_name_or_all(params: ParameterRequests) -> None:
     assert params.get(protocol.GetParameters(("/a", "/b", "/a"), "r1")) == [requests.GetParams(1, ("/a", "/b"))]
     assert params.get(protocol.GetParameters()) == [requests.GetParams(2, (), "/")]
     first = params.answer(requests.ParamsChanged(1, {"/a": 1, "/b": None}))
-    assert first == protocol.ParameterValues(parameters=(protocol.Parameter(name="/a", value=1),), id="r1")
+    assert first == protocol.ParameterValues(parameters=(protocol.FoxgloveParameter(name="/a", value=1),), id="r1")
     second = params.answer(requests.ParamsChanged(2, {}))
     assert second == protocol.ParameterValues(parameters=())
     assert not params.owns(1)
 
 
 def test_setting_is_answered_once_all_are_set(params: ParameterRequests) -> None:
-    message = protocol.SetParameters((protocol.Parameter(name="/a", value=1), protocol.Parameter(name="/b")), "r")
+    message = protocol.SetParameters(
+        (protocol.FoxgloveParameter(name="/a", value=1), protocol.FoxgloveParameter(name="/b")), "r"
+    )
     assert params.set(message) == [requests.SetParam(1, "/a", 1), requests.DeleteParam(2, "/b")]
     assert params.answer(requests.ParamsChanged(1, {"/a": 1})) is None
     answer = params.answer(requests.ParamsChanged(2, {"/b": None}))
-    assert answer == protocol.ParameterValues(parameters=(protocol.Parameter(name="/a", value=1),), id="r")
+    assert answer == protocol.ParameterValues(parameters=(protocol.FoxgloveParameter(name="/a", value=1),), id="r")
 
 
 def test_setting_without_an_id_is_not_answered(params: ParameterRequests) -> None:
-    params.set(protocol.SetParameters((protocol.Parameter(name="/a", value=1),)))
+    params.set(protocol.SetParameters((protocol.FoxgloveParameter(name="/a", value=1),)))
     assert params.answer(requests.ParamsChanged(1, {"/a": 1})) is None
     assert not params.owns(1)
 
 
 def test_one_bad_parameter_leaves_all_as_they_are(params: ParameterRequests) -> None:
-    bad = (protocol.Parameter(name="/a", value=1), protocol.Parameter(name="b", value=1))
+    bad = (protocol.FoxgloveParameter(name="/a", value=1), protocol.FoxgloveParameter(name="b", value=1))
     with pytest.raises(ParameterError):
         params.set(protocol.SetParameters(bad))
     assert not params.owns(1)
@@ -148,7 +150,7 @@ def test_all_parameters_are_followed_and_some_left_out(params: ParameterRequests
     assert params.unfollow(["/a"]) == []
     assert params.answer(requests.ParamsChanged(2, {"/a": 1})) is None
     changed = params.answer(requests.ParamsChanged(2, {"/a": 1, "/b": None}))
-    assert changed == protocol.ParameterValues(parameters=(protocol.Parameter(name="/b"),))
+    assert changed == protocol.ParameterValues(parameters=(protocol.FoxgloveParameter(name="/b"),))
     assert params.follow(["/a"]) == []
     assert params.answer(requests.ParamsChanged(2, {"/a": 1})) is not None
     assert params.unfollow([]) == [requests.UnfollowParams(2)]

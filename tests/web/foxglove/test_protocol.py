@@ -45,7 +45,7 @@ JSON = {
         ),
     ),
     "advertise": (
-        protocol.Advertise(
+        protocol.FoxgloveAdvertise(
             channels=(
                 protocol.Channel(
                     id=1,
@@ -62,11 +62,11 @@ JSON = {
             b'"schemaName":"std_msgs/String","schemaEncoding":"ros1msg","schema":"string data"}]}'
         ),
     ),
-    "unadvertise": (protocol.Unadvertise(channel_ids=(1,)), b'{"op":"unadvertise","channelIds":[1]}'),
+    "unadvertise": (protocol.FoxgloveUnadvertise(channel_ids=(1,)), b'{"op":"unadvertise","channelIds":[1]}'),
     "advertise services": (
-        protocol.AdvertiseServices(
+        protocol.FoxgloveAdvertiseServices(
             services=(
-                protocol.Service(
+                protocol.FoxgloveService(
                     id=1,
                     name="/set_bool",
                     type="std_srvs/SetBool",
@@ -83,14 +83,14 @@ JSON = {
         ),
     ),
     "unadvertise services": (
-        protocol.UnadvertiseServices(service_ids=(1,)),
+        protocol.FoxgloveUnadvertiseServices(service_ids=(1,)),
         b'{"op":"unadvertiseServices","serviceIds":[1]}',
     ),
     "status with id": (
-        protocol.Status(level=1, message="msg", id="i1"),
+        protocol.FoxgloveStatus(level=1, message="msg", id="i1"),
         b'{"op":"status","level":1,"message":"msg","id":"i1"}',
     ),
-    "status": (protocol.Status(level=2, message="x"), b'{"op":"status","level":2,"message":"x"}'),
+    "status": (protocol.FoxgloveStatus(level=2, message="x"), b'{"op":"status","level":2,"message":"x"}'),
     "remove status": (protocol.RemoveStatus(status_ids=("i1",)), b'{"op":"removeStatus","statusIds":["i1"]}'),
     "parameters": (
         protocol.ParameterValues(
@@ -176,15 +176,15 @@ def test_both_names_of_the_subprotocol_are_accepted() -> None:
 
 
 def test_text_that_is_not_utf8_reaches_the_client_as_replacement_characters() -> None:
-    message = protocol.Status(level=0, message="caf\udce9").frame()
+    message = protocol.FoxgloveStatus(level=0, message="caf\udce9").frame()
     assert "caf\N{REPLACEMENT CHARACTER}" in message.data.decode()
 
 
 CLIENT = {
-    '{"op":"subscribe","subscriptions":[{"id":0,"channelId":3},{"id":1,"channelId":5}]}': protocol.Subscribe(
-        (protocol.Subscription(0, 3), protocol.Subscription(1, 5))
+    '{"op":"subscribe","subscriptions":[{"id":0,"channelId":3},{"id":1,"channelId":5}]}': protocol.FoxgloveSubscribe(
+        (protocol.FoxgloveSubscription(0, 3), protocol.FoxgloveSubscription(1, 5))
     ),
-    '{"op":"unsubscribe","subscriptionIds":[0,1]}': protocol.Unsubscribe((0, 1)),
+    '{"op":"unsubscribe","subscriptionIds":[0,1]}': protocol.FoxgloveUnsubscribe((0, 1)),
     '{"op":"advertise","channels":[{"id":4,"topic":"/cmd","encoding":"ros1","schemaName":"std_msgs/String",'
     '"schema":"string data","schemaEncoding":"ros1msg"}]}': protocol.ClientAdvertise(
         (protocol.ClientChannel(4, "/cmd", "ros1", "std_msgs/String", "string data", "ros1msg"),)
@@ -192,13 +192,13 @@ CLIENT = {
     '{"op":"unadvertise","channelIds":[1,2]}': protocol.ClientUnadvertise((1, 2)),
     '{"op":"getParameters","parameterNames":["/a"],"id":"r"}': protocol.GetParameters(("/a",), "r"),
     '{"op":"setParameters","parameters":[{"name":"/a","value":3},{"name":"/b"}]}': protocol.SetParameters(
-        (protocol.Parameter(name="/a", value=3), protocol.Parameter(name="/b"))
+        (protocol.FoxgloveParameter(name="/a", value=3), protocol.FoxgloveParameter(name="/b"))
     ),
     '{"op":"subscribeParameterUpdates","parameterNames":["/a"]}': protocol.SubscribeParameterUpdates(("/a",)),
     '{"op":"unsubscribeParameterUpdates","parameterNames":[]}': protocol.UnsubscribeParameterUpdates(),
     '{"op":"subscribeConnectionGraph"}': protocol.SubscribeConnectionGraph(),
     '{"op":"unsubscribeConnectionGraph","later":1}': protocol.UnsubscribeConnectionGraph(),
-    '{"op":"fetchAsset","uri":"package://foo/robot.urdf","requestId":123}': protocol.FetchAsset(
+    '{"op":"fetchAsset","uri":"package://foo/robot.urdf","requestId":123}': protocol.FoxgloveFetchAsset(
         "package://foo/robot.urdf", 123
     ),
 }
@@ -290,5 +290,5 @@ def test_a_call_and_its_response_have_the_same_layout(service: int, call: int, p
 
 @given(st.text(max_size=200))
 def test_any_text_of_a_status_survives_json(text: str) -> None:
-    decoded = msgspec.json.decode(protocol.Status(level=0, message=text).frame().data)
+    decoded = msgspec.json.decode(protocol.FoxgloveStatus(level=0, message=text).frame().data)
     assert decoded["message"] == text

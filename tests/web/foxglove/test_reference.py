@@ -157,7 +157,7 @@ def test_both_servers_say_the_same(reference: Reference) -> None:
     failed = reference.ask(wrong)  # its answer shows that the subscription has been read
     reference.channel.log(b"payload", log_time=STAMP)
     handle = ours.subscribe(1, 7)
-    ours.hub(requests.Received(handle, "/odom", "nav_msgs/Odometry", memoryview(b"payload"), STAMP))
+    ours.hub(requests.ReceivedMessage(handle, "/odom", "nav_msgs/Odometry", memoryview(b"payload"), STAMP))
     assert ours.said[-1] == reference.receive()
     ours.ask(wrong)
     ours.hub(requests.Failed(ours.last(requests.FetchAsset).handle, "OSError: not found"))

@@ -91,7 +91,7 @@ def test_a_graph_that_did_not_change_says_nothing() -> None:
 def test_an_unknown_type_is_told_and_offered_once_it_is_known() -> None:
     client = Client(knows=False)
     client.graph(CHATTER)
-    asked = client.last(requests.Describe)
+    asked = client.last(requests.DescribeType)
     client.hub(requests.Failed(asked.handle, "no definition of std_msgs/String", "install its package"))
     (status,) = client.of("status")
     assert status["level"] == 1
@@ -105,7 +105,7 @@ def test_an_unknown_type_is_told_and_offered_once_it_is_known() -> None:
 def test_the_warning_about_a_type_ends_with_its_last_topic() -> None:
     client = Client(knows=False)
     client.graph(CHATTER)
-    asked = client.last(requests.Describe)
+    asked = client.last(requests.DescribeType)
     client.hub(requests.Failed(asked.handle, "no definition"))
     client.graph()
     assert client.of("removeStatus")
@@ -116,7 +116,7 @@ def test_the_warning_about_a_type_ends_with_its_last_topic() -> None:
 def test_a_type_is_asked_for_once() -> None:
     client = Client()
     client.graph(*(GraphTopic(f"/t{n}", ("std_msgs/String",), ("/n",)) for n in range(50)))
-    assert sum(isinstance(each, requests.Describe) for each in client.asked) == 1
+    assert sum(isinstance(each, requests.DescribeType) for each in client.asked) == 1
 
 
 def test_many_channels_come_in_several_messages(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,7 +134,7 @@ def test_messages_reach_the_subscription_untouched() -> None:
     client.graph(CHATTER)
     handle = client.subscribe()
     payload = memoryview(b"\x02\x00\x00\x00hi")
-    client.hub(requests.Received(handle, "/chatter", "std_msgs/String", payload, 9, latched=True))
+    client.hub(requests.ReceivedMessage(handle, "/chatter", "std_msgs/String", payload, 9, latched=True))
     (frame,) = client.frames
     assert frame.header == struct.pack("<BIQ", 1, 7, 9)
     assert frame.payload is payload
@@ -222,12 +222,12 @@ def advertise(number: int = 3, topic: str = "/cmd", encoding: str = "ros1", type
 def test_a_client_publishes() -> None:
     client = Client()
     client.send(advertise(topic="cmd"))
-    handle = client.last(requests.Advertise).handle
-    assert client.last(requests.Advertise) == requests.Advertise(handle, "/cmd", "std_msgs/String")
+    handle = client.last(requests.AdvertiseTopic).handle
+    assert client.last(requests.AdvertiseTopic) == requests.AdvertiseTopic(handle, "/cmd", "std_msgs/String")
     client.send(struct.pack("<BI", 1, 3) + b"\x02\x00\x00\x00hi")
-    assert client.last(requests.Publish) == requests.Publish(handle, memoryview(b"\x02\x00\x00\x00hi"))
+    assert client.last(requests.PublishMessage) == requests.PublishMessage(handle, memoryview(b"\x02\x00\x00\x00hi"))
     client.send({"op": "unadvertise", "channelIds": [3]})
-    assert client.last(requests.Unadvertise).handle == handle
+    assert client.last(requests.UnadvertiseTopic).handle == handle
     client.send(struct.pack("<BI", 1, 3))
     assert "not advertised" in client.errors[0]
 
@@ -246,7 +246,7 @@ def test_a_topic_that_cannot_be_published_is_refused(wrong: Any) -> None:
     client = Client()
     client.send(wrong)
     assert len(client.errors) == 1
-    assert not any(isinstance(each, requests.Advertise) for each in client.asked)
+    assert not any(isinstance(each, requests.AdvertiseTopic) for each in client.asked)
 
 
 def test_published_topics_are_bounded_and_numbers_are_used_once() -> None:
@@ -256,17 +256,17 @@ def test_published_topics_are_bounded_and_numbers_are_used_once() -> None:
     client.send(advertise(0))
     client.send(advertise(9999))
     assert len(client.errors) == 2
-    assert sum(isinstance(each, requests.Advertise) for each in client.asked) == limits.FOXGLOVE_ADVERTISED_MAX
+    assert sum(isinstance(each, requests.AdvertiseTopic) for each in client.asked) == limits.FOXGLOVE_ADVERTISED_MAX
 
 
 def test_messages_of_a_failed_publisher_are_dropped_without_a_status_each() -> None:
     client = Client()
     client.send(advertise())
-    client.hub(requests.Failed(client.last(requests.Advertise).handle, "its type is not known"))
+    client.hub(requests.Failed(client.last(requests.AdvertiseTopic).handle, "its type is not known"))
     for _ in range(10):
         client.send(struct.pack("<BI", 1, 3))
     assert client.errors == ["its type is not known"]
-    assert not any(isinstance(each, requests.Publish) for each in client.asked)
+    assert not any(isinstance(each, requests.PublishMessage) for each in client.asked)
 
 
 # --- services ---
@@ -538,7 +538,7 @@ def test_everything_is_released_when_the_client_is_gone() -> None:
     assert set(client.session.close()) == {
         requests.Unsubscribe(client.last(requests.Subscribe).handle),
         requests.Unsubscribe(clock),
-        requests.Unadvertise(client.last(requests.Advertise).handle),
+        requests.UnadvertiseTopic(client.last(requests.AdvertiseTopic).handle),
         requests.CancelCall(client.last(requests.CallService).handle),
         requests.UnfollowParams(client.last(requests.FollowParams).handle),
         requests.UnfollowGraph(graph),
@@ -580,6 +580,6 @@ def test_handles_are_never_used_again() -> None:
     for number in itertools.islice(itertools.count(), 5):
         client.subscribe(1, number)
         client.send({"op": "unsubscribe", "subscriptionIds": [number]})
-    opening = (requests.Subscribe, requests.FollowGraph, requests.Describe)
+    opening = (requests.Subscribe, requests.FollowGraph, requests.DescribeType)
     handles = [each.handle for each in client.asked if isinstance(each, opening)]
     assert len(handles) == len(set(handles))

@@ -6,7 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING, Any
 
 from rmpa.web.gateways.connection import ClientConnection, OutFrame
-from rmpa.web.hub.clients import Client
+from rmpa.web.hub.clients import HubClient
 from rmpa.web.hub.rights import READ_ONLY
 from tests.ros.node.peers import DEADLINE
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     import pytest
 
-    from rmpa.web.hub.requests import Answer, Received
+    from rmpa.web.hub.requests import Answer, ReceivedMessage
 
 
 class Silent(ClientConnection):
@@ -27,7 +27,7 @@ class Silent(ClientConnection):
 
     def answered(self, answer: Answer) -> None: ...
 
-    def encode(self, message: Received) -> Iterable[OutFrame]:
+    def encode(self, message: ReceivedMessage) -> Iterable[OutFrame]:
         return ()
 
     def show_drops(self, dropped: dict[str, int]) -> None: ...
@@ -61,7 +61,7 @@ async def watched(transport: Transport) -> None:
     connection = Silent(hub, READ_ONLY, lambda _: 0, "here", unadvertise_delay=0.0)
     played: Any = transport
     connection._transport = played
-    connection._client = Client(1, "test", READ_ONLY, lambda _: None, 0.0)
+    connection._client = HubClient(1, "test", READ_ONLY, lambda _: None, 0.0)
     await asyncio.wait_for(connection._watch(), DEADLINE)
 
 

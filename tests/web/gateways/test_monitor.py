@@ -187,13 +187,14 @@ async def test_live_values_and_plots_of_a_topic(core: RosCore) -> None:
         assert "not an image" in (await page.next("failed", id=3))["error"]
 
 
-async def test_a_topic_of_a_type_that_nothing_knows_ends_its_watch_with_the_reason(core: RosCore) -> None:
+async def test_a_watch_of_what_cannot_be_a_topic_ends_with_the_reason(core: RosCore) -> None:
     async with page_of(core) as (page, _):
         await page.send("watch", id=1, topic="/a//b", how="value")
-        message = await page.socket.receive()
-        while message.type is aiohttp.WSMsgType.TEXT:
-            message = await page.socket.receive()
-        assert message.data == aiohttp.WSCloseCode.POLICY_VIOLATION
+        message = await page.socket.receive_json()
+        while message["op"] != "failed":
+            message = await page.socket.receive_json()
+        assert message["id"] == 1
+        assert "/a//b" in message["error"]
 
 
 async def test_parameters_are_read_and_set(core: RosCore) -> None:

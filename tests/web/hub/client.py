@@ -10,7 +10,7 @@ from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.node.node import Node
 from rmpa.web.hub.hub import Hub
-from rmpa.web.hub.requests import Answer, Failed, GraphChanged, Received
+from rmpa.web.hub.requests import Answer, Failed, GraphChanged, ReceivedMessage
 from rmpa.web.hub.rights import FULL, Rights
 from tests.ros.node.peers import until
 
@@ -78,7 +78,7 @@ class FakeClient:
 
     def payloads(self, handle: int) -> list[bytes]:
         """What a subscription has received."""
-        return [bytes(message.payload) for message in self.of(Received, handle)]
+        return [bytes(message.payload) for message in self.of(ReceivedMessage, handle)]
 
     async def answer(self, kind: type[_A], handle: int) -> _A:
         """Wait for the answer to a request."""

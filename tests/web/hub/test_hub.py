@@ -11,11 +11,11 @@ from rmpa.ros.types.definitions import parse_definition
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.types.service_types import ServiceType
 from rmpa.web.hub.requests import (
-    Advertise,
+    AdvertiseTopic,
     CallService,
     DeleteParam,
-    Describe,
     Described,
+    DescribeType,
     EndService,
     FindService,
     FollowGraph,
@@ -23,8 +23,8 @@ from rmpa.web.hub.requests import (
     GetParams,
     GraphChanged,
     ParamsChanged,
-    Publish,
-    Received,
+    PublishMessage,
+    ReceivedMessage,
     Respond,
     ServeService,
     ServiceFound,
@@ -32,7 +32,7 @@ from rmpa.web.hub.requests import (
     ServiceResult,
     SetParam,
     Subscribe,
-    Unadvertise,
+    UnadvertiseTopic,
     Unsubscribe,
 )
 from rmpa.web.hub.rights import CONTROL_REMEDY, FULL, READ_ONLY, READ_REMEDY
@@ -61,7 +61,7 @@ async def test_all_clients_share_one_subscription_and_one_payload(core: RosCore)
         publisher.publish_raw(ONE)
         await until(lambda: all(client.payloads(1) for client in clients))
         assert publisher.subscribers == 1
-        first, second = (client.of(Received)[0] for client in clients)
+        first, second = (client.of(ReceivedMessage)[0] for client in clients)
         assert first.payload is second.payload
         assert (first.topic, first.type, bytes(first.payload)) == ("/t", "std_msgs/String", ONE)
         assert abs(first.stamp_ns - time.time_ns()) < DEADLINE * 1e9
@@ -95,7 +95,7 @@ async def test_newcomers_get_the_latched_message_of_each_source_once(core: RosCo
         await until(lambda: len(early.payloads(1)) == 2)
         late.ask(Subscribe(7, "/map"))
         assert sorted(late.payloads(7)) == [ONE, TWO]
-        assert all(message.latched for message in late.of(Received))
+        assert all(message.latched for message in late.of(ReceivedMessage))
         await asyncio.sleep(0)
         assert sorted(early.payloads(1)) == [ONE, TWO]
 
@@ -141,14 +141,14 @@ async def test_what_is_published_while_the_node_is_made_anew_is_sent_then(
         heard: list[bytes] = []
         await base.subscribe("/cmd_vel", callback=lambda message: heard.append(message.raw))
         client = FakeClient(hub)
-        client.ask(Advertise(1, "/cmd_vel", "std_msgs/String"))
-        client.ask(Publish(1, ONE))
+        client.ask(AdvertiseTopic(1, "/cmd_vel", "std_msgs/String"))
+        client.ask(PublishMessage(1, ONE))
         await until(lambda: heard == [ONE])
         present = hub.link.node
         assert present is not None
         await present.close()
         await until(lambda: hub.link.node is None or hub.link.node is not present)
-        client.ask(Publish(1, TWO))  # such as the stop of a robot
+        client.ask(PublishMessage(1, TWO))  # such as the stop of a robot
         await until(lambda: heard[-1] == TWO)
 
 
@@ -213,11 +213,11 @@ async def test_what_a_client_publishes_reaches_nodes_and_other_clients(core: Ros
         await until(lambda: "/t" in hub.graph.topics)
         one, two = FakeClient(hub), FakeClient(hub)
         two.ask(Subscribe(1, "/t"))
-        one.ask(Advertise(1, "/t", "std_msgs/String"))
-        one.ask(Publish(1, ONE))  # at once, before any subscriber is connected
+        one.ask(AdvertiseTopic(1, "/t", "std_msgs/String"))
+        one.ask(PublishMessage(1, ONE))  # at once, before any subscriber is connected
         await until(lambda: heard == [ONE])
         assert two.payloads(1) == [ONE]
-        one.ask(Publish(1, TWO))
+        one.ask(PublishMessage(1, TWO))
         await until(lambda: heard == [ONE, TWO])
         assert two.payloads(1) == [ONE, TWO]
 
@@ -225,8 +225,8 @@ async def test_what_a_client_publishes_reaches_nodes_and_other_clients(core: Ros
 async def test_what_a_client_latches_reaches_late_nodes_and_clients(core: RosCore) -> None:
     async with running_hub(core) as hub, node(core, "echo") as echo:
         one, two = FakeClient(hub), FakeClient(hub)
-        one.ask(Advertise(1, "/t", "std_msgs/String", latch=True))
-        one.ask(Publish(1, ONE))
+        one.ask(AdvertiseTopic(1, "/t", "std_msgs/String", latch=True))
+        one.ask(PublishMessage(1, ONE))
         await until(lambda: core.publishers("/t"))
         heard: list[bytes] = []
         await echo.subscribe("/t", callback=lambda message: heard.append(message.raw))
@@ -238,13 +238,13 @@ async def test_what_a_client_latches_reaches_late_nodes_and_clients(core: RosCor
 async def test_clients_share_a_publisher_and_the_last_withdraws_it_after_a_while(core: RosCore) -> None:
     async with running_hub(core) as hub:
         one, two = FakeClient(hub), FakeClient(hub, unadvertise_delay=0.05)
-        one.ask(Advertise(1, "/t", "std_msgs/String"))
-        two.ask(Advertise(1, "/t", "std_msgs/String"))
+        one.ask(AdvertiseTopic(1, "/t", "std_msgs/String"))
+        two.ask(AdvertiseTopic(1, "/t", "std_msgs/String"))
         await until(lambda: core.publishers("/t"))
-        one.ask(Unadvertise(1))
+        one.ask(UnadvertiseTopic(1))
         assert core.publishers("/t")
         began = time.monotonic()
-        two.ask(Unadvertise(1))
+        two.ask(UnadvertiseTopic(1))
         await until(lambda: not core.publishers("/t"))
         assert time.monotonic() - began >= 0.05
 
@@ -252,11 +252,11 @@ async def test_clients_share_a_publisher_and_the_last_withdraws_it_after_a_while
 async def test_another_type_of_a_published_topic_is_refused(core: RosCore) -> None:
     async with running_hub(core) as hub:
         one, two = FakeClient(hub), FakeClient(hub)
-        one.ask(Advertise(1, "/t", "std_msgs/String"))
-        two.ask(Advertise(1, "/t", "std_msgs/Int32"))
+        one.ask(AdvertiseTopic(1, "/t", "std_msgs/String"))
+        two.ask(AdvertiseTopic(1, "/t", "std_msgs/Int32"))
         failed = await two.failure(1)
         assert "publish /t as std_msgs/String, not std_msgs/Int32" in failed.error
-        one.ask(Advertise(2, "/u", "no_msgs/Such"))
+        one.ask(AdvertiseTopic(2, "/u", "no_msgs/Such"))
         assert "no_msgs/Such" in (await one.failure(2)).error
 
 
@@ -266,7 +266,7 @@ async def test_a_node_that_was_shut_down_comes_back_with_everything(core: RosCor
         publisher = await talker.advertise("/t", STRING)
         client = FakeClient(hub)
         client.ask(Subscribe(1, "/t"))
-        client.ask(Advertise(2, "/u", "std_msgs/String"))
+        client.ask(AdvertiseTopic(2, "/u", "std_msgs/String"))
         await publisher.wait_for_subscriber()
         await until(lambda: core.publishers("/u"))
         first = hub.link.node
@@ -303,7 +303,7 @@ async def test_calls_share_a_connection_and_errors_are_told(core: RosCore) -> No
         assert "/gone" in (await client.answer(ServiceResult, 5)).error
         client.ask(FindService(6, "/set"))
         assert (await client.answer(ServiceFound, 6)).type == SET_BOOL
-        await until(lambda: hub.graph.services["/set"].type == SET_BOOL)
+        await until(lambda: "/set" in hub.graph.services and hub.graph.services["/set"].type == SET_BOOL)
 
 
 async def test_a_call_ends_in_time(core: RosCore) -> None:
@@ -375,13 +375,13 @@ async def test_a_type_that_only_a_publisher_knows_is_described(core: RosCore) ->
     kind = MessageType.learn("my_msgs/Pair", "int32 a\nint32 b\n")
     async with running_hub(core) as hub, node(core, "talker") as talker:
         client = FakeClient(hub)
-        client.ask(Describe(1, "std_msgs/String"))
+        client.ask(DescribeType(1, "std_msgs/String"))
         assert "string data" in (await client.answer(Described, 1)).text
-        client.ask(Describe(2, "std_srvs/SetBool", service=True))
+        client.ask(DescribeType(2, "std_srvs/SetBool", service=True))
         described = await client.answer(Described, 2)
         assert "bool data" in described.text
         assert "bool success" in described.response
-        client.ask(Describe(3, "my_msgs/Pair"))
+        client.ask(DescribeType(3, "my_msgs/Pair"))
         await client.failure(3)
         publisher = await talker.advertise("/pair", kind)
         client.ask(Subscribe(4, "/pair"))
@@ -410,7 +410,7 @@ async def test_a_read_only_client_changes_nothing(core: RosCore) -> None:
     async with running_hub(core) as hub:
         client = FakeClient(hub, READ_ONLY)
         asked: list[Any] = [
-            Advertise(1, "/t", "std_msgs/String"),
+            AdvertiseTopic(1, "/t", "std_msgs/String"),
             CallService(2, "/set", SET_BOOL, b"\x01"),
             ServeService(3, "/s", SET_BOOL),
             SetParam(4, "/p", 1),
@@ -424,5 +424,5 @@ async def test_a_read_only_client_changes_nothing(core: RosCore) -> None:
             assert "may not" in failed.error
             reads = isinstance(request, GetParams | FollowParams)
             assert failed.remedy == (READ_REMEDY if reads else CONTROL_REMEDY)
-        client.ask(Publish(1, ONE))
+        client.ask(PublishMessage(1, ONE))
         assert not core.publishers("/t")

@@ -358,7 +358,7 @@ class _Client:
         self._log = False
         self.session = monitor.MonitorSession(server._details, self._decode, server.rights, time.monotonic())
 
-    def _decode(self, message: requests.Received) -> Any:
+    def _decode(self, message: requests.ReceivedMessage) -> Any:
         topic = message.topic
         if "scan" in topic:
             ranges = [_room(number * math.pi / 180) for number in range(360)]
@@ -389,7 +389,7 @@ class _Client:
                     if "image" in topic
                     else "nav_msgs/Odometry"
                 )
-                received = requests.Received(handle, topic, kind, memoryview(b"\0" * 712), time.time_ns())
+                received = requests.ReceivedMessage(handle, topic, kind, memoryview(b"\0" * 712), time.time_ns())
                 await self.act(self.session.receive_message(received, now))
             if self._log and tick % 10 == 0:
                 await self.act(
@@ -418,7 +418,7 @@ class _Client:
                 self._server.speeds.append(output)
             elif isinstance(output, monitor.FollowLog):
                 self._log = output.on
-            elif isinstance(output, monitor.Close):
+            elif isinstance(output, monitor.MonitorClose):
                 await self._socket.close(code=output.code, message=output.reason.encode())
 
 

@@ -31,6 +31,6 @@ def test_the_page_has_each_question_and_message() -> None:
         assert f"`{what}`" in PAGE
     for permission in session.permissions(replace(FULL, drive=True)):
         assert f"`{permission}`" in PAGE
-    for kind in (messages.Ack, messages.Look, messages.Watch, messages.Unwatch, messages.Ask, messages.Log):
+    for kind in (messages.Ack, messages.Look, messages.Watch, messages.Unwatch, messages.AskQuestion, messages.Log):
         assert f"`{kind.__struct_config__.tag}`" in PAGE
     assert f"`{messages.SUBPROTOCOL}`" in PAGE

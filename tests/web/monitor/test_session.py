@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.web.hub.requests import Received, Subscribe, Unsubscribe
+from rmpa.web.hub.requests import ReceivedMessage, Subscribe, Unsubscribe
 from rmpa.web.hub.rights import FULL, Rights
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.patch import apply
-from rmpa.web.monitor.session import Close, FollowLog, MonitorSession, Question, Speed
+from rmpa.web.monitor.session import FollowLog, MonitorClose, MonitorSession, Question, Speed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -37,7 +37,7 @@ class Page:
         self.frames: list[Any] = []
         self.others: list[Any] = []
 
-    def _decode(self, message: Received) -> Any:
+    def _decode(self, message: ReceivedMessage) -> Any:
         self.decoded += 1
         return {"x": float(message.payload[0]), "bytes": message.payload}
 
@@ -78,7 +78,7 @@ class Page:
         return self.take(self.session.handle_timer(self.now))
 
     def message(self, handle: int, value: int, topic: str = "/odom") -> list[Any]:
-        received = Received(handle, topic, "a/B", memoryview(bytes([value])), int(self.now * 1e9))
+        received = ReceivedMessage(handle, topic, "a/B", memoryview(bytes([value])), int(self.now * 1e9))
         return self.take(self.session.receive_message(received, self.now))
 
 
@@ -268,7 +268,7 @@ DRIVE = {"op": "drive", "topic": "/cmd_vel", "linear": 0, "angular": 0}
 )
 def test_what_is_no_request_closes_the_connection(text: str) -> None:
     outputs = list(Page().session.receive(text.encode("utf-8", "surrogatepass"), 100.0))
-    assert isinstance(outputs[-1], Close)
+    assert isinstance(outputs[-1], MonitorClose)
     assert len(outputs[-1].reason.encode()) <= 123
     assert outputs[-1].refusal == ("message_size" if len(text) > limits.REQUEST_MAX else "message")
 
@@ -287,7 +287,7 @@ def test_a_flood_closes_the_connection() -> None:
     page = Page()
     for _ in range(int(limits.REQUEST_BURST) + 1):
         page.send("ack", n=0)
-    assert isinstance(page.others[-1], Close)
+    assert isinstance(page.others[-1], MonitorClose)
     assert page.others[-1].refusal == "message_rate"
 
 
@@ -334,7 +334,7 @@ def test_a_page_that_takes_nothing_costs_no_processor_time() -> None:
 def test_an_id_that_no_picture_can_carry_closes_the_connection(id_: int) -> None:
     page = Page()
     page.send("watch", id=id_, topic="/image", how="image")
-    assert isinstance(page.others[-1], Close)
+    assert isinstance(page.others[-1], MonitorClose)
 
 
 def test_a_robot_is_stopped_while_the_page_takes_nothing() -> None:

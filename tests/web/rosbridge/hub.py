@@ -10,12 +10,12 @@ import msgspec
 
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.types.service_types import ServiceType
-from rmpa.web.hub.requests import Answer, GraphService, GraphTopic, ParamValue, Received, Request
+from rmpa.web.hub.requests import Answer, GraphService, GraphTopic, ParamValue, ReceivedMessage, Request
 from rmpa.web.rosbridge.encodings import PublishFrames
 from rmpa.web.rosbridge.session import RosbridgeSession, Verify
 
 if TYPE_CHECKING:
-    from rmpa.web.rosbridge.protocol import Frame
+    from rmpa.web.rosbridge.protocol import RosbridgeFrame
 
 NOW_NS = 1_700_000_000_000_000_123
 _R = TypeVar("_R", bound=Request)
@@ -78,7 +78,7 @@ class Client:
         """Let the hub have a message for a subscription; returns its payload."""
         message = MessageType(kind)
         payload = memoryview(message.serialize(message.make(values)))
-        self.answer(Received(handle, topic, kind, payload, NOW_NS))
+        self.answer(ReceivedMessage(handle, topic, kind, payload, NOW_NS))
         return payload
 
     def advance(self, seconds: float) -> None:
@@ -89,7 +89,7 @@ class Client:
             self.session.handle_timer(self.now)
         self.now = end
 
-    def frames(self) -> list[Frame]:
+    def frames(self) -> list[RosbridgeFrame]:
         return self.session.frames_to_send()
 
     def received(self) -> list[dict[str, Any]]:
@@ -104,6 +104,6 @@ class Client:
         return text
 
 
-def decoded(frame: Frame) -> dict[str, Any]:
+def decoded(frame: RosbridgeFrame) -> dict[str, Any]:
     values: dict[str, Any] = cbor2.loads(bytes(frame.data)) if frame.binary else msgspec.json.decode(frame.data)
     return values

@@ -9,7 +9,7 @@ import msgspec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rmpa.web.hub.requests import Failed, Received, ServeService, ServiceFound, ServiceRequest, ServiceResult
+from rmpa.web.hub.requests import Failed, ReceivedMessage, ServeService, ServiceFound, ServiceRequest, ServiceResult
 from rmpa.web.rosbridge.protocol import OPS
 from tests.web.rosbridge.hub import Client, decoded
 
@@ -52,7 +52,7 @@ def test_any_ops_in_any_order(ops: list[dict[str, Any]], binary: bool) -> None:
             continue
         for request in client.send_raw(frame):
             handle = request.handle
-            client.answer(Received(handle, "/t", "std_msgs/String", memoryview(b"\1\0\0\0x"), 5))
+            client.answer(ReceivedMessage(handle, "/t", "std_msgs/String", memoryview(b"\1\0\0\0x"), 5))
             if isinstance(request, ServeService):
                 client.answer(ServiceRequest(handle, 1, bytes(1)))
             for answer in (

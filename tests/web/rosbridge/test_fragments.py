@@ -10,35 +10,35 @@ from hypothesis import strategies as st
 from rmpa.core.errors import LimitExceeded
 from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.fragments import Assembler, split
-from rmpa.web.rosbridge.protocol import Frame, OpError
+from rmpa.web.rosbridge.protocol import OpError, RosbridgeFrame
 
 if TYPE_CHECKING:
     import random
 
 
-def _decoded(frames: list[Frame]) -> list[dict[str, Any]]:
+def _decoded(frames: list[RosbridgeFrame]) -> list[dict[str, Any]]:
     return [msgspec.json.decode(frame.data) for frame in frames]
 
 
 def test_fragments_in_bytes() -> None:
-    first, second = split(Frame((b'{"op":', b'"x"}'), handle=3), 6, "i")
+    first, second = split(RosbridgeFrame((b'{"op":', b'"x"}'), handle=3), 6, "i")
     assert bytes(first.data) == b'{"op":"fragment","id":"i","data":"{\\"op\\":","num":0,"total":2}'
     assert bytes(second.data) == b'{"op":"fragment","id":"i","data":"\\"x\\"}","num":1,"total":2}'
     assert first.handle == second.handle == 3
 
 
 def test_what_fits_and_what_is_binary_stays_whole() -> None:
-    whole = Frame((b"12345",))
+    whole = RosbridgeFrame((b"12345",))
     assert split(whole, 5, 1) == [whole]
-    binary = Frame((b"12345",), binary=True)
+    binary = RosbridgeFrame((b"12345",), binary=True)
     assert split(binary, 1, 1) == [binary]
-    characters = Frame(("ééé".encode(),))
+    characters = RosbridgeFrame(("ééé".encode(),))
     assert split(characters, 3, 1) == [characters]
 
 
 @given(st.text(st.characters(exclude_categories=["Cs"]), min_size=1), st.integers(1, 20), st.randoms())
 def test_fragments_come_together_in_any_order(text: str, size: int, rng: random.Random) -> None:
-    frames = split(Frame((text.encode(),)), size, 7)
+    frames = split(RosbridgeFrame((text.encode(),)), size, 7)
     if len(frames) == 1:
         return
     assembler = Assembler()
@@ -54,7 +54,7 @@ def test_fragments_come_together_in_any_order(text: str, size: int, rng: random.
 
 def test_more_fragments_than_allowed_are_not_made() -> None:
     with pytest.raises(OpError, match="ask for a fragment_size of 2 or more"):
-        split(Frame((b"x" * (limits.FRAGMENTS_MAX + 1),)), 1, 1)
+        split(RosbridgeFrame((b"x" * (limits.FRAGMENTS_MAX + 1),)), 1, 1)
 
 
 @pytest.mark.parametrize(("num", "total"), [(-1, 2), (2, 2), (0, 0), (0, -1)])

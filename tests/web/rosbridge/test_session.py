@@ -8,12 +8,12 @@ import pytest
 
 from rmpa.ros.types.messages import MessageType
 from rmpa.web.hub.requests import (
-    Advertise,
+    AdvertiseTopic,
     Failed,
-    Publish,
-    Received,
+    PublishMessage,
+    ReceivedMessage,
     Subscribe,
-    Unadvertise,
+    UnadvertiseTopic,
     Unsubscribe,
 )
 from rmpa.web.rosbridge import limits
@@ -64,7 +64,7 @@ def test_each_compression() -> None:
 def test_cbor_raw_needs_no_definition() -> None:
     client = Client()
     request = client.one(Subscribe, client.send("subscribe", topic="/t", type="x/Y", compression="cbor-raw"))
-    client.answer(Received(request.handle, "/t", "x/Y", memoryview(b"abc"), 0))
+    client.answer(ReceivedMessage(request.handle, "/t", "x/Y", memoryview(b"abc"), 0))
     assert client.received()[0]["msg"]["bytes"] == b"abc"
 
 
@@ -149,7 +149,7 @@ def test_clients_of_one_topic_share_the_encoded_message() -> None:
     payload = memoryview(HELLO)
     for client in clients:
         handle = client.one(Subscribe, client.send("subscribe", topic="/t")).handle
-        client.answer(Received(handle, "/t", STRING, payload, 0))
+        client.answer(ReceivedMessage(handle, "/t", STRING, payload, 0))
     (first,), (second,) = (client.frames() for client in clients)
     assert first.parts is second.parts
 
@@ -158,7 +158,7 @@ def test_a_broken_message_is_reported_once() -> None:
     client = Client()
     handle = client.one(Subscribe, client.send("subscribe", topic="/t")).handle
     for _ in range(3):
-        client.answer(Received(handle, "/t", STRING, memoryview(b"\xff\xff\xff\xff"), 0))
+        client.answer(ReceivedMessage(handle, "/t", STRING, memoryview(b"\xff\xff\xff\xff"), 0))
     assert "message of /t: 4 bytes are not a std_msgs/String" in client.error()
     client.publish(handle, STRING, {"data": "ok"})
     assert client.received()[0]["msg"] == {"data": "ok"}
@@ -189,9 +189,9 @@ def test_a_subscription_that_the_hub_refuses_is_reported_and_may_begin_again() -
 
 def test_a_client_publishes() -> None:
     client = Client()
-    request = client.one(Advertise, client.send("advertise", topic="t", type=STRING, latch=True, queue_size=5))
+    request = client.one(AdvertiseTopic, client.send("advertise", topic="t", type=STRING, latch=True, queue_size=5))
     assert (request.topic, request.type, request.latch) == ("/t", STRING, True)
-    assert client.send("publish", topic="/t", msg={"data": "hello"}) == [Publish(request.handle, HELLO)]
+    assert client.send("publish", topic="/t", msg={"data": "hello"}) == [PublishMessage(request.handle, HELLO)]
     assert not client.received()
 
 
@@ -200,7 +200,7 @@ def test_a_message_without_all_fields_is_published_with_a_warning() -> None:
     client.send("set_level", level="warning")
     client.send("advertise", topic="/t", type="geometry_msgs/Point")
     (publish,) = client.send("publish", id="p", topic="/t", msg={"x": 1})
-    assert isinstance(publish, Publish)
+    assert isinstance(publish, PublishMessage)
     assert bytes(publish.payload) == bytes(6) + b"\xf0\x3f" + bytes(16)
     (status,) = client.received()
     assert (status["level"], status["id"]) == ("warning", "p")
@@ -212,13 +212,13 @@ def test_what_python_clients_write_for_not_a_number_is_taken(value: str) -> None
     client = Client()
     client.send("advertise", topic="/t", type="std_msgs/Float64")
     (publish,) = client.send_raw(f'{{"op": "publish", "topic": "/t", "msg": {{"data": {value}}}}}')
-    assert isinstance(publish, Publish)
+    assert isinstance(publish, PublishMessage)
     assert bytes(publish.payload)[-2] & 0xF0 == 0xF0
 
 
 def test_a_publisher_is_withdrawn_ten_seconds_after_the_last_id_unadvertised_it() -> None:
     client = Client()
-    handle = client.one(Advertise, client.send("advertise", id="a", topic="/t", type=STRING)).handle
+    handle = client.one(AdvertiseTopic, client.send("advertise", id="a", topic="/t", type=STRING)).handle
     assert not client.send("advertise", id="b", topic="/t", type=STRING)
     client.send("unadvertise", id="a", topic="/t")
     client.advance(60)
@@ -231,16 +231,16 @@ def test_a_publisher_is_withdrawn_ten_seconds_after_the_last_id_unadvertised_it(
     assert not client.session.requests_to_send()
     client.send("unadvertise", topic="/t")
     client.advance(limits.UNADVERTISE_DELAY)
-    assert client.session.requests_to_send() == [Unadvertise(handle)]
+    assert client.session.requests_to_send() == [UnadvertiseTopic(handle)]
 
 
 def test_a_topic_of_the_graph_may_be_published_without_advertising() -> None:
     client = Client()
     client.graph.add_topic("/t", STRING)
     advertise, publish = client.send("publish", topic="/t", msg={"data": "hello"})
-    assert isinstance(advertise, Advertise)
+    assert isinstance(advertise, AdvertiseTopic)
     assert advertise.type == STRING
-    assert publish == Publish(advertise.handle, HELLO)
+    assert publish == PublishMessage(advertise.handle, HELLO)
     assert not client.send("publish", topic="/unknown", msg={})
     assert "advertise it first" in client.error()
 
@@ -262,7 +262,7 @@ def test_binary_frames_are_ops_in_cbor() -> None:
     client.send("advertise", topic="/t", type="std_msgs/UInt8MultiArray")
     message = {"layout": {"dim": [], "data_offset": 0}, "data": b"\x01\x02"}
     (publish,) = client.send_raw(cbor2.dumps({"op": "publish", "topic": "/t", "msg": message}))
-    assert isinstance(publish, Publish)
+    assert isinstance(publish, PublishMessage)
     assert bytes(publish.payload).endswith(b"\x02\0\0\0\x01\x02")
 
 
@@ -339,7 +339,7 @@ def test_all_that_a_client_had_ends_with_it() -> None:
     (subscribe,) = client.send("subscribe", topic="/t", throttle_rate=1000, queue_length=5)
     (advertise,) = client.send("advertise", topic="/u", type=STRING)
     client.session.close()
-    assert client.session.requests_to_send() == [Unsubscribe(subscribe.handle), Unadvertise(advertise.handle)]
+    assert client.session.requests_to_send() == [Unsubscribe(subscribe.handle), UnadvertiseTopic(advertise.handle)]
     assert client.session.next_timer() is None
 
 
@@ -429,11 +429,11 @@ def test_every_op_is_known() -> None:
 TEST = "actionlib/Test"
 
 
-def _goal(client: Client, **values: Any) -> tuple[dict[str, int], Publish]:
+def _goal(client: Client, **values: Any) -> tuple[dict[str, int], PublishMessage]:
     requests = client.send("send_action_goal", action="/f", action_type=TEST, **values)
     *begun, publish = requests
-    assert isinstance(publish, Publish)
-    return {each.topic: each.handle for each in begun if isinstance(each, Subscribe | Advertise)}, publish
+    assert isinstance(publish, PublishMessage)
+    return {each.topic: each.handle for each in begun if isinstance(each, Subscribe | AdvertiseTopic)}, publish
 
 
 def _result(client: Client, part: str, handle: int, goal_id: str, status: int, number: int) -> None:
@@ -454,7 +454,7 @@ def test_a_goal_goes_to_actionlib_and_its_result_comes_back(status: int, code: i
     _result(client, "feedback", handles["/f/feedback"], goal_id, 1, 1)
     _result(client, "feedback", handles["/f/feedback"], "of another client", 1, 7)
     (cancel,) = client.send("cancel_action_goal", id="g", action="/f")
-    assert isinstance(cancel, Publish)
+    assert isinstance(cancel, PublishMessage)
     assert cancel.handle == handles["/f/cancel"]
     assert goal_id.encode() in bytes(cancel.payload)
     _result(client, "result", handles["/f/result"], goal_id, status, 2)
@@ -483,4 +483,4 @@ def test_an_action_that_the_hub_refuses_ends_its_goals() -> None:
     status, result = client.received()
     assert status["level"] == "error"
     assert (result["op"], result["id"], result["result"]) == ("action_result", "g", False)
-    assert {type(each) for each in requests} == {Unsubscribe, Unadvertise}
+    assert {type(each) for each in requests} == {Unsubscribe, UnadvertiseTopic}

@@ -1,15 +1,15 @@
 from __future__ import annotations
 
-from rmpa.web.hub.requests import Received
+from rmpa.web.hub.requests import ReceivedMessage
 from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.throttle import QueuedBytes, Throttle
 
 
-def _message(number: int, size: int = 1) -> Received:
-    return Received(1, "/t", "t/T", memoryview(bytes(size)), number)
+def _message(number: int, size: int = 1) -> ReceivedMessage:
+    return ReceivedMessage(1, "/t", "t/T", memoryview(bytes(size)), number)
 
 
-def _numbers(messages: list[Received]) -> list[int]:
+def _numbers(messages: list[ReceivedMessage]) -> list[int]:
     return [each.stamp_ns for each in messages]
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from rmpa.web.server.auth import (
+    AccessGranted,
     AccessPolicy,
-    Granted,
+    AccessRefused,
     MoveToken,
     Preflight,
-    Refused,
     RequestFacts,
     is_loopback,
     own_names,
@@ -22,8 +22,8 @@ CLOSED = AccessPolicy(8480, HOSTS, TOKEN)
 HERE = ("base.local:8480",)
 
 
-def reason(verdict: Granted | MoveToken | Preflight | Refused) -> str:
-    return verdict.reason if isinstance(verdict, Refused) else type(verdict).__name__
+def reason(verdict: AccessGranted | MoveToken | Preflight | AccessRefused) -> str:
+    return verdict.reason if isinstance(verdict, AccessRefused) else type(verdict).__name__.removeprefix("Access")
 
 
 @pytest.mark.parametrize(
@@ -152,7 +152,7 @@ def test_a_refusal_says_what_to_do() -> None:
         (RequestFacts(HERE, cookie="old"), "the token is wrong"),
     ):
         verdict = CLOSED.judge(facts)
-        assert isinstance(verdict, Refused)
+        assert isinstance(verdict, AccessRefused)
         assert remedy in verdict.detail
 
 

@@ -36,7 +36,7 @@ class Granted:
 
 
 @dataclass(frozen=True, slots=True)
-class Withdraw:
+class WithdrawGrant:
     """Tell a peer that its subscribers of a source have to be relayed.
 
     Args:
@@ -68,7 +68,7 @@ class EndConnections:
     port: int
 
 
-GrantAction = Withdraw | Retry | EndConnections
+GrantAction = WithdrawGrant | Retry | EndConnections
 
 
 class DirectGrants:
@@ -178,7 +178,7 @@ class DirectGrants:
             if source.topic == topic and subscriber == node:
                 self._drop(peer, source, subscriber)
                 self.refuse(peer, source)
-                actions.append(Withdraw(peer, source, subscriber, Unmet(Condition.CALLER_ID, text)))
+                actions.append(WithdrawGrant(peer, source, subscriber, Unmet(Condition.CALLER_ID, text)))
         return actions
 
     def local_subscriber_gone(self, topic: str) -> list[GrantAction]:
@@ -198,7 +198,7 @@ class DirectGrants:
         for peer, subscriber, _ in self.of(source):
             self._drop(peer, source, subscriber)
             self.refuse(peer, source)
-        return [Withdraw(peer, source, "", unmet) for peer in peers]
+        return [WithdrawGrant(peer, source, "", unmet) for peer in peers]
 
     def gone(self, source: Source) -> None:
         """Forget the grants of a source whose publisher has left; see ``published``."""
@@ -219,7 +219,7 @@ class DirectGrants:
         if any(granted.uri != uri for _, _, granted in self.of(source)):
             return self.withdraw(source, unmet)
         away = self._away.pop(source, {})
-        return [*(Withdraw(peer, source, "", unmet) for peer in away), *self.changed(source)]
+        return [*(WithdrawGrant(peer, source, "", unmet) for peer in away), *self.changed(source)]
 
     def judge_again(self, unmet: Callable[[Source, int, Granted], Unmet | None]) -> list[GrantAction]:
         """Withdraw the grants that the rules do not allow any more.
@@ -233,7 +233,7 @@ class DirectGrants:
             if why is not None:
                 self._drop(peer, source, subscriber)
                 self.refuse(peer, source)
-                actions.append(Withdraw(peer, source, subscriber, why))
+                actions.append(WithdrawGrant(peer, source, subscriber, why))
         return actions
 
     def retry_all(self) -> list[GrantAction]:

@@ -15,16 +15,16 @@ from rmpa.web import limits
 from rmpa.web.foxglove.protocol import (
     ENCODING,
     SCHEMA_ENCODING,
-    Advertise,
-    AdvertiseServices,
     Channel,
+    FoxgloveAdvertise,
+    FoxgloveAdvertiseServices,
+    FoxgloveService,
+    FoxgloveStatus,
+    FoxgloveUnadvertise,
+    FoxgloveUnadvertiseServices,
     RemoveStatus,
-    Service,
     ServiceSchema,
-    Status,
     StatusLevel,
-    Unadvertise,
-    UnadvertiseServices,
 )
 from rmpa.web.hub import requests
 
@@ -69,10 +69,10 @@ class ChannelTable:
         self._wanted: dict[tuple[str, str], None] = {}
         self._wanted_services: dict[tuple[str, str], None] = {}
         self._by_key: dict[tuple[str, str], Channel] = {}
-        self._services_by_key: dict[tuple[str, str], Service] = {}
+        self._services_by_key: dict[tuple[str, str], FoxgloveService] = {}
         self.channels: dict[int, Channel] = {}
         """What is offered, by id."""
-        self.services: dict[int, Service] = {}
+        self.services: dict[int, FoxgloveService] = {}
         """Likewise."""
 
     def owns(self, handle: int) -> bool:
@@ -111,7 +111,7 @@ class ChannelTable:
             advice = f"; {answer.remedy}" if answer.remedy else ""
             what = "service" if asked.service else "topic"
             text = f"no {what} of type {asked.name} is shown: {answer.error}{advice}"
-            yield Status(level=StatusLevel.WARNING, message=text, id=_status_id(asked))
+            yield FoxgloveStatus(level=StatusLevel.WARNING, message=text, id=_status_id(asked))
         elif isinstance(answer, requests.Described):
             asked.described = answer
             if asked.warned:
@@ -156,7 +156,7 @@ class ChannelTable:
         if (name, service) not in self._types:
             handle = self._next_handle()
             self._types[name, service] = self._asked[handle] = _Type(handle, name, service)
-            yield requests.Describe(handle, name, service)
+            yield requests.DescribeType(handle, name, service)
 
     def _offer(self) -> Iterator[ServerMessage]:
         gone = [key for key in self._by_key if key not in self._wanted]
@@ -164,11 +164,11 @@ class ChannelTable:
             ids = tuple(self._by_key.pop(key).id for key in gone)
             for each in ids:
                 del self.channels[each]
-            yield Unadvertise(channel_ids=ids)
+            yield FoxgloveUnadvertise(channel_ids=ids)
         new = [channel for key in self._wanted if key not in self._by_key and (channel := self._channel(*key))]
         for channel in new:
             self._by_key[channel.topic, channel.schema_name] = self.channels[channel.id] = channel
-        yield from (Advertise(channels=part) for part in _parts(new, lambda channel: len(channel.schema)))
+        yield from (FoxgloveAdvertise(channels=part) for part in _parts(new, lambda channel: len(channel.schema)))
         yield from self._offer_services()
 
     def _offer_services(self) -> Iterator[ServerMessage]:
@@ -177,13 +177,13 @@ class ChannelTable:
             ids = tuple(self._services_by_key.pop(key).id for key in gone)
             for each in ids:
                 del self.services[each]
-            yield UnadvertiseServices(service_ids=ids)
+            yield FoxgloveUnadvertiseServices(service_ids=ids)
         missing = (key for key in self._wanted_services if key not in self._services_by_key)
         new = [service for key in missing if (service := self._service(*key))]
         for service in new:
             self._services_by_key[service.name, service.type] = self.services[service.id] = service
         sized = _parts(new, lambda service: len(service.request.schema) + len(service.response.schema))
-        yield from (AdvertiseServices(services=part) for part in sized)
+        yield from (FoxgloveAdvertiseServices(services=part) for part in sized)
 
     def _channel(self, topic: str, type_: str) -> Channel | None:
         described = self._types[type_, False].described
@@ -198,7 +198,7 @@ class ChannelTable:
             schema=schema_text(described.text),
         )
 
-    def _service(self, name: str, type_: str) -> Service | None:
+    def _service(self, name: str, type_: str) -> FoxgloveService | None:
         described = self._types[type_, True].described
         if described is None:
             return None
@@ -211,7 +211,7 @@ class ChannelTable:
             )
             for half, text in (("Request", described.text), ("Response", described.response))
         )
-        return Service(id=next(self._service_ids), name=name, type=type_, request=request, response=response)
+        return FoxgloveService(id=next(self._service_ids), name=name, type=type_, request=request, response=response)
 
 
 def schema_text(definition: str) -> str:

@@ -17,7 +17,7 @@ from rmpa.core.errors import RmpaError
 from rmpa.core.names import is_global_name
 from rmpa.core.sizes import INT32_MAX, INT32_MIN
 from rmpa.web import limits
-from rmpa.web.foxglove.protocol import Parameter, ParameterValues
+from rmpa.web.foxglove.protocol import FoxgloveParameter, ParameterValues
 from rmpa.web.hub import requests
 
 if TYPE_CHECKING:
@@ -34,21 +34,21 @@ class ParameterError(RmpaError):
     """A client's parameter has a name or a value that ROS cannot hold."""
 
 
-def to_parameter(name: str, value: ParamValue) -> Parameter:
+def to_parameter(name: str, value: ParamValue) -> FoxgloveParameter:
     """A parameter as clients get it; ``None`` is one that was deleted.
 
     Numbers that JSON lacks (NaN, infinities) become the texts ``nan``, ``inf`` and ``-inf``, without a type.
     """
     if value is None:
-        return Parameter(name=name)
+        return FoxgloveParameter(name=name)
     if isinstance(value, bytes):
-        return Parameter(name=name, type="byte_array", value=base64.b64encode(value).decode())
+        return FoxgloveParameter(name=name, type="byte_array", value=base64.b64encode(value).decode())
     kind: ParameterType | UnsetType = UNSET
     if isinstance(value, float) and math.isfinite(value):
         kind = "float64"
     elif isinstance(value, list) and value and all(isinstance(each, float) and math.isfinite(each) for each in value):
         kind = "float64_array"
-    return Parameter(name=name, type=kind, value=_to_json(value))
+    return FoxgloveParameter(name=name, type=kind, value=_to_json(value))
 
 
 def _to_json(value: ParamValue) -> object:
@@ -63,7 +63,7 @@ def _to_json(value: ParamValue) -> object:
     return value
 
 
-def from_parameter(parameter: Parameter) -> ParamValue:
+def from_parameter(parameter: FoxgloveParameter) -> ParamValue:
     """The value of a client's parameter; ``None`` for one that is to be deleted.
 
     Raises:

@@ -91,7 +91,7 @@ class ServerInfo(FromServer, frozen=True, kw_only=True, tag="serverInfo"):
     session_id: str = ""
 
 
-class Status(FromServer, frozen=True, kw_only=True, tag="status"):
+class FoxgloveStatus(FromServer, frozen=True, kw_only=True, tag="status"):
     """A text for users; a later one with the same ``id`` replaces it."""
 
     level: int
@@ -116,13 +116,13 @@ class Channel(_Part, frozen=True, kw_only=True):
     schema: str
 
 
-class Advertise(FromServer, frozen=True, kw_only=True, tag="advertise"):
+class FoxgloveAdvertise(FromServer, frozen=True, kw_only=True, tag="advertise"):
     """New channels."""
 
     channels: tuple[Channel, ...]
 
 
-class Unadvertise(FromServer, frozen=True, kw_only=True, tag="unadvertise"):
+class FoxgloveUnadvertise(FromServer, frozen=True, kw_only=True, tag="unadvertise"):
     """Channels that are gone; their subscriptions have ended."""
 
     channel_ids: tuple[int, ...]
@@ -137,7 +137,7 @@ class ServiceSchema(_Part, frozen=True, kw_only=True):
     schema: str
 
 
-class Service(_Part, frozen=True, kw_only=True):
+class FoxgloveService(_Part, frozen=True, kw_only=True):
     """A service that a client may call."""
 
     id: int
@@ -147,13 +147,13 @@ class Service(_Part, frozen=True, kw_only=True):
     response: ServiceSchema
 
 
-class AdvertiseServices(FromServer, frozen=True, kw_only=True, tag="advertiseServices"):
+class FoxgloveAdvertiseServices(FromServer, frozen=True, kw_only=True, tag="advertiseServices"):
     """New services."""
 
-    services: tuple[Service, ...]
+    services: tuple[FoxgloveService, ...]
 
 
-class UnadvertiseServices(FromServer, frozen=True, kw_only=True, tag="unadvertiseServices"):
+class FoxgloveUnadvertiseServices(FromServer, frozen=True, kw_only=True, tag="unadvertiseServices"):
     """Services that are gone."""
 
     service_ids: tuple[int, ...]
@@ -170,7 +170,7 @@ class ServiceCallFailure(FromServer, frozen=True, kw_only=True, tag="serviceCall
 ParameterType: TypeAlias = Literal["byte_array", "float64", "float64_array"]
 
 
-class Parameter(_Part, frozen=True, kw_only=True):
+class FoxgloveParameter(_Part, frozen=True, kw_only=True):
     """A parameter in a message of either side.
 
     Attributes:
@@ -188,7 +188,7 @@ class Parameter(_Part, frozen=True, kw_only=True):
 class ParameterValues(FromServer, frozen=True, kw_only=True, tag="parameterValues"):
     """Values of parameters: the answer to the request ``id``, or an update."""
 
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[FoxgloveParameter, ...]
     id: str | UnsetType = UNSET
 
 
@@ -225,12 +225,12 @@ class ConnectionGraphUpdate(FromServer, frozen=True, kw_only=True, tag="connecti
 
 ServerMessage: TypeAlias = (
     ServerInfo
-    | Status
+    | FoxgloveStatus
     | RemoveStatus
-    | Advertise
-    | Unadvertise
-    | AdvertiseServices
-    | UnadvertiseServices
+    | FoxgloveAdvertise
+    | FoxgloveUnadvertise
+    | FoxgloveAdvertiseServices
+    | FoxgloveUnadvertiseServices
     | ServiceCallFailure
     | ParameterValues
     | ConnectionGraphUpdate
@@ -281,7 +281,7 @@ class BinaryFrame:
         return self.header + bytes(self.payload)
 
 
-Frame: TypeAlias = TextFrame | BinaryFrame
+FoxgloveFrame: TypeAlias = TextFrame | BinaryFrame
 
 _DATA: Final = struct.Struct("<BIQ")
 _TIME: Final = struct.Struct("<BQ")
@@ -332,20 +332,20 @@ class _PartFromClient(msgspec.Struct, frozen=True, rename="camel"):
     """A part of a client's message."""
 
 
-class Subscription(_PartFromClient, frozen=True):
+class FoxgloveSubscription(_PartFromClient, frozen=True):
     """A subscription: a number that the client chooses, and the channel."""
 
     id: _Id
     channel_id: Annotated[int, Meta(ge=0)]
 
 
-class Subscribe(_FromClient, frozen=True, tag="subscribe"):
+class FoxgloveSubscribe(_FromClient, frozen=True, tag="subscribe"):
     """Asks for the messages of channels."""
 
-    subscriptions: Annotated[tuple[Subscription, ...], Meta(max_length=limits.FOXGLOVE_SUBSCRIPTIONS_MAX)]
+    subscriptions: Annotated[tuple[FoxgloveSubscription, ...], Meta(max_length=limits.FOXGLOVE_SUBSCRIPTIONS_MAX)]
 
 
-class Unsubscribe(_FromClient, frozen=True, tag="unsubscribe"):
+class FoxgloveUnsubscribe(_FromClient, frozen=True, tag="unsubscribe"):
     """Ends subscriptions."""
 
     subscription_ids: _Ids
@@ -384,7 +384,7 @@ class GetParameters(_FromClient, frozen=True, tag="getParameters"):
 class SetParameters(_FromClient, frozen=True, tag="setParameters"):
     """Sets parameters, and deletes those without a value."""
 
-    parameters: Annotated[tuple[Parameter, ...], Meta(max_length=limits.FOXGLOVE_PARAMETERS_MAX)]
+    parameters: Annotated[tuple[FoxgloveParameter, ...], Meta(max_length=limits.FOXGLOVE_PARAMETERS_MAX)]
     id: _Text | None = None
 
 
@@ -408,7 +408,7 @@ class UnsubscribeConnectionGraph(_FromClient, frozen=True, tag="unsubscribeConne
     """Ends the updates of the graph."""
 
 
-class FetchAsset(_FromClient, frozen=True, tag="fetchAsset"):
+class FoxgloveFetchAsset(_FromClient, frozen=True, tag="fetchAsset"):
     """Asks for a file."""
 
     uri: _Text
@@ -437,8 +437,8 @@ class ServiceCallRequest:
 
 
 ClientText: TypeAlias = (
-    Subscribe
-    | Unsubscribe
+    FoxgloveSubscribe
+    | FoxgloveUnsubscribe
     | ClientAdvertise
     | ClientUnadvertise
     | GetParameters
@@ -447,7 +447,7 @@ ClientText: TypeAlias = (
     | UnsubscribeParameterUpdates
     | SubscribeConnectionGraph
     | UnsubscribeConnectionGraph
-    | FetchAsset
+    | FoxgloveFetchAsset
 )
 ClientBinary: TypeAlias = ClientMessageData | ServiceCallRequest
 _DECODER: Final[msgspec.json.Decoder[ClientText]] = msgspec.json.Decoder(ClientText)

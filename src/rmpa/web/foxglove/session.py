@@ -19,7 +19,7 @@ from rmpa.web.foxglove import protocol
 from rmpa.web.foxglove.channels import ChannelTable
 from rmpa.web.foxglove.connection_graph import ConnectionGraph
 from rmpa.web.foxglove.parameters import ParameterRequests
-from rmpa.web.foxglove.protocol import BinaryFrame, Capability, Frame, StatusLevel
+from rmpa.web.foxglove.protocol import BinaryFrame, Capability, FoxgloveFrame, StatusLevel
 from rmpa.web.hub import requests
 from rmpa.web.hub.rights import CONTROL_REMEDY, READ_REMEDY
 
@@ -37,14 +37,14 @@ _POLICY_VIOLATION: Final = 1008
 
 
 @dataclass(frozen=True, slots=True)
-class Close:
+class FoxgloveClose:
     """The client is to be disconnected, with this WebSocket close code and reason."""
 
     code: int
     reason: str
 
 
-Output: TypeAlias = Frame | requests.Request | Close
+Output: TypeAlias = FoxgloveFrame | requests.Request | FoxgloveClose
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +160,7 @@ class FoxgloveSession:
     def answer(self, answer: requests.Answer) -> list[Output]:
         """Handle an answer of the hub; one for a handle that has ended is ignored."""
         match answer:
-            case requests.Received():
+            case requests.ReceivedMessage():
                 return self._received(answer)
             case requests.GraphChanged():
                 return list(self._graph_changed(answer))
@@ -180,18 +180,18 @@ class FoxgloveSession:
                 return self._failed(answer)
         return []
 
-    def status(self, level: StatusLevel, message: str, identity: str = "") -> Frame:
+    def status(self, level: StatusLevel, message: str, identity: str = "") -> FoxgloveFrame:
         """A status message of the server's own: it says, for example, what a slow client misses."""
-        return protocol.Status(level=level, message=message, id=identity).frame()
+        return protocol.FoxgloveStatus(level=level, message=message, id=identity).frame()
 
-    def remove_status(self, *identities: str) -> Frame:
+    def remove_status(self, *identities: str) -> FoxgloveFrame:
         """Withdraws status messages of the server's own."""
         return protocol.RemoveStatus(status_ids=identities).frame()
 
     def close(self) -> list[requests.Request]:
         """End everything that the hub does for this client, which is gone."""
         out: list[requests.Request] = [requests.Unsubscribe(handle) for handle in self._by_handle]
-        out += [requests.Unadvertise(handle) for handle in self._published.values()]
+        out += [requests.UnadvertiseTopic(handle) for handle in self._published.values()]
         out += [requests.CancelCall(handle) for handle in self._calls]
         out += self._parameters.close()
         if self._clock_handle:
@@ -208,9 +208,9 @@ class FoxgloveSession:
 
     def _text(self, message: protocol.ClientText) -> Iterator[Output | SessionError]:
         match message:
-            case protocol.Subscribe():
+            case protocol.FoxgloveSubscribe():
                 yield from (each for wanted in message.subscriptions for each in self._subscribe(wanted))
-            case protocol.Unsubscribe():
+            case protocol.FoxgloveUnsubscribe():
                 yield from (each for number in message.subscription_ids for each in self._unsubscribe(number))
             case protocol.ClientAdvertise():
                 self._check(self._rights.publish, "publish")
@@ -221,7 +221,7 @@ class FoxgloveSession:
                 yield from self._follow_graph()
             case protocol.UnsubscribeConnectionGraph():
                 self._told = None
-            case protocol.FetchAsset():
+            case protocol.FoxgloveFetchAsset():
                 yield self._fetch(message)
             case _:
                 yield from self._parameter_requests(message)
@@ -250,9 +250,9 @@ class FoxgloveSession:
         handle = self._published.get(message.channel_id)
         if handle is None:
             raise SessionError(f"channel {message.channel_id} is not advertised; advertise it before its messages")
-        return [requests.Publish(handle, message.payload)] if handle in self._publishers else []
+        return [requests.PublishMessage(handle, message.payload)] if handle in self._publishers else []
 
-    def _subscribe(self, wanted: protocol.Subscription) -> Iterator[Output | SessionError]:
+    def _subscribe(self, wanted: protocol.FoxgloveSubscription) -> Iterator[Output | SessionError]:
         channel = self._channels.channels.get(wanted.channel_id)
         if channel is None:
             yield SessionError(f"there is no channel {wanted.channel_id}; its topic may be gone")
@@ -295,14 +295,14 @@ class FoxgloveSession:
             return SessionError(f"{len(self._published)} published topics are the limit of one client")
         handle = self._published[channel.id] = self._next_handle()
         self._publishers.add(handle)
-        return requests.Advertise(handle, topic, channel.schema_name)
+        return requests.AdvertiseTopic(handle, topic, channel.schema_name)
 
     def _unadvertise(self, number: int) -> Output | SessionError:
         handle = self._published.pop(number, None)
         if handle is None:
             return SessionError(f"channel {number} is not advertised, so it cannot be withdrawn")
         self._publishers.discard(handle)
-        return requests.Unadvertise(handle)
+        return requests.UnadvertiseTopic(handle)
 
     def _call(self, message: protocol.ServiceCallRequest) -> Output:
         call = _Call(message.service_id, message.call_id)
@@ -319,7 +319,7 @@ class FoxgloveSession:
         self._calls[handle] = call
         return requests.CallService(handle, service.name, service.type, message.payload)
 
-    def _fetch(self, message: protocol.FetchAsset) -> Output:
+    def _fetch(self, message: protocol.FoxgloveFetchAsset) -> Output:
         error = self._asset_problem(message.uri)
         if error:
             return protocol.asset_failure(message.request_id, error)
@@ -347,7 +347,7 @@ class FoxgloveSession:
 
     # --- the hub's answers ------------------------------------------------------------------------------------
 
-    def _received(self, message: requests.Received) -> list[Output]:
+    def _received(self, message: requests.ReceivedMessage) -> list[Output]:
         if message.handle == self._clock_handle:
             if len(message.payload) != _CLOCK.size:
                 return []
@@ -374,7 +374,7 @@ class FoxgloveSession:
         """The messages; a withdrawn channel ends its subscription too."""
         for message in messages:
             yield message
-            if isinstance(message, protocol.Unadvertise):
+            if isinstance(message, protocol.FoxgloveUnadvertise):
                 for number in message.channel_ids:
                     if subscription := self._by_channel.get(number):
                         self._forget(subscription)
@@ -413,7 +413,7 @@ class FoxgloveSession:
         if self._errors.take(now):
             return [self.status(StatusLevel.ERROR, str(error))]
         if isinstance(error, RemoteProtocolError):
-            return [Close(_POLICY_VIOLATION, "too many malformed messages")]
+            return [FoxgloveClose(_POLICY_VIOLATION, "too many malformed messages")]
         return []
 
 
@@ -421,7 +421,7 @@ def _framed(messages: Iterable[protocol.ServerMessage | requests.Request]) -> li
     return [each.frame() if isinstance(each, protocol.FromServer) else each for each in messages]
 
 
-def _call_failure(call: _Call, error: str) -> Frame:
+def _call_failure(call: _Call, error: str) -> FoxgloveFrame:
     return protocol.ServiceCallFailure(service_id=call.service_id, call_id=call.call_id, message=error).frame()
 
 

@@ -18,14 +18,14 @@ from rmpa.core.errors import RmpaError
 from rmpa.web import limits
 from rmpa.web.gateways.websocket_frames import Opcode, frame_header
 from rmpa.web.hub.fair_queue import FairQueue
-from rmpa.web.hub.requests import Received, Unsubscribe
+from rmpa.web.hub.requests import ReceivedMessage, Unsubscribe
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from aiohttp.abc import AbstractStreamWriter
 
-    from rmpa.web.hub.clients import Client
+    from rmpa.web.hub.clients import HubClient
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.requests import Answer, Payload, Request
     from rmpa.web.hub.rights import Rights
@@ -71,7 +71,7 @@ class ClientConnection(ABC):
         self.hub = hub
         self.rights = rights
         self.address = address
-        self.queue: FairQueue[Received | OutFrame] = FairQueue()
+        self.queue: FairQueue[ReceivedMessage | OutFrame] = FairQueue()
         self.sent = 0
         """Messages and answers that were written."""
         self._heard = 0
@@ -84,12 +84,12 @@ class ClientConnection(ABC):
         self._close: tuple[int, str] | None = None
         self._close_timer: asyncio.TimerHandle | None = None
         self._refused: Callable[[str, str], None] | None = None
-        self._client: Client | None = None
+        self._client: HubClient | None = None
         self._drops_shown = 0
         self._drops_at = 0.0
 
     @property
-    def client(self) -> Client:
+    def client(self) -> HubClient:
         """The client as the hub knows it."""
         assert self._client is not None, "run() connects it"  # noqa: S101
         return self._client
@@ -109,7 +109,7 @@ class ClientConnection(ABC):
         """An answer of the hub that is no message of a subscription."""
 
     @abstractmethod
-    def encode(self, message: Received) -> Iterable[OutFrame]:
+    def encode(self, message: ReceivedMessage) -> Iterable[OutFrame]:
         """The frames of a message; called when the connection can take them."""
 
     @abstractmethod
@@ -169,7 +169,7 @@ class ClientConnection(ABC):
 
     def receive(self, answer: Answer) -> None:
         """Take an answer of the hub."""
-        if isinstance(answer, Received):
+        if isinstance(answer, ReceivedMessage):
             self._queue(answer.handle, answer, len(answer.payload) + _OVERHEAD, answer.topic)
         else:
             self.answered(answer)
@@ -292,7 +292,7 @@ class ClientConnection(ABC):
                     self._wake.clear()
                     await self._wake.wait()
                     continue
-                for frame in self.encode(entry) if isinstance(entry, Received) else (entry,):
+                for frame in self.encode(entry) if isinstance(entry, ReceivedMessage) else (entry,):
                     self._send(*frame)
                 self._tell_drops()
                 await writer.drain()
@@ -326,7 +326,7 @@ class ClientConnection(ABC):
         if small:
             transport.write(b"".join(small))
 
-    def _queue(self, handle: int, entry: Received | OutFrame, size: int, topic: str) -> None:
+    def _queue(self, handle: int, entry: ReceivedMessage | OutFrame, size: int, topic: str) -> None:
         if self._gone:
             return
         priority = self._priority(topic) if handle else 0

@@ -6,17 +6,17 @@ from typing import TYPE_CHECKING
 
 from rmpa.web import limits
 from rmpa.web.foxglove.protocol import BinaryFrame, StatusLevel, TextFrame
-from rmpa.web.foxglove.session import Close, FoxgloveSession
+from rmpa.web.foxglove.session import FoxgloveClose, FoxgloveSession
 from rmpa.web.gateways.connection import ClientConnection, OutFrame
 from rmpa.web.gateways.websocket_frames import Opcode
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from rmpa.web.foxglove.protocol import Frame
+    from rmpa.web.foxglove.protocol import FoxgloveFrame
     from rmpa.web.foxglove.session import Output
     from rmpa.web.hub.hub import Hub
-    from rmpa.web.hub.requests import Answer, Received
+    from rmpa.web.hub.requests import Answer, ReceivedMessage
     from rmpa.web.hub.rights import Rights
 
 
@@ -55,7 +55,7 @@ class FoxgloveConnection(ClientConnection):
         """An answer of the hub."""
         self._do(self._session.answer(answer))
 
-    def encode(self, message: Received) -> Iterable[OutFrame]:
+    def encode(self, message: ReceivedMessage) -> Iterable[OutFrame]:
         """The frame of a message; none where its subscription has ended."""
         return [_out(each) for each in self._session.answer(message) if isinstance(each, TextFrame | BinaryFrame)]
 
@@ -69,13 +69,13 @@ class FoxgloveConnection(ClientConnection):
         for output in outputs:
             if isinstance(output, TextFrame | BinaryFrame):
                 self.push(_out(output))
-            elif isinstance(output, Close):
+            elif isinstance(output, FoxgloveClose):
                 self.end(output.code, output.reason, "message")
             else:
                 self.ask(output)
 
 
-def _out(frame: Frame) -> OutFrame:
+def _out(frame: FoxgloveFrame) -> OutFrame:
     if isinstance(frame, TextFrame):
         return Opcode.TEXT, (frame.data,)
     return Opcode.BINARY, (frame.header, frame.payload)

@@ -12,8 +12,8 @@ from rmpa.core.errors import RmpaError
 from rmpa.web import limits
 from rmpa.web.gateways.connection import ClientConnection
 from rmpa.web.gateways.websocket_frames import Opcode
-from rmpa.web.hub.requests import Advertise, Failed, Publish, Received, Unadvertise
-from rmpa.web.monitor.session import Close, FollowLog, MonitorSession, Question, Speed
+from rmpa.web.hub.requests import AdvertiseTopic, Failed, PublishMessage, ReceivedMessage, UnadvertiseTopic
+from rmpa.web.monitor.session import FollowLog, MonitorClose, MonitorSession, Question, Speed
 
 if TYPE_CHECKING:
     import asyncio
@@ -87,7 +87,7 @@ class MonitorConnection(ClientConnection):
 
     def receive(self, answer: Answer) -> None:
         """Take an answer of the hub; the session itself keeps only the newest message of a watch."""
-        if isinstance(answer, Received):
+        if isinstance(answer, ReceivedMessage):
             self._act(self._session.receive_message(answer, self._loop.time()))
         else:
             self.answered(answer)
@@ -102,7 +102,7 @@ class MonitorConnection(ClientConnection):
         else:
             self._act(self._session.end_watch(answer.handle, answer.error, answer.remedy))
 
-    def encode(self, message: Received) -> Iterable[OutFrame]:  # noqa: ARG002
+    def encode(self, message: ReceivedMessage) -> Iterable[OutFrame]:  # noqa: ARG002
         """Nothing: ``receive`` queues no message of the hub."""
         return ()
 
@@ -144,7 +144,7 @@ class MonitorConnection(ClientConnection):
                     self._monitor.log.follow(self, lambda lines: self._act(self._session.log(lines)))
                 case FollowLog():
                     self._monitor.log.unfollow(self)
-                case Close():
+                case MonitorClose():
                     self.end(output.code, output.reason, output.refusal)
                 case _:
                     self.ask(output)
@@ -170,9 +170,9 @@ class MonitorConnection(ClientConnection):
     def _drive(self, speed: Speed) -> None:
         if speed.topic not in self._driven:
             for handle in self._driven.values():
-                self.ask(Unadvertise(handle))
+                self.ask(UnadvertiseTopic(handle))
             self._driven = {speed.topic: next(self._handles)}
-            self.ask(Advertise(self._driven[speed.topic], speed.topic, _TWIST))
+            self.ask(AdvertiseTopic(self._driven[speed.topic], speed.topic, _TWIST))
         if speed.topic in self._driven:  # it was not refused at once
             handle = self._driven[speed.topic]
-            self.ask(Publish(handle, _SPEEDS.pack(speed.linear, 0, 0, 0, 0, speed.angular)))
+            self.ask(PublishMessage(handle, _SPEEDS.pack(speed.linear, 0, 0, 0, 0, speed.angular)))

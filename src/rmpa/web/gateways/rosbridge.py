@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from rmpa.web.hub.hub import Hub
-    from rmpa.web.hub.requests import Answer, GraphService, GraphTopic, ParamValue, Received
+    from rmpa.web.hub.requests import Answer, GraphService, GraphTopic, ParamValue, ReceivedMessage
     from rmpa.web.hub.rights import Rights
     from rmpa.web.rosbridge.encodings import PublishFrames
-    from rmpa.web.rosbridge.protocol import Frame
+    from rmpa.web.rosbridge.protocol import RosbridgeFrame
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +88,7 @@ class RosbridgeConnection(ClientConnection):
         self._session.receive_answer(answer, self._loop.time())
         self._flush()
 
-    def encode(self, message: Received) -> Iterable[OutFrame]:
+    def encode(self, message: ReceivedMessage) -> Iterable[OutFrame]:
         """The frames of a message; none where it is throttled."""
         self._session.receive_answer(message, self._loop.time())
         frames = self._session.frames_to_send()
@@ -120,5 +120,5 @@ class RosbridgeConnection(ClientConnection):
             self.arm()
 
 
-def _out(frame: Frame) -> OutFrame:
+def _out(frame: RosbridgeFrame) -> OutFrame:
     return (Opcode.BINARY if frame.binary else Opcode.TEXT, frame.parts)

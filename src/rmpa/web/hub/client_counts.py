@@ -30,7 +30,7 @@ class _Connected:
 
 
 class ClientCounts:
-    """Publishes who is connected, latched, from the first client on.
+    """Publishes the number and the list of rosbridge clients, latched, from the first client on.
 
     Args:
         publishers: The hub's.

@@ -19,7 +19,7 @@ Receive: TypeAlias = "Callable[[Answer], None]"
 
 
 @dataclass(slots=True, eq=False)
-class Client:
+class HubClient:
     """One client.
 
     Args:

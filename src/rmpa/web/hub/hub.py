@@ -16,7 +16,7 @@ from rmpa.web import limits
 from rmpa.web.hub import requests
 from rmpa.web.hub.assets import read_asset
 from rmpa.web.hub.client_counts import ClientCounts
-from rmpa.web.hub.clients import OWN_CLIENT, Client
+from rmpa.web.hub.clients import OWN_CLIENT, HubClient
 from rmpa.web.hub.graph import GraphWatch
 from rmpa.web.hub.node_link import NodeLink
 from rmpa.web.hub.params import ParamMirror
@@ -25,7 +25,7 @@ from rmpa.web.hub.rights import CONTROL_REMEDY, READ_REMEDY
 from rmpa.web.hub.ros_time import RosTime
 from rmpa.web.hub.served import ServedServices
 from rmpa.web.hub.services import ServiceCalls
-from rmpa.web.hub.topics import Topics
+from rmpa.web.hub.topics import HubTopics
 from rmpa.web.hub.types import TypeLibrary
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class Hub:
         self._now_ns = now_ns
         self._numbers = itertools.count(1)
         self._started = False
-        self._clients: dict[int, Client] = {}
+        self._clients: dict[int, HubClient] = {}
         self._tasks: dict[Key, asyncio.Task[None]] = {}
         self.link = NodeLink(where, make_node, self._param_updated)
         self.params = ParamMirror(self.link)
@@ -76,7 +76,7 @@ class Hub:
             services_changed=self._services_changed,
             master_back=self.params.reload,
         )
-        self.topics = Topics(self.link, self._learn, self._own_latched, now_ns)
+        self.topics = HubTopics(self.link, self._learn, self._own_latched, now_ns)
         self.publishers = Publishers(
             self.link,
             self.types.find_message,
@@ -86,12 +86,12 @@ class Hub:
         )
         self.time = RosTime(self.topics, self.params, (OWN_CLIENT, 1), now_ns)
         self.counts = ClientCounts(self.publishers, self.types, (OWN_CLIENT, 2), now_ns)
-        self._handlers: Mapping[type[Request], Callable[[Client, Any], None]] = {
+        self._handlers: Mapping[type[Request], Callable[[HubClient, Any], None]] = {
             requests.Subscribe: self._subscribe,
             requests.Unsubscribe: self._unsubscribe,
-            requests.Advertise: self._advertise,
-            requests.Unadvertise: self._unadvertise,
-            requests.Publish: self._publish,
+            requests.AdvertiseTopic: self._advertise,
+            requests.UnadvertiseTopic: self._unadvertise,
+            requests.PublishMessage: self._publish,
             requests.CallService: self._call,
             requests.FindService: self._find_service,
             requests.FindServices: self._find_services,
@@ -106,7 +106,7 @@ class Hub:
             requests.UnfollowParams: lambda client, request: self.params.unfollow((client.number, request.handle)),
             requests.FollowGraph: self._follow_graph,
             requests.UnfollowGraph: lambda client, request: self.graph.unfollow((client.number, request.handle)),
-            requests.Describe: self._describe,
+            requests.DescribeType: self._describe,
             requests.FetchAsset: self._fetch_asset,
         }
 
@@ -152,7 +152,7 @@ class Hub:
     # --- clients ----------------------------------------------------------------------------------------------
 
     @property
-    def clients(self) -> tuple[Client, ...]:
+    def clients(self) -> tuple[HubClient, ...]:
         """All clients."""
         return tuple(self._clients.values())
 
@@ -163,7 +163,7 @@ class Hub:
         receive: Receive,
         *,
         unadvertise_delay: float = limits.UNADVERTISE_DELAY,
-    ) -> Client:
+    ) -> HubClient:
         """Take a client.
 
         Args:
@@ -178,14 +178,14 @@ class Hub:
         if len(self._clients) >= limits.CLIENTS_MAX:
             problem = f"{len(self._clients)} clients are connected, which is the limit"
             raise PeerRefused("the web server", problem, "close some pages")
-        client = Client(next(self._numbers), name, rights, receive, unadvertise_delay)
+        client = HubClient(next(self._numbers), name, rights, receive, unadvertise_delay)
         self._clients[client.number] = client
         self.start()
         self.graph.active = True
         self.graph.look()
         return client
 
-    def disconnect(self, client: Client) -> None:
+    def disconnect(self, client: HubClient) -> None:
         """The client has gone: end all that it had. Its publishers stay for a while, as a page may be reloaded."""
         if self._clients.pop(client.number, None) is None:
             return
@@ -203,7 +203,7 @@ class Hub:
         self.counts.remove(client.number)
         self.graph.active = bool(self._clients)
 
-    def ask(self, client: Client, request: Request) -> None:
+    def ask(self, client: HubClient, request: Request) -> None:
         """Do what a client's session asks; what cannot be done is answered by ``Failed``."""
         if client.number not in self._clients:
             return
@@ -214,7 +214,7 @@ class Hub:
 
     # --- topics -----------------------------------------------------------------------------------------------
 
-    def _subscribe(self, client: Client, request: requests.Subscribe) -> None:
+    def _subscribe(self, client: HubClient, request: requests.Subscribe) -> None:
         client.subscriptions[request.handle] = request.topic
         self.topics.subscribe(
             (client.number, request.handle),
@@ -224,12 +224,12 @@ class Hub:
             functools.partial(_fail, client, request.handle),
         )
 
-    def _unsubscribe(self, client: Client, request: requests.Unsubscribe) -> None:
+    def _unsubscribe(self, client: HubClient, request: requests.Unsubscribe) -> None:
         topic = client.subscriptions.pop(request.handle, None)
         if topic is not None:
             self.topics.unsubscribe((client.number, request.handle), topic)
 
-    def _advertise(self, client: Client, request: requests.Advertise) -> None:
+    def _advertise(self, client: HubClient, request: requests.AdvertiseTopic) -> None:
         _check(client.rights.publish, "publish")
 
         def failed(error: RmpaError) -> None:
@@ -241,12 +241,12 @@ class Hub:
         )
         client.publishers[request.handle] = request.topic
 
-    def _unadvertise(self, client: Client, request: requests.Unadvertise) -> None:
+    def _unadvertise(self, client: HubClient, request: requests.UnadvertiseTopic) -> None:
         topic = client.publishers.pop(request.handle, None)
         if topic is not None:
             self.publishers.unadvertise((client.number, request.handle), topic, client.unadvertise_delay)
 
-    def _publish(self, client: Client, request: requests.Publish) -> None:
+    def _publish(self, client: HubClient, request: requests.PublishMessage) -> None:
         topic = client.publishers.get(request.handle)
         if topic is not None:
             self.publishers.publish(topic, request.payload)
@@ -264,7 +264,7 @@ class Hub:
 
     # --- services ---------------------------------------------------------------------------------------------
 
-    def _call(self, client: Client, request: requests.CallService) -> None:
+    def _call(self, client: HubClient, request: requests.CallService) -> None:
         _check(client.rights.call_services, "call services")
         md5sum = self.types.service(request.type).md5sum if request.type else ""
 
@@ -278,7 +278,7 @@ class Hub:
 
         self._run(client, request.handle, call())
 
-    def _find_service(self, client: Client, request: requests.FindService) -> None:
+    def _find_service(self, client: HubClient, request: requests.FindService) -> None:
         async def find() -> None:
             found = await self.calls.find(request.service)
             known = self.graph.services.get(request.service)
@@ -288,7 +288,7 @@ class Hub:
 
         self._run(client, request.handle, find())
 
-    def _find_services(self, client: Client, request: requests.FindServices) -> None:
+    def _find_services(self, client: HubClient, request: requests.FindServices) -> None:
         async def find() -> None:
             unknown = [each.name for each in self.graph.services.values() if not each.type]
             searches = [asyncio.ensure_future(self.calls.find(name)) for name in unknown]
@@ -302,7 +302,7 @@ class Hub:
 
         self._run(client, request.handle, find())
 
-    def _cancel(self, client: Client, request: requests.CancelCall) -> None:
+    def _cancel(self, client: HubClient, request: requests.CancelCall) -> None:
         task = self._tasks.get((client.number, request.handle))
         if task is not None:
             task.cancel()
@@ -311,7 +311,7 @@ class Hub:
         for name in names:
             self.calls.forget(name)
 
-    def _serve(self, client: Client, request: requests.ServeService) -> None:
+    def _serve(self, client: HubClient, request: requests.ServeService) -> None:
         _check(client.rights.serve_services, "offer services")
 
         def failed(error: RmpaError) -> None:
@@ -325,12 +325,12 @@ class Hub:
         self.served.serve((client.number, request.handle), request.service, kind, called, failed)
         client.services[request.handle] = request.service
 
-    def _end_service(self, client: Client, request: requests.EndService) -> None:
+    def _end_service(self, client: HubClient, request: requests.EndService) -> None:
         service = client.services.pop(request.handle, None)
         if service is not None:
             self.served.end((client.number, request.handle), service)
 
-    def _respond(self, client: Client, request: requests.Respond) -> None:
+    def _respond(self, client: HubClient, request: requests.Respond) -> None:
         service = client.services.get(request.handle)
         if service is not None:
             key = client.number, request.handle
@@ -341,7 +341,7 @@ class Hub:
     def _param_updated(self, key: str, value: XmlRpcValue) -> None:
         self.params.updated(key, value)
 
-    def _get_params(self, client: Client, request: requests.GetParams) -> None:
+    def _get_params(self, client: HubClient, request: requests.GetParams) -> None:
         _check(client.rights.read_parameters, "read parameters", READ_REMEDY)
 
         async def get() -> None:
@@ -351,7 +351,7 @@ class Hub:
 
         self._run(client, request.handle, get())
 
-    def _set_param(self, client: Client, request: requests.SetParam) -> None:
+    def _set_param(self, client: HubClient, request: requests.SetParam) -> None:
         _check(client.rights.set_parameters, "set parameters")
 
         async def set_() -> None:
@@ -360,7 +360,7 @@ class Hub:
 
         self._run(client, request.handle, set_())
 
-    def _delete_param(self, client: Client, request: requests.DeleteParam) -> None:
+    def _delete_param(self, client: HubClient, request: requests.DeleteParam) -> None:
         _check(client.rights.set_parameters, "delete parameters")
 
         async def delete() -> None:
@@ -369,7 +369,7 @@ class Hub:
 
         self._run(client, request.handle, delete())
 
-    def _follow_params(self, client: Client, request: requests.FollowParams) -> None:
+    def _follow_params(self, client: HubClient, request: requests.FollowParams) -> None:
         _check(client.rights.read_parameters, "read parameters", READ_REMEDY)
 
         def changed(values: Mapping[str, requests.ParamValue]) -> None:
@@ -379,7 +379,7 @@ class Hub:
 
     # --- the graph and types ----------------------------------------------------------------------------------
 
-    def _follow_graph(self, client: Client, request: requests.FollowGraph) -> None:
+    def _follow_graph(self, client: HubClient, request: requests.FollowGraph) -> None:
         graph = self.graph
 
         def changed() -> None:
@@ -388,7 +388,7 @@ class Hub:
 
         graph.follow((client.number, request.handle), changed)
 
-    def _describe(self, client: Client, request: requests.Describe) -> None:
+    def _describe(self, client: HubClient, request: requests.DescribeType) -> None:
         async def describe() -> None:
             if request.service:
                 service = await self.types.find_service(request.type)
@@ -407,7 +407,7 @@ class Hub:
 
         self._run(client, request.handle, describe())
 
-    def _fetch_asset(self, client: Client, request: requests.FetchAsset) -> None:
+    def _fetch_asset(self, client: HubClient, request: requests.FetchAsset) -> None:
         _check(client.rights.fetch_assets, "fetch assets", READ_REMEDY)
 
         async def fetch() -> None:
@@ -418,7 +418,7 @@ class Hub:
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    def _run(self, client: Client, handle: int, work: Coroutine[Any, Any, None]) -> None:
+    def _run(self, client: HubClient, handle: int, work: Coroutine[Any, Any, None]) -> None:
         """Do what takes time, in a task; its error is answered by ``Failed``."""
         key = client.number, handle
 
@@ -445,5 +445,5 @@ def _check(right: bool, what: str, remedy: str = CONTROL_REMEDY) -> None:
         raise PeerRefused("the web server", f"this client may not {what}", remedy)
 
 
-def _fail(client: Client, handle: int, error: RmpaError) -> None:
+def _fail(client: HubClient, handle: int, error: RmpaError) -> None:
     client.receive(requests.Failed.of(handle, error))

@@ -42,7 +42,7 @@ class Unsubscribe:
 
 
 @dataclass(frozen=True, slots=True)
-class Advertise:
+class AdvertiseTopic:
     """A publisher on `topic`; `latch` keeps its last message for newcomers."""
 
     handle: int
@@ -52,14 +52,14 @@ class Advertise:
 
 
 @dataclass(frozen=True, slots=True)
-class Unadvertise:
+class UnadvertiseTopic:
     """The publisher of `handle` ends."""
 
     handle: int
 
 
 @dataclass(frozen=True, slots=True)
-class Publish:
+class PublishMessage:
     """One message of the publisher `handle`."""
 
     handle: int
@@ -184,7 +184,7 @@ class UnfollowGraph:
 
 
 @dataclass(frozen=True, slots=True)
-class Describe:
+class DescribeType:
     """Asks for the definition of a message type, or of a service type where `service`.
 
     Answered by `Described`, or by `Failed` where it is not known; then by `Described` if it becomes known later.
@@ -210,9 +210,9 @@ class FetchAsset:
 Request: TypeAlias = (
     Subscribe
     | Unsubscribe
-    | Advertise
-    | Unadvertise
-    | Publish
+    | AdvertiseTopic
+    | UnadvertiseTopic
+    | PublishMessage
     | CallService
     | FindService
     | FindServices
@@ -227,7 +227,7 @@ Request: TypeAlias = (
     | UnfollowParams
     | FollowGraph
     | UnfollowGraph
-    | Describe
+    | DescribeType
     | FetchAsset
 )
 
@@ -236,7 +236,7 @@ Request: TypeAlias = (
 
 
 @dataclass(frozen=True, slots=True)
-class Received:
+class ReceivedMessage:
     """One message for the subscription `handle`. `stamp_ns` is its time of receipt (UTC, nanoseconds).
 
     `source` is the node that published it in this module's graph; "" for a client of the hub. `md5sum` is that of
@@ -361,7 +361,7 @@ class Failed:
 
 
 Answer: TypeAlias = (
-    Received
+    ReceivedMessage
     | ServiceResult
     | ServiceFound
     | ServiceRequest

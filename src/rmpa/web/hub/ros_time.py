@@ -11,8 +11,8 @@ if TYPE_CHECKING:
 
     from rmpa.web.hub.clients import Key
     from rmpa.web.hub.params import ParamMirror
-    from rmpa.web.hub.requests import Received
-    from rmpa.web.hub.topics import Topics
+    from rmpa.web.hub.requests import ReceivedMessage
+    from rmpa.web.hub.topics import HubTopics
 
 CLOCK: Final = "/clock"
 CLOCK_TYPE: Final = "rosgraph_msgs/Clock"
@@ -31,7 +31,7 @@ class RosTime:
     """
 
     def __init__(
-        self, topics: Topics, params: ParamMirror, key: Key, now_ns: Callable[[], int] = time.time_ns
+        self, topics: HubTopics, params: ParamMirror, key: Key, now_ns: Callable[[], int] = time.time_ns
     ) -> None:
         self._topics = topics
         self._params = params
@@ -56,7 +56,7 @@ class RosTime:
         else:
             self._topics.unsubscribe(self._key, CLOCK)
 
-    def _take(self, message: Received) -> None:
+    def _take(self, message: ReceivedMessage) -> None:
         if len(message.payload) == _TIME.size:
             seconds, nanoseconds = _TIME.unpack(message.payload)
             self._sim_ns = seconds * 1_000_000_000 + nanoseconds

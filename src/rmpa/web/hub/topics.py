@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.ros.wire.tcpros import ANY
 from rmpa.web import limits
 from rmpa.web.hub.node_link import Registration
-from rmpa.web.hub.requests import Received
+from rmpa.web.hub.requests import ReceivedMessage
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -35,7 +35,7 @@ class _Sink:
 
     handle: int
     type: str | None
-    deliver: Callable[[Received], None]
+    deliver: Callable[[ReceivedMessage], None]
     failed: Callable[[RmpaError], None]
 
 
@@ -63,7 +63,7 @@ class _Topic:
     bytes: int = 0
 
 
-class Topics:
+class HubTopics:
     """All subscriptions.
 
     Args:
@@ -99,7 +99,7 @@ class Topics:
         key: Key,
         topic: str,
         type_: str | None,
-        deliver: Callable[[Received], None],
+        deliver: Callable[[ReceivedMessage], None],
         failed: Callable[[RmpaError], None],
     ) -> None:
         """Begin a subscription; latched messages that are there are delivered before this returns.
@@ -225,6 +225,7 @@ class Topics:
             else:
                 latched = self._keep(there, source, _Latched(header, type_, payload, stamp_ns))
             had = latched.had
+        md5sum = header.get("md5sum", "")
         for sink in [*there.sinks.values()]:
             if sink.type not in (None, type_):
                 continue
@@ -234,9 +235,7 @@ class Topics:
                 had.add(sink)
             _deliver_to(
                 sink,
-                Received(
-                    sink.handle, there.name, type_, payload, stamp_ns, source=source, md5sum=header.get("md5sum", "")
-                ),
+                ReceivedMessage(sink.handle, there.name, type_, payload, stamp_ns, source=source, md5sum=md5sum),
             )
 
     def _keep(self, there: _Topic, source: str, latched: _Latched) -> _Latched:
@@ -263,7 +262,7 @@ class Topics:
                 latched.had.add(sink)
                 _deliver_to(
                     sink,
-                    Received(
+                    ReceivedMessage(
                         sink.handle,
                         there.name,
                         latched.type,
@@ -276,7 +275,7 @@ class Topics:
                 )
 
 
-def _deliver_to(sink: _Sink, message: Received) -> None:
+def _deliver_to(sink: _Sink, message: ReceivedMessage) -> None:
     try:
         sink.deliver(message)
     except Exception:  # noqa: BLE001 - a fault of one client must not cost the others their messages

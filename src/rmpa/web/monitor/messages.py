@@ -46,7 +46,7 @@ class Unwatch(msgspec.Struct, frozen=True, tag_field="op", tag="unwatch"):
     id: Id
 
 
-class Ask(msgspec.Struct, frozen=True, tag_field="op", tag="ask"):
+class AskQuestion(msgspec.Struct, frozen=True, tag_field="op", tag="ask"):
     """A question or an order that has one answer: ``why``, ``call``, ``params``, ``set_param`` and so on."""
 
     id: Id
@@ -68,11 +68,11 @@ class Drive(msgspec.Struct, frozen=True, tag_field="op", tag="drive"):
     angular: float
 
 
-class Release(msgspec.Struct, frozen=True, tag_field="op", tag="release"):
+class ReleaseJoystick(msgspec.Struct, frozen=True, tag_field="op", tag="release"):
     """The joystick is let go: the robot is stopped at once."""
 
 
-ClientMessage: TypeAlias = Ack | Look | Watch | Unwatch | Ask | Log | Drive | Release
+ClientMessage: TypeAlias = Ack | Look | Watch | Unwatch | AskQuestion | Log | Drive | ReleaseJoystick
 _decoder: Final = msgspec.json.Decoder(ClientMessage)
 
 
@@ -96,7 +96,7 @@ def parse(text: str | bytes) -> ClientMessage:
 def _check(message: ClientMessage) -> None:
     if isinstance(message, Look) and len(message.at) > limits.LOOKS_MAX:
         raise RemoteProtocolError(f"a page looks at {len(message.at)} things; {limits.LOOKS_MAX} is the most")
-    if isinstance(message, Watch | Unwatch | Ask) and not 0 < message.id < 2**32:
+    if isinstance(message, Watch | Unwatch | AskQuestion) and not 0 < message.id < 2**32:
         raise RemoteProtocolError(f"the id {message.id} is not between 1 and 4294967295")
     if isinstance(message, Watch):
         if not 0 < message.rate <= limits.WATCH_RATE_MAX:

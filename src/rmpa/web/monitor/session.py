@@ -16,14 +16,25 @@ from rmpa.core.names import is_global_name
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.web.hub import requests
 from rmpa.web.monitor import limits
-from rmpa.web.monitor.messages import VERSION, Ack, Ask, Drive, Log, Look, Release, Unwatch, Watch, parse
+from rmpa.web.monitor.messages import (
+    VERSION,
+    Ack,
+    AskQuestion,
+    Drive,
+    Log,
+    Look,
+    ReleaseJoystick,
+    Unwatch,
+    Watch,
+    parse,
+)
 from rmpa.web.monitor.patch import difference
 from rmpa.web.monitor.watches import WatchState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from rmpa.web.hub.requests import Received
+    from rmpa.web.hub.requests import ReceivedMessage
     from rmpa.web.hub.rights import Rights
     from rmpa.web.monitor.patch import Tree, Value
     from rmpa.web.monitor.watches import Decode
@@ -88,7 +99,7 @@ class FollowLog:
 
 
 @dataclass(frozen=True, slots=True)
-class Close:
+class MonitorClose:
     """The client is to be disconnected, with this close code of RFC 6455 and reason.
 
     ``refusal`` is counted: ``message``, ``message_size`` or ``message_rate``.
@@ -99,7 +110,7 @@ class Close:
     refusal: str
 
 
-Output: TypeAlias = str | bytes | requests.Request | Question | Speed | FollowLog | Close
+Output: TypeAlias = str | bytes | requests.Request | Question | Speed | FollowLog | MonitorClose
 
 
 class MonitorSession:
@@ -151,13 +162,13 @@ class MonitorSession:
     def receive(self, text: str | bytes, now: float) -> Iterator[Output]:
         """A message of the client."""
         if not self._bucket.take(now):
-            yield Close(1008, f"more than {limits.REQUEST_RATE:g} messages a second", "message_rate")
+            yield MonitorClose(1008, f"more than {limits.REQUEST_RATE:g} messages a second", "message_rate")
             return
         try:
             message = parse(text)
         except RmpaError as error:
             refusal = "message_size" if isinstance(error, LimitExceeded) else "message"
-            yield Close(1008, ascii(str(error))[1:-1][:100], refusal)
+            yield MonitorClose(1008, ascii(str(error))[1:-1][:100], refusal)
             return
         try:
             yield from self._act(message, now)
@@ -174,13 +185,13 @@ class MonitorSession:
         elif isinstance(message, Unwatch):
             if self._watches.pop(message.id, None):
                 yield requests.Unsubscribe(message.id)
-        elif isinstance(message, Ask):
+        elif isinstance(message, AskQuestion):
             yield from self._ask(message)
         elif isinstance(message, Log):
             yield FollowLog(message.on)
         elif isinstance(message, Drive):
             yield from self._drive(message, now)
-        elif isinstance(message, Release):
+        elif isinstance(message, ReleaseJoystick):
             yield from self._stop()
         yield from self.handle_timer(now)
 
@@ -193,7 +204,7 @@ class MonitorSession:
         self._watches[message.id] = WatchState(message, self._decode)
         yield requests.Subscribe(message.id, message.topic)
 
-    def _ask(self, message: Ask) -> Iterator[Output]:
+    def _ask(self, message: AskQuestion) -> Iterator[Output]:
         needed = QUESTIONS.get(message.what)
         if needed is None:
             raise RemoteProtocolError(f"there is no question {message.what[:40]!a}")
@@ -234,7 +245,7 @@ class MonitorSession:
         self._state, self._stale = state, True
         yield from self.handle_timer(now)
 
-    def receive_message(self, message: Received, now: float) -> Iterator[Output]:
+    def receive_message(self, message: ReceivedMessage, now: float) -> Iterator[Output]:
         """A message for one of the watches."""
         watch = self._watches.get(message.handle)
         if watch is None:

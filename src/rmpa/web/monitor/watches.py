@@ -13,10 +13,10 @@ from rmpa.web.monitor.series import SampleBuffer
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from rmpa.web.hub.requests import Received
+    from rmpa.web.hub.requests import ReceivedMessage
     from rmpa.web.monitor.messages import Watch
 
-    Decode = Callable[[Received], Any]  # the values of a message, decoded at most once for all clients
+    Decode = Callable[[ReceivedMessage], Any]  # the values of a message, decoded at most once for all clients
 
 
 class WatchState:
@@ -30,12 +30,12 @@ class WatchState:
     def __init__(self, wanted: Watch, decode: Decode) -> None:
         self.wanted = wanted
         self._decode = decode
-        self._newest: Received | None = None
+        self._newest: ReceivedMessage | None = None
         self._paths = tuple(field_path(field) for field in wanted.fields)
         self._samples = SampleBuffer(len(self._paths))
         self._sent = -1e9
 
-    def receive(self, message: Received) -> None:
+    def receive(self, message: ReceivedMessage) -> None:
         """Keep a message; a plot takes its numbers at once, all others decode only what is sent.
 
         Raises:
@@ -77,7 +77,7 @@ class WatchState:
             yield _text({"op": "value", **about, "size": len(message.payload), "value": cut(values)})
 
 
-def _picture(message: Received, values: Any) -> Any:
+def _picture(message: ReceivedMessage, values: Any) -> Any:
     try:
         if message.type == "sensor_msgs/CompressedImage":
             return compressed_picture(str(values["format"]), values["data"])

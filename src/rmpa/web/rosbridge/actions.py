@@ -10,7 +10,14 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import RmpaError
-from rmpa.web.hub.requests import Advertise, Publish, Received, Subscribe, Unadvertise, Unsubscribe
+from rmpa.web.hub.requests import (
+    AdvertiseTopic,
+    PublishMessage,
+    ReceivedMessage,
+    Subscribe,
+    UnadvertiseTopic,
+    Unsubscribe,
+)
 from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.context import Style, check_count
 from rmpa.web.rosbridge.encodings import Compression
@@ -89,7 +96,7 @@ class Actions:
         if action is None:
             action = self._begin(name, op.action, kind, codec)
         action.goals[goal_id] = _Goal(op.id, style, op.feedback)
-        self._context.ask(Publish(action.publishers["goal"], payload))
+        self._context.ask(PublishMessage(action.publishers["goal"], payload))
 
     def cancel_goal(self, op: protocol.CancelActionGoal) -> None:
         """Ask the server to cancel a goal; its ``action_result`` follows.
@@ -104,9 +111,9 @@ class Actions:
             raise OpError(f"no goal of this id is open for {op.action[: limits.NAME_MAX]}")
         # A stamp of zero: only the goal of this id, not all before a time.
         cancel = self._codec(_CANCEL_TYPE).write({"stamp": {"secs": 0, "nsecs": 0}, "id": found}, 0)
-        self._context.ask(Publish(action.publishers["cancel"], cancel.payload))
+        self._context.ask(PublishMessage(action.publishers["cancel"], cancel.payload))
 
-    def receive(self, message: Received) -> bool:
+    def receive(self, message: ReceivedMessage) -> bool:
         """Take a message of the hub; False if it is of no action here."""
         for action in self._actions.values():
             if message.handle in action.codecs:
@@ -166,8 +173,8 @@ class Actions:
         for handle, (part, codec) in codecs.items():
             ask(Subscribe(handle, f"{name}/{part}", codec.name))
         # Latched, so that a server gets the goal that connects after it was sent; it ends with the last open goal.
-        ask(Advertise(action.publishers["goal"], f"{name}/goal", goal.name, latch=True))
-        ask(Advertise(action.publishers["cancel"], f"{name}/cancel", _CANCEL_TYPE))
+        ask(AdvertiseTopic(action.publishers["goal"], f"{name}/goal", goal.name, latch=True))
+        ask(AdvertiseTopic(action.publishers["cancel"], f"{name}/cancel", _CANCEL_TYPE))
         self._actions[name] = action
         return action
 
@@ -181,4 +188,4 @@ class Actions:
         for handle in action.codecs:
             self._context.ask(Unsubscribe(handle))
         for handle in action.publishers.values():
-            self._context.ask(Unadvertise(handle))
+            self._context.ask(UnadvertiseTopic(handle))

@@ -57,7 +57,7 @@ class Calls:
         self._rosapi = rosapi
         self._open: dict[int, _Call] = {}
 
-    def call(self, op: protocol.CallService) -> None:
+    def call(self, op: protocol.RosbridgeCallService) -> None:
         """Begin a call; each ends with one ``service_response``, also if it fails.
 
         Raises:

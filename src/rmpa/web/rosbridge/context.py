@@ -9,7 +9,7 @@ import msgspec
 
 from rmpa.web.rosbridge.encodings import Compression, encode_cbor, encode_png
 from rmpa.web.rosbridge.fragments import split
-from rmpa.web.rosbridge.protocol import Frame, Id, OpError, status, whole
+from rmpa.web.rosbridge.protocol import Id, OpError, RosbridgeFrame, status, whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -36,7 +36,7 @@ class SessionContext:
         self.graph = graph
         self.ros_time_ns = ros_time_ns
         self.level = "error"
-        self.frames: list[Frame] = []
+        self.frames: list[RosbridgeFrame] = []
         self.requests: list[Request] = []
         self._handles = itertools.count(1)
         self._fragment_ids = itertools.count()
@@ -54,7 +54,7 @@ class SessionContext:
         if LEVELS.index(level) <= LEVELS.index(self.level):
             self.frames.append(status(level, text, mid))
 
-    def send(self, frame: Frame, fragment_size: int | None = None, mid: Id = None) -> None:
+    def send(self, frame: RosbridgeFrame, fragment_size: int | None = None, mid: Id = None) -> None:
         """Send a frame, in fragments where it is text and longer than `fragment_size` characters."""
         if fragment_size is None:
             self.frames.append(frame)
@@ -70,7 +70,7 @@ class SessionContext:
             self.send(encode_cbor(values))
             return
         text = msgspec.json.encode(values)
-        frame = encode_png(text) if style.compression is Compression.PNG else Frame((text,))
+        frame = encode_png(text) if style.compression is Compression.PNG else RosbridgeFrame((text,))
         self.send(frame, style.fragment_size, mid)
 
 

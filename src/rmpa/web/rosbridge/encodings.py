@@ -16,7 +16,7 @@ import msgspec
 
 from rmpa.core.errors import LimitExceeded
 from rmpa.web.rosbridge import limits
-from rmpa.web.rosbridge.protocol import Frame, OpError, write_op
+from rmpa.web.rosbridge.protocol import OpError, RosbridgeFrame, write_op
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -59,10 +59,12 @@ class PublishFrames:
     """
 
     def __init__(self) -> None:
-        self._kept: OrderedDict[tuple[int, str, Compression], tuple[memoryview, Frame]] = OrderedDict()
+        self._kept: OrderedDict[tuple[int, str, Compression], tuple[memoryview, RosbridgeFrame]] = OrderedDict()
         self._bytes = 0
 
-    def encode(self, topic: str, payload: memoryview, compression: Compression, codec: MessageCodec) -> Frame:
+    def encode(
+        self, topic: str, payload: memoryview, compression: Compression, codec: MessageCodec
+    ) -> RosbridgeFrame:
         """A ``publish`` in JSON, PNG or CBOR.
 
         Raises:
@@ -85,26 +87,26 @@ class PublishFrames:
         return frame
 
 
-def _encode(topic: str, payload: memoryview, compression: Compression, codec: MessageCodec) -> Frame:
+def _encode(topic: str, payload: memoryview, compression: Compression, codec: MessageCodec) -> RosbridgeFrame:
     if compression is Compression.CBOR:
         return encode_cbor({"op": "publish", "topic": topic, "msg": codec.cbor_values(payload)})
     head = b'{"op":"publish","topic":' + msgspec.json.encode(topic) + b',"msg":'
-    frame = Frame((head, codec.json(payload), b"}"))
+    frame = RosbridgeFrame((head, codec.json(payload), b"}"))
     return encode_png(frame.data) if compression is Compression.PNG else frame
 
 
-def encode_cbor(values: Mapping[str, Any]) -> Frame:
+def encode_cbor(values: Mapping[str, Any]) -> RosbridgeFrame:
     """An op in CBOR."""
-    return Frame((cbor2.dumps(values),), binary=True)
+    return RosbridgeFrame((cbor2.dumps(values),), binary=True)
 
 
-def encode_cbor_raw(topic: str, payload: memoryview, stamp_ns: int) -> Frame:
+def encode_cbor_raw(topic: str, payload: memoryview, stamp_ns: int) -> RosbridgeFrame:
     """A ``publish`` of ROS 1 bytes, which are not copied: ``msg`` is ``{secs, nsecs, bytes}``."""
     secs, nsecs = divmod(max(0, stamp_ns), 1_000_000_000)
     head = cbor2.dumps({"op": "publish", "topic": topic})
     # A map of three: the two keys above, and msg.
     inner = b"\x63msg\xa3\x64secs" + cbor2.dumps(secs) + b"\x65nsecs" + cbor2.dumps(nsecs) + b"\x65bytes"
-    return Frame((b"\xa3" + head[1:] + inner + _cbor_length(0x40, len(payload)), payload), binary=True)
+    return RosbridgeFrame((b"\xa3" + head[1:] + inner + _cbor_length(0x40, len(payload)), payload), binary=True)
 
 
 def _cbor_length(major: int, length: int) -> bytes:
@@ -119,7 +121,7 @@ def _cbor_length(major: int, length: int) -> bytes:
 # --- PNG ---------------------------------------------------------------------------------------------------------
 
 
-def encode_png(text: bytes | bytearray | memoryview) -> Frame:
+def encode_png(text: bytes | bytearray | memoryview) -> RosbridgeFrame:
     """An op ``png``: the bytes of another op as the RGB pixels of a picture that is nearly square.
 
     Newlines, which JSON allows at its end, fill the last line.

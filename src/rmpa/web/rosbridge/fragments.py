@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 from rmpa.core.errors import LimitExceeded
 from rmpa.web.rosbridge import limits
-from rmpa.web.rosbridge.protocol import Frame, Id, OpError, write_op
+from rmpa.web.rosbridge.protocol import Id, OpError, RosbridgeFrame, write_op
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
-def split(frame: Frame, size: int, mid: Id) -> list[Frame]:
+def split(frame: RosbridgeFrame, size: int, mid: Id) -> list[RosbridgeFrame]:
     """Cut a frame of JSON into fragments of up to `size` characters; a frame that fits, and CBOR, stay whole.
 
     Args:
@@ -35,7 +35,7 @@ def split(frame: Frame, size: int, mid: Id) -> list[Frame]:
     if total == 1:
         return [frame]
     return [
-        Frame(
+        RosbridgeFrame(
             write_op(
                 {
                     "op": "fragment",

@@ -38,7 +38,7 @@ class OpError(RemoteProtocolError):
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class RosbridgeFrame:
     """One WebSocket message to the client.
 
     Args:
@@ -71,7 +71,7 @@ class Op(msgspec.Struct, frozen=True, kw_only=True):
     id: Id = None
 
 
-class Advertise(Op, frozen=True, kw_only=True):
+class RosbridgeAdvertise(Op, frozen=True, kw_only=True):
     """The client will publish on a topic. `queue_size` has no effect: queues are bounded in bytes."""
 
     topic: str
@@ -80,13 +80,13 @@ class Advertise(Op, frozen=True, kw_only=True):
     queue_size: int | None = None
 
 
-class Unadvertise(Op, frozen=True, kw_only=True):
+class RosbridgeUnadvertise(Op, frozen=True, kw_only=True):
     """The client no longer publishes on a topic (with `id`: that of its advertisements)."""
 
     topic: str
 
 
-class Publish(Op, frozen=True, kw_only=True):
+class RosbridgePublish(Op, frozen=True, kw_only=True):
     """A message for a topic."""
 
     topic: str
@@ -94,7 +94,7 @@ class Publish(Op, frozen=True, kw_only=True):
     latch: bool | None = False
 
 
-class Subscribe(Op, frozen=True, kw_only=True):
+class RosbridgeSubscribe(Op, frozen=True, kw_only=True):
     """The client wants a topic's messages. `throttle_rate` is in milliseconds, `fragment_size` in characters."""
 
     topic: str
@@ -105,13 +105,13 @@ class Subscribe(Op, frozen=True, kw_only=True):
     compression: str | None = "none"
 
 
-class Unsubscribe(Op, frozen=True, kw_only=True):
+class RosbridgeUnsubscribe(Op, frozen=True, kw_only=True):
     """The subscription with this `id` ends; without one, all of the topic."""
 
     topic: str
 
 
-class CallService(Op, frozen=True, kw_only=True):
+class RosbridgeCallService(Op, frozen=True, kw_only=True):
     """A call. `args` are an object or the fields in order; `timeout` is in seconds."""
 
     service: str
@@ -166,7 +166,7 @@ class SetLevel(Op, frozen=True, kw_only=True):
     level: str
 
 
-class Status(Op, frozen=True, kw_only=True):
+class RosbridgeStatus(Op, frozen=True, kw_only=True):
     """A status message of the client."""
 
     level: str = "info"
@@ -210,19 +210,19 @@ class ServeAction(Op, frozen=True, kw_only=True):
 
 
 OPS: Final[Mapping[str, type[Op]]] = {
-    "advertise": Advertise,
-    "unadvertise": Unadvertise,
-    "publish": Publish,
-    "subscribe": Subscribe,
-    "unsubscribe": Unsubscribe,
-    "call_service": CallService,
+    "advertise": RosbridgeAdvertise,
+    "unadvertise": RosbridgeUnadvertise,
+    "publish": RosbridgePublish,
+    "subscribe": RosbridgeSubscribe,
+    "unsubscribe": RosbridgeUnsubscribe,
+    "call_service": RosbridgeCallService,
     "advertise_service": AdvertiseService,
     "unadvertise_service": UnadvertiseService,
     "service_response": ServiceResponse,
     "fragment": Fragment,
     "png": Png,
     "set_level": SetLevel,
-    "status": Status,
+    "status": RosbridgeStatus,
     "auth": Auth,
     "send_action_goal": SendActionGoal,
     "cancel_action_goal": CancelActionGoal,
@@ -363,12 +363,12 @@ def _cbor(data: Part) -> object:
 # --- frames to the client ----------------------------------------------------------------------------------------
 
 
-def write_op(values: Mapping[str, Any]) -> Frame:
+def write_op(values: Mapping[str, Any]) -> RosbridgeFrame:
     """A frame of JSON."""
-    return Frame((msgspec.json.encode(values),))
+    return RosbridgeFrame((msgspec.json.encode(values),))
 
 
-def status(level: str, text: str, mid: Id) -> Frame:
+def status(level: str, text: str, mid: Id) -> RosbridgeFrame:
     """A status message."""
     values = {"op": "status", "level": level, "msg": text[: limits.TEXT_MAX]}
     return write_op(values if mid is None else values | {"id": mid})

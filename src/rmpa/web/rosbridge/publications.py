@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rmpa.web.hub.requests import Advertise, Publish, Unadvertise
+from rmpa.web.hub.requests import AdvertiseTopic, PublishMessage, UnadvertiseTopic
 from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.context import check_count
 from rmpa.web.rosbridge.protocol import Id, OpError, graph_name, type_name
@@ -40,7 +40,7 @@ class Publications:
         self._context = context
         self._publishers: dict[str, _Publisher] = {}
 
-    def advertise(self, op: protocol.Advertise) -> None:
+    def advertise(self, op: protocol.RosbridgeAdvertise) -> None:
         """Begin a publisher, or count one more id of it.
 
         Raises:
@@ -67,7 +67,7 @@ class Publications:
         publisher.ends_at = None
         self._context.status("info", f"advertised {name}", op.id)
 
-    def unadvertise(self, op: protocol.Unadvertise, now: float) -> None:
+    def unadvertise(self, op: protocol.RosbridgeUnadvertise, now: float) -> None:
         """Forget the id's advertisement, or all; the publisher ends a while after the last."""
         name = graph_name(op.topic)
         publisher = self._publishers.get(name)
@@ -82,7 +82,7 @@ class Publications:
             publisher.ends_at = now + limits.UNADVERTISE_DELAY
         self._context.status("info", f"unadvertised {name}", op.id)
 
-    def publish(self, op: protocol.Publish) -> None:
+    def publish(self, op: protocol.RosbridgePublish) -> None:
         """Publish a message; a topic that was not advertised is, with the type that the graph knows.
 
         Raises:
@@ -95,7 +95,7 @@ class Publications:
         if written.missing:
             fields = ", ".join(written.missing)
             self._context.status("warning", f"publish {name}: these fields were not given: {fields}", op.id)
-        self._context.ask(Publish(publisher.handle, written.payload))
+        self._context.ask(PublishMessage(publisher.handle, written.payload))
 
     def fail(self, failed: Failed) -> bool:
         """The hub cannot serve a publisher; False if it is none of these."""
@@ -137,9 +137,9 @@ class Publications:
         codec = codec_for(self._context.types.message(kind))
         publisher = _Publisher(self._context.new_handle(), name, kind, latch, codec)
         self._publishers[name] = publisher
-        self._context.ask(Advertise(publisher.handle, name, kind, latch))
+        self._context.ask(AdvertiseTopic(publisher.handle, name, kind, latch))
         return publisher
 
     def _end(self, publisher: _Publisher) -> None:
         del self._publishers[publisher.topic]
-        self._context.ask(Unadvertise(publisher.handle))
+        self._context.ask(UnadvertiseTopic(publisher.handle))

@@ -31,7 +31,7 @@ class _Served:
     """The hub's number of each call that is open, by the id that the client got."""
 
 
-class ServedServices:
+class RosbridgeServedServices:
     """All services that a client offers.
 
     Args:

@@ -10,7 +10,7 @@ from rmpa.web.hub.requests import (
     Answer,
     Failed,
     ParamsChanged,
-    Received,
+    ReceivedMessage,
     Request,
     ServiceFound,
     ServiceRequest,
@@ -22,10 +22,10 @@ from rmpa.web.rosbridge.calls import Calls
 from rmpa.web.rosbridge.context import LEVELS, SessionContext
 from rmpa.web.rosbridge.encodings import PublishFrames, decode_png
 from rmpa.web.rosbridge.fragments import Assembler
-from rmpa.web.rosbridge.protocol import Frame, Id, OpError, Part, id_of, parse_frame, parse_op
+from rmpa.web.rosbridge.protocol import Id, OpError, Part, RosbridgeFrame, id_of, parse_frame, parse_op
 from rmpa.web.rosbridge.publications import Publications
 from rmpa.web.rosbridge.rosapi import GraphView, Rosapi, TypeSource
-from rmpa.web.rosbridge.served import ServedServices
+from rmpa.web.rosbridge.served import RosbridgeServedServices
 from rmpa.web.rosbridge.subscriptions import Subscriptions
 
 if TYPE_CHECKING:
@@ -68,14 +68,14 @@ class RosbridgeSession:
         self._subscriptions = Subscriptions(self._context, frames)
         self._publications = Publications(self._context)
         self._calls = Calls(self._context, Rosapi(graph, types, ros_time_ns))
-        self._served = ServedServices(self._context)
+        self._served = RosbridgeServedServices(self._context)
         self._actions = Actions(self._context, client)
         self._handlers: Mapping[type[protocol.Op], Callable[[Any], None]] = {
-            protocol.Subscribe: self._subscriptions.subscribe,
-            protocol.Unsubscribe: self._subscriptions.unsubscribe,
-            protocol.Advertise: self._publications.advertise,
-            protocol.Publish: self._publications.publish,
-            protocol.CallService: self._calls.call,
+            protocol.RosbridgeSubscribe: self._subscriptions.subscribe,
+            protocol.RosbridgeUnsubscribe: self._subscriptions.unsubscribe,
+            protocol.RosbridgeAdvertise: self._publications.advertise,
+            protocol.RosbridgePublish: self._publications.publish,
+            protocol.RosbridgeCallService: self._calls.call,
             protocol.AdvertiseService: self._served.advertise,
             protocol.UnadvertiseService: self._served.unadvertise,
             protocol.ServiceResponse: self._served.respond,
@@ -83,7 +83,7 @@ class RosbridgeSession:
             protocol.CancelActionGoal: self._actions.cancel_goal,
             protocol.ServeAction: _refuse_to_serve_actions,
             protocol.SetLevel: self._set_level,
-            protocol.Status: lambda _: None,
+            protocol.RosbridgeStatus: lambda _: None,
             protocol.Auth: lambda _: self._context.status("info", "no authentication by 'auth' is needed"),
         }
 
@@ -107,7 +107,7 @@ class RosbridgeSession:
         try:
             if isinstance(op, protocol.Fragment | protocol.Png):
                 self._unwrap(op, now, depth)
-            elif isinstance(op, protocol.Unadvertise):
+            elif isinstance(op, protocol.RosbridgeUnadvertise):
                 self._publications.unadvertise(op, now)
             else:
                 self._handlers[type(op)](op)
@@ -152,7 +152,7 @@ class RosbridgeSession:
 
     def receive_answer(self, answer: Answer, now: float) -> None:
         """Take what the hub answers. Answers to what has ended are ignored."""
-        if isinstance(answer, Received):
+        if isinstance(answer, ReceivedMessage):
             _ = self._subscriptions.receive(answer, now) or self._actions.receive(answer)
         elif isinstance(answer, ServiceRequest):
             self._served.request(answer)
@@ -164,7 +164,7 @@ class RosbridgeSession:
 
     # --- out ------------------------------------------------------------------------------------------------------
 
-    def frames_to_send(self) -> list[Frame]:
+    def frames_to_send(self) -> list[RosbridgeFrame]:
         """The frames for the client since the last call."""
         frames, self._context.frames = self._context.frames, []
         return frames

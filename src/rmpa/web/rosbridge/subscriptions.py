@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rmpa.core.errors import RmpaError
-from rmpa.web.hub.requests import Received, Subscribe, Unsubscribe
+from rmpa.web.hub.requests import ReceivedMessage, Subscribe, Unsubscribe
 from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.context import check_count, fragment_of
 from rmpa.web.rosbridge.encodings import Compression, PublishFrames, encode_cbor_raw
-from rmpa.web.rosbridge.protocol import Frame, Id, OpError, graph_name, type_name, whole
+from rmpa.web.rosbridge.protocol import Id, OpError, RosbridgeFrame, graph_name, type_name, whole
 from rmpa.web.rosbridge.throttle import QueuedBytes, Throttle
 from rmpa.web.values.codec import MessageCodec, codec_for
 
@@ -78,7 +78,7 @@ class Subscriptions:
         """Messages that throttles dropped, of the present subscriptions."""
         return sum(each.throttle.dropped for each in self._topics.values())
 
-    def subscribe(self, op: protocol.Subscribe) -> None:
+    def subscribe(self, op: protocol.RosbridgeSubscribe) -> None:
         """Begin a subscription, or change that of the same id.
 
         Raises:
@@ -116,7 +116,7 @@ class Subscriptions:
         self._context.ask(Subscribe(topic.handle, name, kind))
         return topic
 
-    def unsubscribe(self, op: protocol.Unsubscribe) -> None:
+    def unsubscribe(self, op: protocol.RosbridgeUnsubscribe) -> None:
         """End the subscription with the op's id, or all of the topic."""
         topic = self._topics.get(op.topic)
         if topic is None or (op.id is not None and op.id not in topic.wishes):
@@ -133,7 +133,7 @@ class Subscriptions:
             self._context.ask(Unsubscribe(topic.handle))
         self._context.status("info", f"unsubscribed from {op.topic}", op.id)
 
-    def receive(self, message: Received, now: float) -> bool:
+    def receive(self, message: ReceivedMessage, now: float) -> bool:
         """Take a message of the hub; False if it is of no subscription here."""
         topic = self._by_handle.get(message.handle)
         if topic is not None:
@@ -176,7 +176,7 @@ class Subscriptions:
         topic.throttle.clear()
         del self._topics[topic.name], self._by_handle[topic.handle]
 
-    def _send(self, topic: _Topic, messages: list[Received]) -> None:
+    def _send(self, topic: _Topic, messages: list[ReceivedMessage]) -> None:
         for message in messages:
             try:
                 frame = self._encode(topic, message)
@@ -186,9 +186,9 @@ class Subscriptions:
                     topic.problem = str(error)
                     self._context.status("error", f"message of {topic.name}: {error}")
                 continue
-            self._context.send(Frame(frame.parts, frame.binary, topic.handle), topic.fragment_size)
+            self._context.send(RosbridgeFrame(frame.parts, frame.binary, topic.handle), topic.fragment_size)
 
-    def _encode(self, topic: _Topic, message: Received) -> Frame:
+    def _encode(self, topic: _Topic, message: ReceivedMessage) -> RosbridgeFrame:
         if topic.compression is Compression.CBOR_RAW:
             return encode_cbor_raw(topic.name, message.payload, message.stamp_ns)
         version = message.type, message.md5sum

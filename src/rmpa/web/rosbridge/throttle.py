@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from rmpa.web.rosbridge import limits
 
 if TYPE_CHECKING:
-    from rmpa.web.hub.requests import Received
+    from rmpa.web.hub.requests import ReceivedMessage
 
 
 class QueuedBytes:
@@ -35,7 +35,7 @@ class Throttle:
         self.dropped = 0
         """Messages that were not sent."""
         self._total = total
-        self._queue: deque[Received] = deque()
+        self._queue: deque[ReceivedMessage] = deque()
         self._bytes = 0
         self._free_at = float("-inf")
 
@@ -47,7 +47,7 @@ class Throttle:
         while len(self._queue) > self.length:
             self._drop_oldest()
 
-    def offer(self, message: Received, now: float) -> list[Received]:
+    def offer(self, message: ReceivedMessage, now: float) -> list[ReceivedMessage]:
         """Take a message; returns those to be sent now."""
         if not self._queue and now >= self._free_at:
             self._free_at = now + self.interval
@@ -65,9 +65,9 @@ class Throttle:
             self._count(size)
         return self.due(now)
 
-    def due(self, now: float) -> list[Received]:
+    def due(self, now: float) -> list[ReceivedMessage]:
         """The messages whose time has come: all where there is no interval any more."""
-        sent: list[Received] = []
+        sent: list[ReceivedMessage] = []
         while self._queue and now >= self._free_at:
             message = self._queue.popleft()
             self._count(-len(message.payload))

@@ -21,9 +21,9 @@ from rmpa.web.metrics import content_type, exposition
 from rmpa.web.server.auth import (
     TOKEN_PARAMETER,
     AccessPolicy,
+    AccessRefused,
     MoveToken,
     Preflight,
-    Refused,
     RequestFacts,
     host_name,
     is_loopback,
@@ -144,7 +144,7 @@ class Routes:
 
     async def _respond(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         verdict = self._policy.judge(self._facts(request))
-        if isinstance(verdict, Refused):
+        if isinstance(verdict, AccessRefused):
             return self._refused(request, verdict.reason, rest.problem(verdict.status, verdict.detail))
         if request.method not in _METHODS and not isinstance(verdict, Preflight):
             text = f"{request.method[:20]} is not supported; this server only shows, and is read with GET"
@@ -203,7 +203,7 @@ class Routes:
         allowed = {"Access-Control-Allow-Origin": origin} if origin is not None and self._policy.lists(origin) else {}
         return {"Vary": "Origin", **allowed}
 
-    def _refused(self, request: web.Request, reason: str, problem: rest.Response) -> web.Response:
+    def _refused(self, request: web.Request, reason: str, problem: rest.RestResponse) -> web.Response:
         address = request.remote or "?"
         self._refusals.refuse(time.monotonic(), reason, address, f"{address}: {rest.detail_of(problem)}")
         response = _response(problem)
@@ -305,6 +305,6 @@ def _upgraded(request: web.Request) -> None:
         connection.upgrade()
 
 
-def _response(made: rest.Response) -> web.Response:
+def _response(made: rest.RestResponse) -> web.Response:
     headers = {"Content-Type": made.content_type, **dict(made.headers)}
     return web.Response(status=made.status, body=made.body, headers=headers)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 TOKEN_PARAMETER: Final = "token"  # noqa: S105 - its name, not its value
 REASONS: Final = ("host", "origin", "token")
-"""The values of ``Refused.reason``."""
+"""The values of ``AccessRefused.reason``."""
 _HOST: Final = re.compile(r"(?:\[(?P<six>[0-9A-Fa-f:.]+)\]|(?P<name>[A-Za-z0-9_.-]+))(?::[0-9]{1,5})?")
 _SHOWN: Final = 80
 
@@ -59,7 +59,7 @@ class RequestFacts:
 
 
 @dataclass(frozen=True, slots=True)
-class Granted:
+class AccessGranted:
     """The request is served."""
 
 
@@ -74,7 +74,7 @@ class Preflight:
 
 
 @dataclass(frozen=True, slots=True)
-class Refused:
+class AccessRefused:
     """The request is not served.
 
     Attributes:
@@ -109,7 +109,7 @@ class AccessPolicy:
         """The name of the token's cookie."""
         return f"rmpa_token_{self.port}"
 
-    def judge(self, request: RequestFacts) -> Granted | MoveToken | Preflight | Refused:
+    def judge(self, request: RequestFacts) -> AccessGranted | MoveToken | Preflight | AccessRefused:
         """The decision about a request."""
         refused = self._wrong_host(request) or self._wrong_origin(request)
         if refused is not None:
@@ -122,17 +122,17 @@ class AccessPolicy:
         """Whether an ``Origin`` is one of ``origins``; ``*`` never is."""
         return origin is not None and origin != "*" and origin.lower() in self.origins
 
-    def _wrong_host(self, request: RequestFacts) -> Refused | None:
+    def _wrong_host(self, request: RequestFacts) -> AccessRefused | None:
         if len(request.host) != 1:
-            return Refused("host", 400, f"the request has {len(request.host)} Host headers; send exactly one")
+            return AccessRefused("host", 400, f"the request has {len(request.host)} Host headers; send exactly one")
         host = request.host[0]
         name = host_name(host)
         if name is not None and (is_address(name) or name in self.hosts):
             return None
         remedy = "use its address, or add the name with --host (hosts of [web] in rmpa.toml)"
-        return Refused("host", 403, f"{_short(host)} is no name of this server; {remedy}")
+        return AccessRefused("host", 403, f"{_short(host)} is no name of this server; {remedy}")
 
-    def _wrong_origin(self, request: RequestFacts) -> Refused | None:
+    def _wrong_origin(self, request: RequestFacts) -> AccessRefused | None:
         if request.origin is not None:
             scheme, _, rest = request.origin.partition("://")
             if scheme in ("http", "https") and rest.lower() == request.host[0].lower():
@@ -146,27 +146,27 @@ class AccessPolicy:
             return _foreign("another site")
         return None
 
-    def _by_token(self, request: RequestFacts) -> Granted | MoveToken | Refused:
+    def _by_token(self, request: RequestFacts) -> AccessGranted | MoveToken | AccessRefused:
         if not self.token or request.is_open:
-            return Granted()
+            return AccessGranted()
         if request.token is not None and self._fits(request.token):
-            return MoveToken() if request.is_page else Granted()
+            return MoveToken() if request.is_page else AccessGranted()
         given = [bearer(request.authorization), request.cookie]
         if any(self._fits(each) for each in given if each is not None):
-            return Granted()
+            return AccessGranted()
         remedy = (
             "send it as Authorization: Bearer TOKEN or as ?token=TOKEN; rmpa web says at its start where the token is"
         )
         if request.token is None and not any(each is not None for each in given):
-            return Refused("token", 401, f"this server needs a token; {remedy}")
-        return Refused("token", 401, f"the token is wrong; {remedy}")
+            return AccessRefused("token", 401, f"this server needs a token; {remedy}")
+        return AccessRefused("token", 401, f"the token is wrong; {remedy}")
 
     def _fits(self, token: str) -> bool:
         return hmac.compare_digest(token.encode("utf-8", "replace"), self.token.encode())
 
 
-def _foreign(whose: str) -> Refused:
-    return Refused(
+def _foreign(whose: str) -> AccessRefused:
+    return AccessRefused(
         "origin",
         403,
         f"pages of {whose} may not read from this server; open its own pages instead, or list it as origins of [web]",

@@ -10,7 +10,7 @@ from rmpa.bridge import limits
 from rmpa.bridge.direct import requests
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, reply_of, unmet_by_contract
 from rmpa.bridge.direct.io.nodes import end_from
-from rmpa.bridge.direct.publisher_side import DirectGrants, EndConnections, Granted, Retry, Withdraw
+from rmpa.bridge.direct.publisher_side import DirectGrants, EndConnections, Granted, Retry, WithdrawGrant
 from rmpa.bridge.direct.requests import DirectClosed, RetryDirect
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import is_own
@@ -211,7 +211,7 @@ class DirectExporter:
                     if problem := end_from(action.port, session.address):
                         text = "! %s: connections of local nodes to it may hang: they cannot be ended (%s)"
                         _log.info(text, session.link.name, problem)
-                case Withdraw(source=source) if session.linked:
+                case WithdrawGrant(source=source) if session.linked:
                     self._counters.add("direct.withdrawn")
                     closed = DirectClosed(
                         source.topic,

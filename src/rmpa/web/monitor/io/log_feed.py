@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.web.hub.hub import Hub
-    from rmpa.web.hub.requests import Received
+    from rmpa.web.hub.requests import ReceivedMessage
     from rmpa.web.monitor.io.values import MessageValues
 
 TOPIC: Final = "/rosout_agg"
@@ -65,7 +65,7 @@ class LogFeed:
         """End a ``follow``."""
         self._followers.pop(page, None)
 
-    def _take(self, message: Received) -> None:
+    def _take(self, message: ReceivedMessage) -> None:
         try:
             values = self._values.of(message)
         except RmpaError:

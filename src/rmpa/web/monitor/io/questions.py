@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import msgspec
 
-from rmpa.bridge.proxy_names import proxied_node
+from rmpa.bridge.proxy_names import proxied_peer
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.names import is_global_name
 from rmpa.observe import limits as observe_limits
@@ -216,8 +216,7 @@ class Answers:
         known = self._hub.graph.services.get(name)
         if known is None:
             raise RmpaError(f"the graph of this module has no service {name}")
-        proxies = [proxied_node(node) for node in known.providers]
-        peers = [proxy[0] if proxy is not None else "" for proxy in proxies]
+        peers = [proxied_peer(node) or "" for node in known.providers]
         if peers and peer not in peers:
             whose = peers[0] or "this module"
             raise RmpaError(f"the service {name} of {whose} has this name here, not that of {peer or 'this module'}")

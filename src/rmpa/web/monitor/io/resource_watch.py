@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from rmpa.bridge.proxy_names import proxied_node
+from rmpa.bridge.proxy_names import proxied_peer
 from rmpa.core.errors import RmpaError
 from rmpa.resource.run.descriptor import TOPIC as DESCRIPTOR
 from rmpa.resource.run.descriptor import Descriptor
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.web.hub.hub import Hub
-    from rmpa.web.hub.requests import GraphTopic, Received
+    from rmpa.web.hub.requests import GraphTopic, ReceivedMessage
     from rmpa.web.monitor.io.values import MessageValues
     from rmpa.web.monitor.patch import Tree
 
@@ -161,7 +161,7 @@ class ResourceWatch:
             # A source that is back sends the same latched messages, which a subscription has had: begin anew.
             self._unsubscribe(path, there)
         there.publishers = publishers
-        peers = {_peer_of(node) for node in publishers}
+        peers = {proxied_peer(node) for node in publishers}
         for key, facts in [*self._heard.items()]:
             if facts.name == path and facts.peer not in peers:
                 del self._heard[key]
@@ -182,7 +182,7 @@ class ResourceWatch:
         for topic in wanted.keys() - path.handles.keys():
             handle = path.handles[topic] = next(self._numbers)
 
-            def take(message: Received, topic: str = topic) -> None:
+            def take(message: ReceivedMessage, topic: str = topic) -> None:
                 self._take(name, topic, message)
 
             self._hub.topics.subscribe(
@@ -200,8 +200,8 @@ class ResourceWatch:
             del self._heard[key]
             self._since.pop(key, None)
 
-    def _take(self, name: str, topic: str, message: Received) -> None:
-        peer = _peer_of(message.source)
+    def _take(self, name: str, topic: str, message: ReceivedMessage) -> None:
+        peer = proxied_peer(message.source)
         key = f"{peer}:{name}" if peer else name
         try:
             values = self._values.of(message)
@@ -263,8 +263,3 @@ def _status(values: Any) -> dict[str, Any]:
         "message": values["message"],
         "values": {pair["key"]: pair["value"] for pair in values["values"]},
     }
-
-
-def _peer_of(node: str) -> str | None:
-    proxy = proxied_node(node)
-    return proxy[0] if proxy is not None else None

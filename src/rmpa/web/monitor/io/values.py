@@ -11,7 +11,7 @@ from rmpa.web.values.codec import codec_for
 
 if TYPE_CHECKING:
     from rmpa.web.hub.hub import Hub
-    from rmpa.web.hub.requests import Payload, Received
+    from rmpa.web.hub.requests import Payload, ReceivedMessage
 
 
 _OVERHEAD: Final = 64 * KIB
@@ -30,7 +30,7 @@ class MessageValues:
         self._last: OrderedDict[int, tuple[Payload, Any]] = OrderedDict()
         self._bytes = 0
 
-    def of(self, message: Received) -> Any:
+    def of(self, message: ReceivedMessage) -> Any:
         """The values of a message; they are shared, and must not be changed.
 
         Raises:
