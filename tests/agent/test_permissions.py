@@ -22,6 +22,7 @@ from rmpa.config.settings import NodeSettings, ParamSettings, ServiceSettings, S
 from rmpa.core.contract import ContractRule, Transport
 from rmpa.core.errors import PeerRefused
 from rmpa.observe import limits as observe_limits
+from rmpa.ros.wire.xmlrpc import serialize_response
 from rmpa.trust.permissions import Permissions
 from tests.agent.test_agent import Sink, node, running, settings, until
 from tests.agent.test_services import serving
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from rmpa.observe.why.diagnosis import Diagnosis
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 __all__ = ["settings"]
 
@@ -173,10 +175,14 @@ async def test_parameters_are_read_and_set_only_with_permission(
             except PeerRefused as error:
                 return error.reason
 
-        async def sets(key: str, text: str) -> str:
+        async def sets(key: str, value: XmlRpcValue) -> str:
+            steps = transfer.writing(key, serialize_response(value).decode(), 1)
             try:
-                _, args = next(transfer.writing(key, f"<value>{text}</value>", 1))
-                return str(await b.bridge.rpc.request(link, transfer.SET, args))
+                question = next(steps)
+                while True:
+                    question = steps.send(await b.bridge.rpc.request(link, *question))
+            except StopIteration as done:
+                return f"set {done.value}"
             except PeerRefused as error:
                 return error.reason
 
@@ -194,6 +200,12 @@ async def test_parameters_are_read_and_set_only_with_permission(
         assert await asks(transfer.DELETE, "/other") == no("/other")
         assert a.bridge.counters["permission.param"] == 5
         assert a.core.call("getParam", "/n", "/arm/secret")[2] == 2
+        assert await sets("/arm/speed", 5) == "set 1"
+        assert await sets("/arm/secret", 5) == no("/arm/secret")
+        assert await sets("/arm", {"speed": 6, "secret": 7}) == no("/arm/secret"), "a name of its own words"
+        assert await sets("/arm", 7) == no("/arm"), "the secret would be lost"
+        assert await sets("/arm/secret/deeper", 7) == no("/arm/secret/deeper"), "here too"
+        assert a.core.call("getParam", "/n", "/arm")[2] == {"speed": 5, "secret": 2, "deep": {"x": 3}}
         assert await asks(transfer.DELETE, "/arm/deep") == "{}"
 
 
