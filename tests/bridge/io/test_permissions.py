@@ -49,7 +49,7 @@ class Permitted:
 
     def say(self, speaker: Speaker, count: int, size: int) -> None:
         """Publish some messages; whoever may not have them now shall never hear them."""
-        here = self.world.sides.index(speaker.side)  # type: ignore[arg-type]
+        here = self.world.sides.index(speaker.side)
         for _ in range(count):
             speaker.say(size)
             if speaker.topic not in self.subscribe[here]:
