@@ -32,6 +32,7 @@ from rmpa.observe.io.control_server import ControlServer
 from rmpa.observe.io.diagnostics import Diagnostics
 from rmpa.observe.io.graph_revision import GraphRevisions
 from rmpa.observe.io.peer_clocks import PeerClocks
+from rmpa.observe.io.peer_credentials import control_access
 from rmpa.observe.io.runtime_dir import runtime_dir
 from rmpa.observe.io.snapshot_builder import SnapshotBuilder, SnapshotSources
 from rmpa.observe.why.io.why import WhyService
@@ -144,6 +145,7 @@ class Agent:
             settings.name,
             self.operations.handlers(),
             counters=counters,
+            access=control_access(settings.control_group),
         )
 
     async def start(self) -> None:

@@ -457,6 +457,14 @@ class Settings:
         key="relay.enabled",
         env="RMPA_RELAY",
     )
+    control_group: str = setting(
+        "",
+        TEXT,
+        "A group (its name or number) whose users may use the control socket, besides this user and root.",
+        key="control.group",
+        env="RMPA_CONTROL_GROUP",
+        shown_default="none",
+    )
     log_level: str = setting(
         "info",
         LOG_LEVEL,
@@ -520,6 +528,7 @@ TABLES: Final = {
     "web": "Where the module's state is served over HTTP (docs/web.md).",
     "trust": "What the modules of a secured mesh may do here (docs/design/trust.md).",
     "relay": "Whether this module joins networks that are not routed to each other.",
+    "control": "Who on this machine may use the agent's control socket, which the commands ask.",
     "log": "What the log says, and how.",
 }
 """The tables of ``rmpa.toml``, each with its description."""

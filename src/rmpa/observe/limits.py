@@ -22,6 +22,8 @@ CONTROL_CALL_TIMEOUT: Final = 10.0
 """Time-out of one call of a client: a stopped agent must not block the command line."""
 CONTROL_LOOK_TIMEOUT: Final = 1.0
 """Time-out of a connection that only tests whether an agent runs; the kernel accepts it even for a stopped agent."""
+CONTROL_REFUSED_TIMEOUT: Final = 1.0
+"""A client that is turned away has this long to read why; it holds its place among the clients for so long."""
 CONTROL_BACKLOG: Final = 128
 """Connections that wait to be accepted; the kernel refuses further ones at once."""
 CONTROL_PINGS_MAX: Final = 100

@@ -49,7 +49,7 @@ class Address:
 
 
 @dataclass(frozen=True, slots=True)
-class Access:
+class TokenAccess:
     """The token of a server, and where it is."""
 
     token: str = ""
@@ -57,7 +57,7 @@ class Access:
     is_new: bool = False
 
 
-def access_of(web: WebSettings, module: str, environ: Mapping[str, str], state: str = "") -> Access:
+def access_of(web: WebSettings, module: str, environ: Mapping[str, str], state: str = "") -> TokenAccess:
     """The token that the settings ask for: one beyond loopback, for control or driving, or where a file is given.
 
     Args:
@@ -70,7 +70,7 @@ def access_of(web: WebSettings, module: str, environ: Mapping[str, str], state: 
         StartError: The file cannot be used, or there is no place for one.
     """
     if auth.is_loopback(web.listen) and not (web.token_file or web.control or web.drive):
-        return Access()
+        return TokenAccess()
     if web.token_file:
         file = Path(web.token_file)
     else:
@@ -79,10 +79,10 @@ def access_of(web: WebSettings, module: str, environ: Mapping[str, str], state: 
             raise StartError("rmpa web", "there is no state directory for the token", "choose a --token-file")
         file = module_dir(place, module) / "web-token"
     token, is_new = token_from(file)
-    return Access(token, file, is_new)
+    return TokenAccess(token, file, is_new)
 
 
-def address_of(web: WebSettings, access: Access, port: int) -> Address:
+def address_of(web: WebSettings, access: TokenAccess, port: int) -> Address:
     """Where a server is, for the user."""
     host = socket.gethostname() if web.listen == "0.0.0.0" else web.listen  # noqa: S104 - compared
     query = f"?{auth.TOKEN_PARAMETER}={access.token}" if access.is_new else ""
@@ -92,7 +92,7 @@ def address_of(web: WebSettings, access: Access, port: int) -> Address:
 
 async def serve(
     web: WebSettings,
-    access: Access,
+    access: TokenAccess,
     agent: str | None,
     announce: Callable[[Address], None],
     *,
