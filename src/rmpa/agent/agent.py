@@ -113,6 +113,8 @@ class Agent:
             self.bridge.add(part)
         self.network = Network(settings, self.bridge)
         self.reloader = Reloader(settings, load, self.apply_settings)
+        self.reloaded: Callable[[], None] = lambda: None
+        """Called when changed settings hold."""
         counters = Counters()
         self._collector = GarbageCollector(self._bytes_carried, counters)
         self._clocks = PeerClocks(self.bridge)
@@ -194,6 +196,7 @@ class Agent:
         logging.getLogger().setLevel(settings.log_level.upper())
         for part in (self.bridge, self.snapshots, self._why, self._nodes):
             part.reload(settings)
+        self.reloaded()
 
 
 async def _serve(
@@ -210,6 +213,7 @@ async def _serve(
         loop.add_signal_handler(number, stop.set)
     sighup = SighupHandler(agent.reloader, stop.set)
     web = WebProcess(web_command(settings), random.random, environ=web_environment(settings, os.environ), cpus=cpus)
+    agent.reloaded = web.reload
     await agent.start()
     sighup.start()
     if settings.web.enabled:

@@ -53,6 +53,7 @@ from rmpa.config.values import (
     Multicast,
     list_of,
 )
+from rmpa.config.web_tokens import WEB_TOKENS, WebToken
 from rmpa.core.contract import DEFAULT_TRANSPORT, Contracts, Transport
 
 if TYPE_CHECKING:
@@ -449,6 +450,13 @@ class Settings:
     lanes: LaneSettings = table(LaneSettings, "lanes")
     realtime: RealtimeSettings = table(RealtimeSettings, "realtime")
     web: WebSettings = table(WebSettings, "web")
+    web_tokens: tuple[WebToken, ...] = setting(
+        (),
+        WEB_TOKENS,
+        "Clients of rmpa web with a token and a role of their own.",
+        key="web_token",
+        live=True,
+    )
     trust: TrustSettings = table(TrustSettings, "trust")
     relay: bool = setting(
         False,
