@@ -13,6 +13,7 @@ import pytest
 from rmpa.bridge import limits
 from rmpa.bridge.actions import Action, Publish, Retract, Send
 from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, Source, decode, encode
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.relay import LinkedPeer, Relay, RelayPaths, may_have
 from rmpa.bridge.services.exports import ExportAction, LocalService, ServiceExports
@@ -24,7 +25,7 @@ from rmpa.config.settings import PolicySettings, ServiceSettings
 from rmpa.core.guid import Guid
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
 TYPE = "std_msgs/String"
 
@@ -43,6 +44,7 @@ class Module:
 
     number: int
     relays: bool
+    gate: PermissionGate = field(default_factory=PermissionGate)
     exports: Exports = field(init=False)
     imports: Imports = field(init=False)
     service_exports: ServiceExports = field(init=False)
@@ -59,10 +61,12 @@ class Module:
 
     def __post_init__(self) -> None:
         policy = Policy(PolicySettings())
-        self.exports, self.imports = Exports(policy), Imports(policy, rng=lambda: 0.5)
+        self.exports = Exports(policy, gate=self.gate)
+        self.imports = Imports(policy, rng=lambda: 0.5, gate=self.gate)
         self.relay = Relay(enabled=self.relays)
         rules = ServiceRules(ServiceSettings(), policy)
-        self.service_exports, self.service_imports = ServiceExports(rules), ServiceImports(rules)
+        self.service_exports = ServiceExports(rules, gate=self.gate)
+        self.service_imports = ServiceImports(rules, gate=self.gate)
         self.relay.instance = self.imports.ways.instance = instance(self.number)
         self.service_imports.ways.instance = instance(self.number)
         self.look()
@@ -112,9 +116,11 @@ class Module:
 class Map:
     """Modules and the links between them; what is on its way on each, in order."""
 
-    def __init__(self, count: int, relays: set[int], seed: int) -> None:
+    def __init__(
+        self, count: int, relays: set[int], seed: int, gate: Callable[[int], PermissionGate] = lambda _: OPEN_GATE
+    ) -> None:
         self.rng = random.Random(seed)
-        self.modules = {n: Module(n, n in relays) for n in range(1, count + 1)}
+        self.modules = {n: Module(n, n in relays, gate(n)) for n in range(1, count + 1)}
         self.wires: dict[tuple[int, int], deque[bytes]] = {}
 
     def link(self, one: int, other: int) -> None:

@@ -95,6 +95,7 @@ class Agent:
             settings.params,
             settings.time,
             settings.limits.params,
+            self.bridge.gate,
         )
         rules = ServiceRules(settings.services, policy, names)
         self.services = Services(
@@ -105,6 +106,7 @@ class Agent:
             rules,
             settings.limits,
             self.bridge.counters,
+            self.bridge.gate,
         )
         reports = LimitReports(
             self.bridge.sessions, self.bridge.rpc, self.bridge.topics, self.services, settings.limits
@@ -131,7 +133,7 @@ class Agent:
             requests=requests,
         )
         self.snapshots = SnapshotBuilder(settings, sources)
-        self._nodes = NodeRequests(settings, self.core, self.bridge.rpc)
+        self._nodes = NodeRequests(settings, self.core, self.bridge.rpc, self.bridge.gate)
         self._why = WhyService(settings, self.core, self.bridge, self.services, self.snapshots)
         self.operations = ControlOperations(
             settings.name,

@@ -21,7 +21,7 @@ from rmpa.bridge import limits
 from rmpa.bridge.messages import Origin
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from rmpa.bridge.messages import Source
     from rmpa.core.guid import Guid
@@ -129,9 +129,13 @@ class RelayPaths:
     """The receiving side: selects the path to each module, its own link first, else the best relay.
 
     The best relay has the shortest path; among equal ones, the lowest GUID. All sources of a module use one path.
+
+    Args:
+        may_relay: Whether a peer, by its name, may be a relay at all.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, may_relay: Callable[[str], bool] = lambda _: True) -> None:
+        self._may_relay = may_relay
         self.instance = ""
         """Our own, as 32 hexadecimal digits."""
         self._linked: dict[int, LinkedPeer] = {}
@@ -208,7 +212,10 @@ class RelayPaths:
 
     def _best(self, instance: str) -> int | None:
         known = self._origins.get(instance)
-        return min(known.ways, key=lambda peer: self._rank(known, peer), default=None) if known is not None else None
+        if known is None:
+            return None
+        ways = (peer for peer in known.ways if self._may_relay(self._linked[peer].name))
+        return min(ways, key=lambda peer: self._rank(known, peer), default=None)
 
     def _rank(self, known: _Origin, peer: int) -> tuple[int, int, int]:
         guid = self._linked[peer].guid

@@ -324,6 +324,13 @@ class TrustSettings:
         env="RMPA_TRUST_RELAYS",
         live=True,
     )
+    direct: bool = setting(
+        False,
+        BOOL,
+        "Let nodes connect directly to those of other machines although nothing protects these connections.",
+        env="RMPA_TRUST_DIRECT",
+        live=True,
+    )
     require: bool = setting(
         False, BOOL, "Refuse to start while this module has not joined a secured mesh.", env="RMPA_TRUST_REQUIRE"
     )

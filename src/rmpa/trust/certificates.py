@@ -6,7 +6,7 @@ For browsers, which ``rmpa web`` serves with it, it has host names too (``server
 
 Errors::
 
-    RemoteProtocolError
+    TrustError
     └── CertificateError    a certificate or a request is refused; ``reason`` is the word for it
 """
 
@@ -24,10 +24,9 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import peer_name_problem
 from rmpa.trust import limits
-from rmpa.trust.reasons import TrustReason
+from rmpa.trust.reasons import TrustError, TrustReason
 
 if TYPE_CHECKING:
     from rmpa.trust.documents import DenyList
@@ -48,17 +47,8 @@ _UNREADABLE: Final = (
 """What ``cryptography`` raises about malformed input."""
 
 
-class CertificateError(RemoteProtocolError):
-    """A certificate or a request is refused.
-
-    Args:
-        reason: The word for it; a request that is malformed is ``foreign``.
-        text: What is wrong.
-    """
-
-    def __init__(self, reason: TrustReason, text: str) -> None:
-        super().__init__(text)
-        self.reason = reason
+class CertificateError(TrustError):
+    """A certificate or a request is refused; a request that is malformed is ``foreign``."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -76,6 +76,13 @@ JOIN_REQUEST_MAX: Final = 16 * KIB
 JOIN_ANSWER_MAX: Final = 1 * MIB
 """Bytes of one message of the authority: two signed documents in base64."""
 
+JOINS_AT_ONCE: Final = 16
+"""Joins and renewals that the authority serves at a time; each may wait for a user."""
+JOIN_STEP_TIMEOUT: Final = 10.0
+"""For each step of a join or renewal that waits for no user: connecting, the TLS handshake, one answer."""
+ISSUED_MAX: Final = 1024
+"""Modules whose last certificate the authority remembers, two for each member of a full roster."""
+
 # --- certificates -----------------------------------------------------------------------------------------------
 CERTIFICATE_LIFETIME: Final = 7 * 86_400
 """Validity of a module's certificate. It bounds how long a stolen key is of use where no deny list arrives."""
@@ -88,6 +95,16 @@ RENEWAL_SHARE: Final = 0.5
 be there."""
 RENEWAL_GRACE: Final = 365 * 86_400
 """A certificate that ended less than this long ago is renewed without a new invitation: a robot was in a drawer."""
+RENEWAL_RETRY_FIRST: Final = 60.0
+"""Until a renewal that failed is tried again; each further time it is twice as long."""
+RENEWAL_RETRY_CAP: Final = 3600.0
+"""The longest such time."""
+RENEWAL_LOOK: Final = 30.0
+"""How often an agent looks whether its certificate is to be renewed: the wall clock may be set at any time."""
+EXPIRY_NEAR: Final = 2 * 86_400
+"""A certificate that ends within this time is a warning: renewals have failed for a day and a half."""
+EARLIEST_TIME: Final = 1_735_689_600
+"""A clock before 2025 is not set: a new mesh would have certificates that no other machine accepts."""
 CSR_MAX: Final = 4 * KIB
 """Bytes of a request for a certificate (DER); one has some 250."""
 CERTIFICATE_MAX: Final = 8 * KIB

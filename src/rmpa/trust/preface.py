@@ -25,11 +25,10 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.trust import limits
 from rmpa.trust.keyring import KeyPurpose
-from rmpa.trust.reasons import TrustReason
+from rmpa.trust.reasons import TrustError, TrustReason
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -57,17 +56,8 @@ class Purpose(IntEnum):
     """A member whose certificate has ended asks for another."""
 
 
-class PrefaceError(RemoteProtocolError):
-    """Bytes that are not the preface of a secured mesh; the connection is closed.
-
-    Args:
-        reason: What is answered, where the dialler can read an answer.
-        text: What is wrong.
-    """
-
-    def __init__(self, reason: TrustReason, text: str) -> None:
-        super().__init__(text)
-        self.reason = reason
+class PrefaceError(TrustError):
+    """Bytes that are not the preface of a secured mesh; ``reason`` is answered where the dialler can read it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Final
 
+from rmpa.core.errors import RemoteProtocolError
+
 
 class TrustReason(IntEnum):
     """Why a connection is refused; the numbers continue those of ``mesh.handshake.Refusal`` on the wire."""
@@ -53,3 +55,16 @@ _REMEDIES: Final = {
     TrustReason.DOWNGRADE: "install the same release of rmpa on both",
     TrustReason.FLOOD: "it is tried again; is something else connecting to this port?",
 }
+
+
+class TrustError(RemoteProtocolError):
+    """A secured mesh refuses a connection, a certificate or a request.
+
+    Args:
+        reason: The word for it.
+        text: What is wrong.
+    """
+
+    def __init__(self, reason: TrustReason, text: str) -> None:
+        super().__init__(text)
+        self.reason = reason

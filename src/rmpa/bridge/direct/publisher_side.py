@@ -62,7 +62,10 @@ class Retry:
 
 @dataclass(frozen=True, slots=True)
 class EndConnections:
-    """End the connections from a local publisher's port to a peer's address: the peer cannot be reached."""
+    """End the connections from a local publisher's port to a peer's address.
+
+    The peer cannot be reached, or may not have them any more.
+    """
 
     peer: int
     port: int
@@ -221,16 +224,21 @@ class DirectGrants:
         away = self._away.pop(source, {})
         return [*(WithdrawGrant(peer, source, "", unmet) for peer in away), *self.changed(source)]
 
-    def judge_again(self, unmet: Callable[[Source, int, Granted], Unmet | None]) -> list[GrantAction]:
+    def judge_again(
+        self, unmet: Callable[[Source, int, Granted], Unmet | None], *, end: bool = False
+    ) -> list[GrantAction]:
         """Withdraw the grants that the rules do not allow any more.
 
         Args:
             unmet: ``(source, peer, grant)``: the condition that does not hold by the new rules, if any.
+            end: End the connections at once, too, rather than leave that to the peer's agent.
         """
         actions: list[GrantAction] = []
         for source, peer, subscriber, granted in list(self):
             why = unmet(source, peer, granted)
             if why is not None:
+                if end:
+                    actions.append(EndConnections(peer, granted.port))
                 self._drop(peer, source, subscriber)
                 self.refuse(peer, source)
                 actions.append(WithdrawGrant(peer, source, subscriber, why))

@@ -9,9 +9,11 @@ import msgspec
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.io.proxy_kills import KILL
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.policy import OWN_NODE, is_own
 from rmpa.bridge.proxy_names import proxied_node
 from rmpa.config import limits as config_limits
+from rmpa.config.permission_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import RmpaError
 from rmpa.core.names import is_global_name, matches
@@ -44,9 +46,11 @@ class NodeRequests:
         settings: The agent's settings.
         core: The local core.
         asks: Receives the requests.
+        gate: Decides which nodes each peer may end.
     """
 
-    def __init__(self, settings: Settings, core: Core, asks: PeerRpc) -> None:
+    def __init__(self, settings: Settings, core: Core, asks: PeerRpc, gate: PermissionGate = OPEN_GATE) -> None:
+        self._gate = gate
         self._settings = settings
         self._core = core
         asks.on_request(LIST, self._list)
@@ -81,6 +85,8 @@ class NodeRequests:
 
     async def _kill(self, asker: PeerSession, args: dict[str, Any]) -> NodeEnd:
         node, uri = self._own(args)
+        if why := self._gate.why_not(Access.KILL, asker.link.name, node):
+            raise RmpaError(why)
         who = f"{asker.link.name}'s {str(args.get('by', ''))[: bridge_limits.ASK_NAME_MAX]}"
         here = self._settings.name
         if not any(matches(glob, node) for glob in self._settings.nodes.kill):
