@@ -91,3 +91,7 @@ WHY_PROBE: Final = 2.0
 """Time-out of a probe of a service's server, which is on the same machine as the agent that asks."""
 WHY_SOURCES_MAX: Final = 64
 """Publishers of one topic in one module that ``rmpa why`` reports."""
+DOCTOR_NODES_TIMEOUT: Final = 2.0
+"""Seconds in which a core tells the addresses of its nodes; each takes a millisecond."""
+DOCTOR_NODES_MAX: Final = 500
+"""Nodes of one core whose ports are looked at, so that the check ends in time."""
