@@ -153,6 +153,18 @@ CLOCK_STEP: Final = 0.05
 a contradiction between two exchanges."""
 CLOCK_INTERVAL: Final = 1.0
 """Interval of the pings on a link whose pongs alone keep it alive."""
+SECURING_TIMEOUT: Final = 3.0
+"""The longest TLS handshake of a secured mesh: two round trips and 3 ms of work."""
+PREFACE_TIMEOUT: Final = 1.0
+"""The longest time from an accepted connection to its whole preface, which a member sends at once: TCP's first
+repetition of a lost packet comes within it."""
+HANDSHAKES_PER_ADDRESS: Final = 16
+"""TLS handshakes that one address may have at a time, each with a valid preface: several agents of one machine."""
+PLAIN_ANSWERS_RATE: Final = 20.0
+"""Connections a second, over all addresses, that are told why they are refused in front of TLS; the others are closed
+without an answer, which takes half the time."""
+REFUSAL_LINGER: Final = 0.5
+"""How long a connection whose certificate was refused may still send, so that it reads the alert."""
 PENDING_PER_ADDRESS: Final = 8
 """Connections without a handshake that one address may have, so that one port scanner does not take all places."""
 JOIN_RETRY: Final = 1.0

@@ -11,20 +11,22 @@ from __future__ import annotations
 
 import contextlib
 import ssl
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol, cast
 
 from rmpa.core.errors import LocalProtocolError
 from rmpa.core.sizes import KIB
+from rmpa.runtime.segments import SegmentedSocket
 
 if TYPE_CHECKING:
+    import socket
     from collections.abc import Sequence
 
 Buffer = bytes | bytearray | memoryview
 
 _RECORD: Final = 16 * KIB
 """Plain bytes of the largest record (RFC 8446, section 5.1)."""
-_WRITE: Final = 256 * KIB
-"""Plain bytes that are encrypted at once, as many as a fragment and its header may have: 0.3 ms."""
+_WRITE_MAX: Final = 256 * KIB
+"""Plain bytes that are encrypted at once at most, as many as a fragment and its header may have: 0.3 ms."""
 _READ: Final = 256 * KIB
 """Bytes that are read from the socket at once."""
 _scratch: Final = memoryview(bytearray(_READ))
@@ -123,6 +125,9 @@ class SecureSocket:
         self._incoming = incoming
         self._outgoing = outgoing
         self._unsent: memoryview | None = None
+        self._most = _WRITE_MAX
+        """Plain bytes that are encrypted at once: one record once the socket was full, as neither the drop policy
+        nor more urgent messages reach what is encrypted; more again as long as the socket takes all."""
         self.readable = incoming.pending > 0
         """Whether there may be bytes for ``recv_into`` that epoll does not know of."""
 
@@ -140,13 +145,14 @@ class SecureSocket:
         """
         if self._unsent is not None and not self.flush():
             raise BlockingIOError
+        most = self._most
         taken = 0
         small: list[Buffer] = []
         waiting = 0
         for part in parts:
             size = len(part)
-            if size > _WRITE - taken:
-                part = memoryview(part)[: _WRITE - taken]  # noqa: PLW2901 - the rest is for the next call
+            if size > most - taken:
+                part = memoryview(part)[: most - taken]  # noqa: PLW2901 - the rest is for the next call
                 size = len(part)
             taken += size
             if waiting + size <= _RECORD:
@@ -159,12 +165,16 @@ class SecureSocket:
             self._tls.write(b"".join((*small, view[:room])))
             self._tls.write(view[room:])
             small, waiting = [], 0
-            if taken == _WRITE:
+            if taken == most:
                 break
         if waiting:
             self._tls.write(b"".join(small))
         if taken:
             self._send(self._outgoing.read())
+            if self._unsent is not None:
+                self._most = _RECORD
+            elif most < _WRITE_MAX and taken == most:
+                self._most = 2 * most
         return taken
 
     def flush(self) -> bool:
@@ -186,21 +196,27 @@ class SecureSocket:
             BlockingIOError: Nothing came.
             OSError: The connection is gone, or (``ssl.SSLError``) its bytes are not TLS, or an alert came.
         """
-        if self.readable:
-            count = self._decrypt(buffer)
-            if count:
-                return count
-        received = self._sock.recv_into(_scratch)
-        if not received:
-            return 0
-        self._incoming.write(_scratch[:received])
+        held = self.readable
+        if not held:
+            received = self._sock.recv_into(_scratch)
+            if not received:
+                return 0
+            self._incoming.write(_scratch[:received])
         try:
             count = self._decrypt(buffer)
         except ssl.SSLZeroReturnError:
             return 0
         if not count:
-            raise RecordIncomplete
+            # What is held is read alone, without the socket, so that a fast sender does not keep the loop busy.
+            raise BlockingIOError if held else RecordIncomplete
         return count
+
+    def segment(self, size: int) -> None:
+        """Send in packets of at most ``size`` bytes from now on."""
+        if isinstance(self._sock, SegmentedSocket):
+            self._sock.size = size
+        else:
+            self._sock = SegmentedSocket(cast("socket.socket", self._sock), size)
 
     def shutdown(self, how: int) -> None:
         """Say the end of the stream, and close one direction of the socket."""

@@ -168,7 +168,9 @@ class PrefaceGuard:
             skew = preface.time_ms / 1000 - wall
             if abs(skew) > limits.CLOCK_TOLERANCE:
                 ahead = "ahead of" if skew > 0 else "behind"
-                raise PrefaceError(TrustReason.CLOCK, f"its clock is {abs(skew):.0f} s {ahead} ours")
+                raise PrefaceError(
+                    TrustReason.CLOCK, f"the dialler's clock is {abs(skew):.0f} s {ahead} the acceptor's"
+                )
         self._check_nonce(preface.nonce, now)
         return preface
 
@@ -176,13 +178,13 @@ class PrefaceGuard:
         if preface.purpose is Purpose.JOIN:
             key = self._token_key(preface.token_id)
             if key is None or not signed_with(data, key):
-                raise PrefaceError(TrustReason.KEY, "its token is unknown here, was used or has ended")
+                raise PrefaceError(TrustReason.KEY, "the dialler's token is unknown here, was used or has ended")
             return
         group = self._ring.find(preface.key)
         if group is None:
-            raise PrefaceError(TrustReason.KEY, f"its group key {preface.key} is unknown here")
+            raise PrefaceError(TrustReason.KEY, f"the dialler's group key {preface.key} is unknown to the acceptor")
         if not signed_with(data, group.key_for(KeyPurpose.PREFACE)):
-            raise PrefaceError(TrustReason.KEY, f"it does not have our group key {preface.key}")
+            raise PrefaceError(TrustReason.KEY, f"the dialler does not have the acceptor's group key {preface.key}")
         if not self._ring.verifies(group, now) and not self._old_keys.take(now):
             raise PrefaceError(TrustReason.FLOOD, "too many connections with an old group key")
 

@@ -1,0 +1,195 @@
+"""Meshes with TLS on both lanes, over real sockets: links, and refusals with their reasons at both ends."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from functools import partial
+from typing import TYPE_CHECKING
+
+import pytest
+
+pytest.importorskip("cryptography")
+
+from rmpa.core.sizes import MIB
+from rmpa.trust.keyring import GroupKey
+from rmpa.trust.preface import Purpose
+from tests.mesh.io.members import Member, meshes
+from tests.mesh.io.meshes import DEADLINE, Peer, until
+from tests.trust.authority import Authority
+
+if TYPE_CHECKING:
+    from rmpa.mesh.peering import PeerStatus
+    from rmpa.trust.preface import Preface
+
+DAY = 86_400.0
+
+
+@pytest.fixture(scope="module")
+def lab() -> Authority:
+    return Authority()
+
+
+def _has_all(peer: Peer) -> bool:
+    return len(peer.data) == 2 and bool(peer.controls)
+
+
+def status(at: Peer, of: Peer) -> PeerStatus:
+    return next(s for s in at.mesh.peers() if s.identity.guid == of.identity.guid)
+
+
+async def test_members_link_by_both_lanes_and_messages_cross(lab: Authority) -> None:
+    async with meshes(Member(lab, "arm"), Member(lab, "base")) as (arm, base):
+        await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
+        large = bytes(range(256)) * (64 * MIB // 256)
+        for one, other in ((arm, base), (base, arm)):
+            one.link(other).express.send(1, 7, 0, b"small")
+            one.link(other).bulk.send(2, 8, 0, large)
+            one.link(other).send_control(b'{"op":"x"}')
+        for peer in (arm, base):
+            await until(partial(_has_all, peer), "all messages")
+            assert peer.messages(1) == [(7, b"small")]
+            assert peer.messages(2)[0][1] == large
+        assert arm.mesh.counters.as_dict() == base.mesh.counters.as_dict() == {}
+
+
+async def test_nothing_is_readable_on_the_wire(lab: Authority) -> None:
+    """A tap between two members sees neither names nor messages."""
+    async with meshes(Member(lab, "arm"), Member(lab, "base")) as (arm, base):
+        await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
+        sock = base.link(arm).connection.sock
+        seen = b""
+        arm.link(base).express.send(1, 7, 0, b"a secret text" * 100)
+        while b"\x17\x03\x03" not in seen:
+            try:
+                seen = sock.recv(65536, socket.MSG_PEEK)
+            except BlockingIOError:
+                break  # the stream was faster
+        assert b"secret" not in seen
+        await until(lambda: bool(base.data), "the message")
+        assert arm.link(base).connection.stream._secure is not None
+        bulk = base.link(arm).bulk_connection
+        assert bulk is not None
+        assert bulk.stream._secure is not None
+
+
+def _bad(lab: Authority, what: str) -> Member:
+    """A module that is no member, for one reason."""
+    if what == "foreign":
+        return Member(Authority(), "arm")
+    if what == "key":
+        return Member(lab, "arm", group_key=GroupKey(1, b"x" * 32))
+    return Member(lab, "arm", issued=8 * DAY if what == "expired" else 0.0, ahead=3600.0 if what == "clock" else 0.0)
+
+
+@pytest.mark.parametrize("other", ["foreign", "expired", "clock", "key", "name", "revoked"])
+@pytest.mark.parametrize("dials", [True, False])
+async def test_refusals_have_their_reason_at_both_ends(lab: Authority, other: str, dials: bool) -> None:
+    good = Member(lab, "base")
+    bad, name = _bad(lab, other), "crane" if other == "name" else "arm"
+    if other == "revoked":
+        good.deny("arm")
+    securities, names = ((bad, good), (name, "base")) if dials else ((good, bad), ("base", name))
+    async with meshes(*securities, names=names) as (low, high):
+        await until(
+            lambda: status(low, high).state == "refused" and other in status(low, high).last_error,
+            "the dialler shows it",
+        )
+        await until(lambda: high.mesh.counters[f"link.refused.{other}"] > 0, "the acceptor counts it")
+        assert low.mesh.counters[f"link.refused.{other}"] > 0
+        assert not low.ups or not low.linked(high)
+        if other not in {"clock", "key"}:  # those are refused before the acceptor knows more than an address
+            await until(lambda: other in status(high, low).last_error, "the acceptor shows it")
+
+
+async def test_a_plain_module_learns_that_the_mesh_is_secured(lab: Authority) -> None:
+    async with meshes(None, Member(lab, "base")) as (plain, secured):
+        await until(lambda: status(plain, secured).state == "refused", "refused")
+        assert "plain" in status(plain, secured).last_error
+        assert "rmpa trust join" in status(plain, secured).last_error
+        assert secured.mesh.counters["link.refused.plain"] > 0
+        assert not plain.ups
+
+
+async def test_a_member_never_falls_back_to_plain(lab: Authority) -> None:
+    async with meshes(Member(lab, "arm"), None) as (secured, plain):
+        await until(lambda: status(secured, plain).state == "refused", "refused")
+        assert "unsecured" in status(secured, plain).last_error
+        assert plain.mesh.counters["link.refused.unsecured"] > 0
+        assert not secured.ups
+        assert not plain.ups
+
+
+@pytest.mark.parametrize("dialler", [True, False])
+async def test_a_revoked_module_is_gone_at_once_at_both_ends(lab: Authority, dialler: bool) -> None:
+    members = Member(lab, "arm"), Member(lab, "base")
+    async with meshes(*members) as (arm, base):
+        await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
+        judge, other = (arm, base) if dialler else (base, arm)
+        members[not dialler].deny(other.mesh.identity.name)
+        assert not judge.linked(other), "without waiting for the other side"
+        assert judge.downs[0][1].startswith("revoked:")
+        await until(lambda: bool(other.downs), "the other side sees it")
+        assert "revoked" in other.downs[0][1]
+        await until(lambda: status(other, judge).last_error.startswith("revoked"), "it is shown there")
+        await until(lambda: not judge.mesh.connections(), "both lanes ended")
+
+
+async def test_another_modules_run_cannot_be_taken_over(lab: Authority) -> None:
+    """A member that claims the instance of another one, under its own name."""
+    async with meshes(Member(lab, "arm"), Member(lab, "base")) as (arm, base):
+        await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
+        thief = Peer(arm.number, name="thief", security=Member(lab, "thief"))
+        try:
+            assert thief.identity.instance == arm.identity.instance
+            await thief.mesh.start()
+            thief.mesh.peer_found(base.identity)
+            await until(lambda: base.mesh.counters["link.refused.name"] > 0, "refused")
+            assert base.linked(arm)
+            assert not thief.ups or not thief.linked(base)
+        finally:
+            await thief.mesh.close()
+
+
+async def test_a_test_of_reachability_is_no_failure(lab: Authority) -> None:
+    async with meshes(Member(lab, "base")) as (base,):
+        for _ in range(50):
+            (await _dial(base)).close()
+        sock = await _dial(base)
+        sock.send(b"RM")
+        sock.close()
+        await until(lambda: not unproven(base), "all are over")
+        assert base.mesh.counters["link.refused.plain"] == base.mesh.counters["link.unfinished"] == 0
+
+
+def unproven(peer: Peer) -> int:
+    """Connections whose preface is awaited."""
+    assert peer.mesh._securing is not None
+    return len(peer.mesh._securing._unproven)
+
+
+async def _dial(peer: Peer) -> socket.socket:
+    sock = socket.socket()
+    sock.setblocking(False)
+    await asyncio.get_running_loop().sock_connect(sock, ("127.0.0.1", peer.port))
+    return sock
+
+
+async def test_a_preface_one_byte_at_a_time_is_read(lab: Authority) -> None:
+    joined: list[tuple[socket.socket, Preface]] = []
+    peer = Peer(0, security=Member(lab, "base"), on_join=lambda sock, preface: joined.append((sock, preface)))
+    try:
+        await peer.mesh.start()
+        sock = await _dial(peer)
+        for byte in Member(lab, "arm").preface(Purpose.RENEWAL):
+            sock.send(bytes([byte]))
+            await asyncio.sleep(0)
+        sock.send(b"behind it")
+        await until(lambda: bool(joined), "handed on")
+        taken, preface = joined[0]
+        assert preface.purpose is Purpose.RENEWAL
+        assert await asyncio.wait_for(asyncio.get_running_loop().sock_recv(taken, 100), DEADLINE) == b"behind it"
+        taken.close()
+        sock.close()
+    finally:
+        await peer.mesh.close()
