@@ -35,6 +35,7 @@ from rmpa.observe.io.control_server import ControlServer
 from rmpa.observe.io.diagnostics import Diagnostics
 from rmpa.observe.io.graph_revision import GraphRevisions
 from rmpa.observe.io.peer_clocks import PeerClocks
+from rmpa.observe.io.peer_credentials import control_access
 from rmpa.observe.io.runtime_dir import runtime_dir
 from rmpa.observe.io.snapshot_builder import SnapshotBuilder, SnapshotSources
 from rmpa.observe.why.io.why import WhyService
@@ -128,6 +129,8 @@ class Agent:
             self.bridge.add(self.trust)
         self.network = Network(settings, self.bridge, self.trust)
         self.reloader = Reloader(settings, load, self.apply_settings)
+        self.reloaded: Callable[[], None] = lambda: None
+        """Called when changed settings hold."""
         counters = Counters()
         self._collector = GarbageCollector(self._bytes_carried, counters)
         self._clocks = PeerClocks(self.bridge)
@@ -162,6 +165,7 @@ class Agent:
             settings.name,
             self.operations.handlers(),
             counters=counters,
+            access=control_access(settings.control_group),
         )
 
     async def start(self) -> None:
@@ -222,6 +226,7 @@ class Agent:
         logging.getLogger().setLevel(settings.log_level.upper())
         for part in (self.bridge, self.snapshots, self._why, self._nodes):
             part.reload(settings)
+        self.reloaded()
 
 
 async def _serve(
@@ -238,6 +243,7 @@ async def _serve(
         loop.add_signal_handler(number, stop.set)
     sighup = SighupHandler(agent.reloader, stop.set)
     web = WebProcess(web_command(settings), random.random, environ=web_environment(settings, os.environ), cpus=cpus)
+    agent.reloaded = web.reload
     await agent.start()
     sighup.start()
     if settings.web.enabled:

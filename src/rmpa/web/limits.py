@@ -188,3 +188,5 @@ WEB_TOKEN_LENGTH_MIN: Final = 16
 """Characters of a token that the user chose."""
 WEB_TOKEN_FILE_MAX: Final = 4096
 """Bytes of a token's file; a larger one is no token."""
+CERTIFICATE_LOOK_PERIOD: Final = 5.0
+"""Seconds between two looks at the files of the certificate: a renewed one is served long before the old one ends."""

@@ -11,13 +11,14 @@ import aiohttp
 import msgspec
 import pytest
 
+from rmpa.config.settings import Settings, WebSettings
 from rmpa.core.contract import ContractRule, Contracts, Priority
 from rmpa.web import limits
 from rmpa.web.gateways.gateways import Gateways
-from rmpa.web.hub.rights import FULL, READ_ONLY
 from rmpa.web.server.agent_watch import AgentWatch
 from rmpa.web.server.auth import AccessPolicy, own_names
-from rmpa.web.server.hub_setup import make_hub, priority_of, rights_of
+from rmpa.web.server.hub_setup import make_hub, priority_of
+from rmpa.web.server.roles import WebRoles
 from rmpa.web.server.server import WebServer
 from tests.ros.node.peers import DEADLINE, LATCHED, until
 from tests.web.hub.client import local_core, node
@@ -36,7 +37,8 @@ async def running(token: str = "", **policy: Any) -> AsyncIterator[tuple[WebServ
         agent = msgspec.structs.replace(SNAPSHOT.agent, core_uri=core.uri)
         watch = AgentWatch(lambda: msgspec.structs.replace(SNAPSHOT, agent=agent))
         hub = make_hub(watch, 8480)
-        rights = rights_of(has_token=bool(token), control=bool(token))
+        settings = Settings(web=WebSettings(control=bool(token)))
+        rights = WebRoles(settings, has_token=bool(token), trusted=False).of("")
         gateways = Gateways(hub, "test", lambda _: rights)
         access = AccessPolicy(0, own_names(("base",)), token, **policy)
         server = WebServer(watch, access, "127.0.0.1", gateways, (0,))
@@ -132,17 +134,6 @@ async def test_the_server_ends_while_clients_are_connected() -> None:
         aiohttp.WSMsgType.CLOSED,
         aiohttp.WSMsgType.CLOSING,
     )
-
-
-def test_rights_need_a_token() -> None:
-    assert rights_of(has_token=False, control=True) is READ_ONLY
-    assert rights_of(has_token=True, control=True) == FULL
-    readers = rights_of(has_token=True, control=False)
-    assert readers.read_parameters
-    assert (readers.publish, readers.call_services, readers.set_parameters, readers.serve_services) == (False,) * 4
-    assert not readers.drive
-    assert rights_of(has_token=True, control=False, drive=True).drive
-    assert not rights_of(has_token=False, control=True, drive=True).drive
 
 
 async def test_contracts_give_priorities() -> None:

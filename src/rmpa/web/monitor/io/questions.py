@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import msgspec
 
 from rmpa.bridge.proxy_names import proxied_peer
+from rmpa.config.permission_rules import Access
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.names import is_global_name
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.io.control_client import ControlClient, choose_agent
 from rmpa.observe.io.peer_params import PeerParams, parameters_in
 from rmpa.resource.run.dynamic_reconfigure import SERVICE_TYPE
+from rmpa.web.hub.rights import FULL
 from rmpa.web.monitor import limits
 from rmpa.web.values.codec import codec_for
 
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.requests import ParamValue
+    from rmpa.web.hub.rights import Rights
     from rmpa.web.monitor.io.resource_watch import ResourceWatch
     from rmpa.web.monitor.session import Question
 
@@ -34,6 +37,12 @@ Args = dict[str, Any]
 _CALL_TIMEOUT: Final = 30.0
 _READ_TIMEOUT: Final = 5.0
 _KINDS: Final = ("topic", "service")
+_SET_PARAMETERS: Final = "set_parameters"
+"""The service of a resource that takes another configuration (wiki.ros.org/dynamic_reconfigure)."""
+_RECONFIGURES: Final = ("profile", "context", "configure")
+_CHANGES_PARAM: Final = ("set_param", "delete_param")
+_WITH_PARAMS: Final = ("params", *_CHANGES_PARAM)
+"""Questions whose answer has all parameters of a module."""
 _LISTS: Final = {"bool": "bools", "int": "ints", "double": "doubles", "str": "strs"}
 """The lists of a ``dynamic_reconfigure/Config`` by the types of parameters."""
 
@@ -69,13 +78,31 @@ class Answers:
             "configure": self._configure,
         }
 
-    async def answer(self, question: Question) -> Any:
+    async def answer(self, question: Question, rights: Rights = FULL) -> Any:
         """The answer, as values for JSON.
 
+        Args:
+            question: One that the page may ask.
+            rights: What its client may do; names are judged here. A peer's parameters count by their names there.
+
         Raises:
-            RmpaError: There is none; the text says why.
+            RmpaError: There is none, or the client may not; the text says why.
         """
-        return await self._handlers[question.what](question.args)
+        self._check(question, rights)
+        value = await self._handlers[question.what](question.args)
+        if question.what in _WITH_PARAMS:
+            return {"values": rights.visible_tree(value["values"])}
+        return value
+
+    def _check(self, question: Question, rights: Rights) -> None:
+        args = question.args
+        if question.what == "call":
+            rights.check_change(Access.CALL, _name(args, "service"))
+        elif question.what in _RECONFIGURES:
+            rights.check_change(Access.CALL, f"{_name(args, 'resource')}/{_SET_PARAMETERS}")
+        elif question.what in _CHANGES_PARAM:
+            value_of = (lambda _name: None) if _text(args, "peer") else self._hub.params.value
+            rights.check_param_change(_name(args, "name"), value_of, args.get("value"))
 
     def close(self) -> None:
         """End the threads, once what the agent was asked is answered or has timed out."""
@@ -196,7 +223,7 @@ class Answers:
 
     async def _reconfigure(self, args: Args, config: Args) -> None:
         resource = _name(args, "resource")
-        service = self._service({"service": f"{resource}/set_parameters", "peer": args.get("peer", "")})
+        service = self._service({"service": f"{resource}/{_SET_PARAMETERS}", "peer": args.get("peer", "")})
         kind = self._hub.types.service(SERVICE_TYPE)
         body = codec_for(kind.request).write({"config": config}, time.time_ns()).payload
         await self._hub.calls.call(service, kind.md5sum, body, _CALL_TIMEOUT)
