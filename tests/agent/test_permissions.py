@@ -15,6 +15,7 @@ import pytest
 
 from rmpa.agent import Agent
 from rmpa.agent.permission_notes import permission_notes
+from rmpa.bridge.io.node_requests import INFO
 from rmpa.bridge.io.proxy_kills import KILL
 from rmpa.bridge.params import transfer
 from rmpa.config.permission_rules import Effect, PermissionRule
@@ -207,6 +208,21 @@ async def test_parameters_are_read_and_set_only_with_permission(
         assert await sets("/arm/secret/deeper", 7) == no("/arm/secret/deeper"), "here too"
         assert a.core.call("getParam", "/n", "/arm")[2] == {"speed": 5, "secret": 2, "deep": {"x": 3}}
         assert await asks(transfer.DELETE, "/arm/deep") == "{}"
+
+
+async def test_facts_about_a_node_leave_out_what_the_asker_may_not_have(
+    settings: Callable[..., Settings],
+) -> None:
+    a_settings = with_rules(settings("a"), allow("b", subscribe="/odom", publish="/cmd_vel"))
+    async with secured(a_settings, with_rules(settings("b"))) as (a, b), node("base", a) as base:
+        for topic in ("/odom", "/secret"):
+            await base.advertise(topic, "std_msgs/String")
+        for topic in ("/cmd_vel", "/hidden"):
+            await base.subscribe(topic, "std_msgs/String", lambda _: None)
+        link = next(iter(b.bridge.sessions.linked()))
+        facts = await b.bridge.rpc.request(link, INFO, {"node": "/base"})
+        assert (list(facts["publications"]), list(facts["subscriptions"])) == (["/odom"], ["/cmd_vel"])
+        assert facts["services"] == []
 
 
 async def test_nodes_are_ended_only_with_permission(settings: Callable[..., Settings]) -> None:

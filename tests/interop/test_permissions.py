@@ -151,7 +151,7 @@ def test_parameters_and_nodes_of_another_module_need_permission(pair: tuple[Modu
     base, joystick = pair
     for key in ("/speed/max", "/secret"):
         base.ros.tool("rosparam", "set", key, "5")
-    assert joystick.agent.rmpa("param", "get", "/speed/max", "--peer", "base") == (0, "5\n")
+    assert joystick.agent.rmpa("param", "get", "/speed/max", "--peer", "base") == (0, "5")
     code, said = joystick.agent.rmpa("param", "get", "/secret", "--peer", "base")
     assert code != 0
     assert "the permissions there do not let joystick read or set /secret" in said

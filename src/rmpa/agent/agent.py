@@ -217,6 +217,7 @@ class Agent:
     def _notes(self) -> Iterator[str]:
         yield from (f"{key} waits for a restart" for key in self.reloader.waiting)
         yield from self.params.notes()
+        yield from permission_notes(self._settings, secured=self.bridge.gate.on)
         if self.trust is not None:
             yield from self.trust.notes()
 

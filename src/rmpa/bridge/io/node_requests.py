@@ -69,15 +69,29 @@ class NodeRequests:
         found = list_nodes(*tables, state.nodes, problems, yielding_to_data)
         return tuple(line for line in found if not is_own(line.name))
 
-    async def _info(self, _asker: PeerSession, args: dict[str, Any]) -> NodeFacts:
+    async def _info(self, asker: PeerSession, args: dict[str, Any]) -> NodeFacts:
         node, uri = self._own(args)
         state = self._core.state()
         facts = describe_node(node, uri, state.publishers, state.subscribers, state.services, state.types)
+        facts = self._permitted(asker.link.name, facts)
         try:
             answer = await ping_node(node, uri, OWN_NODE)
         except RmpaError as error:
             return msgspec.structs.replace(facts, problem=str(error))
         return msgspec.structs.replace(facts, pid=answer.pid)
+
+    def _permitted(self, asker: str, facts: NodeFacts) -> NodeFacts:
+        """The facts about a node, without the names of what a peer may not have."""
+
+        def may(access: Access, name: str) -> bool:
+            return self._gate.judge(access, asker, name).allowed
+
+        return msgspec.structs.replace(
+            facts,
+            publications={name: kind for name, kind in facts.publications.items() if may(Access.SUBSCRIBE, name)},
+            subscriptions={name: kind for name, kind in facts.subscriptions.items() if may(Access.PUBLISH, name)},
+            services=tuple(name for name in facts.services if may(Access.CALL, name)),
+        )
 
     async def _ping(self, _asker: PeerSession, args: dict[str, Any]) -> NodePing:
         node, uri = self._own(args)
