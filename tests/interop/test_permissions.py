@@ -63,6 +63,7 @@ def pair(lab: Lab, agent: AgentFactory, shell: ShellFactory, tmp_path: Path) -> 
         mesh.folder = tmp_path / "state" / host.name
         mesh.save(host.name, time.time())
         made.append(Module(host, agent(host, name=host.name, config=config), shell(host)))
+        made[-1].ros.env["ROS_IP"] = host.address  # so that nodes could be connected directly
     base, joystick = made
     base.agent.wait_peer("joystick")
     joystick.agent.wait_peer("base")
@@ -145,6 +146,18 @@ def test_what_the_permissions_say_crosses_and_a_reload_closes_and_opens_it(
     flows(odom)
     _wait_services(joystick.ros, "/stop")
     eventually(lambda: _calls(caller, "echo 0 100 1 once")["ok"] == 1, what="/stop can be called again")
+
+    # Plain connections where both modules allow them, and only where the permissions let the topic cross.
+    for module, config in ((base, BASE), (joystick, JOYSTICK)):
+        (tmp_path / f"{module.name}.toml").write_text("[trust]\ndirect = true\n" + config)
+        code, said = module.agent.rmpa("reload", "--json")
+        assert (code, json.loads(said)["changed"]) == (0, ["trust.direct"])
+    eventually(lambda: "direct to 10." in why(joystick, "base:/odom"), what="/odom is direct")
+    flows(odom)
+    file.write_text("[trust]\ndirect = true\n" + BASE + FORBIDDEN)
+    assert base.agent.rmpa("reload")[0] == 0
+    has_remote(joystick, "/odom", "base", there=False)
+    eventually(lambda: "/display" not in base.ros.tool("rosnode", "info", "/say_odom"), what="no direct connection")
 
 
 def test_parameters_and_nodes_of_another_module_need_permission(pair: tuple[Module, Module]) -> None:
