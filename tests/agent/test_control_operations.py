@@ -9,9 +9,9 @@ import pytest
 
 from rmpa.config.sources import Loaded
 from rmpa.core.errors import PeerRefused
+from rmpa.observe.graph_changes import GraphRevision
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.observe.io.control_operations import OPERATIONS
-from rmpa.observe.snapshot import GraphRevision
 from rmpa.ros.node_info import PeerNodes
 from tests.agent.test_agent import running, settings, until
 from tests.ros.node.peers import DEADLINE

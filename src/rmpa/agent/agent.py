@@ -137,7 +137,7 @@ class Agent:
             self.snapshots,
             self._why,
             self.reloader.reload,
-            GraphRevisions(self.core),
+            GraphRevisions(self.core, rows=settings.core_mode == "embedded"),
         )
         self._control = ControlServer(
             runtime_dir(os.environ, settings.runtime_dir),

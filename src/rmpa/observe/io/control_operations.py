@@ -16,8 +16,9 @@ from rmpa.bridge.policy import OWN_NODE
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
 from rmpa.observe import limits
+from rmpa.observe.graph_changes import GraphRevision
 from rmpa.observe.reload_reply import ReloadReply
-from rmpa.observe.snapshot import FollowedInfo, GraphRevision, PingReply, Snapshot
+from rmpa.observe.snapshot import FollowedInfo, PingReply, Snapshot
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.node_info import NodeLine, PeerNodes
 
