@@ -88,6 +88,26 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
     end_connections: str | None = None
 
 
+class LaneInfo(msgspec.Struct, kw_only=True, frozen=True):
+    """One of the two lanes of a link.
+
+    Attributes:
+        name: ``express`` (control and small messages) or ``bulk`` (large ones).
+        connected: Whether it has its TCP connection; messages for a lane without one wait.
+        bytes_in: Received by its present connection.
+        bytes_out: Sent by its present connection.
+        queued: Bytes that wait in its send queue.
+        dropped: Messages dropped because it was too slow, since the link came up.
+    """
+
+    name: str
+    connected: bool
+    bytes_in: int = 0
+    bytes_out: int = 0
+    queued: int = 0
+    dropped: int = 0
+
+
 class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
     """The live link to a peer.
 
@@ -106,6 +126,7 @@ class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
         packet: Bytes of the largest packets that are sent, headers included.
         path_problem: What is wrong with the network path, ready to read; empty if nothing is known.
         path_remedy: What to do about that.
+        lanes: Its lanes, ``express`` first; empty from an agent that does not report them.
     """
 
     remote: str
@@ -122,6 +143,7 @@ class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
     packet: int | None = None
     path_problem: str = ""
     path_remedy: str = ""
+    lanes: tuple[LaneInfo, ...] = ()
 
 
 class BoundInfo(msgspec.Struct, kw_only=True, frozen=True):
@@ -555,6 +577,19 @@ class FollowedInfo(msgspec.Struct, kw_only=True, frozen=True):
     state: str
     size: int | None = None
     problem: str = ""
+
+
+class ContractTerm(msgspec.Struct, kw_only=True, frozen=True):
+    """One term of a topic's contract by this module's settings; values of the operation ``contract``, by key.
+
+    Attributes:
+        value: Its value; seconds, messages a second, or a word of docs/contracts.md.
+        rule: What sets it: ``rule 2: topics /cmd/**`` (the second ``[[contract]]``), ``[bridge] transport``, or
+            ``default``.
+    """
+
+    value: str | float | None
+    rule: str
 
 
 class GraphRevision(msgspec.Struct, kw_only=True, frozen=True):

@@ -15,9 +15,12 @@ from rmpa.bridge.params.transfer import QUESTIONS as PARAM_REQUESTS
 from rmpa.bridge.policy import OWN_NODE
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
+from rmpa.core.names import is_global_name
 from rmpa.observe import limits
+from rmpa.observe.io.agent_requests import INFO as AGENT_INFO
+from rmpa.observe.peer_agent import PeerAgent
 from rmpa.observe.reload_reply import ReloadReply
-from rmpa.observe.snapshot import FollowedInfo, GraphRevision, PingReply, Snapshot
+from rmpa.observe.snapshot import ContractTerm, FollowedInfo, GraphRevision, PingReply, Snapshot
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.node_info import NodeLine, PeerNodes
 
@@ -151,6 +154,17 @@ class ControlOperations:
             nodes = tuple(NodeLine(name=node) for node, _ in session.proxies)
             return PeerNodes(peer=peer, nodes=nodes, problem=str(error))
 
+    async def agent(self, args: Args) -> Any:
+        """What the agent of a peer tells of itself: ``peer``, its name or GUID."""
+        return await self._bridge.rpc.request(self._session(args.get("peer", "")), AGENT_INFO, {})
+
+    def contract(self, args: Args) -> dict[str, ContractTerm]:
+        """The terms that this module's settings give a ``topic`` of a ``type_name``, by key; it need not exist."""
+        topic, type_name = str(args.get("topic", "")), str(args.get("type_name", ""))
+        if not is_global_name(topic):
+            raise ConfigError("topic", f"{topic!r} is not a topic", "write /name")
+        return self._snapshots.contract(topic, type_name)
+
     async def graph(self, args: Args) -> GraphRevision:
         """The arguments of ``GraphRevisions.after``."""
         return await self._graph.after(args)
@@ -222,6 +236,8 @@ OPERATIONS: Final = (
     Operation("param", ControlOperations.param, object),  # the value that the peer replies
     Operation("graph", ControlOperations.graph, GraphRevision),
     Operation("followed", ControlOperations.followed, tuple[FollowedInfo, ...]),
+    Operation("agent", ControlOperations.agent, PeerAgent),
+    Operation("contract", ControlOperations.contract, dict[str, ContractTerm]),
     Operation("node", ControlOperations.node, object),  # tuple[PeerNodes, ...] for lists, else as REPLIES says
 )
 """All operations of the control socket."""
