@@ -579,19 +579,6 @@ class FollowedInfo(msgspec.Struct, kw_only=True, frozen=True):
     problem: str = ""
 
 
-class ContractTerm(msgspec.Struct, kw_only=True, frozen=True):
-    """One term of a topic's contract by this module's settings; values of the operation ``contract``, by key.
-
-    Attributes:
-        value: Its value; seconds, messages a second, or a word of docs/contracts.md.
-        rule: What sets it: ``rule 2: topics /cmd/**`` (the second ``[[contract]]``), ``[bridge] transport``, or
-            ``default``.
-    """
-
-    value: str | float | None
-    rule: str
-
-
 class GraphRevision(msgspec.Struct, kw_only=True, frozen=True):
     """The value of the operation ``graph``.
 

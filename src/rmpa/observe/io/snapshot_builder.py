@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from rmpa.bridge.services.io.part import Services
     from rmpa.config.settings import Settings
     from rmpa.core.counters import Counters
+    from rmpa.observe.contract_term import ContractTerm
     from rmpa.observe.io.peer_clocks import PeerClocks
     from rmpa.observe.io.peers_section import EndpointView
-    from rmpa.observe.snapshot import ContractTerm
     from rmpa.ros.core.api import Core
     from rmpa.runtime.realtime import SchedulingRequest
 

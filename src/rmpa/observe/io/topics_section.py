@@ -16,8 +16,8 @@ from rmpa.bridge.topics.remote_topic import RouteState
 from rmpa.config.param_rules import CLOCK
 from rmpa.core import limits
 from rmpa.core.contract import KEYS, Contract
+from rmpa.observe.contract_term import ContractTerm
 from rmpa.observe.snapshot import (
-    ContractTerm,
     EventInfo,
     LatencyInfo,
     RouteInfo,
