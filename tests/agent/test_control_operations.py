@@ -17,7 +17,10 @@ from rmpa.observe.io.control_client import ControlClient
 from rmpa.observe.io.control_operations import OPERATIONS
 from rmpa.observe.peer_agent import PeerAgent
 from rmpa.observe.snapshot import GraphRevision
-from rmpa.ros.node_info import PeerNodes
+from rmpa.ros.environment import RosEnvironment
+from rmpa.ros.node.node import Node
+from rmpa.ros.node_info import NodeFacts, PeerNodes
+from rmpa.ros.types.messages import MessageType
 from tests.agent.test_agent import running, settings, until
 from tests.ros.node.peers import DEADLINE
 
@@ -95,6 +98,33 @@ async def test_nodes_of_all_peers_are_listed(settings: Callable[..., Settings]) 
         (nodes,) = await a.operations.node({"what": "node.list"})
     assert isinstance(nodes, PeerNodes)
     assert (nodes.peer, nodes.problem) == ("b", "")
+
+
+async def test_a_node_tells_its_connections_here_and_at_a_peer(settings: Callable[..., Settings]) -> None:
+    text = MessageType("std_msgs/String")
+    async with (
+        running(settings("a"), settings("b")) as (a, b),
+        Node("/talker", master_uri=a.core.uri, environment=RosEnvironment()) as talker,
+        Node("/listener", master_uri=a.core.uri, environment=RosEnvironment()) as listener,
+    ):
+        await until(lambda: list(b.bridge.sessions.linked()))
+        await talker.advertise("/chatter", text)
+        await listener.subscribe("/chatter", text, lambda _: None)
+
+        async def connections(node: str) -> set[tuple[str, bool, str]]:
+            own = await a.operations.node({"what": "node.info", "node": node})
+            theirs = msgspec.convert(
+                await b.operations.node({"what": "node.info", "peer": "a", "node": node}), NodeFacts
+            )
+            assert isinstance(own, NodeFacts)
+            assert own.connections is not None
+            assert own.connections == theirs.connections
+            return {(each.topic, each.inbound, each.other) for each in own.connections}
+
+        async with asyncio.timeout(DEADLINE):
+            while ("/chatter", False, "/listener") not in await connections("/talker"):
+                await asyncio.sleep(0)
+            assert ("/chatter", True, "/talker") in await connections("/listener")
 
 
 async def test_a_peer_tells_of_itself_and_a_module_is_diagnosed(settings: Callable[..., Settings]) -> None:

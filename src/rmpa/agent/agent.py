@@ -140,6 +140,7 @@ class Agent:
             self._why,
             self.reloader.reload,
             GraphRevisions(self.core),
+            self._nodes,
         )
         self._control = ControlServer(
             runtime_dir(os.environ, settings.runtime_dir),

@@ -94,8 +94,7 @@ class LaneInfo(msgspec.Struct, kw_only=True, frozen=True):
     Attributes:
         name: ``express`` (control and small messages) or ``bulk`` (large ones).
         connected: Whether it has its TCP connection; messages for a lane without one wait.
-        bytes_in: Received by its present connection.
-        bytes_out: Sent by its present connection.
+        bytes_in, bytes_out: Received and sent by its present connection.
         queued: Bytes that wait in its send queue.
         dropped: Messages dropped because it was too slow, since the link came up.
     """

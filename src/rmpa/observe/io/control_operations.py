@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Collection
 
     from rmpa.bridge.io.bridge import Bridge
+    from rmpa.bridge.io.node_requests import NodeRequests
     from rmpa.bridge.params.io.part import Params
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.observe.io.control_server import Handler
@@ -50,6 +51,7 @@ class ControlOperations:
         why: Answers ``why``.
         reload: Reads the settings again; with ``check`` it changes nothing.
         graph: Counts the changes of the local graph.
+        nodes: Knows the nodes of this module.
     """
 
     def __init__(
@@ -61,6 +63,7 @@ class ControlOperations:
         why: WhyService,
         reload: Callable[..., Awaitable[ReloadReply]],
         graph: GraphRevisions,
+        nodes: NodeRequests,
     ) -> None:
         self._name = name
         self._bridge = bridge
@@ -69,6 +72,7 @@ class ControlOperations:
         self._why = why
         self._reload = reload
         self._graph = graph
+        self._nodes = nodes
 
     def handlers(self) -> dict[str, Handler]:
         """The handler of each operation, for ``ControlServer``."""
@@ -133,8 +137,13 @@ class ControlOperations:
         )
 
     async def node(self, args: Args) -> Any:
-        """Pass a request about a node on to a peer: ``peer``, ``what``, ``node``; without a peer, list all nodes."""
+        """Pass a request about a node on to a peer: ``peer``, ``what``, ``node``.
+
+        Without a peer: the facts about a node of this module, or a list of the nodes of all peers.
+        """
         what, peer = _request(args, node_requests.REPLIES), args.get("peer")
+        if peer is None and what == node_requests.INFO:
+            return await self._nodes.info(args)
         if peer is None:
             return await asyncio.gather(
                 *(self._nodes_of(session) for session in list(self._bridge.sessions.linked()))
