@@ -24,7 +24,6 @@ from rmpa.config.settings import NodeSettings, ParamSettings, ServiceSettings, S
 from rmpa.core.contract import ContractRule, Transport
 from rmpa.core.errors import PeerRefused
 from rmpa.observe import limits as observe_limits
-from rmpa.observe.snapshot import ServiceInfo
 from rmpa.ros.wire.xmlrpc import serialize_response
 from rmpa.trust.permissions import Permissions
 from tests.agent.test_agent import Sink, node, running, settings, until
@@ -300,7 +299,7 @@ async def test_direct_transport_is_off_between_machines_until_both_modules_allow
         await until(lambda: subscriber.publishers and transport(b) == ("relay", "trust"))
         await until(lambda: topic(b) == ("relay", "trust"))
         b.apply_settings(replace(b_settings, trust=opened))
-        await until(lambda: "server's module" in (about(b) or ServiceInfo(name="", node="")).relayed_because)
+        await until(lambda: (found := about(b)) is not None and "server's module" in found.relayed_because)
         assert transport(b) == ("relay", "trust"), "a does not allow it"
         assert topic(b)[1] == "subscriber", "the next condition: this node is bound to loopback"
         a.apply_settings(replace(a_settings, trust=opened))
