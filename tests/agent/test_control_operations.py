@@ -13,10 +13,10 @@ import rmpa
 from rmpa.config.sources import Loaded
 from rmpa.core.contract import ContractRule, Reliability
 from rmpa.core.errors import PeerRefused
+from rmpa.observe.graph_changes import GraphRevision
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.observe.io.control_operations import OPERATIONS
 from rmpa.observe.peer_agent import PeerAgent
-from rmpa.observe.snapshot import GraphRevision
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.node.node import Node
 from rmpa.ros.node_info import NodeFacts, PeerNodes

@@ -139,7 +139,7 @@ class Agent:
             self.snapshots,
             self._why,
             self.reloader.reload,
-            GraphRevisions(self.core),
+            GraphRevisions(self.core, rows=settings.core_mode == "embedded"),
             self._nodes,
         )
         self._control = ControlServer(

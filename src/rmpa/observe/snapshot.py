@@ -578,16 +578,6 @@ class FollowedInfo(msgspec.Struct, kw_only=True, frozen=True):
     problem: str = ""
 
 
-class GraphRevision(msgspec.Struct, kw_only=True, frozen=True):
-    """The value of the operation ``graph``.
-
-    Attributes:
-        revision: Stands for the present local graph; another number stands for another graph.
-    """
-
-    revision: int
-
-
 class PingReply(msgspec.Struct, kw_only=True, frozen=True):
     """The value of the operation ``ping``.
 

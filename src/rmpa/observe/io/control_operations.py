@@ -18,10 +18,11 @@ from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableErr
 from rmpa.core.names import is_global_name
 from rmpa.observe import limits
 from rmpa.observe.contract_term import ContractTerm
+from rmpa.observe.graph_changes import GraphRevision
 from rmpa.observe.io.agent_requests import INFO as AGENT_INFO
 from rmpa.observe.peer_agent import PeerAgent
 from rmpa.observe.reload_reply import ReloadReply
-from rmpa.observe.snapshot import FollowedInfo, GraphRevision, PingReply, Snapshot
+from rmpa.observe.snapshot import FollowedInfo, PingReply, Snapshot
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.node_info import NodeLine, PeerNodes
 
