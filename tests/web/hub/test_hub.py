@@ -10,6 +10,7 @@ from rmpa.core.errors import RmpaError
 from rmpa.ros.types.definitions import parse_definition
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.types.service_types import ServiceType
+from rmpa.web import limits
 from rmpa.web.hub.requests import (
     AdvertiseTopic,
     CallService,
@@ -17,6 +18,7 @@ from rmpa.web.hub.requests import (
     Described,
     DescribeType,
     EndService,
+    Failed,
     FindService,
     FollowGraph,
     FollowParams,
@@ -84,6 +86,56 @@ async def test_the_last_client_ends_the_subscription_after_a_while(core: RosCore
         three = FakeClient(hub)
         three.ask(Subscribe(1, "/t"))
         await publisher.wait_for_subscriber()
+
+
+async def test_beyond_a_bound_only_topics_with_a_publisher_are_subscribed_to(
+    core: RosCore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "SUBSCRIBED_TOPICS_MAX", 3)
+    async with running_hub(core) as hub, node(core, "talker") as talker:
+        publisher = await talker.advertise("/t", STRING)
+        client, other = FakeClient(hub), FakeClient(hub)
+        await until(lambda: "/t" in hub.graph.topics and hub.graph.topics["/t"].publishers)
+        for handle in range(1, 5):
+            client.ask(Subscribe(handle, f"/none{handle}"))
+        (refused,) = client.of(Failed)
+        assert refused.handle == 4
+        assert "/none4 has no publisher" in refused.error
+        other.ask(Subscribe(1, "/none1"))
+        other.ask(Subscribe(2, "/t"))
+        assert not other.of(Failed)
+        await publisher.wait_for_subscriber()
+        client.ask(Unsubscribe(4))
+        client.close()
+
+
+async def test_a_storm_of_subscriptions_leaves_nothing_registered(
+    core: RosCore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "SUBSCRIPTION_LINGER", 0.0)
+    async with running_hub(core) as hub, node(core, "talker") as talker:
+        publisher = await talker.advertise("/t", STRING)
+        client = FakeClient(hub)
+        for handle in range(1, 300):
+            client.ask(Subscribe(handle, "/t" if handle % 2 else f"/none{handle}"))
+            client.ask(AdvertiseTopic(handle, "/out", "std_msgs/String", latch=bool(handle % 2)))
+            if handle % 3:
+                await asyncio.sleep(0)
+            client.ask(Unsubscribe(handle))
+            client.ask(UnadvertiseTopic(handle))
+        client.ask(Subscribe(300, "/t"))
+        await publisher.wait_for_subscriber()
+        publisher.publish_raw(ONE)
+        await until(lambda: client.payloads(300) == [ONE])
+        client.ask(Unsubscribe(300))
+
+        async def registered() -> list[str]:
+            state: Any = await talker.call_master("getSystemState")
+            return [name for part in state[:2] for name, nodes in part if "/rmpa_web" in nodes and name != "/rosout"]
+
+        async with asyncio.timeout(DEADLINE):
+            while await registered():
+                await asyncio.sleep(0.05)
 
 
 async def test_newcomers_get_the_latched_message_of_each_source_once(core: RosCore) -> None:

@@ -215,6 +215,12 @@ class Hub:
     # --- topics -----------------------------------------------------------------------------------------------
 
     def _subscribe(self, client: HubClient, request: requests.Subscribe) -> None:
+        subscribed = self.topics.names
+        if len(subscribed) >= limits.SUBSCRIBED_TOPICS_MAX and request.topic not in subscribed:
+            known = self.graph.topics.get(request.topic)
+            if known is None or not known.publishers:
+                problem = f"its clients subscribe to {len(subscribed)} topics, and {request.topic} has no publisher"
+                raise PeerRefused("the web server", problem, "subscribe when it has one, or to fewer topics")
         client.subscriptions[request.handle] = request.topic
         self.topics.subscribe(
             (client.number, request.handle),
