@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import time
+import warnings
 from typing import TYPE_CHECKING, Any
 
 from rmpa.core.errors import RmpaError
@@ -356,6 +358,22 @@ async def test_calls_share_a_connection_and_errors_are_told(core: RosCore) -> No
         client.ask(FindService(6, "/set"))
         assert (await client.answer(ServiceFound, 6)).type == SET_BOOL
         await until(lambda: "/set" in hub.graph.services and hub.graph.services["/set"].type == SET_BOOL)
+
+
+async def test_a_client_that_goes_right_after_its_requests_leaves_no_coroutine_behind(core: RosCore) -> None:
+    async with running_hub(core) as hub:
+        client = FakeClient(hub)
+        client.ask(GetParams(1))
+        client.ask(FindService(2, "/rosout/get_loggers"))
+        client.ask(CallService(3, "/rosout/get_loggers", None, b""))
+        client.close()
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always")
+            for _ in range(3):
+                await asyncio.sleep(0)
+            gc.collect()
+        assert not [str(each.message) for each in warned if each.category is RuntimeWarning]
+        assert not client.answers
 
 
 async def test_a_call_ends_in_time(core: RosCore) -> None:

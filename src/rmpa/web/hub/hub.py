@@ -440,6 +440,7 @@ class Hub:
         task = self._tasks[key] = asyncio.get_running_loop().create_task(run(), name=f"request of {client.name}")
 
         def ended(task: asyncio.Task[None]) -> None:
+            work.close()  # of a client that has gone before it began
             if self._tasks.get(key) is task:
                 del self._tasks[key]
 
