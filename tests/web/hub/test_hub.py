@@ -376,6 +376,32 @@ async def test_a_client_that_goes_right_after_its_requests_leaves_no_coroutine_b
         assert not client.answers
 
 
+async def test_clients_that_leave_in_the_middle_of_their_calls_keep_no_connection_of_the_server(
+    core: RosCore,
+) -> None:
+    asked = 0
+
+    async def slow(_: Any) -> dict[str, object]:
+        nonlocal asked
+        asked += 1
+        if asked <= limits.CALLS_AT_ONCE:
+            await asyncio.Event().wait()
+        return {"success": True, "message": "done"}
+
+    async with running_hub(core) as hub, node(core, "server") as server:
+        await server.advertise_service("/slow", SET_BOOL, slow)
+        leaving, staying = FakeClient(hub), FakeClient(hub)
+        for handle in range(1, limits.CALLS_AT_ONCE + 5):
+            leaving.ask(CallService(handle, "/slow", SET_BOOL, b"\x01"))
+        await until(lambda: asked == limits.CALLS_AT_ONCE)
+        staying.ask(CallService(1, "/slow", SET_BOOL, b"\x01"))
+        leaving.close()
+        await until(lambda: staying.of(ServiceResult))
+        assert staying.of(ServiceResult)[0].ok
+        assert not leaving.answers
+        assert asked == limits.CALLS_AT_ONCE + 1
+
+
 async def test_a_call_ends_in_time(core: RosCore) -> None:
     async with running_hub(core) as hub, node(core, "server") as server:
         await server.advertise_service("/slow", SET_BOOL, lambda _: asyncio.sleep(DEADLINE))
