@@ -25,6 +25,9 @@ CLIENTS_MAX: Final = 256
 """Clients of both gateways together."""
 SUBSCRIPTION_LINGER: Final = 2.0
 """Time that the hub stays subscribed to a topic without a client: pages reload, and panels move."""
+SUBSCRIBED_TOPICS_MAX: Final = 4000
+"""Topics that the hub subscribes to for all clients; beyond, only those with a publisher are added. Each name is
+registered with the master, which takes a millisecond and some kilobytes."""
 UNADVERTISE_DELAY: Final = 10.0
 """Time until a topic is withdrawn that no client advertises any more, as rosbridge_suite does."""
 PUBLISHERS_MAX: Final = 2000

@@ -215,6 +215,12 @@ class Hub:
     # --- topics -----------------------------------------------------------------------------------------------
 
     def _subscribe(self, client: HubClient, request: requests.Subscribe) -> None:
+        subscribed = self.topics.names
+        if len(subscribed) >= limits.SUBSCRIBED_TOPICS_MAX and request.topic not in subscribed:
+            known = self.graph.topics.get(request.topic)
+            if known is None or not known.publishers:
+                problem = f"its clients subscribe to {len(subscribed)} topics, and {request.topic} has no publisher"
+                raise PeerRefused("the web server", problem, "subscribe when it has one, or to fewer topics")
         client.subscriptions[request.handle] = request.topic
         self.topics.subscribe(
             (client.number, request.handle),
@@ -441,6 +447,7 @@ class Hub:
         task = self._tasks[key] = asyncio.get_running_loop().create_task(run(), name=f"request of {client.name}")
 
         def ended(task: asyncio.Task[None]) -> None:
+            work.close()  # of a client that has gone before it began
             if self._tasks.get(key) is task:
                 del self._tasks[key]
 
