@@ -8,7 +8,7 @@ costs little.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias, cast
 
 import msgspec
 
@@ -16,7 +16,7 @@ from rmpa.web.monitor import limits
 from rmpa.web.monitor.patch import Tree, Value, without_nulls
 from rmpa.web.monitor.places import Places
 from rmpa.web.monitor.resources import resource_detail, resource_entry, resource_flows
-from rmpa.web.monitor.steady import Steady
+from rmpa.web.monitor.steady import Steady, steady_figure
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -81,6 +81,33 @@ class _ByteRates:
                 self._rates.pop(name, None)
 
 
+_Facts: TypeAlias = tuple[str, tuple[bool, bool], list[tuple[str, bool]], int, int, str, bool]
+"""Of a topic: its type, whether this module publishes and subscribes, peers and whether they send it, messages lost,
+messages dropped, the problem, whether it crosses."""
+_Figures: TypeAlias = tuple[float | None, float | None, float | None]
+
+
+class _KnownTopic(NamedTuple):
+    """A topic of the last snapshot.
+
+    Args:
+        topic: The topic.
+        entry: What the state says of it.
+        figures: Its rate, bandwidth and latency as shown.
+        facts: All else of which the entry is made.
+        flows: What it adds to flows: each ``from>to``, messages and bytes a second.
+    """
+
+    topic: TopicInfo
+    entry: Tree
+    figures: _Figures
+    facts: _Facts
+    flows: list[tuple[str, float, float]]
+
+
+_UNKNOWN_FIGURES: _Figures = (None, None, None)
+
+
 class StateBuilder:
     """Makes the state of each snapshot.
 
@@ -94,7 +121,7 @@ class StateBuilder:
         self._places = Places(own)
         self._steady = Steady()
         self._bytes = _ByteRates()
-        self._idle: dict[str, tuple[TopicInfo, Tree]] = {}
+        self._known: dict[str, _KnownTopic] = {}
         self._served: dict[str, tuple[ServiceInfo, Tree]] = {}
         self._sections: Tree = {}
 
@@ -118,13 +145,14 @@ class StateBuilder:
         peers = snapshot.peers[: limits.MODULES_SHOWN]
         self._bytes.keep(peer.name for peer in peers)
         self._places.update((peer.name for peer in peers), taken)
+        topics, flows = self._topics_and_flows(snapshot.topics)
         state: Tree = {
             "reach": {"ok": True},
             "agent": self._agent(snapshot),
             "ring": {"slots": self._places.slots, "places": dict(self._places.places)},
             "modules": dict(self._modules(snapshot, peers)),
-            "flows": {**self._flows(snapshot.topics), **resource_flows(resources, self.own, self._steady)},
-            "topics": self._topics(snapshot.topics[: limits.TOPICS_SHOWN]),
+            "flows": {**flows, **resource_flows(resources, self.own, self._steady)},
+            "topics": topics,
             "services": self._services(snapshot.services[: limits.SERVICES_SHOWN]),
             "resources": {one.key: resource_entry(one, self.own) for one in resources},
             "alarms": {
@@ -222,41 +250,40 @@ class StateBuilder:
                 "bytes_in": steady.figure(f"{name} in", rates[0] if rates else None, share=0.1, least=20.0),
                 "bytes_out": steady.figure(f"{name} out", rates[1] if rates else None, share=0.1, least=20.0),
             }
-        return _tree({key: value for key, value in entry.items() if value not in ("", [], ())})
+        return _given(entry)
 
-    def _flows(self, topics: Iterable[TopicInfo]) -> dict[str, Tree]:
-        """What flows on the own links, ``from>to``: messages and bytes a second, and the busiest topics."""
-        sums: dict[str, list[tuple[float, float, str]]] = {}
-        for topic in topics:
-            for route in topic.routes:
-                rate, bandwidth = _figures(route)
-                if rate:
-                    ends = (route.peer, self.own) if route.direction == "in" else (self.own, route.peer)
-                    sums.setdefault(">".join(ends), []).append((rate, bandwidth, topic.name))
-        found: dict[str, Tree] = {}
-        for key, parts in sums.items():
-            parts.sort(key=lambda part: (-part[0], part[2]))
-            names: list[Value] = list(dict.fromkeys(part[2] for part in parts))[: limits.FLOW_TOPICS]  # type: ignore[assignment]
-            names.sort(key=str)
-            found[key] = _tree({
-                "rate": self._steady.figure(f"{key} rate", sum(part[0] for part in parts)),
-                "bandwidth": self._steady.figure(f"{key} bandwidth", sum(part[1] for part in parts), share=0.1),
-                "topics": names,
-            })  # fmt: skip
-        return found
+    def _topics_and_flows(self, topics: Sequence[TopicInfo]) -> tuple[Tree, dict[str, Tree]]:
+        """The topics by name, and what flows on the own links, ``from>to``.
 
-    def _topics(self, topics: Sequence[TopicInfo]) -> Tree:
-        """By name. Most topics of a large mesh are idle: their entries are kept until they change."""
-        found: Tree = {}
-        idle: dict[str, tuple[TopicInfo, Tree]] = {}
-        for topic in topics:
-            before = self._idle.get(topic.name)
-            entry = before[1] if before is not None and before[0] == topic else self._topic(topic)
-            found[topic.name] = entry
-            if "rate" not in entry:
-                idle[topic.name] = (topic, entry)
-        self._idle = idle
-        return found
+        Most topics of a large mesh are idle, and their entries are kept until they change.
+        """
+        known, shown = self._known, limits.TOPICS_SHOWN
+        entries: Tree = {}
+        kept: dict[str, _KnownTopic] = {}
+        flows: dict[str, list[tuple[float, float, str]]] = {}
+        for index, topic in enumerate(topics):
+            name = topic.name
+            before = known.get(name)
+            if before is None or before.flows or (before.topic is not topic and before.topic != topic):
+                before = self._topic(topic, before)
+            kept[name] = before
+            if index < shown:
+                entries[name] = before.entry
+            for key, rate, bandwidth in before.flows:
+                flows.setdefault(key, []).append((rate, bandwidth, name))
+        self._known = kept
+        return entries, {key: self._flow(key, parts) for key, parts in flows.items()}
+
+    def _flow(self, key: str, parts: list[tuple[float, float, str]]) -> Tree:
+        """Messages and bytes a second, and the busiest topics."""
+        parts.sort(key=lambda part: (-part[0], part[2]))
+        names = list(dict.fromkeys(part[2] for part in parts))[: limits.FLOW_TOPICS]
+        names.sort()
+        return _given({
+            "rate": self._steady.figure(f"{key} rate", sum(part[0] for part in parts)),
+            "bandwidth": self._steady.figure(f"{key} bandwidth", sum(part[1] for part in parts), share=0.1),
+            "topics": names,
+        })  # fmt: skip
 
     def _services(self, services: Sequence[ServiceInfo]) -> Tree:
         """By ``service_key``; entries are kept until they change."""
@@ -264,38 +291,61 @@ class StateBuilder:
         for service in services:
             key = service_key(service)
             before = self._served.get(key)
-            served[key] = before if before is not None and before[0] == service else (service, _service(service))
+            same = before is not None and (before[0] is service or before[0] == service)
+            served[key] = before if before is not None and same else (service, _service(service))
         self._served = served
         return {key: entry for key, (_, entry) in served.items()}
 
-    def _topic(self, topic: TopicInfo) -> Tree:
-        incoming = [route for route in topic.routes if route.direction == "in"]
-        figures = [_figures(route) for route in topic.routes]
-        bandwidth = sum(one[1] for one in figures)
-        sources = {route.peer for route in incoming}
-        targets = {
-            route.peer
-            for route in topic.routes
-            if route.direction == "out" and (route.state == "open" or any(map(_is_direct, route.subscribers)))
-        }
-        entry = {
-            "type": topic.type,
-            "from": sorted(sources | {self.own} if topic.publishers else sources),
-            "to": sorted(targets | {self.own} if topic.subscribers else targets),
-            "rate": self._steady.figure(f"{topic.name} rate", max((one[0] for one in figures), default=0.0) or None),
-            "bandwidth": self._steady.figure(f"{topic.name} bandwidth", bandwidth or None, share=0.1),
-            "latency": self._steady.figure(
-                f"{topic.name} latency",
-                max((r.latency.p50 for r in incoming if r.latency), default=None),
-                share=0.25,
-                least=1e-4,
-            ),
-            "lost": sum(r.lost + r.expired for r in topic.routes),
-            "dropped": sum(r.dropped + r.oversized for r in topic.routes),
-            "problem": _problem(topic),
-            "crosses": topic.crosses,
-        }
-        return _said(entry)
+    def _topic(self, topic: TopicInfo, before: _KnownTopic | None) -> _KnownTopic:
+        own = self.own
+        most = bandwidth = 0.0
+        latency: float | None = None
+        lost = dropped = 0
+        ends: list[tuple[str, bool]] = []
+        flows: list[tuple[str, float, float]] = []
+        for route in topic.routes:
+            peer, rate, bytes_ = route.peer, *_figures(route)
+            most, bandwidth = max(most, rate), bandwidth + bytes_
+            lost += route.lost + route.expired
+            dropped += route.dropped + route.oversized
+            incoming = route.direction == "in"
+            if rate:
+                flows.append((f"{peer}>{own}" if incoming else f"{own}>{peer}", rate, bytes_))
+            if incoming:
+                ends.append((peer, True))
+                if route.latency is not None and (latency is None or route.latency.p50 > latency):
+                    latency = route.latency.p50
+            elif route.state == "open" or any(map(_is_direct, route.subscribers)):
+                ends.append((peer, False))
+        old = before.figures if before is not None else _UNKNOWN_FIGURES
+        figures = (
+            steady_figure(old[0], most or None),
+            steady_figure(old[1], bandwidth or None, 0.1),
+            steady_figure(old[2], latency, 0.25, 1e-4),
+        )
+        here = bool(topic.publishers), bool(topic.subscribers)
+        facts: _Facts = (topic.type, here, ends, lost, dropped, _problem(topic), topic.crosses)
+        if before is not None and before.figures == figures and before.facts == facts:
+            return _KnownTopic(topic, before.entry, figures, facts, flows)
+        return _KnownTopic(topic, _topic_entry(own, figures, facts), figures, facts, flows)
+
+
+def _topic_entry(own: str, figures: _Figures, facts: _Facts) -> Tree:
+    type_, (published, subscribed), ends, lost, dropped, problem, crosses = facts
+    sources = {peer for peer, incoming in ends if incoming} | ({own} if published else set())
+    targets = {peer for peer, incoming in ends if not incoming} | ({own} if subscribed else set())
+    return _said({
+        "type": type_,
+        "from": sorted(sources),
+        "to": sorted(targets),
+        "rate": figures[0],
+        "bandwidth": figures[1],
+        "latency": figures[2],
+        "lost": lost,
+        "dropped": dropped,
+        "problem": problem,
+        "crosses": crosses,
+    })  # fmt: skip
 
 
 def _is_direct(subscriber: SubscriberTransport) -> bool:
@@ -317,12 +367,19 @@ def _figures(route: RouteInfo) -> tuple[float, float]:
 
 def _said(entry: Mapping[str, object]) -> Tree:
     """Without what says nothing: no, none, nothing, not known. A page takes a missing member as that."""
-    return cast("Tree", {key: value for key, value in entry.items() if value not in ("", 0, [], None)})
+    return cast("Tree", {key: value for key, value in entry.items() if value})
+
+
+def _given(entry: Mapping[str, object]) -> Tree:
+    """Without empty texts and lists, and without what is not known; zeros stay."""
+    return cast("Tree", {key: value for key, value in entry.items() if value or value == 0})
 
 
 def _problem(topic: TopicInfo) -> str:
-    said = (*topic.mismatches, *topic.unreachable, *(route.problem for route in topic.routes if route.problem))
-    return next(iter(said), "")
+    for texts in (topic.mismatches, topic.unreachable):
+        if texts:
+            return texts[0]
+    return next((route.problem for route in topic.routes if route.problem), "")
 
 
 def service_key(service: ServiceInfo) -> str:
@@ -342,7 +399,7 @@ def _service(service: ServiceInfo) -> Tree:
         "transport": service.transport,
         "problem": service.problem or service.hidden,
     }
-    return _tree({key: value for key, value in entry.items() if value not in ("", 0)})
+    return _said(entry)
 
 
 def details(snapshot: Snapshot, resources: Mapping[str, ResourceFacts], kind: str, name: str) -> Tree | None:
