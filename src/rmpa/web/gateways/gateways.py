@@ -18,6 +18,7 @@ from rmpa.web import limits
 from rmpa.web.foxglove.protocol import SUBPROTOCOLS, choose_subprotocol
 from rmpa.web.gateways.figures import PROTOCOLS, GatewayFigures
 from rmpa.web.gateways.foxglove import FoxgloveConnection
+from rmpa.web.gateways.frame_writer import FrameSocket
 from rmpa.web.gateways.monitor import MonitorConnection
 from rmpa.web.gateways.rosbridge import RosbridgeConnection
 from rmpa.web.monitor import limits as monitor_limits
@@ -73,7 +74,7 @@ class Gateways:
         self._priority = priority
         self._session_id = secrets.token_hex(8)
         self._frames = PublishFrames()
-        self._open: dict[ClientConnection, web.WebSocketResponse] = {}
+        self._open: dict[ClientConnection, FrameSocket] = {}
         self._sent: Counter[str] = Counter()
         self._dropped: Counter[str] = Counter()
 
@@ -122,7 +123,7 @@ class Gateways:
         return await self._serve(request, connection, most)
 
     async def _serve(self, request: web.Request, connection: ClientConnection, most: int) -> web.StreamResponse:
-        response = web.WebSocketResponse(
+        response = FrameSocket(
             protocols=(*SUBPROTOCOLS, SUBPROTOCOL),
             autoping=False,
             compress=False,
