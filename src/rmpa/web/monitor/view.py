@@ -97,14 +97,14 @@ class _KnownTopic(NamedTuple):
         entry: What the state says of it.
         figures: Its rate, bandwidth and latency as shown.
         facts: All else of which the entry is made.
-        flows: What it adds to flows: each ``from>to``, messages and bytes a second.
+        flows: What it adds to flows: each a peer and whether that sends it, messages and bytes a second.
     """
 
     topic: TopicInfo
     entry: Tree
     figures: _Figures
     facts: _Facts
-    flows: list[tuple[str, float, float]]
+    flows: list[tuple[tuple[str, bool], float, float]]
 
 
 _UNKNOWN_FIGURES: _Figures = (None, None, None)
@@ -269,7 +269,7 @@ class StateBuilder:
         known, shown = self._known, limits.TOPICS_SHOWN
         entries: Tree = {}
         kept: dict[str, _KnownTopic] = {}
-        flows: dict[str, list[tuple[float, float, str]]] = {}
+        flows: dict[tuple[str, bool], list[tuple[float, float, str]]] = {}
         for index, topic in enumerate(topics):
             name = topic.name
             before = known.get(name)
@@ -278,17 +278,18 @@ class StateBuilder:
             kept[name] = before
             if index < shown:
                 entries[name] = before.entry
-            for key, rate, bandwidth in before.flows:
-                flows.setdefault(key, []).append((rate, bandwidth, name))
+            for end, rate, bandwidth in before.flows:
+                flows.setdefault(end, []).append((rate, bandwidth, name))
         self._known = kept
-        return entries, {key: self._flow(key, parts) for key, parts in flows.items()}
+        return entries, dict(self._flow(*end, parts) for end, parts in flows.items())
 
-    def _flow(self, key: str, parts: list[tuple[float, float, str]]) -> Tree:
-        """Messages and bytes a second, and the busiest topics."""
+    def _flow(self, peer: str, incoming: bool, parts: list[tuple[float, float, str]]) -> tuple[str, Tree]:
+        """Its key ``from>to``; messages and bytes a second, and the busiest topics."""
+        key = f"{peer}>{self.own}" if incoming else f"{self.own}>{peer}"
         parts.sort(key=lambda part: (-part[0], part[2]))
         names = list(dict.fromkeys(part[2] for part in parts))[: limits.FLOW_TOPICS]
         names.sort()
-        return _given({
+        return key, _given({
             "rate": self._steady.figure(f"{key} rate", sum(part[0] for part in parts)),
             "bandwidth": self._steady.figure(f"{key} bandwidth", sum(part[1] for part in parts), share=0.1),
             "topics": names,
@@ -306,26 +307,30 @@ class StateBuilder:
         return {key: entry for key, (_, entry) in served.items()}
 
     def _topic(self, topic: TopicInfo, before: _KnownTopic | None) -> _KnownTopic:
-        own = self.own
         most = bandwidth = 0.0
         latency: float | None = None
         lost = dropped = 0
+        problem = _problem(topic)
         ends: list[tuple[str, bool]] = []
-        flows: list[tuple[str, float, float]] = []
+        flows: list[tuple[tuple[str, bool], float, float]] = []
         for route in topic.routes:
-            peer, rate, bytes_ = route.peer, *_figures(route)
-            most, bandwidth = max(most, rate), bandwidth + bytes_
+            rate, bytes_ = _figures(route) if route.subscribers else (route.rate or 0.0, route.bandwidth or 0.0)
+            bandwidth += bytes_
             lost += route.lost + route.expired
             dropped += route.dropped + route.oversized
             incoming = route.direction == "in"
+            end = route.peer, incoming
             if rate:
-                flows.append((f"{peer}>{own}" if incoming else f"{own}>{peer}", rate, bytes_))
+                flows.append((end, rate, bytes_))
+                most = max(most, rate)
             if incoming:
-                ends.append((peer, True))
+                ends.append(end)
                 if route.latency is not None and (latency is None or route.latency.p50 > latency):
                     latency = route.latency.p50
             elif route.state == "open" or any(map(_is_direct, route.subscribers)):
-                ends.append((peer, False))
+                ends.append(end)
+            if route.problem and not problem:
+                problem = route.problem
         old = before.figures if before is not None else _UNKNOWN_FIGURES
         figures = (
             steady_figure(old[0], most or None),
@@ -333,10 +338,10 @@ class StateBuilder:
             steady_figure(old[2], latency, 0.25, 1e-4),
         )
         here = bool(topic.publishers), bool(topic.subscribers)
-        facts: _Facts = (topic.type, here, ends, lost, dropped, _problem(topic), topic.crosses)
+        facts: _Facts = (topic.type, here, ends, lost, dropped, problem, topic.crosses)
         if before is not None and before.figures == figures and before.facts == facts:
             return _KnownTopic(topic, before.entry, figures, facts, flows)
-        return _KnownTopic(topic, _topic_entry(own, figures, facts), figures, facts, flows)
+        return _KnownTopic(topic, _topic_entry(self.own, figures, facts), figures, facts, flows)
 
 
 def _topic_entry(own: str, figures: _Figures, facts: _Facts) -> Tree:
@@ -385,10 +390,10 @@ def _given(entry: Mapping[str, object]) -> Tree:
 
 
 def _problem(topic: TopicInfo) -> str:
-    for texts in (topic.mismatches, topic.unreachable):
-        if texts:
-            return texts[0]
-    return next((route.problem for route in topic.routes if route.problem), "")
+    """What is wrong with the topic itself, or empty; its routes have problems of their own."""
+    if topic.mismatches:
+        return topic.mismatches[0]
+    return topic.unreachable[0] if topic.unreachable else ""
 
 
 def service_key(service: ServiceInfo) -> str:
