@@ -120,7 +120,7 @@ class FrameWriter:
             if not sent:
                 break
         self._keep(left)
-        self._loop.add_writer(sock, self._writable)
+        self._loop.add_writer(sock.fileno(), self._writable)
 
     def _keep(self, buffers: Sequence[Payload]) -> None:
         for buffer in buffers:
@@ -144,7 +144,7 @@ class FrameWriter:
             sent -= len(first)
             self._waiting.popleft()
         if not self._waiting:
-            self._loop.remove_writer(sock)
+            self._loop.remove_writer(sock.fileno())
         if self._waiting_bytes <= limits.WRITE_BUFFER:
             self._make_room()
 
@@ -180,7 +180,7 @@ class FrameWriter:
         waiting, self._waiting, self._waiting_bytes = self._waiting, deque(), 0
         if self._socket is not None:
             if waiting:
-                self._loop.remove_writer(self._socket)
+                self._loop.remove_writer(self._socket.fileno())
             self._socket.close()
             self._socket = None
         self._make_room()
