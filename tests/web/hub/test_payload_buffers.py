@@ -49,6 +49,6 @@ def test_the_bytes_that_are_kept_are_bounded() -> None:
     assert buffers.bytes == 0
     small = [buffers.copy(data(b"c", limits.PAYLOAD_BUFFER_MIN)) for _ in range(2 * limits.PAYLOAD_BUFFERS_MAX)]
     assert buffers.bytes <= limits.PAYLOAD_BUFFERS_MAX * limits.PAYLOAD_BUFFER_MIN
-    assert all(view[-1:] == b"c" for view in small)
+    assert all(view[-1] == ord("c") for view in small)
     buffers.clear()
     assert buffers.bytes == 0
