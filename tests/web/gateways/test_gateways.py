@@ -6,13 +6,16 @@ import asyncio
 import contextlib
 import json
 import socket
+import ssl
 import struct
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import aiohttp
 
 from rmpa.ros.types.messages import MessageType
 from rmpa.web.hub.rights import READ_ONLY
+from rmpa.web.server.tls import tls_context
 from tests.ros.node.peers import DEADLINE, LATCHED, STRING, until
 from tests.web.gateways.server import Client, Server, running_server
 from tests.web.hub.client import node
@@ -179,6 +182,33 @@ async def test_large_messages_arrive_whole_at_every_client(core: RosCore) -> Non
             await bridge.send("subscribe", topic="/image", compression="cbor-raw")
             assert (await fox.next_bytes())[13:] == bytes(payload)
             assert bytes(payload) in await bridge.next_bytes()
+
+
+async def test_large_messages_arrive_whole_by_tls_at_a_client_that_reads_late(core: RosCore) -> None:
+    files = Path(__file__).parents[1] / "server" / "tls"
+    tls = tls_context(str(files / "cert.pem"), str(files / "key.pem"))
+    assert tls is not None
+    trusted = ssl.create_default_context(cafile=files / "cert.pem")
+    payload = bytes(BYTES.serialize(BYTES.make({"data": bytes(range(250)) * 40_000})))
+    async with (
+        running_server(core, tls=(tls, trusted)) as server,
+        node(core, "mapper") as mapper,
+        server.client(FOXGLOVE) as client,
+    ):
+        publisher = await mapper.advertise("/map", BYTES)
+        channel = await channel_of(client, "/map")
+        await client.send("subscribe", subscriptions=[{"id": 1, "channelId": channel["id"]}])
+        await publisher.wait_for_subscriber()
+        await until(lambda: all(each.subscriptions for each in server.hub.clients))
+        client.socket._reader._protocol.pause_reading()
+        (connection,) = server.gateways.connections
+        before = connection.sent
+        publisher.publish_raw(payload)
+        await until(lambda: connection.sent > before)
+        publisher.publish_raw(payload[:100])
+        client.socket._reader._protocol.resume_reading()
+        assert (await client.next_bytes())[13:] == payload
+        assert (await client.next_bytes())[13:] == payload[:100]
 
 
 async def test_a_client_that_stops_reading_costs_its_bound_and_no_other_a_message(core: RosCore) -> None:
