@@ -27,6 +27,7 @@ from rmpa.bridge.services.rules import ServiceRules
 from rmpa.core.counters import Counters
 from rmpa.core.errors import StartError
 from rmpa.core.open_files import remedy
+from rmpa.observe.io.agent_requests import AgentRequests
 from rmpa.observe.io.control_operations import ControlOperations
 from rmpa.observe.io.control_server import ControlServer
 from rmpa.observe.io.diagnostics import Diagnostics
@@ -129,6 +130,7 @@ class Agent:
         )
         self.snapshots = SnapshotBuilder(settings, sources)
         self._nodes = NodeRequests(settings, self.core, self.bridge.rpc)
+        AgentRequests(self.bridge.rpc, self.snapshots)
         self._why = WhyService(settings, self.core, self.bridge, self.services, self.snapshots)
         self.operations = ControlOperations(
             settings.name,
@@ -137,7 +139,8 @@ class Agent:
             self.snapshots,
             self._why,
             self.reloader.reload,
-            GraphRevisions(self.core),
+            GraphRevisions(self.core, rows=settings.core_mode == "embedded"),
+            self._nodes,
         )
         self._control = ControlServer(
             runtime_dir(os.environ, settings.runtime_dir),
