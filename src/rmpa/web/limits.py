@@ -165,7 +165,8 @@ REST_NAMES_COMPARED: Final = 1000
 
 # --- HTTP server --------------------------------------------------------------------------------------------------
 WEB_CONNECTIONS_MAX: Final = 256
-"""Connections at one time: a browser has six, Prometheus one. Each takes some 10 KiB and a file descriptor."""
+"""Connections at one time: a browser has six, Prometheus one. Each takes some 10 KiB and a file descriptor, and
+a WebSocket one more."""
 WEB_LINE_MAX: Final = 4096
 """Bytes of a request line: twice the longest path of the API, for a token behind it."""
 WEB_FIELD_MAX: Final = 8 * KIB

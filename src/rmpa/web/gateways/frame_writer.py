@@ -101,8 +101,9 @@ class FrameWriter:
     def hand_over(self) -> None:
         """Pass what waits on to the transport, behind which others may write to it, and write by it from now on."""
         waiting = self._stop()
-        for view in waiting:
-            self._transport.write(view)
+        if not self._transport.is_closing():
+            for view in waiting:
+                self._transport.write(view)
 
     def close(self) -> None:
         """Forget what waits; the connection itself is not closed."""
