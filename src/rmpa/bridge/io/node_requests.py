@@ -71,8 +71,8 @@ class NodeRequests:
         found = list_nodes(*tables, state.nodes, problems, yielding_to_data)
         return tuple(line for line in found if not is_own(line.name))
 
-    async def _info(self, _asker: PeerSession, args: dict[str, Any]) -> NodeFacts:
-        return await self.info(args)
+    async def _info(self, asker: PeerSession, args: dict[str, Any]) -> NodeFacts:
+        return self._permitted(asker.link.name, await self.info(args))
 
     async def info(self, args: Mapping[str, object]) -> NodeFacts:
         """The facts about the ``node`` of this module that a request names.
@@ -90,6 +90,24 @@ class NodeRequests:
         names = {address: name for name, address in state.nodes.items()}
         connections = await node_connections(uri, OWN_NODE, names)
         return msgspec.structs.replace(facts, pid=answer.pid, connections=connections)
+
+    def _permitted(self, asker: str, facts: NodeFacts) -> NodeFacts:
+        """The facts about a node, without the names of what a peer may not have."""
+
+        def may(access: Access, name: str) -> bool:
+            return self._gate.judge(access, asker, name).allowed
+
+        connections = facts.connections
+        if connections is not None:
+            needed = {True: Access.PUBLISH, False: Access.SUBSCRIBE}
+            connections = tuple(one for one in connections if may(needed[one.inbound], one.topic))
+        return msgspec.structs.replace(
+            facts,
+            publications={name: kind for name, kind in facts.publications.items() if may(Access.SUBSCRIBE, name)},
+            subscriptions={name: kind for name, kind in facts.subscriptions.items() if may(Access.PUBLISH, name)},
+            services=tuple(name for name in facts.services if may(Access.CALL, name)),
+            connections=connections,
+        )
 
     async def _ping(self, _asker: PeerSession, args: dict[str, Any]) -> NodePing:
         node, uri = self._own(args)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import msgspec
 
@@ -41,6 +41,14 @@ if TYPE_CHECKING:
 Args = dict[str, object]
 
 
+class TrustCommands(Protocol):
+    """Answers the commands of ``rmpa trust``: ``agent.trust_operations`` has them."""
+
+    async def answer_command(self, args: Args, /) -> object:
+        """The reply to one command; an ``RmpaError`` is the client's error."""
+        ...
+
+
 class ControlOperations:
     """The operations of one agent.
 
@@ -52,6 +60,7 @@ class ControlOperations:
         why: Answers ``why``.
         reload: Reads the settings again; with ``check`` it changes nothing.
         graph: Counts the changes of the local graph.
+        trust: Answers the commands of ``rmpa trust``.
         nodes: Knows the nodes of this module.
     """
 
@@ -64,6 +73,7 @@ class ControlOperations:
         why: WhyService,
         reload: Callable[..., Awaitable[ReloadReply]],
         graph: GraphRevisions,
+        trust: TrustCommands,
         nodes: NodeRequests,
     ) -> None:
         self._name = name
@@ -73,6 +83,7 @@ class ControlOperations:
         self._why = why
         self._reload = reload
         self._graph = graph
+        self._trust = trust
         self._nodes = nodes
 
     def handlers(self) -> dict[str, Handler]:
@@ -180,6 +191,10 @@ class ControlOperations:
         """The arguments of ``GraphRevisions.after``."""
         return await self._graph.after(args)
 
+    async def trust(self, args: Args) -> object:
+        """``what``: the command, with its own arguments."""
+        return await self._trust.answer_command(args)
+
     def _session(self, name: object) -> PeerSession:
         """The linked peer of a name or GUID.
 
@@ -247,6 +262,7 @@ OPERATIONS: Final = (
     Operation("param", ControlOperations.param, object),  # the value that the peer replies
     Operation("graph", ControlOperations.graph, GraphRevision),
     Operation("followed", ControlOperations.followed, tuple[FollowedInfo, ...]),
+    Operation("trust", ControlOperations.trust, object),  # TrustStatus, or as the command says (trust.status)
     Operation("agent", ControlOperations.agent, PeerAgent),
     Operation("contract", ControlOperations.contract, dict[str, ContractTerm]),
     Operation("node", ControlOperations.node, object),  # tuple[PeerNodes, ...] for lists, else as REPLIES says
