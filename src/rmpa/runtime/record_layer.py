@@ -26,8 +26,8 @@ Buffer = bytes | bytearray | memoryview
 _RECORD: Final = 16 * KIB
 """Plain bytes of the largest record (RFC 8446, section 5.1)."""
 _WRITE_MAX: Final = 128 * KIB
-"""Plain bytes that are encrypted at once at most, 0.1 ms. Twice as many are no faster, and OpenSSL keeps buffers of the
-largest size for each connection."""
+"""Plain bytes that are encrypted at once at most, 0.1 ms. Twice as many are no faster, and OpenSSL keeps buffers of
+the largest size for each connection."""
 _READ: Final = 128 * KIB
 """Bytes that are read from the socket at once."""
 _scratch: Final = memoryview(bytearray(_READ))
