@@ -7,6 +7,8 @@ and what a linked agent loses and uses while forged beacons, forged prefaces and
 
 from __future__ import annotations
 
+import asyncio
+import socket
 import statistics
 import sys
 import time
@@ -19,6 +21,7 @@ import psutil
 from lab import samples
 from lab.bed.bench import Bed
 from lab.bed.members import ALLOWED, MeasuredMesh
+from lab.bed.processes import BedError
 from lab.bed.ros import NODES
 from lab.bench import schedule
 from lab.bench.joining import meshed
@@ -28,16 +31,23 @@ from lab.results import finish
 from lab.tables import dash, ratio, table_of, us
 from lab.usage import Meter
 from rmpa.core.guid import Guid
+from rmpa.core.outbox import Outbox
+from rmpa.mesh import limits
+from rmpa.runtime.event_loop import AgentLoop
 from rmpa.runtime.record_layer import TlsHandshake
+from rmpa.runtime.stream import Stream
 from rmpa.trust.io.contexts import link_context
 
 if TYPE_CHECKING:
     import ssl
+    from collections.abc import Callable
     from pathlib import Path
 
     from rich.console import Console
     from rich.table import Table
 
+    from lab.bed.agents import Agent
+    from rmpa.runtime.record_layer import SecureSocket
     from rmpa.trust.io.store import TrustStore
 
 _MB: Final = 1024 * 1024
@@ -50,10 +60,13 @@ _HANDSHAKE_LIMIT: Final = 5.0
 _LINKED_LIMIT: Final = 2.0
 _MEMORY_LIMIT: Final = 3.0
 _ATTACKED_LIMIT: Final = 25.0
+_LINKS: Final = 16
 _FORGED: Final = 10_000.0
 """A second."""
 _DEADLINE: Final = 180.0
 _SETTLE: Final = 3.0
+_STREAMED: Final = {64: 3000, 8192: 1000, 65536: 300, _MB: 30}
+"""Messages of each size that cross alone, in this process."""
 _ATTACKS: Final = ("beacons", "prefaces", "handshakes")
 _KINDS: Final = (
     schedule.AgentPair("agents_plain", "two agents"),
@@ -128,30 +141,38 @@ class Joined:
 
     Args:
         joins: Seconds from the start of the last one to the full mesh.
-        memory: MB of each agent that is private to it.
+        memory: MB of each agent that is private to it, with its links.
+        alone: MB of the first one before the others were started.
     """
 
     joins: list[float]
     memory: list[float]
+    alone: float
 
 
 def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:
     """Measure, print the tables, write the file; return the result."""
     plan = QUICK if quick else FULL
     mesh = MeasuredMesh()
-    handshakes = _handshakes(plan, mesh)
+    handshakes, alone = _in_process(plan, mesh)
     scores, attacked = _streams(plan, mesh, console)
     joined = {kind.key: _joined(plan, mesh if kind.config else None, console) for kind in _KINDS}
     console.print(_table(scores))
     console.print(_attack_table(attacked))
     result: dict[str, object] = {
         "streams": {key: _row(score) for key, score in scores.items()},
+        "stream_us": {str(size): costs for size, costs in alone.items()},
         "handshake_ms": _spread(handshakes),
         "joined": {key: asdict(one) for key, one in joined.items()},
         "attacked": {name: asdict(one) for name, one in attacked.items()},
     }
     return finish(
-        console, "trust", asdict(plan), result, json, claims=_claims(plan, scores, handshakes, joined, attacked)
+        console,
+        "trust",
+        asdict(plan),
+        result,
+        json,
+        claims=_claims(plan, scores, handshakes, joined, attacked, alone),
     )
 
 
@@ -212,21 +233,91 @@ def _streams(plan: TrustPlan, mesh: MeasuredMesh, console: Console) -> tuple[dic
 # --- handshakes, links, memory --------------------------------------------------------------------------------------
 
 
-def _handshakes(plan: TrustPlan, mesh: MeasuredMesh) -> list[float]:
-    """Processor time of TLS handshakes, both ends together, ms."""
+def _in_process(plan: TrustPlan, mesh: MeasuredMesh) -> tuple[list[float], dict[int, tuple[float, float]]]:
+    """Handshakes, ms of processor time of both ends; and by size µs of a message and end, plain and with TLS.
+
+    One process has both ends, so that other processes disturb these figures least.
+    """
     with Bed() as bed:
         stores = [mesh.admit(bed.home, "lab", name) for name in ("one", "other")]
         contexts = [_context(store, server_side=bool(n)) for n, store in enumerate(stores)]
-        taken = []
-        for _ in range(plan.handshakes):
-            begun = time.thread_time_ns()
-            client, server = (TlsHandshake(c, server_side=bool(n)) for n, c in enumerate(contexts))
-            client.receive(b"")
-            while not (client.done and server.done):
-                server.receive(client.take_output())
-                client.receive(server.take_output())
-            taken.append((time.thread_time_ns() - begun) / 1e6)
-        return taken
+    taken = []
+    for _ in range(plan.handshakes):
+        begun = time.thread_time_ns()
+        _shake(contexts)
+        taken.append((time.thread_time_ns() - begun) / 1e6)
+    costs = {}
+    for size, count in _STREAMED.items():
+        rounds = [[_cost(size, count, made) for made in (None, contexts)] for _ in range(plan.rounds * 2)]
+        costs[size] = (round(min(one[0] for one in rounds), 2), round(min(one[1] for one in rounds), 2))
+    return taken, costs
+
+
+def _cost(size: int, count: int, contexts: list[ssl.SSLContext] | None) -> float:
+    loop = AgentLoop()
+    try:
+        return loop.run_until_complete(_ping_pong(size, count, contexts))
+    finally:
+        loop.close()
+
+
+async def _ping_pong(size: int, count: int, contexts: list[ssl.SSLContext] | None) -> float:
+    """µs of processor time an end and message, which crosses alone: each end sends when it has one."""
+    loop = asyncio.get_running_loop()
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        socks = [socket.create_connection(listener.getsockname()), listener.accept()[0]]
+    for sock in socks:
+        sock.setblocking(False)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    secure: list[SecureSocket | None] = [None, None]
+    if contexts is not None:
+        secure = [end.secure(sock) for end, sock in zip(_shake(contexts), socks, strict=True)]
+    message = (bytes(limits.FRAME_HEADER_BYTES), bytes(size))
+    whole = limits.FRAME_HEADER_BYTES + size
+    done: asyncio.Future[None] = loop.create_future()
+    streams: list[Stream] = []
+    left = 0
+
+    def reader(other: int) -> Callable[[memoryview], tuple[int, int]]:
+        def received(view: memoryview) -> tuple[int, int]:
+            nonlocal left
+            if len(view) < whole:
+                return 0, whole
+            left -= 1
+            if left > 0:
+                streams[other].send(message, 1)
+            elif not done.done():
+                done.set_result(None)
+            return whole, 0
+
+        return received
+
+    for number, sock in enumerate(socks):
+        outbox = Outbox(_MB, 64 * _MB)
+        streams.append(Stream(sock, on_bytes=reader(number), on_close=_ended, outbox=outbox, secure=secure[number]))
+    begun = 0
+    for trips in (count // 10, count):
+        left, done = trips, loop.create_future()
+        begun = time.thread_time_ns()
+        streams[0].send(message, 1)
+        await done
+    spent = time.thread_time_ns() - begun
+    for stream in streams:
+        stream.close()
+    return spent / count / 2e3
+
+
+def _ended(error: Exception | None) -> None:
+    raise BedError(f"a measured connection ended: {error}")
+
+
+def _shake(contexts: list[ssl.SSLContext]) -> tuple[TlsHandshake, TlsHandshake]:
+    client, server = (TlsHandshake(context, server_side=bool(n)) for n, context in enumerate(contexts))
+    client.receive(b"")
+    while not (client.done and server.done):
+        server.receive(client.take_output())
+        client.receive(server.take_output())
+    return client, server
 
 
 def _context(store: TrustStore, *, server_side: bool) -> ssl.SSLContext:
@@ -244,10 +335,14 @@ def _joined(plan: TrustPlan, mesh: MeasuredMesh | None, console: Console) -> Joi
                 mesh.admit(bed.home, host.name, host.name)
         config = ALLOWED if mesh is not None else ""
         agents = [bed.agent(host, name=host.name, start=False, config=config) for host in hosts]
-        for agent in agents:
+        agents[0].start()
+        agents[0].wait_ready(_DEADLINE)
+        time.sleep(_SETTLE)
+        alone = _memory(agents[0])
+        for agent in agents[1:]:
             agent.start()
         with ThreadPoolExecutor(len(agents)) as waiting:
-            list(waiting.map(lambda agent: agent.wait_ready(_DEADLINE), agents))
+            list(waiting.map(lambda agent: agent.wait_ready(_DEADLINE), agents[1:]))
         meshed(agents)
         last, joins = agents[-1], []
         for _ in range(plan.joins):
@@ -258,8 +353,13 @@ def _joined(plan: TrustPlan, mesh: MeasuredMesh | None, console: Console) -> Joi
             last.wait_ready(_DEADLINE)
             joins.append(meshed(agents) - last.process.started)
         time.sleep(_SETTLE)
-        memory = [psutil.Process(agent.pid).memory_full_info().uss / 1e6 for agent in agents[:-1]]
-        return Joined([round(one, 3) for one in joins], [round(one, 2) for one in memory])
+        memory = [round(_memory(agent), 2) for agent in agents[:-1]]
+        return Joined([round(one, 3) for one in joins], memory, round(alone, 2))
+
+
+def _memory(agent: Agent) -> float:
+    """MB that are this process's alone."""
+    return float(psutil.Process(agent.pid).memory_full_info().uss) / 1e6
 
 
 # --- what came out --------------------------------------------------------------------------------------------------
@@ -271,13 +371,16 @@ def _claims(
     handshakes: list[float],
     joined: dict[str, Joined],
     attacked: dict[str, Attacked],
+    alone: dict[int, tuple[float, float]],
 ) -> list[Claim]:
     plain, secured = (scores[kind.key] for kind in _KINDS)
     bare, members = (joined[kind.key] for kind in _KINDS)
     more = statistics.median(secured.cpu) - statistics.median(plain.cpu)
-    memory = (statistics.median(members.memory) - statistics.median(bare.memory)) * 16 / (plan.modules - 1)
+    links = [statistics.median(one.memory) - one.alone for one in (members, bare)]
+    memory = (links[0] - links[1]) * _LINKS / (plan.modules - 1)
     return [
         Claim("64 B: processor time a message and agent more with TLS, µs", round(more, 2), _CPU_LIMIT),
+        Claim("64 B: the same of a stream alone, an end, µs", round(alone[64][1] - alone[64][0], 2), _CPU_LIMIT),
         Claim("64 B: p50, TLS / plain", ratio(_p50(secured.small), _p50(plain.small)), _SMALL_LIMIT),
         Claim("1 MB: p50, TLS / plain", ratio(_p50(secured.large), _p50(plain.large)), _LARGE_LIMIT),
         Claim(
@@ -294,7 +397,7 @@ def _claims(
             round(statistics.median(members.joins), 3),
             _LINKED_LIMIT,
         ),
-        Claim("memory more with TLS, MB for 16 links", round(memory, 2), _MEMORY_LIMIT),
+        Claim(f"memory more with TLS, MB for {_LINKS} links", round(memory, 2), _MEMORY_LIMIT),
         *(
             Claim(f"{_FORGED:.0f} forged {name} a second: messages lost", one.lost, 0)
             for name, one in attacked.items()
