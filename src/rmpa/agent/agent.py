@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Final
 from rmpa.agent.core_choice import make_core
 from rmpa.agent.network import Network
 from rmpa.agent.reload import Reloader, SighupHandler
+from rmpa.agent.trust import AgentTrust, open_membership
+from rmpa.agent.trust_operations import PlainOperations, TrustOperations
 from rmpa.agent.web_process import WebProcess, web_command, web_environment
 from rmpa.bridge.io.bridge import Bridge
 from rmpa.bridge.io.limit_reports import LimitReports
@@ -43,12 +45,15 @@ from rmpa.runtime.descriptors import is_shortage, raise_file_limit
 from rmpa.runtime.event_loop import AgentLoop
 from rmpa.runtime.garbage_collector import GarbageCollector
 from rmpa.runtime.service_manager import notify_service_manager
+from rmpa.runtime.system_clock import SystemClock
+from rmpa.trust.permissions import Permissions
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator
 
     from rmpa.config.settings import Settings
     from rmpa.config.sources import Loaded
+    from rmpa.core.identity import Identity
     from rmpa.ros.core.api import Core
 
 _log = logging.getLogger(__name__)
@@ -75,6 +80,8 @@ class Agent:
         load: Callable[[], Loaded] | None = None,
     ) -> None:
         self._settings = settings
+        clock = SystemClock()
+        membership = open_membership(settings, clock)
         policy, names = Policy(settings.policy, settings.peers, settings.time), Names(settings.peers)
         self.core: Core = make_core(settings)
         self.bridge = Bridge(
@@ -85,6 +92,7 @@ class Agent:
             names=names,
             relay=settings.relay,
             limit_settings=settings.limits,
+            permissions=Permissions(settings.trust) if membership is not None else None,
         )
         self.params = Params(
             self.core,
@@ -113,7 +121,12 @@ class Agent:
         )
         for part in (self.params, self.services, reports):
             self.bridge.add(part)
-        self.network = Network(settings, self.bridge)
+        self.trust: AgentTrust | None = None
+        """This module's part in a secured mesh; ``None``: trust is off."""
+        if membership is not None:
+            self.trust = AgentTrust(membership, self.bridge, clock, random.random)
+            self.bridge.add(self.trust)
+        self.network = Network(settings, self.bridge, self.trust)
         self.reloader = Reloader(settings, load, self.apply_settings)
         self.reloaded: Callable[[], None] = lambda: None
         """Called when changed settings hold."""
@@ -131,6 +144,7 @@ class Agent:
             notes=self._notes,
             started=time.time(),
             requests=requests,
+            trust=self.trust.status if self.trust is not None else lambda: None,
         )
         self.snapshots = SnapshotBuilder(settings, sources)
         self._nodes = NodeRequests(settings, self.core, self.bridge.rpc, self.bridge.gate)
@@ -143,6 +157,7 @@ class Agent:
             self._why,
             self.reloader.reload,
             GraphRevisions(self.core),
+            self._trust_operations(),
         )
         self._control = ControlServer(
             runtime_dir(os.environ, settings.runtime_dir),
@@ -180,6 +195,14 @@ class Agent:
             self._undo = undo.pop_all()
         _log.info("= ROS_MASTER_URI=%s", self.core.uri)
 
+    def _trust_operations(self) -> PlainOperations | TrustOperations:
+        if self.trust is None:
+            return PlainOperations(self._settings)
+        return TrustOperations(self.trust, self.bridge, self._identity)
+
+    def _identity(self) -> Identity | None:
+        return self.network.endpoint.identity if self.network.endpoint is not None else None
+
     async def close(self) -> None:
         """Close every part: the goodbye comes first, then the proxies leave the local graph, the core is last."""
         await self._undo.aclose()
@@ -191,6 +214,8 @@ class Agent:
     def _notes(self) -> Iterator[str]:
         yield from (f"{key} waits for a restart" for key in self.reloader.waiting)
         yield from self.params.notes()
+        if self.trust is not None:
+            yield from self.trust.notes()
 
     def apply_settings(self, settings: Settings) -> None:
         """Take settings that were read again; only those of ``agent.reload.LIVE`` differ."""

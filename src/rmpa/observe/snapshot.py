@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Self
 
 import msgspec
 
+from rmpa.trust.status import TrustStatus  # noqa: TC001 - msgspec needs it to decode
+
 if TYPE_CHECKING:
     from rmpa.core.stats import SampleSummary
 
@@ -525,6 +527,7 @@ class Snapshot(msgspec.Struct, kw_only=True, frozen=True):
         counters: What was refused or dropped, by name: ``beacon.malformed`` …
         notes: What the user should know (a port taken, no multicast), each ready to read.
         unreachable: Nodes of the local graph to which no connection can be made, by name.
+        trust: The module's membership of a secured mesh; ``None``: trust is off.
     """
 
     agent: AgentInfo
@@ -535,6 +538,7 @@ class Snapshot(msgspec.Struct, kw_only=True, frozen=True):
     counters: dict[str, int] = {}
     notes: tuple[str, ...] = ()
     unreachable: tuple[UnreachableInfo, ...] = ()
+    trust: TrustStatus | None = None
 
 
 class FollowedInfo(msgspec.Struct, kw_only=True, frozen=True):

@@ -18,10 +18,11 @@ from rmpa.trust import certificates
 from rmpa.trust.certificates import CertificateError, make_request
 from rmpa.trust.documents import DocumentKind
 from rmpa.trust.io import store as files_of
-from rmpa.trust.io.authority import MeshAuthority, found_mesh, private_key, request_der, request_pem
+from rmpa.trust.io.authority import MeshAuthority, found_mesh, request_der, request_pem
 from rmpa.trust.io.join_server import JoinServer, JoinState
 from rmpa.trust.io.joining import join_mesh, renew_at_authority
 from rmpa.trust.io.membership import Membership
+from rmpa.trust.io.private_keys import private_key
 from rmpa.trust.io.store import MemberFiles, TrustStore
 from rmpa.trust.preface import PREFACE_BYTES, PrefaceError
 from tests.trust.authority import WALL

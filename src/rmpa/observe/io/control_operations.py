@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import msgspec
 
@@ -35,6 +35,14 @@ if TYPE_CHECKING:
 Args = dict[str, object]
 
 
+class TrustCommands(Protocol):
+    """Answers the commands of ``rmpa trust``: ``agent.trust_operations`` has them."""
+
+    async def answer_command(self, args: Args, /) -> object:
+        """The reply to one command; an ``RmpaError`` is the client's error."""
+        ...
+
+
 class ControlOperations:
     """The operations of one agent.
 
@@ -46,6 +54,7 @@ class ControlOperations:
         why: Answers ``why``.
         reload: Reads the settings again; with ``check`` it changes nothing.
         graph: Counts the changes of the local graph.
+        trust: Answers the commands of ``rmpa trust``.
     """
 
     def __init__(
@@ -57,6 +66,7 @@ class ControlOperations:
         why: WhyService,
         reload: Callable[..., Awaitable[ReloadReply]],
         graph: GraphRevisions,
+        trust: TrustCommands,
     ) -> None:
         self._name = name
         self._bridge = bridge
@@ -65,6 +75,7 @@ class ControlOperations:
         self._why = why
         self._reload = reload
         self._graph = graph
+        self._trust = trust
 
     def handlers(self) -> dict[str, Handler]:
         """The handler of each operation, for ``ControlServer``."""
@@ -155,6 +166,10 @@ class ControlOperations:
         """The arguments of ``GraphRevisions.after``."""
         return await self._graph.after(args)
 
+    async def trust(self, args: Args) -> object:
+        """``what``: the command, with its own arguments."""
+        return await self._trust.answer_command(args)
+
     def _session(self, name: object) -> PeerSession:
         """The linked peer of a name or GUID.
 
@@ -222,6 +237,7 @@ OPERATIONS: Final = (
     Operation("param", ControlOperations.param, object),  # the value that the peer replies
     Operation("graph", ControlOperations.graph, GraphRevision),
     Operation("followed", ControlOperations.followed, tuple[FollowedInfo, ...]),
+    Operation("trust", ControlOperations.trust, object),  # TrustStatus, or as the command says (trust.status)
     Operation("node", ControlOperations.node, object),  # tuple[PeerNodes, ...] for lists, else as REPLIES says
 )
 """All operations of the control socket."""

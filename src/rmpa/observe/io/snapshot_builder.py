@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from rmpa.observe.io.peers_section import EndpointView
     from rmpa.ros.core.api import Core
     from rmpa.runtime.realtime import SchedulingRequest
+    from rmpa.trust.status import TrustStatus
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +54,7 @@ class SnapshotSources:
         notes: What else the user should know, each ready to read.
         started: When the agent started, seconds since the epoch.
         requests: The outcome of each request of ``--realtime``.
+        trust: The state of trust; ``None``: it is off.
     """
 
     core: Core
@@ -65,6 +67,7 @@ class SnapshotSources:
     notes: Callable[[], Iterable[str]]
     started: float
     requests: tuple[SchedulingRequest, ...] = ()
+    trust: Callable[[], TrustStatus | None] = lambda: None
 
 
 class SnapshotBuilder:
@@ -120,6 +123,7 @@ class SnapshotBuilder:
             counters=dict(sorted(counters.items())),
             notes=self._notes(endpoint),
             unreachable=unreachable_infos(self._sources.core, time.monotonic()),
+            trust=self._sources.trust(),
         )
 
     def _counters(self, endpoint: EndpointView | None) -> Iterator[Counters]:

@@ -7,14 +7,14 @@ import ssl
 from typing import TYPE_CHECKING, Final
 
 import msgspec
-from cryptography.hazmat.primitives import serialization
-from cryptography.hazmat.primitives.asymmetric import ec
 
-from rmpa.core.errors import StartError
+from rmpa.config.values import did_you_mean
+from rmpa.core.errors import ConfigError, StartError
 from rmpa.trust import certificates, limits
 from rmpa.trust.certificates import CertificateError
 from rmpa.trust.documents import DenyList, DocumentKind, KeyList, sign
 from rmpa.trust.io import store as files_of
+from rmpa.trust.io.private_keys import new_key, private_key
 from rmpa.trust.io.store import Issued, MemberFiles
 from rmpa.trust.join import MeshSecrets
 from rmpa.trust.keyring import GroupKey
@@ -22,7 +22,10 @@ from rmpa.trust.reasons import TrustReason
 from rmpa.trust.tokens import Token, fingerprint_of
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
     from ipaddress import IPv4Address
+
+    from cryptography.hazmat.primitives.asymmetric import ec
 
     from rmpa.trust.certificates import CertificateRequest, ModuleCertificate
     from rmpa.trust.io.membership import Membership
@@ -50,30 +53,6 @@ class JoinFile(msgspec.Struct, frozen=True):
     def __repr__(self) -> str:
         """Without the keys."""
         return f"JoinFile({len(self.certificate)} bytes of a certificate)"
-
-
-def new_key() -> bytes:
-    """A private key (PKCS #8, PEM) for a module or a CA."""
-    return _key_pem(ec.generate_private_key(certificates.CURVE))
-
-
-def private_key(data: bytes, where: str) -> ec.EllipticCurvePrivateKey:
-    """Read a private key (PEM).
-
-    Args:
-        data: The PEM.
-        where: The file, for the error.
-
-    Raises:
-        StartError: It is none.
-    """
-    try:
-        key = serialization.load_pem_private_key(data, None)
-    except (ValueError, TypeError):
-        key = None
-    if not isinstance(key, ec.EllipticCurvePrivateKey):
-        raise StartError(where, "is broken: not a private key in PEM", "join again, or take it from a copy")
-    return key
 
 
 def found_mesh(store: TrustStore, name: str, label: str, wall: float) -> None:
@@ -235,10 +214,8 @@ class MeshAuthority:
 
     def renew_own(self) -> None:
         """Renew the certificate of the authority itself; raises as ``issue``."""
-        member = self._membership
-        key = private_key(member.files.key, str(self._store.path(files_of.KEY)))
-        _, certificate = self.issue(certificates.make_request(key, member.name))
-        member.renewed(certificate)
+        _, certificate = self.issue(self._membership.request())
+        self._membership.renewed(certificate)
 
     def join_file(self, request: bytes) -> tuple[CertificateRequest, JoinFile]:
         """The answer to a request (DER) in a join by files; raises as ``issue``."""
@@ -247,6 +224,31 @@ class MeshAuthority:
         return asked, JoinFile(certificate, secrets.ca, secrets.keys, secrets.deny)
 
     # --- documents --------------------------------------------------------------------------------------------
+
+    def revoke_known(self, name: str, linked: Collection[str] = (), *, force: bool = False) -> DenyList:
+        """Revoke a module that a user names; return the new list.
+
+        Args:
+            name: The module's.
+            linked: The names of the linked modules.
+            force: Also if no certificate of that name is known here.
+
+        Raises:
+            ConfigError: It is this module, or no member is known by that name.
+            StartError: The clock is not set, or a file cannot be written.
+        """
+        if name == self._membership.name:
+            text = f"{name} is the authority itself"
+            raise ConfigError("NAME", text, "a new authority is a new mesh: rmpa trust leave, rmpa trust init")
+        known = {*self._issued, *linked} - {self._membership.name}
+        if name not in known and not force:
+            similar = did_you_mean(name, sorted(known))
+            remedy = f"did you mean {similar}?" if similar else "rmpa trust status lists them"
+            raise ConfigError("NAME", f"no module {name} has a certificate of this mesh", f"{remedy}; or add --force")
+        try:
+            return self.revoke(name)
+        except ValueError as error:
+            raise ConfigError("NAME", str(error)) from None
 
     def revoke(self, name: str) -> DenyList:
         """Refuse all certificates of a module from now on, and make a new group key; return the new list.
@@ -288,12 +290,6 @@ def request_der(pem: bytes) -> bytes:
     if "BEGIN CERTIFICATE REQUEST" not in text:
         raise ValueError("it does not begin with BEGIN CERTIFICATE REQUEST")
     return ssl.PEM_cert_to_DER_cert(text.replace(" CERTIFICATE REQUEST-", " CERTIFICATE-"))
-
-
-def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
-    return key.private_bytes(
-        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-    )
 
 
 def _serial() -> int:

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, UnreachableError
 from rmpa.trust import certificates, limits
 from rmpa.trust.io import store as files_of
-from rmpa.trust.io.authority import new_key, private_key
 from rmpa.trust.io.join_connection import (
     JoinConnection,
     NotTlsError,
     join_client_context,
     renewal_context,
 )
+from rmpa.trust.io.private_keys import new_key, private_key
 from rmpa.trust.io.store import MemberFiles
 from rmpa.trust.join import CodeShown, Joined, JoiningSide
 from rmpa.trust.preface import Preface, Purpose
@@ -193,8 +193,7 @@ async def renew_at_authority(
         RemoteProtocolError: The other side is not the authority.
     """
     store = membership.store
-    key = private_key(membership.files.key, str(store.path(files_of.KEY)))
-    request = certificates.make_request(key, membership.name)
+    request = membership.request()
     context = renewal_context(
         store.path(files_of.CERTIFICATE), store.path(files_of.KEY), membership.files.ca, server_side=False
     )

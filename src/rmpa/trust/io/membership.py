@@ -14,6 +14,7 @@ from rmpa.trust import certificates, limits
 from rmpa.trust.documents import DenyList, DocumentKind, KeyList, read_deny_list, read_key_list
 from rmpa.trust.io import store as files_of
 from rmpa.trust.io.contexts import link_context
+from rmpa.trust.io.private_keys import private_key
 from rmpa.trust.keyring import KeyPurpose, KeyRing
 from rmpa.trust.packets import PacketSigner, PacketTrust, PacketVerifier
 from rmpa.trust.preface import Preface, PrefaceGuard, Purpose
@@ -151,6 +152,11 @@ class Membership:
             raise TrustError(TrustReason.NAME, f"the certificate is of {name}, not of {claimed}")
         if self._deny.denies(name, begin + limits.CERTIFICATE_BACKDATE):
             raise TrustError(TrustReason.REVOKED, f"{name} was revoked (deny list {self._deny.number})")
+
+    def request(self) -> bytes:
+        """A request (DER) for a newer certificate of this module and its key."""
+        key = private_key(self.files.key, str(self.store.path(files_of.KEY)))
+        return certificates.make_request(key, self.name)
 
     # --- what is newer ----------------------------------------------------------------------------------------
 
