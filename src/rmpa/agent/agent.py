@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.agent.core_choice import make_core
 from rmpa.agent.network import Network
+from rmpa.agent.permission_notes import permission_notes
 from rmpa.agent.reload import Reloader, SighupHandler
 from rmpa.agent.trust import AgentTrust, open_membership
 from rmpa.agent.trust_operations import PlainOperations, TrustOperations
@@ -173,6 +174,8 @@ class Agent:
         Raises:
             StartError: The name, the core's port or the mesh's port is taken.
         """
+        for note in permission_notes(self._settings, secured=self.bridge.gate.on):
+            _log.warning("! %s", note)
         async with contextlib.AsyncExitStack() as undo:
             self._control.lock()
             undo.push_async_callback(self._control.close)
