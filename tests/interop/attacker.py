@@ -1,6 +1,6 @@
 """An attacker in a network namespace of its own: sends to a secured mesh what docs/design/trust.md forbids.
 
-attacker.py MODE ARGUMENTS, where ARGUMENTS is a JSON object; the functions of ``MODES`` say what each takes. Trailers,
+attacker.py MODE ARGUMENTS, where ARGUMENTS is a JSON object; the functions of ``MODES`` say what it has. Trailers,
 prefaces, tokens and messages of a join are written here byte by byte, from that page and not from the code under
 test; hellos and beacons, which are the same in a plain mesh, are made by rmpa. Run it by rmpa's own interpreter.
 Each answer is an event: ``@ {"event": ...}``; the last one is ``done``.
@@ -18,12 +18,12 @@ import socket
 import ssl
 import struct
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import psutil
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -35,8 +35,6 @@ from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Hello, Refuse
 
-GROUP, PORT = "239.255.82.77", 11312
-"""Replaced by the arguments ``group`` and ``port``."""
 LINK, JOIN, RENEWAL = 1, 2, 3
 RNG = random.Random(14)
 TIMEOUT = 10.0
@@ -195,6 +193,14 @@ def secured(sock: socket.socket, context: ssl.SSLContext, then: bytes) -> dict[s
         return told(wrapped)
 
 
+def udp_socket() -> socket.socket:
+    """A socket whose multicasts leave by the host's cable: it has no default route."""
+    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    (own,) = [each.address for each in psutil.net_if_addrs()["eth0"] if each.family is socket.AF_INET]
+    made.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(own))
+    return made
+
+
 # --- on the wire ------------------------------------------------------------------------------------------------
 
 
@@ -228,7 +234,7 @@ def record(given: Arguments) -> None:
 def replay(given: Arguments) -> None:
     """Send what was recorded again: ``file``, ``times``."""
     found = json.loads(Path(given["file"]).read_text())
-    udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    udp = udp_socket()
     sent = 0
     for _ in range(given["times"]):
         for each in found["beacons"]:
@@ -281,7 +287,7 @@ def flood(given: Arguments) -> None:
     ``beacons`` go to the group ``group``. ``half`` has the group's key ``key`` and begins TLS without going on.
     """
     rate, end = given["rate"], time.monotonic() + given["seconds"]
-    udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    udp = udp_socket()
     false_key, held, sent = os.urandom(32), [], 0
     began = time.monotonic()
     while (now := time.monotonic()) < end:
@@ -360,7 +366,7 @@ def insider(given: Arguments) -> None:
 
 def tell_beacon(given: Arguments) -> None:
     """Send beacons with the group's key: ``key``, ``group``, ``udp``, ``here``, ``listen`` (our port), ``name``."""
-    udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    udp = udp_socket()
     identity = Identity(Guid.of(given["here"], given["listen"], 1), os.urandom(16), given["name"], 0)
     for number in range(1, 6):
         packet = Beacon(BeaconKind.ANNOUNCE, identity, 60_000, number).serialize(extended=True)
@@ -499,5 +505,4 @@ MODES: dict[str, Callable[[Arguments], None]] = {
 }
 
 if __name__ == "__main__":
-    tempfile.tempdir = None
     MODES[sys.argv[1]](json.loads(sys.argv[2]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-import re
+import sys
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -11,11 +11,11 @@ import pytest
 
 pytest.importorskip("cryptography")
 
-from lab.bed.agents import RMPA
 from lab.bed.processes import Process, eventually
 from rmpa.trust import limits as trust_limits
 from rmpa.trust.io.store import CERTIFICATE, KEY
 from tests.interop.modules import Module, flows
+from tests.interop.ros import NODES
 from tests.interop.secured import (
     GROUP,
     UDP_PORT,
@@ -212,16 +212,17 @@ def test_a_member_in_the_middle_of_a_join_makes_the_codes_differ(fortress: Fortr
     given = {"token": invited["token"], "listen": 40998, "here": fortress.eve.address, "name": "victim"}
     with start_attack(fortress.eve, "middle", **given, **files) as middle:
         bent = str(middle.wait_event("ready", 20.0)["token"])
-        victim = fortress.b.host  # any host without a membership of the victim's name
-        command = [RMPA, "trust", "join", bent, "--name", "victim", "--json"]
-        with Process(victim.command(command), env=_fresh(fortress.b, fortress.home)) as joining:
-            shown = str(middle.wait_event("codes", 60.0)["authority"])
-            step = control(fortress.a.agent, "step", id=invited["id"], after=0)
-            assert step["code"] == shown
-            line = eventually(lambda: _code_in(joining.output), 30.0, what="the victim's code")
-            assert line != shown
+        joiner: list[str | Path] = [sys.executable, NODES / "joiner.py", "victim"]
+        with Process(fortress.b.host.command(joiner), commands=True) as victim:
+            victim.tell(bent)
+            there = str(middle.wait_event("codes", 60.0)["authority"])
+            here = str(victim.wait_event("code", 60.0)["code"])
+            shown = control(fortress.a.agent, "step", id=invited["id"], after=0)["code"]
+            assert shown == there, "the attacker shows that it knows what the authority's user sees"
+            assert here != shown
+            victim.tell("no")
             control(fortress.a.agent, "answer", id=invited["id"], agree=False)
-            assert joining.wait(60.0) != 0
+            assert "codes differ" in str(victim.wait_event("refused", 60.0)["text"])
         done = middle.wait_event("done", 60.0)
     assert done["authority"] != "grant"
     assert "victim" not in {each["name"] for each in control(fortress.a.agent, "status")["members"]}
@@ -282,21 +283,6 @@ modules = ["*"]
 publish = ["/tf"]
 subscribe = ["/odom"]
 """
-
-
-def _fresh(module: Module, home: Path) -> dict[str, str]:
-    """The environment of a module that never was one."""
-    return {
-        **module.agent.env,
-        "RMPA_STATE_DIR": str(home / "state" / "victim"),
-        "RMPA_RUNTIME_DIR": str(home / "run"),
-    }
-
-
-def _code_in(output: str) -> str:
-    """The six digits in what ``rmpa trust join`` shows."""
-    found = re.search(r"\b(\d{3}) ?(\d{3})\b", output)
-    return f"{found[1]}{found[2]}" if found else ""
 
 
 def _member(fortress: Fortress, host: Host, agent: AgentFactory, shell: ShellFactory, config: str = OPEN) -> Module:
