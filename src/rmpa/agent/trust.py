@@ -238,6 +238,10 @@ class AgentTrust(Part):
                 store.save_authority(place)
             except StartError as error:
                 _log.warning("! %s", error)
+        self.look_now()
+
+    def look_now(self) -> None:
+        """See at once whether the certificate is to be renewed: something has changed since the last attempt."""
         self._retry_at = 0.0
         self._wake.set()
 

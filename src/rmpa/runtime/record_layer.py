@@ -19,15 +19,16 @@ from rmpa.runtime.segments import SegmentedSocket
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
 Buffer = bytes | bytearray | memoryview
 
 _RECORD: Final = 16 * KIB
 """Plain bytes of the largest record (RFC 8446, section 5.1)."""
-_WRITE_MAX: Final = 256 * KIB
-"""Plain bytes that are encrypted at once at most, as many as a fragment and its header may have: 0.3 ms."""
-_READ: Final = 256 * KIB
+_WRITE_MAX: Final = 128 * KIB
+"""Plain bytes that are encrypted at once at most, 0.1 ms. Twice as many are no faster, and OpenSSL keeps buffers of
+the largest size for each connection."""
+_READ: Final = 128 * KIB
 """Bytes that are read from the socket at once."""
 _scratch: Final = memoryview(bytearray(_READ))
 """Where every connection reads ciphertext: one loop, one thread, and nothing stays in it."""
@@ -121,7 +122,10 @@ class SecureSocket:
         self, sock: DataSocket, tls: ssl.SSLObject, incoming: ssl.MemoryBIO, outgoing: ssl.MemoryBIO
     ) -> None:
         self._sock = sock
+        self._transmit = _sender(sock)
         self._tls = tls
+        self._write = tls.write
+        self._read = cast("Callable[[int, memoryview], int]", tls.read)
         self._incoming = incoming
         self._outgoing = outgoing
         self._unsent: memoryview | None = None
@@ -145,36 +149,44 @@ class SecureSocket:
         """
         if self._unsent is not None and not self.flush():
             raise BlockingIOError
-        most = self._most
-        taken = 0
-        small: list[Buffer] = []
-        waiting = 0
+        size = 0
         for part in parts:
-            size = len(part)
-            if size > most - taken:
-                part = memoryview(part)[: most - taken]  # noqa: PLW2901 - the rest is for the next call
-                size = len(part)
+            size += len(part)
+        if size > _RECORD:
+            size = self._encrypt(parts)
+        elif size:
+            self._write(b"".join(parts))
+        else:
+            return 0
+        self._send(self._outgoing.read())
+        if self._unsent is not None:
+            self._most = _RECORD
+        elif size == self._most < _WRITE_MAX:
+            self._most *= 2
+        return size
+
+    def _encrypt(self, parts: Sequence[Buffer]) -> int:
+        """Encrypt more than one record, at most ``_most`` bytes; return how many were taken."""
+        most = self._most
+        taken = waiting = 0
+        small: list[Buffer] = []
+        for part in parts:
+            view = memoryview(part)[: most - taken]
+            size = len(view)
             taken += size
             if waiting + size <= _RECORD:
-                small.append(part)
+                small.append(view)
                 waiting += size
-                continue
-            # The first record is filled up, so that a header is none of its own; OpenSSL makes records of the rest.
-            view = memoryview(part)
-            room = _RECORD - waiting
-            self._tls.write(b"".join((*small, view[:room])))
-            self._tls.write(view[room:])
-            small, waiting = [], 0
+            else:
+                # The first record is filled up, so that a header is none of its own; OpenSSL divides the rest.
+                room = _RECORD - waiting
+                self._write(b"".join((*small, view[:room])))
+                self._write(view[room:])
+                small, waiting = [], 0
             if taken == most:
                 break
         if waiting:
-            self._tls.write(b"".join(small))
-        if taken:
-            self._send(self._outgoing.read())
-            if self._unsent is not None:
-                self._most = _RECORD
-            elif most < _WRITE_MAX and taken == most:
-                self._most = 2 * most
+            self._write(b"".join(small))
         return taken
 
     def flush(self) -> bool:
@@ -214,9 +226,10 @@ class SecureSocket:
     def segment(self, size: int) -> None:
         """Send in packets of at most ``size`` bytes from now on."""
         if isinstance(self._sock, SegmentedSocket):
-            self._sock.size = size
+            self._sock.segment(size)
         else:
             self._sock = SegmentedSocket(cast("socket.socket", self._sock), size)
+            self._transmit = _sender(self._sock)
 
     def shutdown(self, how: int) -> None:
         """Say the end of the stream, and close one direction of the socket."""
@@ -234,27 +247,34 @@ class SecureSocket:
     def _decrypt(self, buffer: memoryview) -> int:
         """Read records into a buffer until it is full or there is none; return the number of bytes."""
         count, size = 0, len(buffer)
-        more = True
+        pending = 0
         try:
+            count = self._read(size, buffer)
             # Asking first: the error by which OpenSSL says that there is no more takes a quarter of a message's time.
-            while more and count < size:
-                got: int = self._tls.read(size - count, buffer[count:])  # type: ignore[assignment] # with a buffer
-                count += got
-                more = got > 0 and (self._incoming.pending > 0 or self._tls.pending() > 0)
+            while (pending := self._incoming.pending) and count < size:
+                count += self._read(size - count, buffer[count:])
         except ssl.SSLWantReadError:
-            pass
+            pending = 0
         except ssl.SSLZeroReturnError:
             if not count:
+                self.readable = False
                 raise
-        self.readable = more and count == size
+        # A buffer with room left has the whole last record; OpenSSL reads no further than the end of a record.
+        self.readable = count == size and (pending > 0 or self._tls.pending() > 0)
         if self._outgoing.pending and self._unsent is None:
             self._send(self._outgoing.read())  # the answer to an update of keys
         return count
 
     def _send(self, ciphertext: Buffer) -> None:
         try:
-            sent = self._sock.sendmsg((ciphertext,))
+            sent = self._transmit(ciphertext)
         except (BlockingIOError, InterruptedError):
             sent = 0
         if sent < len(ciphertext):
             self._unsent = memoryview(ciphertext)[sent:]
+
+
+def _sender(sock: DataSocket) -> Callable[[Buffer], int]:
+    """What sends the bytes of one buffer by a socket; ``send`` is 0.3 µs faster than ``sendmsg``."""
+    send: Callable[[Buffer], int] | None = getattr(sock, "send", None)
+    return send if send is not None else lambda data: sock.sendmsg((data,))

@@ -97,6 +97,7 @@ class Stream:
         self._kept: list[tuple[Sequence[Buffer], int, bool]] = []
         self._kept_bytes = 0
         self._closed = False
+        self._reading_held = False
         self._drained: asyncio.Future[None] | None = None
         self._report: asyncio.Handle | None = None
         self.bytes_in = 0
@@ -467,7 +468,9 @@ class Stream:
             self._buffer = buffer
             self._view = memoryview(buffer)
 
-    def _readable(self) -> None:
+    def _readable(self, *, held: bool = False) -> None:
+        if self._reading_held and not held:
+            return  # within ``_read_held``, whose handlers yield to data: its bytes come first
         try:
             count = self._sock.recv_into(self._view[self._filled :])
         except RecordIncomplete:
@@ -488,13 +491,20 @@ class Stream:
             self._reserve(_BUSY_BUFFER)  # more bytes wait, so messages are large: read more at once from now on
         if self._filled >= self._wanted or self._filled == len(self._buffer):
             self._deliver()
-        if self._secure is not None and self._secure.readable:
+        if self._secure is not None and self._secure.readable and not held:
             self._read_held()
 
     def _read_held(self) -> None:
         """Read the bytes that were received with a record but found no room, as the loop does not see them."""
-        if self._secure is not None and self._secure.readable and not self._closed:
-            self._readable()
+        self._reading_held = True
+        try:
+            while self._is_holding():
+                self._readable(held=True)
+        finally:
+            self._reading_held = False
+
+    def _is_holding(self) -> bool:
+        return self._secure is not None and self._secure.readable and not self._closed
 
     def _heard(self) -> None:
         """Note that bytes came now."""
