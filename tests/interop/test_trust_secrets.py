@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from lab.bed.agents import Agent
     from lab.bed.namespaces import Lab
     from rmpa.trust.io.store import TrustStore
-    from tests.interop.conftest import AgentFactory, WebFactory
+    from tests.interop.conftest import AgentFactory
 
 pytestmark = [pytest.mark.netns, pytest.mark.timeout(180)]
 
@@ -99,13 +99,16 @@ def run(agent: Agent, *words: str) -> bytes:
     return agent.rmpa(*words)[1].encode()
 
 
-def test_no_key_and_no_token_leaves_its_file(tmp_path: Path, lab: Lab, agent: AgentFactory, web: WebFactory) -> None:
+def test_no_key_and_no_token_leaves_its_file(tmp_path: Path, lab: Lab, agent: AgentFactory) -> None:
     mesh = SecuredMesh(tmp_path, "a")
     mesh.add("b")
     hosts = lab.hosts("a", "b", "eve")
     a, b = (agent(host, name=host.name, log_level="debug") for host in hosts[:2])
     a.wait_peer("b")
-    served = web(a, "--control")
+    words_of_web: list[str | Path] = [RMPA, "web", "--listen", "0.0.0.0", "--agent", "a", "--control", "--json"]
+    with Process(a.host.command(words_of_web), env=a.env, name="rmpa web") as served:
+        file = json.loads(served.wait_for(r"(\{.*\})", 90.0)[1])["token_file"]
+    web_token = Path(file).read_bytes().strip()
     outputs = {" ".join(words): run(each, *words) for each in (a, b) for words in COMMANDS}
 
     # Joins that succeed and fail, with what is printed and answered.
@@ -124,7 +127,7 @@ def test_no_key_and_no_token_leaves_its_file(tmp_path: Path, lab: Lab, agent: Ag
     outputs["revoke"] = json.dumps(control(a, "revoke", name="c", force=True)).encode()
 
     secrets = _secrets([mesh.store("a"), mesh.store("b")], token)
-    secrets["web token"] = [served.token.encode()] if served.token else []
+    secrets["web token"] = [web_token]
     # Errors about files that cannot be used: their content must not be in the text.
     outputs |= _broken(b)
     for name, data in outputs.items():
