@@ -107,8 +107,9 @@ def test_no_key_and_no_token_leaves_its_file(tmp_path: Path, lab: Lab, agent: Ag
     a.wait_peer("b")
     words_of_web: list[str | Path] = [RMPA, "web", "--listen", "0.0.0.0", "--agent", "a", "--control", "--json"]
     with Process(a.host.command(words_of_web), env=a.env, name="rmpa web") as served:
-        file = json.loads(served.wait_for(r"(\{.*\})", 90.0)[1])["token_file"]
-    web_token = Path(file).read_bytes().strip()
+        told = json.loads(served.wait_for(r"(\{.*\})", 90.0)[1])
+    assert told["url"].startswith("https://"), told
+    web_token = Path(told["token_file"]).read_bytes().strip()
     outputs = {" ".join(words): run(each, *words) for each in (a, b) for words in COMMANDS}
 
     # Joins that succeed and fail, with what is printed and answered.
@@ -192,6 +193,7 @@ def _check_files(home: Path, secrets: dict[str, list[bytes]]) -> None:
         assert found <= allowed, f"{path} has a {found - allowed}"
         if found or path.parent.name == files_of.FOLDER:
             assert mode & 0o077 == 0, f"{path} has mode {mode:o}"
+        if path.parent.name == files_of.FOLDER:
             assert path.parent.stat().st_mode & 0o077 == 0, path.parent
         seen |= found
     assert seen >= {"private key", "group key", "CA key"}, "the search finds what is there"
