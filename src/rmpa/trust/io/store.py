@@ -188,6 +188,11 @@ class TrustStore:
         """The key (PEM) of a join by files; raises as ``load``."""
         return self._read(REQUEST_KEY, "begin again: rmpa trust join --request FILE")
 
+    def check_writable(self) -> None:
+        """Raise ``StartError`` if files cannot be written here."""
+        self.write(REQUEST_KEY, b"-")
+        self.forget(REQUEST_KEY)
+
     def forget(self, name: str) -> None:
         """Remove a file that is not needed any more, if it is there."""
         with contextlib.suppress(OSError):
