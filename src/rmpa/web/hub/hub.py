@@ -403,8 +403,15 @@ class Hub:
                 return
 
             def known(kind: Any) -> None:
-                client.receive(requests.Described(request.handle, request.type, kind.definition))
+                answer = requests.Described(request.handle, request.type, kind.definition, md5sum=kind.md5sum)
+                client.receive(answer)
 
+            if request.md5sum:
+                version = self.types.seen_version(request.type, request.md5sum)
+                if version is None:
+                    raise RmpaError(f"no publisher has told the version {request.md5sum} of {request.type}")
+                known(version)
+                return
             try:
                 known(await self.types.find_message(request.type))
             except RmpaError:
