@@ -150,6 +150,7 @@ async def test_messages_of_all_kinds_are_decoded_and_recorded_byte_by_byte(
     mcap_reader = pytest.importorskip("mcap.reader", reason="mcap is not installed (extra web-peers)")
     mcap_ros1 = pytest.importorskip("mcap_ros1.decoder", reason="mcap-ros1-support is not installed (web-peers)")
     decode: list[str | Path] = ["node", npm.CLIENTS / "decode.mjs", npm.packages(), url(served), f"{KINDS}/"]
+    filler = await arm.advertise("/filler", "std_msgs/String")
     async with all_kinds(arm) as sent:
         with Process(decode, name="decode.mjs") as decoder:
             await until(lambda: len(decoder.events("message")) >= len(sent) or decoder.returncode, "each type")
@@ -162,7 +163,6 @@ async def test_messages_of_all_kinds_are_decoded_and_recorded_byte_by_byte(
 
             # The recorder of the examples keeps 5 MB until it writes: more follows behind what is looked for.
             file = tmp_path / "all.mcap"
-            filler = await arm.advertise("/filler", "std_msgs/String")
             with example("mcap-record", "--output", file, url(served)) as recorder:
                 await recorder.expect("subscribing to /filler")
                 await filler.wait_for_subscriber()
