@@ -272,6 +272,7 @@ class Securing:
         on_secured: A connection is a member's; the callee owns the socket.
         on_refused: ``(address, refusal)``: the TLS handshake with a holder of the group key failed.
         on_join: Takes connections that are no link: joins and renewals; ``None``: they are closed.
+        pause: Stops accepting for some seconds, because too many connections show no group key.
     """
 
     def __init__(
@@ -283,6 +284,7 @@ class Securing:
         on_secured: Callable[[socket.socket, SocketAddress, SecuredSocket], None],
         on_refused: Callable[[str, Refuse], None],
         on_join: OnJoin | None,
+        pause: Callable[[float], None],
     ) -> None:
         self._security = security
         self._clock = clock
@@ -290,6 +292,8 @@ class Securing:
         self._on_secured = on_secured
         self._on_refused = on_refused
         self._on_join = on_join
+        self._pause = pause
+        self._bad = TokenBucket(limits.UNPROVEN_RATE, limits.UNPROVEN_BURST)
         self._unproven: dict[int, _Unproven] = {}
         """By file descriptor, the oldest first."""
         self._unproven_there: Counter[str] = Counter()
@@ -306,6 +310,7 @@ class Securing:
             sock.close()
             text = f"closed a connection from {host}: too many have not shown that they are of this mesh"
             self._refusals.refuse(self._clock.now(), "link.pending_full", host, text)
+            self._note_bad()
             return
         one = _Unproven(sock, address, self._clock.now() + limits.PREFACE_TIMEOUT)
         if self._fill(one):
@@ -361,6 +366,7 @@ class Securing:
     def _proceed(self, one: _Unproven) -> None:
         if one.ended:
             one.sock.close()
+            self._note_bad()
             _log.debug("! %s: closed after %d bytes", one.address[0], len(one.data))
         elif is_preface(one.data) is False:
             text = "the dialler is not secured, but this mesh is"
@@ -391,6 +397,7 @@ class Securing:
 
     def _refuse(self, sock: socket.socket, host: str, refuse: Refuse) -> None:
         """Count, answer unless there are many, and close."""
+        self._note_bad()
         now = self._clock.now()
         text = f"refused a connection from {host}: {refuse.text}"
         self._refusals.refuse(now, f"link.refused.{refuse.label}", host, text)
@@ -400,6 +407,12 @@ class Securing:
                 sock.shutdown(socket.SHUT_WR)
                 sock.recv(_READ)  # unread bytes would make the end a reset, which overtakes the answer
         sock.close()
+
+    def _note_bad(self) -> None:
+        """Leave a flood of connections that show no group key to the kernel for a moment."""
+        if not self._bad.take(self._clock.now()):
+            self._refusals.count("link.paused")
+            self._pause(limits.UNPROVEN_PAUSE)
 
     def _arm(self) -> None:
         self._timer = None
