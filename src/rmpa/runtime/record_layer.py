@@ -246,12 +246,13 @@ class SecureSocket:
             while (pending := self._incoming.pending) and count < size:
                 got = self._read(size - count, buffer[count:])
                 if not got:
-                    raise ssl.SSLZeroReturnError
+                    self.readable = True  # the next call says the end; nothing behind it is read, whatever follows
+                    return count
                 count += got
         except ssl.SSLWantReadError:
             return count
         except ssl.SSLZeroReturnError:
-            self.readable = True  # the next call says the end; nothing behind it is read, whatever follows
+            self.readable = True
             return count
         self.readable = count == size and (pending > 0 or self._tls.pending() > 0)
         return count
