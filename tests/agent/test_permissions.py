@@ -15,8 +15,10 @@ import pytest
 
 from rmpa.agent import Agent
 from rmpa.agent.permission_notes import permission_notes
+from rmpa.bridge.io.node_requests import INFO
 from rmpa.bridge.io.proxy_kills import KILL
 from rmpa.bridge.params import transfer
+from rmpa.bridge.session.peer_session import PeerSession
 from rmpa.config.permission_rules import Effect, PermissionRule
 from rmpa.config.settings import NodeSettings, ParamSettings, ServiceSettings, Settings, TrustSettings
 from rmpa.core.contract import ContractRule, Transport
@@ -26,6 +28,7 @@ from rmpa.ros.wire.xmlrpc import serialize_response
 from rmpa.trust.permissions import Permissions
 from tests.agent.test_agent import Sink, node, running, settings, until
 from tests.agent.test_services import serving
+from tests.agent.test_services_direct import about, transport
 from tests.agent.test_why import ask, stopped_at
 
 if TYPE_CHECKING:
@@ -121,11 +124,18 @@ async def test_why_tells_nothing_of_topics_and_services_that_the_asker_may_not_h
         async with serving(a, "/open_door"):
             for real, made_up in (("/secret", "/secrex"), ("/open_door", "/open_doox")):
                 for peer in ("a", None):
-                    answers = [str(await ask(b, name, peer)).replace(name, "NAME") for name in (real, made_up)]
+                    answers = [
+                        [
+                            (one.kind, one.node, str(one.failed).replace(name, "NAME"))
+                            for one in await ask(b, name, peer)
+                        ]
+                        for name in (real, made_up)
+                    ]
                     assert answers[0] == answers[1]
-                    assert "the permissions of a do not let b" in answers[0]
-                    assert "talker" not in answers[0]
-                    assert "adder" not in answers[0]
+                    said = str(answers[0])
+                    assert "the permissions of a do not let b" in said
+                    assert "talker" not in said
+                    assert "adder" not in said
 
 
 async def test_services_are_shown_and_called_only_as_both_sides_permit(
@@ -209,6 +219,21 @@ async def test_parameters_are_read_and_set_only_with_permission(
         assert await asks(transfer.DELETE, "/arm/deep") == "{}"
 
 
+async def test_facts_about_a_node_leave_out_what_the_asker_may_not_have(
+    settings: Callable[..., Settings],
+) -> None:
+    a_settings = with_rules(settings("a"), allow("b", subscribe="/odom", publish="/cmd_vel"))
+    async with secured(a_settings, with_rules(settings("b"))) as (a, b), node("base", a) as base:
+        for topic in ("/odom", "/secret"):
+            await base.advertise(topic, "std_msgs/String")
+        for topic in ("/cmd_vel", "/hidden"):
+            await base.subscribe(topic, "std_msgs/String", lambda _: None)
+        link = next(iter(b.bridge.sessions.linked()))
+        facts = await b.bridge.rpc.request(link, INFO, {"node": "/base"})
+        assert (list(facts["publications"]), list(facts["subscriptions"])) == (["/odom"], ["/cmd_vel"])
+        assert facts["services"] == []
+
+
 async def test_nodes_are_ended_only_with_permission(settings: Callable[..., Settings]) -> None:
     nodes = NodeSettings(kill=("/**",))
     a_settings = replace(with_rules(settings("a"), allow("b", kill="/demo/**")), nodes=nodes)
@@ -245,3 +270,44 @@ async def test_the_start_writes_it_once(
     async with running(with_rules(settings("a"), allow("b", publish="/x"))):
         pass
     assert caplog.text.count("[[permission]] has no effect") == 1
+
+
+async def test_direct_transport_is_off_between_machines_until_both_modules_allow_it(
+    settings: Callable[..., Settings], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(PeerSession, "same_machine", property(lambda _: False))
+    services = ServiceSettings(transport=Transport.AUTO)
+    closed = TrustSettings(default="allow")
+    opened = replace(closed, direct=True)
+    a_settings, b_settings = (
+        replace(settings(name), services=services, transport=Transport.AUTO, trust=closed) for name in "ab"
+    )
+
+    def topic(agent: Agent) -> tuple[str, str]:
+        routes = [r for t in agent.operations.snapshot({}).topics if t.name == "/odom" for r in t.routes]
+        found = [one for route in routes for one in route.subscribers]
+        return (found[0].transport, found[0].condition) if found else ("", "")
+
+    async with (
+        secured(a_settings, b_settings) as (a, b),
+        serving(a),
+        node("talker", a) as talker,
+        node("hearer", b) as hearer,
+    ):
+        await talker.advertise("/odom", "std_msgs/String")
+        subscriber = await hearer.subscribe("/odom", "std_msgs/String", Sink())
+        await until(lambda: subscriber.publishers and transport(b) == ("relay", "trust"))
+        await until(lambda: topic(b) == ("relay", "trust"))
+        b.apply_settings(replace(b_settings, trust=opened))
+        await until(lambda: (found := about(b)) is not None and "server's module" in found.relayed_because)
+        assert transport(b) == ("relay", "trust"), "a does not allow it"
+        assert topic(b)[1] == "subscriber", "the next condition: this node is bound to loopback"
+        a.apply_settings(replace(a_settings, trust=opened))
+        await until(lambda: transport(b) == ("direct", ""))
+        a.apply_settings(a_settings)
+        await until(lambda: transport(b) == ("relay", "trust"))
+        a.apply_settings(replace(a_settings, trust=opened))
+        await until(lambda: transport(b) == ("direct", ""))
+        b.apply_settings(replace(b_settings, trust=replace(opened, rules=(deny("a", serve="/**", publish="/**"),))))
+        await until(lambda: not subscriber.publishers and not b.core.state().services.get("/add"))
+        assert b.bridge.counters["direct.service_stopped"] == 1, "also connections of persistent clients end"

@@ -30,6 +30,7 @@ from rmpa.bridge.services.rules import ServiceRules
 from rmpa.core.counters import Counters
 from rmpa.core.errors import StartError
 from rmpa.core.open_files import remedy
+from rmpa.observe.io.agent_requests import AgentRequests
 from rmpa.observe.io.control_operations import ControlOperations
 from rmpa.observe.io.control_server import ControlServer
 from rmpa.observe.io.diagnostics import Diagnostics
@@ -149,6 +150,7 @@ class Agent:
         )
         self.snapshots = SnapshotBuilder(settings, sources)
         self._nodes = NodeRequests(settings, self.core, self.bridge.rpc, self.bridge.gate)
+        AgentRequests(self.bridge.rpc, self.snapshots)
         self._why = WhyService(settings, self.core, self.bridge, self.services, self.snapshots)
         self.operations = ControlOperations(
             settings.name,
@@ -157,8 +159,9 @@ class Agent:
             self.snapshots,
             self._why,
             self.reloader.reload,
-            GraphRevisions(self.core),
+            GraphRevisions(self.core, rows=settings.core_mode == "embedded"),
             self._trust_operations(),
+            self._nodes,
         )
         self._control = ControlServer(
             runtime_dir(os.environ, settings.runtime_dir),
@@ -217,6 +220,7 @@ class Agent:
     def _notes(self) -> Iterator[str]:
         yield from (f"{key} waits for a restart" for key in self.reloader.waiting)
         yield from self.params.notes()
+        yield from permission_notes(self._settings, secured=self.bridge.gate.on)
         if self.trust is not None:
             yield from self.trust.notes()
 

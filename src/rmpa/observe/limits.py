@@ -32,6 +32,9 @@ CONTROL_HANDLER_TIMEOUT: Final = 30.0
 """Time-out of an operation in the agent; ``rmpa why`` waits for peers."""
 CONTROL_WAIT_MAX: Final = 25.0
 """The longest wait for a change of the graph in one request: it must end within ``CONTROL_HANDLER_TIMEOUT``."""
+GRAPH_HISTORY: Final = 4096
+"""Changes of the graph that are kept for clients of ``graph``: the start of a large graph makes fewer while a slow
+client does not ask. A client that is further behind gets the whole graph. Some 0.5 MB."""
 CONTROL_PATH_MAX: Final = 107
 """Bytes in a UNIX socket's path: Linux's sun_path less its final zero."""
 CPU_INTERVAL: Final = 1.0

@@ -15,6 +15,12 @@ CLIENT_QUEUE_BYTES: Final = 16 * MIB
 always fits where no other waits."""
 SUBSCRIPTION_QUEUE_BYTES: Final = 8 * MIB
 """Bytes that wait for one subscription of one client; its newest message always fits."""
+PAYLOAD_BUFFER_MIN: Final = 64 * KIB
+"""Bytes from which on a received message is copied into a buffer that was used before; smaller ones cost little."""
+PAYLOAD_BUFFERS_BYTES: Final = 16 * MIB
+"""Bytes of these buffers that are kept, used and unused: what waits for one slow client."""
+PAYLOAD_BUFFERS_MAX: Final = 64
+"""Such buffers; each is looked at until one is unused."""
 CLIENTS_MAX: Final = 256
 """Clients of both gateways together."""
 SUBSCRIPTION_LINGER: Final = 2.0

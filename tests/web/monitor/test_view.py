@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
+from rmpa.observe.snapshot import TopicInfo, UnreachableInfo
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.patch import Tree, apply, difference
 from rmpa.web.monitor.resources import ResourceFacts
@@ -199,3 +200,33 @@ def test_a_strange_descriptor_of_a_peer_breaks_nothing() -> None:
     )
     state = build(RECORDED[0], resources=[strange])
     assert state["resources"]["y:/x"]["module"] == "y"
+
+
+def test_nodes_of_all_modules_are_listed_and_each_has_its_topics_and_services() -> None:
+    nodes = build(RECORDED[0], resources=RESOURCES)["nodes"]
+    assert nodes["base:/base"]["module"] == "base"
+    assert "/odom" in details_of("node", "base:/base")["publishes"]
+    own = next(name for name, one in nodes.items() if "module" not in one and one.get("subscribes"))
+    assert nodes[own]["subscribes"] == len(details_of("node", own)["subscribes"])
+    served = next(name for name, one in nodes.items() if one.get("serves") and one.get("module") == "base")
+    assert all(each.startswith("base:/") for each in details_of("node", served)["services"])
+    assert details(RECORDED[0], {}, "node", "base:/nothing") is None
+
+
+def details_of(kind: str, name: str) -> Any:
+    return details(RECORDED[0], {}, kind, name)
+
+
+def test_a_node_that_cannot_be_reached_says_so() -> None:
+    gone = UnreachableInfo(node="/talker", uri="http://robot:1/", problem="no route", ago=3.0)
+    topic = TopicInfo(name="/chatter", publishers=("/talker",))
+    snapshot = msgspec.structs.replace(FULL, topics=(topic,), services=(), unreachable=(gone,))
+    assert build(snapshot)["nodes"]["/talker"]["problem"] == "no route"
+    assert "no route" in str((details(snapshot, {}, "node", "/talker") or {})["problem"])
+
+
+def test_nodes_beyond_the_limit_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "NODES_SHOWN", 2)
+    state = build(RECORDED[0])
+    assert len(state["nodes"]) == 2
+    assert state["hidden"]["nodes"] > 0

@@ -28,7 +28,7 @@ class Diagnosis(msgspec.Struct, frozen=True, kw_only=True):
     """The path of a topic (service) from its publisher (server) in one module to its users in another.
 
     Attributes:
-        kind: ``topic`` or ``service``.
+        kind: ``topic``, ``service`` or ``module``.
         name: Its name in the graph of the module that diagnoses.
         peer: The module of the publisher (server).
         to: The module of the users.

@@ -19,6 +19,7 @@ from rmpa.web import limits
 from rmpa.web.foxglove.protocol import SUBPROTOCOLS, choose_subprotocol
 from rmpa.web.gateways.figures import PROTOCOLS, GatewayFigures
 from rmpa.web.gateways.foxglove import FoxgloveConnection
+from rmpa.web.gateways.frame_writer import FrameSocket
 from rmpa.web.gateways.monitor import MonitorConnection
 from rmpa.web.gateways.rosbridge import RosbridgeConnection
 from rmpa.web.monitor import limits as monitor_limits
@@ -51,7 +52,7 @@ _SERVICE_RESTART: Final = 1012
 
 @dataclass(frozen=True, slots=True)
 class _OpenClient:
-    response: web.WebSocketResponse
+    response: FrameSocket
     request: web.Request
     rights: Rights
 
@@ -138,7 +139,7 @@ class Gateways:
     async def _serve(
         self, request: web.Request, connection: ClientConnection, most: int, rights: Rights
     ) -> web.StreamResponse:
-        response = web.WebSocketResponse(
+        response = FrameSocket(
             protocols=(*SUBPROTOCOLS, SUBPROTOCOL),
             autoping=False,
             compress=False,

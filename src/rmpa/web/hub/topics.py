@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.ros.wire.tcpros import ANY
 from rmpa.web import limits
 from rmpa.web.hub.node_link import Registration
+from rmpa.web.hub.payload_buffers import PayloadBuffers
 from rmpa.web.hub.requests import ReceivedMessage
 
 if TYPE_CHECKING:
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
 
     from rmpa.core.errors import RmpaError
     from rmpa.ros.node.node import Node, Subscriber
-    from rmpa.ros.node.topics import Received as RosReceived
     from rmpa.web.hub.clients import Key
     from rmpa.web.hub.node_link import NodeLink
 
@@ -88,6 +88,7 @@ class HubTopics:
         self._ending: dict[str, Registration[Subscriber]] = {}
         self._latched_bytes = 0
         self._latched_order: OrderedDict[tuple[str, str], None] = OrderedDict()
+        self._buffers = PayloadBuffers()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -168,7 +169,7 @@ class HubTopics:
     # --- inside -----------------------------------------------------------------------------------------------
 
     async def _register(self, there: _Topic, node: Node) -> Subscriber:
-        return await node.subscribe(there.name, None, functools.partial(self._take, there))
+        return await node.subscribe(there.name, None, on_bytes=functools.partial(self._take, there))
 
     def _refused(self, there: _Topic, error: RmpaError) -> None:
         if self._topics.get(there.name) is there:
@@ -188,11 +189,13 @@ class HubTopics:
             there.registration.end()
             self._ending = {name: each for name, each in self._ending.items() if not each.ended}
             self._ending[there.name] = there.registration
+        if not self._topics:
+            self._buffers.clear()
 
-    def _take(self, there: _Topic, message: RosReceived) -> None:
+    def _take(self, there: _Topic, data: memoryview, header: Mapping[str, str]) -> None:
         if self._topics.get(there.name) is not there:
             return  # it has ended, and is being withdrawn
-        header = message.header
+        stamp_ns = self._now_ns()
         source = header.get("callerid", "?")
         if there.headers.get(source) is not header:
             there.headers[source] = header
@@ -200,8 +203,8 @@ class HubTopics:
                 del there.headers[next(iter(there.headers))]
             self._learn(there.name, header)
         latch = header.get("latching") == "1"
-        payload = memoryview(message.raw)
-        self._deliver(there, source, header, header.get("type", ""), payload, message.stamp_ns, latch=latch)
+        payload = self._buffers.copy(data)
+        self._deliver(there, source, header, header.get("type", ""), payload, stamp_ns, latch=latch)
 
     def _deliver(
         self,

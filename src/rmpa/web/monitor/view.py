@@ -8,11 +8,13 @@ costs little.
 from __future__ import annotations
 
 import math
+from itertools import islice
 from typing import TYPE_CHECKING, cast
 
 import msgspec
 
 from rmpa.web.monitor import limits
+from rmpa.web.monitor.nodes import node_detail, node_entries
 from rmpa.web.monitor.patch import Tree, Value, without_nulls
 from rmpa.web.monitor.places import Places
 from rmpa.web.monitor.resources import resource_detail, resource_entry, resource_flows
@@ -104,6 +106,7 @@ class StateBuilder:
         resources: Sequence[ResourceFacts] = (),
         alarms: Sequence[Tree] = (),
         recorded: int = 0,
+        parameters: int = 0,
     ) -> Tree:
         """The state of ``snapshot``.
 
@@ -113,11 +116,13 @@ class StateBuilder:
             alarms: The alarms that stand, each with ``id``, ``module`` (empty: this one), ``resource``, ``level``,
                 ``text`` and ``at``.
             recorded: How many entries the history has had.
+            parameters: How often the parameters of this module's core have changed.
         """
         taken = snapshot.taken
         peers = snapshot.peers[: limits.MODULES_SHOWN]
         self._bytes.keep(peer.name for peer in peers)
         self._places.update((peer.name for peer in peers), taken)
+        nodes = node_entries(snapshot)
         state: Tree = {
             "reach": {"ok": True},
             "agent": self._agent(snapshot),
@@ -126,12 +131,14 @@ class StateBuilder:
             "flows": {**self._flows(snapshot.topics), **resource_flows(resources, self.own, self._steady)},
             "topics": self._topics(snapshot.topics[: limits.TOPICS_SHOWN]),
             "services": self._services(snapshot.services[: limits.SERVICES_SHOWN]),
+            "nodes": dict(islice(nodes.items(), limits.NODES_SHOWN)),
             "resources": {one.key: resource_entry(one, self.own) for one in resources},
             "alarms": {
                 str(alarm.get("id", index)): {**alarm, "module": alarm.get("module") or self.own}
                 for index, alarm in enumerate(alarms)
             },
             "recorded": recorded,
+            "parameters": parameters,
             "notes": list(snapshot.notes[:100]),
             "unreachable": [str(each) for each in snapshot.unreachable[:100]],
         }
@@ -139,6 +146,7 @@ class StateBuilder:
             "topics": len(snapshot.topics) - limits.TOPICS_SHOWN,
             "services": len(snapshot.services) - limits.SERVICES_SHOWN,
             "modules": len(snapshot.peers) - limits.MODULES_SHOWN,
+            "nodes": len(nodes) - limits.NODES_SHOWN,
         }
         state["hidden"] = {kind: count for kind, count in hidden.items() if count > 0}
         self._steady.sweep()
@@ -351,14 +359,16 @@ def details(snapshot: Snapshot, resources: Mapping[str, ResourceFacts], kind: st
     Args:
         snapshot: The newest.
         resources: By ``ResourceFacts.key``.
-        kind: ``module``, ``topic``, ``service`` or ``resource``; or ``counters``, without a name.
-        name: A module's or topic's name; ``service_key`` of a service; ``key`` of a resource.
+        kind: ``module``, ``topic``, ``service``, ``node`` or ``resource``; or ``counters``, without a name.
+        name: A module's or topic's name; ``service_key`` of a service; ``node_key``; ``key`` of a resource.
     """
     own = snapshot.agent.name
     if kind == "counters":
         return dict(sorted(snapshot.counters.items()))
     if kind == "resource":
         return resource_detail(resources[name], own) if name in resources else None
+    if kind == "node":
+        return node_detail(snapshot, name)
     if kind == "module" and name == own:
         return _tree(msgspec.to_builtins(snapshot.agent))
     found: object = None

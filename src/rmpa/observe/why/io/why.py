@@ -13,10 +13,13 @@ from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
 from rmpa.core.names import is_global_name
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, Check
+from rmpa.observe.io.agent_requests import INFO as AGENT_INFO
+from rmpa.observe.peer_agent import PeerAgent
 from rmpa.observe.why.diagnosis import PERMISSION_THERE, BothEnds, Diagnosis, TopicAtPublisher, without_rules
 from rmpa.observe.why.direct_stages import connected_directly
 from rmpa.observe.why.io.service_evidence import ServiceEvidence
 from rmpa.observe.why.io.topic_evidence import TopicEvidence, name_in
+from rmpa.observe.why.modules import diagnose_module
 from rmpa.observe.why.services import ServiceAtServer, diagnose_service
 from rmpa.observe.why.topics import diagnose_topic, find_peer, peer_stages
 
@@ -74,12 +77,15 @@ class WhyService:
 
         Args:
             args: ``name``: a topic or a service; ``peer``: one peer's name or GUID, or ``None`` for all peers that
-                have it or receive it; ``service``: whether a service is meant even where a topic has that name.
+                have it or receive it; ``service``: whether a service is meant even where a topic has that name. Or
+                ``module`` alone: a peer's name or GUID.
 
         Raises:
             ConfigError: The name is not a ROS name.
         """
         name, peer = args.get("name"), args.get("peer")
+        if isinstance(module := args.get("module"), str) and module:
+            return (await self._module(module),)
         if not isinstance(name, str) or not is_global_name(name):
             raise ConfigError("name", f"{name!r} is not a topic, nor a service", "write /name, or PEER:/name")
         wanted = str(peer) if peer is not None else None
@@ -95,6 +101,19 @@ class WhyService:
             # Whether there is a topic or a service of this name is not told to those who may not have it.
             return (*found, *(diagnosis for diagnosis in service if _is_denied(diagnosis)))
         return found
+
+    async def _module(self, name: str) -> Diagnosis:
+        """A module itself: its link, and what its agent tells."""
+        told, refusal = None, ""
+        snapshot = self._snapshots.build(frozenset())
+        found = find_peer(snapshot, name)
+        session = next((s for s in self._bridge.sessions.linked() if found and str(s.link.guid) == found.guid), None)
+        if session is not None:
+            try:
+                told = msgspec.convert(await self._bridge.rpc.request(session, AGENT_INFO, {}), PeerAgent)
+            except (RmpaError, msgspec.ValidationError) as error:
+                refusal = str(error)
+        return diagnose_module(self._snapshots.build(frozenset()), name, told, refusal)
 
     def _is_service(self, name: str) -> bool:
         state = self._core.state()

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import math
 import time
 from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import msgspec
 
+from rmpa.bridge.io.node_requests import INFO
+from rmpa.bridge.policy import is_own
 from rmpa.bridge.proxy_names import proxied_peer
 from rmpa.config.permission_rules import Access
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
@@ -20,6 +24,7 @@ from rmpa.observe.io.peer_params import PeerParams, parameters_in
 from rmpa.resource.run.dynamic_reconfigure import SERVICE_TYPE
 from rmpa.web.hub.rights import FULL
 from rmpa.web.monitor import limits
+from rmpa.web.monitor.nodes import node_key, shown_node
 from rmpa.web.values.codec import codec_for
 
 if TYPE_CHECKING:
@@ -36,7 +41,7 @@ if TYPE_CHECKING:
 Args = dict[str, Any]
 _CALL_TIMEOUT: Final = 30.0
 _READ_TIMEOUT: Final = 5.0
-_KINDS: Final = ("topic", "service")
+_KINDS: Final = ("topic", "service", "module")
 _SET_PARAMETERS: Final = "set_parameters"
 """The service of a resource that takes another configuration (wiki.ros.org/dynamic_reconfigure)."""
 _RECONFIGURES: Final = ("profile", "context", "configure")
@@ -69,6 +74,10 @@ class Answers:
             "why": self._why,
             "history": self._history,
             "describe": self._describe,
+            "agent": self._agent_of,
+            "contract": self._contract,
+            "node": self._node,
+            "param_names": self._param_names,
             "params": self._params,
             "call": self._call,
             "set_param": self._set_param,
@@ -113,12 +122,35 @@ class Answers:
     async def _why(self, args: Args) -> Any:
         kind = args.get("kind")
         if kind not in _KINDS:
-            raise ConfigError("kind", f"{str(kind)[:40]!r} is not a topic or a service")
+            raise ConfigError("kind", f"{str(kind)[:40]!r} is not a topic, a service or a module")
+        if kind == "module":
+            return await self._control_call("why", module=_text(args, "name"))
         name, peer = _name(args, "name"), _text(args, "peer")
+        return await self._control_call("why", name=name, peer=peer or None, service=kind == "service")
+
+    async def _agent_of(self, args: Args) -> Any:
+        return await self._control_call("agent", peer=_text(args, "peer"))
+
+    async def _contract(self, args: Args) -> Any:
+        return await self._control_call("contract", topic=_name(args, "topic"), type_name=_text(args, "type"))
+
+    async def _node(self, args: Args) -> Any:
+        """The facts about a node, with names of nodes as pages have them."""
+        name, peer = _name(args, "name"), _text(args, "peer")
+        if not peer and is_own(name):
+            raise RmpaError(f"{name} belongs to the agent of this module; nothing is asked of it")
+        about = await self._control_call("node", what=INFO, node=name, **({"peer": peer} if peer else {}))
+        for each in about.get("connections") or ():
+            other = str(each["other"])
+            each["other"] = shown_node(other) if not peer or is_own(other) else node_key(peer, other)
+        return about
+
+    async def _control_call(self, op: str, **args: object) -> Any:
+        """Call an operation of the agent, in a thread."""
 
         def ask() -> Any:
             with self._control() as client:
-                return client.call("why", object, name=name, peer=peer or None, service=kind == "service")
+                return client.call(op, object, **args)
 
         return await asyncio.get_running_loop().run_in_executor(self._threads, ask)
 
@@ -138,16 +170,28 @@ class Answers:
     # --- parameters -------------------------------------------------------------------------------------------
 
     async def _params(self, args: Args) -> Any:
+        """All parameters with their ``digest``; where the page ``has`` that digest they are not repeated."""
         peer = _text(args, "peer")
-        if not peer:
-            self._hub.link.need()
-            try:
-                async with asyncio.timeout(_READ_TIMEOUT):
-                    await self._hub.params.loaded.wait()
-            except TimeoutError:
-                raise UnreachableError("parameters of the core", "its API", "is it busy? ask again") from None
-            return {"values": _plain(self._hub.params.tree)}
-        return {"values": _plain(await self._of_peer(peer, lambda params: params.get("/")))}
+        if peer:
+            values = _plain(await self._of_peer(peer, lambda params: params.get("/")))
+        else:
+            values = _plain(await self._own_params())
+        digest = hashlib.sha256(msgspec.json.encode(values, order="sorted")).hexdigest()[:16]
+        return {"digest": digest} if args.get("has") == digest else {"values": values, "digest": digest}
+
+    async def _own_params(self) -> Mapping[str, ParamValue]:
+        self._hub.link.need()
+        try:
+            async with asyncio.timeout(_READ_TIMEOUT):
+                await self._hub.params.loaded.wait()
+        except TimeoutError:
+            raise UnreachableError("parameters of the core", "its API", "is it busy? ask again") from None
+        return self._hub.params.tree
+
+    async def _param_names(self, _args: Args) -> Any:
+        await self._own_params()
+        names = list(islice(self._hub.params.values((), "/"), limits.PARAMETER_NAMES_SHOWN))
+        return {"names": sorted(names)}
 
     async def _set_param(self, args: Args) -> Any:
         name, peer, value = _name(args, "name"), _text(args, "peer"), args.get("value")
