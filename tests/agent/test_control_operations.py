@@ -13,7 +13,7 @@ import rmpa
 from rmpa.config.sources import Loaded
 from rmpa.core.contract import ContractRule, Reliability
 from rmpa.core.errors import PeerRefused
-from rmpa.observe.graph_changes import GraphRevision
+from rmpa.observe.graph_changes import GraphRevision, TopicRow
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.observe.io.control_operations import OPERATIONS
 from rmpa.observe.peer_agent import PeerAgent
@@ -169,3 +169,24 @@ async def test_a_change_of_the_graph_ends_the_wait_for_it(settings: Callable[...
         changed = await asyncio.wait_for(waiting, DEADLINE)
         assert changed != known
         assert await asyncio.to_thread(ask, after=known, wait=20.0) == changed  # it has changed before: at once
+
+
+async def test_the_agent_tells_what_has_changed_in_its_own_core(
+    settings: Callable[..., Settings], tmp_path: Path
+) -> None:
+    async with running(settings("a")) as (a,):
+
+        def ask(**args: object) -> GraphRevision:
+            with ControlClient(tmp_path / "a.sock") as client:
+                return client.call("graph", GraphRevision, rows=True, **args)
+
+        first = await asyncio.to_thread(ask)
+        assert first.core_uri == a.core.uri
+        assert first.rows is not None
+        assert first.rows.whole
+        waiting = asyncio.create_task(asyncio.to_thread(ask, after=first.revision, wait=20.0))
+        a.core.call("registerPublisher", "/talker", "/chatter", "std_msgs/String", "http://127.0.0.1:9/")
+        changed = await asyncio.wait_for(waiting, DEADLINE)
+        assert changed.rows is not None
+        assert not changed.rows.whole
+        assert TopicRow("/chatter", "std_msgs/String", ("/talker",), ()) in changed.rows.topics

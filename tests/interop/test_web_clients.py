@@ -150,6 +150,7 @@ async def test_messages_of_all_kinds_are_decoded_and_recorded_byte_by_byte(
     mcap_reader = pytest.importorskip("mcap.reader", reason="mcap is not installed (extra web-peers)")
     mcap_ros1 = pytest.importorskip("mcap_ros1.decoder", reason="mcap-ros1-support is not installed (web-peers)")
     decode: list[str | Path] = ["node", npm.CLIENTS / "decode.mjs", npm.packages(), url(served), f"{KINDS}/"]
+    filler = await arm.advertise("/filler", "std_msgs/String")
     async with all_kinds(arm) as sent:
         with Process(decode, name="decode.mjs") as decoder:
             await until(lambda: len(decoder.events("message")) >= len(sent) or decoder.returncode, "each type")
@@ -162,7 +163,6 @@ async def test_messages_of_all_kinds_are_decoded_and_recorded_byte_by_byte(
 
             # The recorder of the examples keeps 5 MB until it writes: more follows behind what is looked for.
             file = tmp_path / "all.mcap"
-            filler = await arm.advertise("/filler", "std_msgs/String")
             with example("mcap-record", "--output", file, url(served)) as recorder:
                 await recorder.expect("subscribing to /filler")
                 await filler.wait_for_subscriber()
@@ -307,13 +307,22 @@ def roslibpy_source(folder: Path) -> Path:
 # --- HTTP -----------------------------------------------------------------------------------------------------------
 
 
-async def test_promtool_finds_nothing_wrong_with_the_metrics(served: Web, arm: Node) -> None:
+async def test_promtool_finds_nothing_wrong_with_the_metrics(
+    agents: tuple[Agent, Agent], served: Web, arm: Node
+) -> None:
     promtool = shutil.which("promtool")
     if promtool is None:
         pytest.skip("no promtool here (apt install prometheus)")
-    await arm.subscribe("/chatter", "std_msgs/String", lambda _: None)
-    async with http_client() as http, http.get(f"{served.url}/metrics", headers=served.bearer) as response:
-        body = await response.read()
+    numbers = await arm.advertise("/numbers", "std_msgs/Int32", latch=True)
+    numbers.publish(numbers.make({"data": 1}))
+    async with node_of(agents[0]) as base, http_client() as http:
+        heard = asyncio.Event()
+        await base.subscribe("/numbers", "std_msgs/Int32", lambda _: heard.set())
+        async with asyncio.timeout(DEADLINE):
+            await heard.wait()
+        await served.wait_counts(http, "rmpa_route_messages_total", "topic", lambda found: "/numbers" in found)
+        async with http.get(f"{served.url}/metrics", headers=served.bearer) as response:
+            body = await response.read()
     done = await asyncio.to_thread(subprocess.run, [promtool, "check", "metrics"], input=body, capture_output=True)
     assert (done.returncode, done.stderr) == (0, b""), done.stderr.decode()
 
@@ -328,6 +337,9 @@ async def test_each_response_of_the_api_fits_its_openapi_document(served: Web, a
             async with http.get(URL(f"{served.url}{path}", encoded=True), headers=served.bearer) as response:
                 return response.status, response.headers["Content-Type"], await response.read()
 
+        async with asyncio.timeout(DEADLINE):
+            while (await get("/api/v1/topics/odom"))[0] != 200:
+                await asyncio.sleep(0.05)
         document = json.loads((await get("/openapi.json"))[2])
         config = openapi_core.Config(extra_media_type_deserializers={"application/problem+json": json.loads})
         api = openapi_core.OpenAPI.from_dict(document, config=config)  # it validates the document too

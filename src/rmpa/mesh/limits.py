@@ -163,6 +163,13 @@ HANDSHAKES_PER_ADDRESS: Final = 16
 PLAIN_ANSWERS_RATE: Final = 20.0
 """Connections a second, over all addresses, that are told why they are refused in front of TLS; the others are closed
 without an answer, which takes half the time."""
+UNPROVEN_RATE: Final = 1000.0
+"""Connections a second that show no group key and are read all the same; they take 30 to 60 µs each. Above this rate
+the kernel's queue is left to fill up for a moment, so that a flood of them does not delay data."""
+UNPROVEN_BURST: Final = 200
+"""Such connections that may come at once: the tests of reachability of a large network."""
+UNPROVEN_PAUSE: Final = 0.05
+"""Pause of accepting above that rate; a member's dial is repeated after 0.3 s."""
 REFUSAL_LINGER: Final = 0.5
 """How long a connection whose certificate was refused may still send, so that it reads the alert."""
 PENDING_PER_ADDRESS: Final = 8

@@ -96,7 +96,8 @@ class LaneInfo(msgspec.Struct, kw_only=True, frozen=True):
     Attributes:
         name: ``express`` (control and small messages) or ``bulk`` (large ones).
         connected: Whether it has its TCP connection; messages for a lane without one wait.
-        bytes_in, bytes_out: Received and sent by its present connection.
+        bytes_in: Bytes that its present connection has received.
+        bytes_out: Bytes that its present connection has sent.
         queued: Bytes that wait in its send queue.
         dropped: Messages dropped because it was too slow, since the link came up.
     """

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import socket
+import time
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -12,13 +14,18 @@ import pytest
 pytest.importorskip("cryptography")
 
 from rmpa.core.sizes import MIB
+from rmpa.mesh import limits
 from rmpa.trust.keyring import GroupKey
 from rmpa.trust.preface import Purpose
 from tests.mesh.io.members import Member, meshes
-from tests.mesh.io.meshes import DEADLINE, Peer, until
+from tests.mesh.io.meshes import DEADLINE, Peer, introduce, until
 from tests.trust.authority import Authority
+from tests.trust.io.member_files import HandClock, SecuredMesh
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from rmpa.mesh.io.securing import MeshSecurity
     from rmpa.mesh.peering import PeerStatus
     from rmpa.trust.preface import Preface
 
@@ -193,3 +200,102 @@ async def test_a_preface_one_byte_at_a_time_is_read(lab: Authority) -> None:
         sock.close()
     finally:
         await peer.mesh.close()
+
+
+async def test_a_flood_of_forged_prefaces_costs_no_message_and_members_still_link(
+    lab: Authority, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "UNPROVEN_BURST", 20)
+    monkeypatch.setattr(limits, "UNPROVEN_RATE", 100.0)
+    members = Member(lab, "arm"), Member(lab, "base"), Member(lab, "crane")
+    async with meshes(*members, found=False) as (arm, base, crane):
+        introduce([arm, base])
+        await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
+        forged = Member(lab, "arm", group_key=GroupKey(1, b"x" * 32)).preface(Purpose.LINK)
+        sent = 0
+        while base.mesh.counters["link.paused"] < 3:
+            for _ in range(10):
+                sock = socket.socket()
+                sock.setblocking(False)
+                base.hand_made.append(sock)
+                with contextlib.suppress(OSError):
+                    sock.connect(("127.0.0.1", base.port))
+                    # a connection is there at once on loopback, unless the queue is full
+                with contextlib.suppress(OSError):
+                    sock.send(forged + b"x" * 300)
+            arm.link(base).express.send(1, sent, 0, b"x")
+            sent += 1
+            await asyncio.sleep(0)
+        assert base.mesh.counters["link.refused.key"] > 20
+        introduce([base, crane])
+        await until(lambda: base.linked(crane), "a new member")
+        await until(lambda: len(base.data) == sent, "all messages")
+        assert not base.downs
+
+
+async def test_silent_connections_leave_room_for_members(lab: Authority) -> None:
+    members = Member(lab, "arm"), Member(lab, "base")
+    async with meshes(*members, found=False) as (arm, base):
+        silent = [await _dial(base) for _ in range(limits.PENDING_PER_ADDRESS + 4)]
+        await until(lambda: base.mesh.counters["link.pending_full"] == 4, "four closed")
+        assert unproven(base) == limits.PENDING_PER_ADDRESS
+        introduce([arm, base])
+        await until(lambda: base.linked(arm), "linked once those are given up")
+        assert base.mesh.counters["link.unfinished"] == limits.PENDING_PER_ADDRESS
+        for sock in silent:
+            sock.close()
+
+
+@pytest.mark.parametrize("rest", [b"", b"\x16\x03\x01\x02\x00\x01", b"garbage" * 20])
+async def test_a_handshake_that_stands_still_or_is_none_is_given_up(
+    lab: Authority, monkeypatch: pytest.MonkeyPatch, rest: bytes
+) -> None:
+    monkeypatch.setattr(limits, "SECURING_TIMEOUT", 0.3)
+    async with meshes(Member(lab, "base")) as (base,):
+        sock = await _dial(base)
+        sock.send(Member(lab, "arm").preface(Purpose.LINK) + rest)
+        counters = base.mesh.counters
+        await until(lambda: counters["link.unfinished"] + counters["link.refused.downgrade"] == 1, "given up")
+        assert counters["link.refused.downgrade"] == (rest[:1] == b"g")
+        assert not base.mesh.connections()
+        sock.close()
+
+
+async def test_a_replayed_preface_is_refused(lab: Authority) -> None:
+    async with meshes(Member(lab, "base")) as (base,):
+        preface = Member(lab, "arm").preface(Purpose.LINK)
+        socks = [await _dial(base) for _ in range(2)]
+        for sock in socks:
+            sock.send(preface)
+        await until(lambda: base.mesh.counters["link.refused.flood"] == 1, "the second one")
+        for sock in socks:
+            sock.close()
+
+
+@pytest.fixture
+def memberships(tmp_path: Path) -> list[MeshSecurity]:
+    """Of modules with real files."""
+    mesh = SecuredMesh(tmp_path, clock=SystemHandClock())
+    return [mesh.member(name, time.time()) for name in ("arm", "base")]
+
+
+async def test_memberships_are_what_a_mesh_needs(memberships: list[MeshSecurity]) -> None:
+    made = [Peer(number, name=name, security=memberships[number]) for number, name in enumerate(("arm", "base"))]
+    try:
+        for peer in made:
+            await peer.mesh.start()
+        introduce(made)
+        await until(lambda: made[0].both_lanes(made[1]) and made[1].both_lanes(made[0]), "both lanes")
+    finally:
+        await asyncio.gather(*(peer.mesh.close() for peer in made))
+    assert not any(security.on_denied for security in memberships)
+
+
+class SystemHandClock(HandClock):
+    """The machine's clock, for handshakes that OpenSSL judges."""
+
+    def now(self) -> float:
+        return time.monotonic()
+
+    def wall(self) -> float:
+        return time.time()

@@ -104,7 +104,7 @@ def test_a_clock_is_set_if_it_is_behind_the_begin_of_the_own_certificate(mesh: S
     mesh.clock.wall_seconds = begin + 1
     assert base.wall() == begin + 1
     assert reason_of(base, mesh.authority.module("arm", WALL - 30 * DAY), "arm") is TrustReason.EXPIRED
-    with pytest.raises(PrefaceError, match="behind ours"):
+    with pytest.raises(PrefaceError, match="behind the acceptor's"):
         base.guard.admit(base.preface(Purpose.LINK), 1.0, WALL + DAY)
 
 

@@ -310,6 +310,27 @@ async def test_a_node_of_this_module_shows_its_lines_of_the_log_alone(site: Site
     assert "somebody_else" not in await page.run("document.querySelector('main').innerText")
 
 
+async def test_topics_that_carry_data_come_first_and_the_filter_looks_among_all(site: Site) -> None:
+    page = await site.open("topics")
+    await page.wait_text("are left out")
+    rows = "[...document.querySelectorAll('tbody th')].map((each) => each.innerText.trim())"
+    assert await page.run(rows) == ["/command_information", "/odom", "/velocity_order"]
+    await page.run("(() => { const field = document.querySelector('main input'); field.value = 'base/qual';"
+                   " field.dispatchEvent(new Event('input', {bubbles: true})); })()")  # fmt: skip
+    await page.wait(f"{rows}.join() === '/base/quality'")
+    page = await site.open("module/base")
+    await page.wait("document.querySelector('details')")
+    assert "/base/quality" not in await page.run("document.querySelector('main').innerText")
+
+
+async def test_one_trouble_of_many_topics_is_one_line(site: Site) -> None:
+    page = await site.open()
+    lost = {"problem": "its peer is away"}
+    await receive(page, {"topics": dict.fromkeys(("/odom", "/velocity_order"), lost)})
+    await page.wait_text("2 topics")
+    assert await page.run("document.querySelectorAll('.concerns li').length") == 1
+
+
 async def test_the_contract_of_a_topic_shows_before_it_has_a_route(site: Site) -> None:
     page = await site.open("topic/%2Fvelocity_order")
     await page.wait_text("rule 1: topics /velocity")

@@ -25,6 +25,7 @@ import msgspec
 from aiohttp import WSMsgType, web
 
 from rmpa.core.contract import ContractRule, Contracts
+from rmpa.observe.peer_agent import PeerAgent
 from rmpa.observe.snapshot import LaneInfo, Snapshot
 from rmpa.observe.why.modules import diagnose_module
 from rmpa.web.hub import requests
@@ -326,7 +327,8 @@ class FakeServer:
 
     def _answer_why(self, args: dict[str, Any]) -> Any:
         if args["kind"] == "module":
-            return msgspec.to_builtins((diagnose_module(self._snapshot, args["name"]),))
+            told = msgspec.convert(self._answer_agent({"peer": args["name"]}), PeerAgent)
+            return msgspec.to_builtins((diagnose_module(self._snapshot, args["name"], told),))
         flows = self._why[0]
         if self.agent.scene == "demo":
             return [flows]

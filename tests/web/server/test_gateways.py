@@ -144,3 +144,39 @@ async def test_contracts_give_priorities() -> None:
     hub = make_hub(AgentWatch(lambda: SNAPSHOT), 8480)
     priority = priority_of(hub, Contracts(rules))
     assert [priority(topic) for topic in ("/cmd_vel", "/odom", "/image")] == [1, 0, -1]
+
+
+def fragment(opcode: int, payload: bytes, *, last: bool = False) -> bytes:
+    """A client's frame, with a mask that changes nothing."""
+    return bytes([0x80 * last | opcode, 0x80 | len(payload)]) + bytes(4) + payload
+
+
+async def test_a_message_whose_fragments_never_end_disconnects_its_client_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(limits, "PING_INTERVAL", 0.2)
+    monkeypatch.setattr(limits, "MESSAGE_TIMEOUT", 1.0)
+    async with (
+        running() as (server, _),
+        aiohttp.ClientSession() as session,
+        connect(session, server) as other,
+        connect(session, server) as socket,
+    ):
+        reading = asyncio.ensure_future(other.receive())  # answers pings
+        transport = socket._writer.transport
+        transport.write(fragment(1, b"{"))
+
+        async def go_on() -> None:
+            while True:
+                transport.write(fragment(0, b" ") + fragment(10, b"alive", last=True))
+                await asyncio.sleep(0.05)
+
+        going_on = asyncio.ensure_future(go_on())
+        async with asyncio.timeout(DEADLINE):
+            message = await socket.receive()
+        going_on.cancel()
+        assert (message.type, message.data) == (aiohttp.WSMsgType.CLOSE, 1008)
+        assert server._gateways is not None
+        assert server._gateways.counters["message"] == 1
+        await other.send_json({"op": "call_service", "service": "/rosapi/get_time", "id": "1"})
+        assert json.loads((await asyncio.wait_for(reading, DEADLINE)).data)["result"]

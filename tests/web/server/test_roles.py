@@ -18,6 +18,10 @@ from rmpa.config.web_tokens import WebRole, WebToken
 from rmpa.core.errors import PeerRefused
 from rmpa.web.gateways.gateways import Gateways
 from rmpa.web.hub.rights import FULL, READ_ONLY, Rights
+from rmpa.web.monitor.io.questions import Answers
+from rmpa.web.monitor.io.resource_watch import ResourceWatch
+from rmpa.web.monitor.io.values import MessageValues
+from rmpa.web.monitor.session import Question
 from rmpa.web.server.agent_watch import AgentWatch
 from rmpa.web.server.app import CLIENT
 from rmpa.web.server.auth import AccessPolicy, own_names
@@ -25,7 +29,7 @@ from rmpa.web.server.hub_setup import make_hub
 from rmpa.web.server.roles import WebRoles
 from rmpa.web.server.server import WebServer
 from tests.ros.node.peers import DEADLINE, until
-from tests.web.hub.client import local_core, node
+from tests.web.hub.client import local_core, node, running_hub
 from tests.web.snapshots import FULL as SNAPSHOT
 
 if TYPE_CHECKING:
@@ -246,6 +250,33 @@ async def test_rosapi_shows_no_parameter_that_is_denied() -> None:
             answer = (await boss.receive()).data
         assert "the client boss may not param /motors/pid" in answer
         assert await setter.get_param("/motors/pid") == 3
+
+
+async def test_a_page_of_the_monitor_gets_no_denied_parameter_and_changes_none() -> None:
+    async with local_core() as core, running_hub(core) as hub, node(core, "setter") as setter:
+        await setter.set_param("/motors/pid", 3)
+        await setter.set_param("/name", "base")
+        await until(lambda: hub.params.value("/name") and hub.params.value("/motors/pid"))
+        answers = Answers(hub, ResourceWatch(hub, MessageValues(hub)), {}, lambda: "")
+
+        async def ask(what: str, client: str, **args: object) -> Any:
+            return await answers.answer(Question(1, what, args), ROLES.of(client))
+
+        shown = await ask("params", "boss")
+        assert shown["values"] == {"name": "base"} | {k: v for k, v in shown["values"].items() if k != "name"}
+        assert "motors" not in shown["values"]
+        assert await ask("params", "boss", has=shown["digest"]) == {"digest": shown["digest"]}
+        assert "/motors/pid" not in (await ask("param_names", "boss"))["names"]
+        for what, args in (
+            ("set_param", {"name": "/motors/pid", "value": 4}),
+            ("delete_param", {"name": "/motors"}),
+            ("call", {"service": "/motors/enable"}),
+            ("profile", {"resource": "/motors", "choice": "fast"}),
+        ):
+            with pytest.raises(PeerRefused, match="the client boss may not"):
+                await ask(what, "boss", **args)
+        assert await setter.get_param("/motors/pid") == 3
+        answers.close()
 
 
 async def test_clients_whose_rights_change_are_disconnected_and_others_stay() -> None:

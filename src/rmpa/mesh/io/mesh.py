@@ -138,6 +138,7 @@ class Mesh:
                 on_secured=self._secured,
                 on_refused=self._peering.refused_from,
                 on_join=on_join,
+                pause=self._acceptor.pause,
             )
             security.on_denied.append(self._denied)
         self._rng = rng
@@ -497,7 +498,6 @@ class Mesh:
                 _log.debug("= %s: silent, but not for want of a way to it", link.name)
                 sock.close()
                 return
-            _log.debug("= %s: silent, but it can be reached at %s:%d: a new link", link.name, *endpoint)
             try:
                 secured = await self._secure_dialled(sock)
             except OSError as error:

@@ -89,8 +89,8 @@ class MeshSecurity(Protocol):
         """Seconds since 1970; ``None`` while the machine's clock is not set."""
         ...
 
-    def preface(self, purpose: Purpose) -> bytes:
-        """The first bytes of a connection that is dialled."""
+    def preface(self, purpose: Purpose, host: str = "") -> bytes:
+        """The first bytes of a connection that is dialled, to a module at this address."""
         ...
 
     def judge_member(self, certificate: Certificate | bytes, claimed: str | None) -> None:
@@ -185,7 +185,8 @@ async def secure_dialled(sock: socket.socket, security: MeshSecurity) -> Secured
     loop = asyncio.get_running_loop()
     try:
         async with asyncio.timeout(limits.SECURING_TIMEOUT):
-            await loop.sock_sendall(sock, security.preface(Purpose.LINK) + handshake.take_output())
+            preface = security.preface(Purpose.LINK, sock.getpeername()[0])
+            await loop.sock_sendall(sock, preface + handshake.take_output())
             first = await _received(sock)
             if first[0] not in _TLS_RECORDS:
                 raise await _plain_refusal(sock, first)
@@ -272,6 +273,7 @@ class Securing:
         on_secured: A connection is a member's; the callee owns the socket.
         on_refused: ``(address, refusal)``: the TLS handshake with a holder of the group key failed.
         on_join: Takes connections that are no link: joins and renewals; ``None``: they are closed.
+        pause: Stops accepting for some seconds, because too many connections show no group key.
     """
 
     def __init__(
@@ -283,6 +285,7 @@ class Securing:
         on_secured: Callable[[socket.socket, SocketAddress, SecuredSocket], None],
         on_refused: Callable[[str, Refuse], None],
         on_join: OnJoin | None,
+        pause: Callable[[float], None],
     ) -> None:
         self._security = security
         self._clock = clock
@@ -290,6 +293,8 @@ class Securing:
         self._on_secured = on_secured
         self._on_refused = on_refused
         self._on_join = on_join
+        self._pause = pause
+        self._bad = TokenBucket(limits.UNPROVEN_RATE, limits.UNPROVEN_BURST)
         self._unproven: dict[int, _Unproven] = {}
         """By file descriptor, the oldest first."""
         self._unproven_there: Counter[str] = Counter()
@@ -306,6 +311,7 @@ class Securing:
             sock.close()
             text = f"closed a connection from {host}: too many have not shown that they are of this mesh"
             self._refusals.refuse(self._clock.now(), "link.pending_full", host, text)
+            self._note_bad()
             return
         one = _Unproven(sock, address, self._clock.now() + limits.PREFACE_TIMEOUT)
         if self._fill(one):
@@ -361,6 +367,7 @@ class Securing:
     def _proceed(self, one: _Unproven) -> None:
         if one.ended:
             one.sock.close()
+            self._note_bad()
             _log.debug("! %s: closed after %d bytes", one.address[0], len(one.data))
         elif is_preface(one.data) is False:
             text = "the dialler is not secured, but this mesh is"
@@ -391,6 +398,7 @@ class Securing:
 
     def _refuse(self, sock: socket.socket, host: str, refuse: Refuse) -> None:
         """Count, answer unless there are many, and close."""
+        self._note_bad()
         now = self._clock.now()
         text = f"refused a connection from {host}: {refuse.text}"
         self._refusals.refuse(now, f"link.refused.{refuse.label}", host, text)
@@ -400,6 +408,12 @@ class Securing:
                 sock.shutdown(socket.SHUT_WR)
                 sock.recv(_READ)  # unread bytes would make the end a reset, which overtakes the answer
         sock.close()
+
+    def _note_bad(self) -> None:
+        """Leave a flood of connections that show no group key to the kernel for a moment."""
+        if not self._bad.take(self._clock.now()):
+            self._refusals.count("link.paused")
+            self._pause(limits.UNPROVEN_PAUSE)
 
     def _arm(self) -> None:
         self._timer = None

@@ -17,6 +17,7 @@ from aiohttp import WebSocketError, WSCloseCode, WSMsgType
 from rmpa.core.errors import RmpaError
 from rmpa.web import limits
 from rmpa.web.gateways.frame_writer import FrameWriter
+from rmpa.web.gateways.message_arrival import MessageArrival
 from rmpa.web.gateways.websocket_frames import Opcode
 from rmpa.web.hub.fair_queue import FairQueue
 from rmpa.web.hub.requests import ReceivedMessage, Unsubscribe
@@ -77,6 +78,8 @@ class ClientConnection(ABC):
         self.sent = 0
         """Messages and answers that were written."""
         self._heard = 0
+        self._received: Callable[[], int] = int
+        self._arrival = MessageArrival()
         self._priority = priority
         self._unadvertise_delay = unadvertise_delay
         self._wake = asyncio.Event()
@@ -188,7 +191,7 @@ class ClientConnection(ABC):
         self,
         request: web.Request,
         socket_: FrameSocket,
-        upgraded: Callable[[web.Request], None],
+        upgraded: Callable[[web.Request], Callable[[], int]],
         refused: Callable[[str, str], None],
     ) -> None:
         """Serve the client until it has gone.
@@ -196,7 +199,7 @@ class ClientConnection(ABC):
         Args:
             request: Asks for the WebSocket.
             socket_: Not prepared yet.
-            upgraded: Called when the handshake is done.
+            upgraded: Called when the handshake is done; what it returns counts the bytes that the client has sent.
             refused: ``(reason, text)``: called if the client is disconnected for one of ``figures.REASONS``.
 
         Raises:
@@ -209,7 +212,8 @@ class ClientConnection(ABC):
         tasks: list[asyncio.Task[None]] = []
         try:
             writer = await socket_.prepare(request)
-            upgraded(request)
+            self._received = upgraded(request)
+            self._arrival.message_ended(self._received())
             self._transport = request.transport
             if self._transport is None:
                 return  # it went during the handshake
@@ -241,6 +245,10 @@ class ClientConnection(ABC):
             self._heard += 1
             if self._heard % _TURN == 0:
                 await asyncio.sleep(0)  # frames that have arrived already do not suspend this task
+            if message.type in (WSMsgType.PING, WSMsgType.PONG):
+                self._arrival.control_frame(len(message.data))
+            else:
+                self._arrival.message_ended(self._received())
             if message.type == WSMsgType.ERROR:
                 self._failed(message.data)
             if self._gone:
@@ -272,15 +280,19 @@ class ClientConnection(ABC):
     async def _watch(self) -> None:
         """Disconnect a client without a sign of life: it sends nothing, answers no ping, and takes nothing.
 
-        A large message on a slow link holds up the ping behind it; that it goes on is a sign of life, too.
+        A large message on a slow link holds up the ping behind it; that it goes on is a sign of life, too. A client
+        whose message never ends is disconnected as well, alive or not.
         """
-        silent, heard, waiting = 0, -1, 0
+        silent, heard, waiting = 0, (-1, 0), 0
         while silent < _SILENT_LOOKS:
             await asyncio.sleep(limits.PING_INTERVAL / 2)
-            now = self._waiting
-            alive = self._heard != heard or (waiting and now != waiting)
+            now, received = self._waiting, self._received()
+            if self._arrival.takes_too_long(received, self._loop.time()):
+                self.end(WSCloseCode.POLICY_VIOLATION, "a message did not end in time", "message")
+                return
+            alive = (self._heard, received) != heard or (waiting and now != waiting)
             silent = 0 if alive else silent + 1
-            heard, waiting = self._heard, now
+            heard, waiting = (self._heard, received), now
             if not waiting:
                 self._send(Opcode.PING, ())
         _log.info("= %s gave no sign of life, and is disconnected", self.client.name)

@@ -101,8 +101,9 @@ class FrameWriter:
     def hand_over(self) -> None:
         """Pass what waits on to the transport, behind which others may write to it, and write by it from now on."""
         waiting = self._stop()
-        for view in waiting:
-            self._transport.write(view)
+        if not self._transport.is_closing():
+            for view in waiting:
+                self._transport.write(view)
 
     def close(self) -> None:
         """Forget what waits; the connection itself is not closed."""
@@ -120,7 +121,7 @@ class FrameWriter:
             if not sent:
                 break
         self._keep(left)
-        self._loop.add_writer(sock, self._writable)
+        self._loop.add_writer(sock.fileno(), self._writable)
 
     def _keep(self, buffers: Sequence[Payload]) -> None:
         for buffer in buffers:
@@ -144,7 +145,7 @@ class FrameWriter:
             sent -= len(first)
             self._waiting.popleft()
         if not self._waiting:
-            self._loop.remove_writer(sock)
+            self._loop.remove_writer(sock.fileno())
         if self._waiting_bytes <= limits.WRITE_BUFFER:
             self._make_room()
 
@@ -180,7 +181,7 @@ class FrameWriter:
         waiting, self._waiting, self._waiting_bytes = self._waiting, deque(), 0
         if self._socket is not None:
             if waiting:
-                self._loop.remove_writer(self._socket)
+                self._loop.remove_writer(self._socket.fileno())
             self._socket.close()
             self._socket = None
         self._make_room()

@@ -79,8 +79,9 @@ class Gateways:
         self.counters = Counters()
         """Clients that were refused or disconnected, by the words of ``figures.REASONS``."""
         self._refusals = RefusalLog(_log, self.counters)
-        self.upgraded: Callable[[web.Request], None] = lambda _: None
-        """Called when the handshake of a WebSocket is done."""
+        self.upgraded: Callable[[web.Request], Callable[[], int]] = lambda _: int
+        """Called when the handshake of a WebSocket is done; returns a counter of the bytes that its client has sent,
+        which is 0 where they are not counted."""
         self._monitor = monitor
         self._hub = hub
         self._name = name

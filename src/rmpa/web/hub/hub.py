@@ -217,6 +217,12 @@ class Hub:
 
     def _subscribe(self, client: HubClient, request: requests.Subscribe) -> None:
         client.rights.check_look(Access.SUBSCRIBE, request.topic)
+        subscribed = self.topics.names
+        if len(subscribed) >= limits.SUBSCRIBED_TOPICS_MAX and request.topic not in subscribed:
+            known = self.graph.topics.get(request.topic)
+            if known is None or not known.publishers:
+                problem = f"its clients subscribe to {len(subscribed)} topics, and {request.topic} has no publisher"
+                raise PeerRefused("the web server", problem, "subscribe when it has one, or to fewer topics")
         client.subscriptions[request.handle] = request.topic
         self.topics.subscribe(
             (client.number, request.handle),
@@ -406,8 +412,15 @@ class Hub:
                 return
 
             def known(kind: Any) -> None:
-                client.receive(requests.Described(request.handle, request.type, kind.definition))
+                answer = requests.Described(request.handle, request.type, kind.definition, md5sum=kind.md5sum)
+                client.receive(answer)
 
+            if request.md5sum:
+                version = self.types.seen_version(request.type, request.md5sum)
+                if version is None:
+                    raise RmpaError(f"no publisher has told the version {request.md5sum} of {request.type}")
+                known(version)
+                return
             try:
                 known(await self.types.find_message(request.type))
             except RmpaError:
@@ -443,6 +456,7 @@ class Hub:
         task = self._tasks[key] = asyncio.get_running_loop().create_task(run(), name=f"request of {client.name}")
 
         def ended(task: asyncio.Task[None]) -> None:
+            work.close()  # of a client that has gone before it began
             if self._tasks.get(key) is task:
                 del self._tasks[key]
 

@@ -50,8 +50,12 @@ class PayloadBuffers:
         self._bytes = 0
 
     def _unused(self, size: int) -> bytearray | None:
-        """Take out the buffer that was used longest ago, of those that are large enough and not far too large."""
-        for index, buffer in enumerate(self._kept):
+        """Take out the buffer that was used last, of those that are large enough and not far too large.
+
+        It is the one that the processor's caches are most likely to hold.
+        """
+        for index in reversed(range(len(self._kept))):
+            buffer = self._kept[index]
             if size <= len(buffer) <= 2 * size and not _has_views(buffer):
                 del self._kept[index]
                 return buffer

@@ -302,11 +302,13 @@ def _connection(request: web.Request) -> GuardedConnection | None:
     return protocol if isinstance(protocol, GuardedConnection) else None
 
 
-def _upgraded(request: web.Request) -> None:
-    """The limits of requests do not hold for the connection any more."""
+def _upgraded(request: web.Request) -> Callable[[], int]:
+    """The limits of requests do not hold for the connection any more; returns what counts its bytes."""
     connection = _connection(request)
-    if connection is not None:
-        connection.upgrade()
+    if connection is None:
+        return int
+    connection.upgrade()
+    return lambda: connection.received
 
 
 def _response(made: rest.RestResponse) -> web.Response:

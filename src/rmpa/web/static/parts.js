@@ -131,7 +131,7 @@ export function useAnswer(connection, what, args, period = 0, key = "") {
 export const nodeKey = (module, node) => (module ? `${module}:${node}` : node);
 export const NodeLink = ({ name, children }) => html`<a class="mono" href=${href("node", name)}>${children?.length ? children : name}</a>`;
 export const NodeLinks = ({ names }) => names.map((name, at) => html`${at > 0 && ", "}<${NodeLink} key=${name} name=${name} />`);
-export const ModuleLink = ({ name }) => html`<${Link} page="module" name=${name} />`;
+export const ModuleLink = ({ name }) => html`<a class="whole" href=${href("module", name)}>${name}</a>`;
 
 const VERDICTS = { ok: "OK", warn: "WARN", fail: "ERROR", unknown: "STALE" };
 const WORDS = { topic: ["It flows", "It does not flow"], service: ["It can be called", "It cannot be called"], module: ["It is reached", "It is not reached"] };

@@ -100,7 +100,9 @@ class Answers:
         self._check(question, rights)
         value = await self._handlers[question.what](question.args)
         if question.what in _WITH_PARAMS:
-            return {"values": rights.visible_tree(value["values"])}
+            return _with_digest(rights.visible_tree(value), question.args.get("has"))
+        if question.what == "param_names":
+            return {"names": sorted(rights.visible(dict.fromkeys(value)))}
         return value
 
     def _check(self, question: Question, rights: Rights) -> None:
@@ -170,14 +172,11 @@ class Answers:
     # --- parameters -------------------------------------------------------------------------------------------
 
     async def _params(self, args: Args) -> Any:
-        """All parameters with their ``digest``; where the page ``has`` that digest they are not repeated."""
+        """All parameters."""
         peer = _text(args, "peer")
         if peer:
-            values = _plain(await self._of_peer(peer, lambda params: params.get("/")))
-        else:
-            values = _plain(await self._own_params())
-        digest = hashlib.sha256(msgspec.json.encode(values, order="sorted")).hexdigest()[:16]
-        return {"digest": digest} if args.get("has") == digest else {"values": values, "digest": digest}
+            return _plain(await self._of_peer(peer, lambda params: params.get("/")))
+        return _plain(await self._own_params())
 
     async def _own_params(self) -> Mapping[str, ParamValue]:
         self._hub.link.need()
@@ -190,8 +189,7 @@ class Answers:
 
     async def _param_names(self, _args: Args) -> Any:
         await self._own_params()
-        names = list(islice(self._hub.params.values((), "/"), limits.PARAMETER_NAMES_SHOWN))
-        return {"names": sorted(names)}
+        return list(islice(self._hub.params.values((), "/"), limits.PARAMETER_NAMES_SHOWN))
 
     async def _set_param(self, args: Args) -> Any:
         name, peer, value = _name(args, "name"), _text(args, "peer"), args.get("value")
@@ -322,6 +320,12 @@ def _name(args: Args, key: str) -> str:
     if value != "/" and not is_global_name(value):
         raise ConfigError(key, f"{value[:80]!r} is not a name", "write it as /name")
     return value
+
+
+def _with_digest(values: Mapping[str, ParamValue], has: object) -> Args:
+    """Parameters with their ``digest``; where the page ``has`` that digest they are not repeated."""
+    digest = hashlib.sha256(msgspec.json.encode(values, order="sorted")).hexdigest()[:16]
+    return {"digest": digest} if has == digest else {"values": values, "digest": digest}
 
 
 def _json(text: bytes) -> Any:

@@ -5,7 +5,7 @@ import { bandwidth, bounded, bytes, count, duration, percent, seconds } from "..
 import { entries, section } from "../state.js";
 import { Facts, Gone, Link, Mark, Page, Panel, Since, Table, Uptime, Why, useAnswer } from "../parts.js";
 import { NODE_COLUMNS, NodeRow } from "./nodes.js";
-import { TopicRow } from "./topics.js";
+import { TopicRow, isData } from "./topics.js";
 import { Lines } from "../plot.js";
 
 const DIRECTIONS = [["bytes_in", "received"], ["bytes_out", "sent"]];
@@ -15,7 +15,8 @@ export function ModulePage({ name, state, connection }) {
   if (!module) return html`<${Page} title=${name} kind="Module"><${Gone} kind="module" name=${name} /><//>`;
   const own = section(state, "agent").name === name;
   const detail = section(section(state, "detail"), `module:${name}`);
-  const topics = entries(state, "topics").filter(([, one]) => (one.from || []).includes(name));
+  const all = entries(state, "topics").filter(([, one]) => (one.from || []).includes(name));
+  const topics = all.filter(([topic]) => isData(topic, state));
   const resources = entries(state, "resources").filter(([, one]) => one.module === name);
   const nodes = entries(state, "nodes").filter(([, one]) => (one.module || section(state, "agent").name) === name);
   return html`<${Page} title=${name} kind="Module" aside=${html`<${Mark} state=${module.state} />`}><div class="grid">
@@ -30,7 +31,8 @@ export function ModulePage({ name, state, connection }) {
     ${resources.length > 0 && html`<${Panel} title="Smart Resources"><${Table} caption="Smart Resources" columns=${["Resource", "Quality", "Profile", "Says"]}>${resources.map(([key, one]) => html`<tr key=${key}><th scope="row"><${Link} page="resource" name=${key}>${one.name}<//></th><td><${Mark} state=${one.level} /></td><td>${one.profile || "none"}</td><td>${one.message}</td></tr>`)}<//><//>`}
     ${nodes.length > 0 && html`<${Panel} title=${`Nodes of ${name}`}><${Table} caption="Nodes" columns=${NODE_COLUMNS}>${nodes.slice(0, 100).map(([key, one]) => html`<${NodeRow} key=${key} name=${key} node=${one} />`)}<//>${nodes.length > 100 && html`<p class="empty"><a href="#/nodes">${nodes.length - 100} more</a></p>`}<//>`}
     ${own && html`<${Counters} state=${state} connection=${connection} />`}
-    <${Panel} title=${`Topics of ${name}`} wide><${Table} caption="Topics" columns=${["Topic", "Type", "#Rate", "#Bytes", "#Latency", "#Lost", "From → to"]} empty="It publishes no topic.">${topics.map(([topic, one]) => html`<${TopicRow} key=${topic} name=${topic} topic=${one} />`)}<//><//>
+    <${Panel} title=${`Topics of ${name}`} wide><${Table} caption="Topics" columns=${["Topic", "Type", "#Rate", "#Bytes", "#Latency", "#Lost", "From → to"]} empty=${all.length ? "It publishes no data." : "It publishes no topic."}>${topics.map(([topic, one]) => html`<${TopicRow} key=${topic} name=${topic} topic=${one} />`)}<//>
+      ${all.length > topics.length && html`<details><summary>${all.length - topics.length} of its Smart Resources, about themselves, and of the log</summary><${Table} caption="Topics of Smart Resources" columns=${["Topic", "Type", "#Rate", "#Bytes", "#Latency", "#Lost", "From → to"]}>${all.filter((each) => !topics.includes(each)).map(([topic, one]) => html`<${TopicRow} key=${topic} name=${topic} topic=${one} />`)}<//></details>`}<//>
   </div><//>`;
 }
 

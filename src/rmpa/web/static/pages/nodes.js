@@ -44,18 +44,21 @@ export function NodePage({ name, state, connection }) {
       ["Publishes", count(publishes.length)], ["Subscribes", facts || !peer ? count(subscribes.length) : undefined], ["Services", count(services.length)]]} />
       ${problem && html`<p class="failure">${problem}</p>`}
       ${failure && html`<p class="empty">The node cannot be asked: ${failure.error}. ${failure.remedy}</p>`}<//>
-    <${Panel} title="Services"><${Table} caption="Services" columns=${["Service", "Type"]} empty="It offers no service.">${services.map((each) => { const service = section(state, "services")[each]; return html`<tr key=${each}><th scope="row">${service ? html`<${Link} page="service" name=${each}>${service.name}<//>` : html`<span class="mono">${each.slice(each.indexOf(":") + 1)}</span>`}</th><td class="muted">${service ? service.type || "not asked yet" : "does not cross"}</td></tr>`; })}<//><//>
+    <${Panel} title="Services"><${Table} caption="Services" columns=${["Service", "Type"]} empty="It offers no service.">${services.map((each) => { const service = section(state, "services")[each]; return html`<tr key=${each}><th scope="row">${service ? html`<${Link} page="service" name=${each}>${service.name}<//>` : html`<span class="mono">${each.slice(each.indexOf(":") + 1)}</span>`}</th><td class="muted">${service ? service.type || "not asked yet" : "not known here"}</td></tr>`; })}<//><//>
     ${[["Publishes", publishes, facts?.publications, "It publishes nothing."], ["Subscribes", subscribes, facts?.subscriptions, peer && !facts ? "Not known: only its own module knows what it subscribes to." : "It subscribes to nothing."]].map(([title, names, types, empty]) => html`<${Panel} key=${title} title=${title}>
-      <${Table} caption=${title} columns=${["Topic", "Type", "#Rate"]} empty=${empty}>${names.map((each) => html`<tr key=${each}><th scope="row">${topics[each] ? html`<${Link} page="topic" name=${each} />` : html`<span class="mono">${each}</span>`}</th><td class="muted">${topics[each]?.type || types?.[each] || ""}</td><td class="number">${topics[each] ? hertz(topics[each].rate) : html`<span class="muted">does not cross</span>`}</td></tr>`)}<//><//>`)}
-    <${Connections} facts=${facts} failure=${failure} />
+      <${Table} caption=${title} columns=${["Topic", "Type", "#Rate"]} empty=${empty}>${names.map((each) => html`<tr key=${each}><th scope="row">${topics[each] ? html`<${Link} page="topic" name=${each} />` : html`<span class="mono">${each}</span>`}</th><td class="muted">${topics[each]?.type || types?.[each] || ""}</td><td class="number">${topics[each] ? hertz(topics[each].rate) : html`<span class="muted">not known here</span>`}</td></tr>`)}<//><//>`)}
+    <${Connections} facts=${facts} failure=${failure} module=${peer || own} own=${own} />
     <${NodeLog} node=${node} peer=${peer} connection=${connection} />
   </div><//>`;
 }
 
-const Connections = ({ facts, failure }) => html`<${Panel} title="Connections" wide>${facts && !facts.connections
+// The agent of a module is a node of its graph: it takes messages to and from peers.
+const OtherEnd = ({ name, module, own }) => (name === "/rmpa" || name.endsWith(":/rmpa") ? html`the agent of <${ModuleLink} name=${module} />` : name.includes("://") ? html`<code>${name}</code>` : html`<${NodeLink} name=${name.startsWith(`${own}:`) ? name.slice(own.length + 1) : name} />`);
+
+const Connections = ({ facts, failure, module, own }) => html`<${Panel} title="Connections" wide>${facts && !facts.connections
   ? html`<p class="empty">${facts.problem ? "Not known: the node does not answer." : "Not told by this peer: its agent is of an earlier release."}</p>`
-  : html`<${Table} caption="Connections" columns=${["Topic", "Way", "Other end", "State"]} empty=${facts ? "It has no connection." : failure ? "Not known: the node cannot be asked." : "Asking …"}>${(facts?.connections || []).map((one, at) => html`<tr key=${at}><th scope="row"><${Link} page="topic" name=${one.topic} /></th><td>${one.inbound ? "← from" : "→ to"}</td>
-    <td>${one.other.includes("://") ? html`<code>${one.other}</code>` : html`<${NodeLink} name=${one.other} />`}</td><td><${Mark} state=${one.connected ? "up" : "silent"} word=${one.connected ? "connected" : "not connected"} /></td></tr>`)}<//>`}<//>`;
+  : html`<${Table} caption="Connections" columns=${["Topic", "Way", "Other end", "State"]} empty=${facts ? "It has no connection." : failure ? "Not known: the node cannot be asked." : "Asking …"}>${(facts?.connections || []).map((one, at) => html`<tr key=${at}><th scope="row"><${Link} page="topic" name=${one.topic} /></th><td class="muted">${one.inbound ? "← from" : "→ to"}</td>
+    <td><${OtherEnd} name=${one.other} module=${module} own=${own} /></td><td><${Mark} state=${one.connected ? "up" : "silent"} word=${one.connected ? "connected" : "not connected"} /></td></tr>`)}<//>`}<//>`;
 
 function NodeLog({ node, peer, connection }) {
   const lines = useLog(connection, false).filter((line) => line.node === node);

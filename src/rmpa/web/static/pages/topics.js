@@ -13,23 +13,33 @@ export const TopicRow = memo(({ name, topic }) => html`<tr>
   <th scope="row"><${Link} page="topic" name=${name} />${topic.problem && html`<div class="muted"><${Mark} state="WARN" word=${""} />${topic.problem}</div>`}</th>
   <td><span class="muted">${topic.type}</span></td><td class="number">${hertz(topic.rate)}</td><td class="number">${bandwidth(topic.bandwidth)}</td>
   <td class="number">${seconds(topic.latency)}</td><td class="number">${topic.lost || topic.dropped ? count((topic.lost || 0) + (topic.dropped || 0)) : "–"}</td>
-  <td>${(topic.from || []).join(", ") || "–"} → ${(topic.to || []).join(", ") || "–"}${topic.crosses ? "" : html` <span class="muted">stays here</span>`}</td></tr>`);
+  <td>${(topic.from || []).join(", ") || html`<span class="muted">no publisher</span>`} → ${(topic.to || []).join(", ") || html`<span class="muted">no subscriber here</span>`}${topic.crosses ? "" : html` <span class="muted">stays here</span>`}</td></tr>`);
+
+// What Smart Resources and the log publish about themselves, next to the topics that carry data.
+const ABOUT = /\/(alarms|context|decision|descriptor|observed|parameter_descriptions|parameter_updates|profile|quality|requirements|responses|set_context|state)$/;
+export function isData(name, state) {
+  if (name === "/rosout" || name === "/rosout_agg" || name === "/diagnostics") return false;
+  const owner = name.replace(ABOUT, "");
+  return owner === name || !Object.values(section(state, "resources")).some((one) => one.name === owner);
+}
 
 const FILTERS = {
-  flowing: ["Flowing", (one) => one.rate !== undefined], all: ["All", () => true],
+  data: ["Data", (one, name, state) => isData(name, state)], flowing: ["Flowing", (one) => one.rate !== undefined], all: ["All", () => true],
   wrong: ["With a problem", (one) => one.problem || one.lost || one.dropped],
 };
 const MOST = 300;
 
 export function Topics({ state }) {
-  const [filter, setFilter] = useState("all");
+  const [filter, setFilter] = useState("data");
   const [text, setText] = useState("");
   const all = entries(state, "topics");
-  const shown = all.filter(([name, one]) => FILTERS[filter][1](one) && `${name} ${one.type}`.toLowerCase().includes(text.toLowerCase()));
+  const fits = FILTERS[filter === "data" && text ? "all" : filter][1]; // what is typed is looked for among all
+  const shown = all.filter(([name, one]) => fits(one, name, state) && `${name} ${one.type}`.toLowerCase().includes(text.toLowerCase()));
   const hidden = section(state, "hidden").topics;
   return html`<${Page} title="Topics" kind=${`${all.filter(([, one]) => one.rate !== undefined).length} of ${all.length} flow between modules`} aside=${html`<${Choice} label="Which topics" value=${filter} onChoose=${setFilter} options=${Object.entries(FILTERS).map(([key, [word]]) => [key, word])} />`}>
     <input class="filter" type="search" placeholder="Filter by name or type" aria-label="Filter by name or type" value=${text} onInput=${(event) => setText(event.target.value)} />
     <${Panel}><${Table} caption="Topics" columns=${COLUMNS} empty="No topic is like that.">${shown.slice(0, MOST).map(([name, one]) => html`<${TopicRow} key=${name} name=${name} topic=${one} />`)}<//>
+    ${filter === "data" && all.length > shown.length && !text && html`<p class="empty">${all.length - shown.length} topics of the log and of Smart Resources about themselves are left out. <button type="button" onClick=${() => setFilter("all")}>Show all</button></p>`}
     ${(shown.length > MOST || hidden) && html`<p class="empty">${shown.length > MOST ? `${shown.length - MOST} more: filter by name. ` : ""}${hidden ? `The server leaves out ${hidden} further topics.` : ""}</p>`}<//><//>`;
 }
 
@@ -52,12 +62,12 @@ export function TopicPage({ name, state, connection }) {
       ["Published in", (topic.from || []).join(", ")], ["Subscribed in", (topic.to || []).join(", ")], [`Publishers in ${own}`, (detail.publishers || []).length > 0 ? html`<${NodeLinks} names=${detail.publishers} />` : ""], [`Subscribers in ${own}`, (detail.subscribers || []).length > 0 ? html`<${NodeLinks} names=${detail.subscribers} />` : ""],
       ["Crosses", topic.crosses ? "yes" : "no"], ["Because", detail.policy], ["MD5 sum", detail.md5 && html`<code>${detail.md5}</code>`]]} /><//>
     <${Panel} title="Way of a message"><${Why} connection=${connection} kind="topic" name=${name} /><//>
+    <${Live} connection=${connection} topic=${name} type=${topic.type} />
     ${flowing.length > 0 && html`<${Panel} wide title="Figures" aside=${html`<${Choice} label="Figure" value=${figure} onChoose=${setFigure} options=${FIGURES.map(([key, word]) => [key, word])} />`}>
       <${Lines} key=${figure} label=${figure} format=${format} series=${flowing.map(([key, route]) => ({ label: key, value: figureOf(route, figure) }))} /><//>`}
     <${Panel} title="Routes" wide><${Table} caption="Routes" columns=${["Source", "State", "#Rate", "#Jitter p99", "#Latency p50, p99", "#Lost", "#Dropped", "Transport", "Contract"]} empty="It has no route to or from a peer.">${routes.map(([key, route]) => html`<${Route} key=${key} route=${route} own=${own} />`)}<//><//>
     <${ContractPanel} connection=${connection} topic=${name} type=${topic.type} own=${own} routes=${routes.length} />
     <${Events} routes=${routes} />
-    <${Live} connection=${connection} topic=${name} type=${topic.type} />
   </div><//>`;
 }
 
