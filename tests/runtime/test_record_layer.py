@@ -167,6 +167,23 @@ def test_the_end_is_the_end(contexts: tuple[ssl.SSLContext, ssl.SSLContext], soc
     assert one.recv_into(view) == 10
 
 
+@pytest.mark.parametrize("room", [3, 100])
+@pytest.mark.parametrize("before", [b"", b"bye"])
+def test_what_follows_the_end_is_not_read(
+    contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets, before: bytes, room: int
+) -> None:
+    one, other = secure_pair(contexts, *sockets)
+    if before:
+        one.sendmsg((before,))
+    with pytest.raises(ssl.SSLError):
+        one._tls.unwrap()
+    sockets[0].send(one._outgoing.read() + bytes(500))
+    view = memoryview(bytearray(room))
+    if before:
+        assert other.recv_into(view) == len(before)
+    assert other.recv_into(view) == 0
+
+
 def test_an_end_in_the_middle_is_the_end(contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets) -> None:
     one, other = secure_pair(contexts, Slow(sockets[0], 10), sockets[1])
     one.sendmsg((b"x" * 100,))

@@ -123,6 +123,7 @@ class SecureSocket:
     ) -> None:
         self._sock = sock
         self._transmit = _sender(sock)
+        self._receive = sock.recv_into
         self._tls = tls
         self._write = tls.write
         self._read = cast("Callable[[int, memoryview], int]", tls.read)
@@ -208,19 +209,52 @@ class SecureSocket:
             BlockingIOError: Nothing came.
             OSError: The connection is gone, or (``ssl.SSLError``) its bytes are not TLS, or an alert came.
         """
-        held = self.readable
-        if not held:
-            received = self._sock.recv_into(_scratch)
-            if not received:
-                return 0
-            self._incoming.write(_scratch[:received])
+        if self.readable:
+            return self._read_held(buffer)
+        received = self._receive(_scratch)
+        if not received:
+            return 0
+        incoming = self._incoming
+        incoming.write(_scratch[:received])
         try:
-            count = self._decrypt(buffer)
+            count = self._read(len(buffer), buffer)
+        except ssl.SSLWantReadError:
+            raise RecordIncomplete from None
         except ssl.SSLZeroReturnError:
             return 0
-        if not count:
-            # What is held is read alone, without the socket, so that a fast sender does not keep the loop busy.
-            raise BlockingIOError if held else RecordIncomplete
+        # A buffer with room left has the whole record; OpenSSL reads no further than the end of a record.
+        if not count or (count < len(buffer) and not incoming.pending):
+            return count
+        return self._read_more(buffer, count)
+
+    def _read_held(self, buffer: memoryview) -> int:
+        """Read what is held alone, without the socket, so that a fast sender does not keep the loop busy."""
+        self.readable = False
+        try:
+            count = self._read(len(buffer), buffer)
+        except ssl.SSLWantReadError:
+            raise BlockingIOError from None
+        except ssl.SSLZeroReturnError:
+            return 0
+        return self._read_more(buffer, count) if count else 0
+
+    def _read_more(self, buffer: memoryview, count: int) -> int:
+        """Read further records until the buffer is full or there is none; return the number of all bytes."""
+        size = len(buffer)
+        try:
+            # Asking first: the error by which OpenSSL says that there is no more takes a quarter of a message's time.
+            while (pending := self._incoming.pending) and count < size:
+                got = self._read(size - count, buffer[count:])
+                if not got:
+                    self.readable = True  # the next call says the end; nothing behind it is read, whatever follows
+                    return count
+                count += got
+        except ssl.SSLWantReadError:
+            return count
+        except ssl.SSLZeroReturnError:
+            self.readable = True
+            return count
+        self.readable = count == size and (pending > 0 or self._tls.pending() > 0)
         return count
 
     def segment(self, size: int) -> None:
@@ -243,27 +277,6 @@ class SecureSocket:
         """Close the socket."""
         self._unsent = None
         self._sock.close()
-
-    def _decrypt(self, buffer: memoryview) -> int:
-        """Read records into a buffer until it is full or there is none; return the number of bytes."""
-        count, size = 0, len(buffer)
-        pending = 0
-        try:
-            count = self._read(size, buffer)
-            # Asking first: the error by which OpenSSL says that there is no more takes a quarter of a message's time.
-            while (pending := self._incoming.pending) and count < size:
-                count += self._read(size - count, buffer[count:])
-        except ssl.SSLWantReadError:
-            pending = 0
-        except ssl.SSLZeroReturnError:
-            if not count:
-                self.readable = False
-                raise
-        # A buffer with room left has the whole last record; OpenSSL reads no further than the end of a record.
-        self.readable = count == size and (pending > 0 or self._tls.pending() > 0)
-        if self._outgoing.pending and self._unsent is None:
-            self._send(self._outgoing.read())  # the answer to an update of keys
-        return count
 
     def _send(self, ciphertext: Buffer) -> None:
         try:

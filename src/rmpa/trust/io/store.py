@@ -156,7 +156,7 @@ class TrustStore:
         remedy = "remove it: open tokens are then void"
         try:
             invitations = msgspec.json.decode(self._read(TOKENS, remedy), type=list[Invitation])
-        except (msgspec.MsgspecError, UnicodeError) as error:
+        except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
             raise StartError(str(self.path(TOKENS)), f"is broken: {error!s:.200}", remedy) from None
         return TokenBook(invitations)
 
