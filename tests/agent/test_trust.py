@@ -20,6 +20,7 @@ from rmpa.config.settings import Multicast, Settings, TrustSettings
 from rmpa.core.errors import ConfigError, PeerRefused, StartError
 from rmpa.ros.node.node import Node
 from rmpa.runtime.system_clock import SystemClock
+from rmpa.trust import limits
 from rmpa.trust.documents import DocumentKind
 from rmpa.trust.io import store as files_of
 from rmpa.trust.io.authority import found_mesh
@@ -232,6 +233,24 @@ async def test_a_group_key_is_changed_without_a_pause(tmp_path: Path) -> None:
         assert arm is not None
         await until(lambda: arm.membership.ring.newest.number == 2)
         assert [session.link for session in fleet.agents["arm"].bridge.sessions.linked()] == links
+
+
+async def test_a_module_that_missed_changes_of_the_group_key_is_linked_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with a_fleet(tmp_path) as fleet:
+        await fleet.add("arm")
+        await fleet.linked("base", "arm")
+        await fleet.stop("arm")
+        monkeypatch.setattr(limits, "KEY_SPREAD", 0.0)
+        monkeypatch.setattr(limits, "KEY_OVERLAP", 0.0)
+        for _ in range(3):
+            await fleet.command("base", "rotate")
+        arm = await fleet.start("arm")  # it does not know the key that base signs with
+        await fleet.linked("base", "arm")
+        assert arm.trust is not None
+        member = arm.trust.membership
+        await until(lambda: member.ring.newest.number == 4)
 
 
 async def test_two_users_compare_the_code_over_the_control_socket(tmp_path: Path) -> None:

@@ -32,7 +32,8 @@ else:
 
     def _recorded() -> list[bytes]:
         joining, inviting = _sides()
-        seeds = [b"", b"\x00\x00\x00\x02{}", b"\xff\xff\xff\xff"]
+        deep = b'{"op":"agree","x":' + b"[" * 2000
+        seeds = [b"", b"\x00\x00\x00\x02{}", b"\xff\xff\xff\xff", len(deep).to_bytes(4, "big") + deep]
         for _ in range(3):
             seeds.append(inviting.take_output())
             joining.receive(seeds[-1], WALL)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.agent.core_choice import make_core
 from rmpa.agent.network import Network
+from rmpa.agent.permission_notes import permission_notes
 from rmpa.agent.reload import Reloader, SighupHandler
 from rmpa.agent.trust import AgentTrust, open_membership
 from rmpa.agent.trust_operations import PlainOperations, TrustOperations
@@ -29,11 +30,13 @@ from rmpa.bridge.services.rules import ServiceRules
 from rmpa.core.counters import Counters
 from rmpa.core.errors import StartError
 from rmpa.core.open_files import remedy
+from rmpa.observe.io.agent_requests import AgentRequests
 from rmpa.observe.io.control_operations import ControlOperations
 from rmpa.observe.io.control_server import ControlServer
 from rmpa.observe.io.diagnostics import Diagnostics
 from rmpa.observe.io.graph_revision import GraphRevisions
 from rmpa.observe.io.peer_clocks import PeerClocks
+from rmpa.observe.io.peer_credentials import control_access
 from rmpa.observe.io.runtime_dir import runtime_dir
 from rmpa.observe.io.snapshot_builder import SnapshotBuilder, SnapshotSources
 from rmpa.observe.why.io.why import WhyService
@@ -127,6 +130,8 @@ class Agent:
             self.bridge.add(self.trust)
         self.network = Network(settings, self.bridge, self.trust)
         self.reloader = Reloader(settings, load, self.apply_settings)
+        self.reloaded: Callable[[], None] = lambda: None
+        """Called when changed settings hold."""
         counters = Counters()
         self._collector = GarbageCollector(self._bytes_carried, counters)
         self._clocks = PeerClocks(self.bridge)
@@ -145,6 +150,7 @@ class Agent:
         )
         self.snapshots = SnapshotBuilder(settings, sources)
         self._nodes = NodeRequests(settings, self.core, self.bridge.rpc, self.bridge.gate)
+        AgentRequests(self.bridge.rpc, self.snapshots)
         self._why = WhyService(settings, self.core, self.bridge, self.services, self.snapshots)
         self.operations = ControlOperations(
             settings.name,
@@ -153,14 +159,16 @@ class Agent:
             self.snapshots,
             self._why,
             self.reloader.reload,
-            GraphRevisions(self.core),
+            GraphRevisions(self.core, rows=settings.core_mode == "embedded"),
             self._trust_operations(),
+            self._nodes,
         )
         self._control = ControlServer(
             runtime_dir(os.environ, settings.runtime_dir),
             settings.name,
             self.operations.handlers(),
             counters=counters,
+            access=control_access(settings.control_group),
         )
 
     async def start(self) -> None:
@@ -169,6 +177,8 @@ class Agent:
         Raises:
             StartError: The name, the core's port or the mesh's port is taken.
         """
+        for note in permission_notes(self._settings, secured=self.bridge.gate.on):
+            _log.warning("! %s", note)
         async with contextlib.AsyncExitStack() as undo:
             self._control.lock()
             undo.push_async_callback(self._control.close)
@@ -210,6 +220,7 @@ class Agent:
     def _notes(self) -> Iterator[str]:
         yield from (f"{key} waits for a restart" for key in self.reloader.waiting)
         yield from self.params.notes()
+        yield from permission_notes(self._settings, secured=self.bridge.gate.on)
         if self.trust is not None:
             yield from self.trust.notes()
 
@@ -219,6 +230,7 @@ class Agent:
         logging.getLogger().setLevel(settings.log_level.upper())
         for part in (self.bridge, self.snapshots, self._why, self._nodes):
             part.reload(settings)
+        self.reloaded()
 
 
 async def _serve(
@@ -235,6 +247,7 @@ async def _serve(
         loop.add_signal_handler(number, stop.set)
     sighup = SighupHandler(agent.reloader, stop.set)
     web = WebProcess(web_command(settings), random.random, environ=web_environment(settings, os.environ), cpus=cpus)
+    agent.reloaded = web.reload
     await agent.start()
     sighup.start()
     if settings.web.enabled:

@@ -74,7 +74,7 @@ def _show(decision: PermissionDecision, groups: tuple[str, ...], *, as_json: boo
 @click.argument("file", type=click.Path(path_type=Path))
 @json_option
 def import_(file: Path, as_json: bool) -> None:
-    """Print the [[permission]] tables for the grants of a permissions.xml of SROS 2.
+    """Print the [[permission]] tables for a permissions.xml, or policy.xml, of SROS 2.
 
     Put them into the rmpa.toml of the modules that the grants' subject talks to. Comments say what does not fit.
     """

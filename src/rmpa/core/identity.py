@@ -73,6 +73,14 @@ class Identity:
         port = self.guid.port
         return tuple(dict.fromkeys([self.guid.endpoint, *((str(a), port) for a in self.addresses)]))
 
+    def is_same_run(self, other: Identity) -> bool:
+        """Whether two identities are of one run of one agent.
+
+        The instance alone does not tell: every member of a mesh hears it, and may claim it. In a secured mesh only
+        the name is proved.
+        """
+        return self.instance == other.instance and self.name == other.name
+
     def __str__(self) -> str:
         """``base (10.0.0.1:40001#7)``."""
         return f"{self.name} ({self.guid})"

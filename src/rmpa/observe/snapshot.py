@@ -90,6 +90,26 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
     end_connections: str | None = None
 
 
+class LaneInfo(msgspec.Struct, kw_only=True, frozen=True):
+    """One of the two lanes of a link.
+
+    Attributes:
+        name: ``express`` (control and small messages) or ``bulk`` (large ones).
+        connected: Whether it has its TCP connection; messages for a lane without one wait.
+        bytes_in: Bytes that its present connection has received.
+        bytes_out: Bytes that its present connection has sent.
+        queued: Bytes that wait in its send queue.
+        dropped: Messages dropped because it was too slow, since the link came up.
+    """
+
+    name: str
+    connected: bool
+    bytes_in: int = 0
+    bytes_out: int = 0
+    queued: int = 0
+    dropped: int = 0
+
+
 class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
     """The live link to a peer.
 
@@ -108,6 +128,7 @@ class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
         packet: Bytes of the largest packets that are sent, headers included.
         path_problem: What is wrong with the network path, ready to read; empty if nothing is known.
         path_remedy: What to do about that.
+        lanes: Its lanes, ``express`` first; empty from an agent that does not report them.
     """
 
     remote: str
@@ -124,6 +145,7 @@ class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
     packet: int | None = None
     path_problem: str = ""
     path_remedy: str = ""
+    lanes: tuple[LaneInfo, ...] = ()
 
 
 class BoundInfo(msgspec.Struct, kw_only=True, frozen=True):
@@ -559,16 +581,6 @@ class FollowedInfo(msgspec.Struct, kw_only=True, frozen=True):
     state: str
     size: int | None = None
     problem: str = ""
-
-
-class GraphRevision(msgspec.Struct, kw_only=True, frozen=True):
-    """The value of the operation ``graph``.
-
-    Attributes:
-        revision: Stands for the present local graph; another number stands for another graph.
-    """
-
-    revision: int
 
 
 class PingReply(msgspec.Struct, kw_only=True, frozen=True):

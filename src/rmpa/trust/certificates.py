@@ -2,6 +2,7 @@
 
 Keys are P-256. A module's certificate has its name as CN and as SAN ``urn:rmpa:<name>``; the SAN decides. This module
 needs the library ``cryptography`` (extra ``rmpa[trust]``); links do without it, as OpenSSL checks the chain there.
+For browsers, which ``rmpa web`` serves with it, it has host names too (``server_names``).
 
 Errors::
 
@@ -12,6 +13,7 @@ Errors::
 from __future__ import annotations
 
 import hashlib
+import ipaddress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Final
@@ -174,7 +176,7 @@ def issue(
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(_key_usage(signs_certificates=False), critical=True)
         .add_extension(x509.ExtendedKeyUsage(_PURPOSES), critical=False)
-        .add_extension(_subject_alternative(request.name), critical=False)
+        .add_extension(_subject_alternative(request.name, server=True), critical=False)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(_authority_key(authority)), critical=False)
         .sign(ca_key, hashes.SHA256())
@@ -339,8 +341,22 @@ def _name(common: str) -> x509.Name:
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
 
 
-def _subject_alternative(name: str) -> x509.SubjectAlternativeName:
-    return x509.SubjectAlternativeName([x509.UniformResourceIdentifier(URN + name)])
+def _subject_alternative(name: str, *, server: bool = False) -> x509.SubjectAlternativeName:
+    names: list[x509.GeneralName] = [x509.UniformResourceIdentifier(URN + name)]
+    if server:
+        names += map(x509.DNSName, server_names(name))
+        names.append(x509.IPAddress(ipaddress.IPv4Address("127.0.0.1")))
+    return x509.SubjectAlternativeName(names)
+
+
+def server_names(name: str) -> tuple[str, ...]:
+    """The hosts that a browser finds in a module's certificate, besides 127.0.0.1 (RFC 9525).
+
+    They follow from the module's name and are not asked for, so that no module gets those of another. A host's name
+    has ``-`` where the module's name, which is made of it, has ``_``.
+    """
+    host = name.replace("_", "-").lower()
+    return (host, f"{host}.local", "localhost")
 
 
 def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:

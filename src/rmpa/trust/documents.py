@@ -180,7 +180,7 @@ def _read(data: bytes, key: ec.EllipticCurvePublicKey, kind: DocumentKind, form:
         document = msgspec.json.decode(envelope.signed, type=form)
     except InvalidSignature:
         raise DocumentError("the document is not signed by our authority") from None
-    except (msgspec.MsgspecError, UnicodeError) as error:
+    except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
         raise DocumentError(f"the document cannot be read: {error!s:.200}") from None
     if not 0 <= document.number <= UINT32_MAX:
         raise DocumentError(f"the document's number is {document.number}")

@@ -223,7 +223,7 @@ class _Side(ABC):
             self._refuse(error.reason, error.text)
         except certificates.CertificateError as error:
             self._refuse(error.reason.label, str(error))
-        except (msgspec.MsgspecError, UnicodeError, RemoteProtocolError) as error:
+        except (msgspec.MsgspecError, UnicodeError, RecursionError, RemoteProtocolError) as error:
             self._refuse("malformed", f"{error!s:.200}")
 
     @abstractmethod

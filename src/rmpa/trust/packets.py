@@ -18,7 +18,7 @@ from __future__ import annotations
 import hashlib
 import hmac
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
@@ -72,12 +72,14 @@ class Verification:
     Args:
         verdict: Only of an accepted packet (or one with an older key) anything may be used.
         size: Bytes of the packet without its trailer.
+        key: The low 16 bits of the number of its group key, if its tag is right.
         skew: By how many seconds the sender's clock is ahead of ours; 0 if either is not set.
     """
 
     verdict: Verdict
     size: int = 0
     skew: int = 0
+    key: int = field(default=0, compare=False)
 
 
 class PacketSigner:
@@ -156,7 +158,7 @@ class PacketVerifier:
             return Verification(Verdict.REPEATED)
         if freshness is Freshness.STALE:
             return Verification(Verdict.REPLAYED)
-        return Verification(Verdict.OLD_KEY if old else Verdict.ACCEPTED, size, skew)
+        return Verification(Verdict.OLD_KEY if old else Verdict.ACCEPTED, size, skew, short)
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,3 +174,14 @@ class PacketTrust:
     signer: PacketSigner
     verifier: PacketVerifier
     wall: Callable[[], float | None]
+    old_keys: dict[str, int] = field(default_factory=dict)
+    """By address: the group key of a module that was away, so that it is dialled with one that it knows."""
+
+    def heard(self, host: str, found: Verification) -> None:
+        """Remember which key the sender of a usable packet has."""
+        if found.verdict is Verdict.OLD_KEY:
+            if len(self.old_keys) >= limits.OLD_KEYS_MAX:
+                self.old_keys.clear()
+            self.old_keys[host] = found.key
+        elif self.old_keys:
+            self.old_keys.pop(host, None)

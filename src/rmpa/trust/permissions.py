@@ -157,13 +157,13 @@ class Permissions:
         return None
 
 
-def refusal(access: Access, module: str, name: str) -> str:
+def refusal(access: Access, module: str, name: str, where: str = "there") -> str:
     """What a refused module is told: that it may not, and nothing of the rules."""
-    return f"the permissions there do not let {module} {_DONE[access]} {name}"
+    return f"the permissions {where} do not let {module} {_DONE[access]} {name}"
 
 
 def prohibition(access: Access, module: str, name: str) -> str:
-    """That a module may not do something here: ``arm2 may not publish /cmd_vel``."""
+    """That a module may not do something: ``arm2 may not publish /cmd_vel``."""
     return f"{module} may not {_DONE[access]} {name}"
 
 

@@ -86,6 +86,6 @@ def decode_renewal(data: bytes | bytearray) -> RenewalMessage | None:
         return None
     try:
         message: RenewalMessage = _decoder.decode(bytes(data[_LENGTH.size : _LENGTH.size + length]))
-    except (msgspec.MsgspecError, UnicodeError) as error:
+    except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
         raise RemoteProtocolError(f"not a message of a renewal: {error!s:.200}") from None
     return message

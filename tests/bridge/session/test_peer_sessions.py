@@ -106,6 +106,20 @@ def test_a_short_silence_goes_unnoticed() -> None:
     assert play(scene) == ["up 1", "down", "up 1"]
 
 
+def test_another_module_that_claims_a_run_does_not_get_its_session() -> None:
+    """Instances are no secret: each member hears them in beacons. In a secured mesh the name alone is proved."""
+
+    async def scene(made: Scene) -> None:
+        made.sessions.link_down(made.link())
+        thief = Link(1, silent=True)
+        thief.name = "thief"
+        thief.identity = Identity(thief.guid, thief.identity.instance, "thief")
+        made.sessions.link_up(cast("PeerLink", thief))
+        assert [(session.peer, session.link.name) for session in made.sessions] == [(2, "thief")]
+
+    assert play(scene) == ["up 1", "down", "gone", "up 2"]
+
+
 def test_a_session_that_nothing_waits_for_ends_after_the_grace() -> None:
     async def scene(made: Scene) -> None:
         made.sessions.link_down(made.link())

@@ -68,7 +68,7 @@ class Member:
     def wall(self) -> float | None:
         return time.time() + self.ahead
 
-    def preface(self, purpose: Purpose) -> bytes:
+    def preface(self, purpose: Purpose, host: str = "") -> bytes:
         preface = Preface(purpose, self.group_key.short, int((time.time() + self.ahead) * 1000), os.urandom(16))
         return preface.serialize(self.group_key.key_for(KeyPurpose.PREFACE))
 

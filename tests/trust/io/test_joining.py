@@ -70,7 +70,7 @@ class Lab:
             return agree
 
         def read_refusal(answer: bytes) -> tuple[str, str] | None:
-            return ("token", answer[6:].decode()) if answer.startswith(b"plain ") else None
+            return ("key", answer[6:].decode()) if answer.startswith(b"plain ") else None
 
         return await join_mesh(token, name, self.clock, compare or say, read_refusal)
 
@@ -153,7 +153,7 @@ async def test_a_token_lets_one_module_join_also_after_a_restart(lab: Lab) -> No
     async with running(lab):
         token = lab.invite(unattended=True)
         await lab.join(token)
-        with pytest.raises(PeerRefused, match=r"was used or has ended \(token\); ask for a new one"):
+        with pytest.raises(PeerRefused, match=r"was used, or has ended \(token\); ask for a new one"):
             await lab.join(token, "gripper")
     assert lab.store.load_tokens().key_of(token.token_id) is None
 

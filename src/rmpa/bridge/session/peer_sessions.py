@@ -107,7 +107,7 @@ class PeerSessions:
         for session in self:
             if session.linked:
                 continue
-            if session.link.identity.instance == link.identity.instance:
+            if session.link.identity.is_same_run(link.identity):
                 return session
             if session.link.guid.place == link.guid.place or session.link.name == link.name:
                 self._end(session)

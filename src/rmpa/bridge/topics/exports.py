@@ -73,6 +73,7 @@ class _Route:
     Args:
         contract: The contract in force: the stronger terms of both ends.
         asked: The contract that the peer asked for.
+        name: The peer's name.
         live: Whether data is sent on it yet.
         epoch: Identifies the numbering of a reliable route; 0 for best effort.
         after: Sequence of the last message that the peer has, if this continues a suspended route; else ``None``.
@@ -81,6 +82,7 @@ class _Route:
 
     contract: Contract
     asked: Contract
+    name: str = ""
     live: bool = False
     epoch: int = 0
     after: int | None = None
@@ -266,6 +268,11 @@ class Exports:
             for source in dict.fromkeys(routes.values()):
                 if why := self._gate.why_not(Access.SUBSCRIBE, known.name, source.topic):
                     actions += self._end_for(source, peer, why)
+        for source, flow in list(self._flows.items()):
+            for peer, route in list(flow.away.items()):
+                if not self._gate.judge(Access.SUBSCRIBE, route.name, source.topic).allowed:
+                    del flow.away[peer]
+                    actions += [RemoveRoute(source, peer, 0), *self._disconnect(source, flow)]
         return actions
 
     def graph(self, topic: str, publishers: Mapping[str, LocalSource]) -> list[Action]:
@@ -462,6 +469,8 @@ class Exports:
         routes[message.route] = source
         away = flow.away.pop(peer, None) if flow is not None else None
         route = self._route(message, source.topic, local, away)
+        known = self._catalogue.peer(peer)
+        route.name = known.name if known is not None else ""
         if flow is None:
             flow = self._flows[source] = _ExportedFlow(local.uri)
             flow.routes[peer, message.route] = route

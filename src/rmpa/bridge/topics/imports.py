@@ -392,6 +392,8 @@ class Imports:
             if (entry.type, entry.origin) == (offer.type, offer.origin):
                 # It was offered over an earlier link: open the route again that ended with that link.
                 waits = entry.state is RouteState.WAITING and entry.timer is None
+                if waits or entry.state is RouteState.IDLE:
+                    entry.problem = ""  # the peer was away, and is back
                 return self._routes.open(peer, source, entry, now) if waits else []
             actions += self._forget(peer, source)
         elif len(known) >= self._limit_settings.topics:

@@ -132,6 +132,7 @@ class PacketFilter:
             return False
         found = trust.verifier.verify(data, KeyPurpose.BEACON, RUN_AT, now, trust.wall())
         if found.verdict in _USABLE:
+            trust.heard(host, found)
             return True
         text = _refusal(found)
         if text:

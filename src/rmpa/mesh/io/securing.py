@@ -89,8 +89,8 @@ class MeshSecurity(Protocol):
         """Seconds since 1970; ``None`` while the machine's clock is not set."""
         ...
 
-    def preface(self, purpose: Purpose) -> bytes:
-        """The first bytes of a connection that is dialled."""
+    def preface(self, purpose: Purpose, host: str = "") -> bytes:
+        """The first bytes of a connection that is dialled, to a module at this address."""
         ...
 
     def judge_member(self, certificate: Certificate | bytes, claimed: str | None) -> None:
@@ -185,7 +185,8 @@ async def secure_dialled(sock: socket.socket, security: MeshSecurity) -> Secured
     loop = asyncio.get_running_loop()
     try:
         async with asyncio.timeout(limits.SECURING_TIMEOUT):
-            await loop.sock_sendall(sock, security.preface(Purpose.LINK) + handshake.take_output())
+            preface = security.preface(Purpose.LINK, sock.getpeername()[0])
+            await loop.sock_sendall(sock, preface + handshake.take_output())
             first = await _received(sock)
             if first[0] not in _TLS_RECORDS:
                 raise await _plain_refusal(sock, first)

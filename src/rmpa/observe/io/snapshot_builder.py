@@ -17,6 +17,7 @@ from rmpa.observe.io.direct_section import DirectSection
 from rmpa.observe.io.peers_section import PeersSection, own_text
 from rmpa.observe.io.services_section import ServicesSection
 from rmpa.observe.io.topics_section import TopicsSection, unreachable_infos
+from rmpa.observe.peer_agent import PeerAgent
 from rmpa.observe.snapshot import AgentInfo, FilesInfo, Snapshot
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.descriptors import DESCRIPTORS
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.services.io.part import Services
     from rmpa.config.settings import Settings
     from rmpa.core.counters import Counters
+    from rmpa.observe.contract_term import ContractTerm
     from rmpa.observe.io.peer_clocks import PeerClocks
     from rmpa.observe.io.peers_section import EndpointView
     from rmpa.ros.core.api import Core
@@ -102,6 +104,24 @@ class SnapshotBuilder:
         """Use other settings from now on."""
         self._settings = settings
         self._topics.reload(settings)
+
+    def contract(self, topic: str, type_name: str) -> dict[str, ContractTerm]:
+        """The terms of a topic's contract by the settings, by key; ``type_name`` may be empty."""
+        return self._topics.contract(topic, type_name)
+
+    def peer_agent(self) -> PeerAgent:
+        """What this agent tells its peers of itself."""
+        agent = self._agent(self.endpoint)
+        return PeerAgent(
+            version=agent.version,
+            uptime=agent.uptime,
+            core_uri=agent.core_uri,
+            cpu=agent.cpu,
+            rss=agent.rss,
+            files_open=agent.files.open if agent.files is not None else None,
+            files_limit=agent.files.limit if agent.files is not None else None,
+            proxies=agent.proxies,
+        )
 
     def build(self, topics: Collection[str] | None = None) -> Snapshot:
         """A snapshot of this moment. It yields to data between its parts.

@@ -23,6 +23,7 @@ from rmpa.trust.io.private_keys import new_key, private_key
 from rmpa.trust.io.store import MemberFiles
 from rmpa.trust.join import CodeShown, Joined, JoiningSide
 from rmpa.trust.preface import Preface, Purpose
+from rmpa.trust.reasons import TrustReason
 from rmpa.trust.renewal import Renew, RenewalGrant, RenewalRefused, decode_renewal, encode_renewal
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ ReadRefusal = Callable[[bytes], tuple[str, str] | None]
 """Reads what a mesh answers without TLS: the word and the text of a refusal, or ``None`` if it is none."""
 _REMEDIES: Final = {
     "token": "ask for a new one: rmpa trust invite at the authority",
-    "key": "ask for a new one: rmpa trust invite at the authority",
+    "key": "is it still the same mesh? else join again: rmpa trust invite at the authority",
     "used": "each token lets one module join; ask for a new one: rmpa trust invite at the authority",
     "late": "ask for a new one: rmpa trust invite at the authority",
     "name": "join with the --name that it is for",
@@ -79,8 +80,14 @@ async def _open(address: str, port: int, preface: bytes) -> socket.socket:
     return sock
 
 
-async def _secure(connection: JoinConnection, read_refusal: ReadRefusal) -> None:
-    """Do the handshake of the dialling side; errors are texts for the user."""
+async def _secure(connection: JoinConnection, read_refusal: ReadRefusal, unproven: tuple[str, str]) -> None:
+    """Do the handshake of the dialling side; errors are texts for the user.
+
+    Args:
+        connection: The connection.
+        read_refusal: Reads a refusal without TLS.
+        unproven: The word and the text of one that is due to the preface's key.
+    """
     try:
         async with asyncio.timeout(limits.JOIN_STEP_TIMEOUT):
             await connection.handshake()
@@ -90,6 +97,8 @@ async def _secure(connection: JoinConnection, read_refusal: ReadRefusal) -> None
             raise RemoteProtocolError(
                 "the program at the token's address is not an agent of a secured mesh"
             ) from None
+        if found[0] == TrustReason.KEY.label:  # its own remedy is for links
+            found = unproven
         raise refused(*found) from None
     except (ssl.SSLError, OSError) as error:
         reason = getattr(error, "reason", None) or str(error) or "no answer"
@@ -128,7 +137,7 @@ async def join_mesh(
     sock = await _open(str(token.address), token.port, preface.serialize(token.key))
     connection = JoinConnection(sock, join_client_context(), server_side=False)
     try:
-        await _secure(connection, read_refusal)
+        await _secure(connection, read_refusal, ("token", "the token is unknown there, was used, or has ended"))
         nonce = os.urandom(limits.NONCE_BYTES)
         side = JoiningSide(name, request, token, connection.certificate(), nonce, clock.now())
         joined = await _joining(connection, side, clock, compare)
@@ -200,7 +209,7 @@ async def renew_at_authority(
     sock = await _open(address, port, membership.preface(Purpose.RENEWAL))
     connection = JoinConnection(sock, context, server_side=False)
     try:
-        await _secure(connection, read_refusal)
+        await _secure(connection, read_refusal, ("key", "our group keys are unknown there, or too old"))
         try:
             async with asyncio.timeout(limits.JOIN_STEP_TIMEOUT):
                 await connection.send(encode_renewal(Renew(request)))

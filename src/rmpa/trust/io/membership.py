@@ -119,9 +119,17 @@ class Membership:
         """For links that are dialled."""
         return self._context(server_side=False)
 
-    def preface(self, purpose: Purpose) -> bytes:
-        """The first bytes of a connection that is dialled, signed by the group key that signs now."""
+    def preface(self, purpose: Purpose, host: str = "") -> bytes:
+        """The first bytes of a connection that is dialled, signed by the group key that signs now.
+
+        Args:
+            purpose: What the connection is for.
+            host: The address that is dialled. A module there whose beacons have an older key was away, and does not
+                know the present one: the connection is signed with the older key, and TLS proves the rest.
+        """
         key = self.ring.signing(self._clock.now())
+        if old := self.packets.old_keys.get(host):
+            key = self.ring.find(old) or key
         wall = self.wall()
         nonce = os.urandom(limits.PREFACE_NONCE_BYTES)
         preface = Preface(purpose, key.short, 0 if wall is None else int(wall * 1000), nonce)
@@ -181,10 +189,10 @@ class Membership:
             if keys.number <= self._keys.number:
                 return False
             self._take_keys(keys, data)
-        self._write(_FILES[kind], data)
-        if kind is DocumentKind.DENY:
+        if kind is DocumentKind.DENY:  # before a slow disk is written
             for call in tuple(self.on_denied):
                 call()
+        self._write(_FILES[kind], data)
         return True
 
     def renewed(self, certificate: bytes) -> None:

@@ -156,7 +156,7 @@ class TrustStore:
         remedy = "remove it: open tokens are then void"
         try:
             invitations = msgspec.json.decode(self._read(TOKENS, remedy), type=list[Invitation])
-        except (msgspec.MsgspecError, UnicodeError) as error:
+        except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
             raise StartError(str(self.path(TOKENS)), f"is broken: {error!s:.200}", remedy) from None
         return TokenBook(invitations)
 
@@ -187,6 +187,11 @@ class TrustStore:
     def load_request_key(self) -> bytes:
         """The key (PEM) of a join by files; raises as ``load``."""
         return self._read(REQUEST_KEY, "begin again: rmpa trust join --request FILE")
+
+    def check_writable(self) -> None:
+        """Raise ``StartError`` if files cannot be written here."""
+        self.write(REQUEST_KEY, b"-")
+        self.forget(REQUEST_KEY)
 
     def forget(self, name: str) -> None:
         """Remove a file that is not needed any more, if it is there."""

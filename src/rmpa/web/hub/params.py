@@ -46,6 +46,8 @@ class ParamMirror:
         self._told = 0
         self.loaded = asyncio.Event()
         """Set once the parameters are known."""
+        self.changes = 0
+        """How often they have changed."""
         link.on_node.append(self._load_from)
 
     @property
@@ -171,7 +173,10 @@ class ParamMirror:
         before = self._parameters.tree
         apply()
         after = self._parameters.tree
-        if before is after or not self._followers:
+        if before is after:
+            return
+        self.changes += 1
+        if not self._followers:
             return
         leaves: dict[str, ParamValue] | None = None
         for follower in [*self._followers.values()]:

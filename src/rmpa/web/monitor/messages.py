@@ -14,7 +14,7 @@ SUBPROTOCOL: Final = "rmpa.monitor.v1"
 """The WebSocket subprotocol; a version that older pages cannot read has another one."""
 
 Id: TypeAlias = int
-Kind: TypeAlias = Literal["module", "topic", "service", "resource", "counters"]
+Kind: TypeAlias = Literal["module", "topic", "service", "node", "resource", "counters"]
 How: TypeAlias = Literal["value", "plot", "image", "scan"]
 
 

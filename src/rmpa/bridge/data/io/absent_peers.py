@@ -63,7 +63,7 @@ class AbsentPeers:
     def number_of(self, identity: Identity) -> int | None:
         """The number of this very run of a peer, if ``back`` would return it; else ``None``."""
         for peer, absent in self._absent.items():
-            if absent.identity.instance == identity.instance:
+            if absent.identity.is_same_run(identity):
                 return peer
             if absent.identity.guid.place == identity.guid.place or absent.identity.name == identity.name:
                 return None
@@ -73,7 +73,7 @@ class AbsentPeers:
         """Remove and return the absent peer of a new link: the same run, or an earlier run of its module."""
         for peer, absent in list(self._absent.items()):
             was = absent.identity
-            if was.instance == identity.instance:
+            if was.is_same_run(identity):
                 return self._absent.pop(peer)
             if was.guid.place == identity.guid.place or was.name == identity.name:
                 for past in absent.pasts.values():

@@ -205,10 +205,19 @@ class DirectServiceImporter:
             return
         self._act(self.services.consider(key, remote.node, wanted, unmet, self._now()))
 
-    def hidden(self, peer: int, service: str) -> None:
-        """Forget a service that leaves the local graph; clients keep the connections that they have."""
+    def hidden(self, peer: int, service: str, *, end: bool = False) -> None:
+        """Forget a service that leaves the local graph; clients keep the connections that they have.
+
+        Args:
+            peer: The peer.
+            service: The service.
+            end: End these connections, too: the peer may not serve it here any more.
+        """
+        found = self.answer(peer, service)
         self._stop(ServiceKey(peer, service))
         self._act(self.services.remove(ServiceKey(peer, service)))
+        if end and found is not None:
+            self._end(self._imports.peer_name(peer), (found.endpoint,), same_machine=found.nearby)
 
     def renewed(self, peer: int, service: str) -> None:
         """Ask again for a service that was offered again."""

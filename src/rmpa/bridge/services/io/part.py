@@ -433,7 +433,8 @@ class Services(Part):
         shown = self._shown.pop((action.peer, action.service), None)
         if shown is None:
             return
-        self.direct_imports.hidden(action.peer, action.service)
+        remote = self.imports.get(action.peer, action.service)
+        self.direct_imports.hidden(action.peer, action.service, end=remote is not None and remote.denied)
         proxy = shown.proxy
         text = f"service [{shown.service}] of {shown.peer_name}: {action.reason}"
         self._fail_waiting(shown, text)

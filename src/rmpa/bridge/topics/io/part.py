@@ -243,7 +243,7 @@ class Topics(Part):
         peer, identity = session.peer, session.link.identity
         absent = self._absent.back(identity)
         if absent is not None:
-            again = absent.identity.instance == identity.instance
+            again = absent.identity.is_same_run(identity)
             if not again:
                 self.exports.inherit(absent.peer, peer)
                 self.outbound.inherit(absent.peer, peer)

@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import math
 import time
 from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import msgspec
 
+from rmpa.bridge.io.node_requests import INFO
+from rmpa.bridge.policy import is_own
 from rmpa.bridge.proxy_names import proxied_peer
+from rmpa.config.permission_rules import Access
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.names import is_global_name
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.io.control_client import ControlClient, choose_agent
 from rmpa.observe.io.peer_params import PeerParams, parameters_in
 from rmpa.resource.run.dynamic_reconfigure import SERVICE_TYPE
+from rmpa.web.hub.rights import FULL
 from rmpa.web.monitor import limits
+from rmpa.web.monitor.nodes import node_key, shown_node
 from rmpa.web.values.codec import codec_for
 
 if TYPE_CHECKING:
@@ -27,13 +34,20 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.requests import ParamValue
+    from rmpa.web.hub.rights import Rights
     from rmpa.web.monitor.io.resource_watch import ResourceWatch
     from rmpa.web.monitor.session import Question
 
 Args = dict[str, Any]
 _CALL_TIMEOUT: Final = 30.0
 _READ_TIMEOUT: Final = 5.0
-_KINDS: Final = ("topic", "service")
+_KINDS: Final = ("topic", "service", "module")
+_SET_PARAMETERS: Final = "set_parameters"
+"""The service of a resource that takes another configuration (wiki.ros.org/dynamic_reconfigure)."""
+_RECONFIGURES: Final = ("profile", "context", "configure")
+_CHANGES_PARAM: Final = ("set_param", "delete_param")
+_WITH_PARAMS: Final = ("params", *_CHANGES_PARAM)
+"""Questions whose answer has all parameters of a module."""
 _LISTS: Final = {"bool": "bools", "int": "ints", "double": "doubles", "str": "strs"}
 """The lists of a ``dynamic_reconfigure/Config`` by the types of parameters."""
 
@@ -60,6 +74,10 @@ class Answers:
             "why": self._why,
             "history": self._history,
             "describe": self._describe,
+            "agent": self._agent_of,
+            "contract": self._contract,
+            "node": self._node,
+            "param_names": self._param_names,
             "params": self._params,
             "call": self._call,
             "set_param": self._set_param,
@@ -69,13 +87,33 @@ class Answers:
             "configure": self._configure,
         }
 
-    async def answer(self, question: Question) -> Any:
+    async def answer(self, question: Question, rights: Rights = FULL) -> Any:
         """The answer, as values for JSON.
 
+        Args:
+            question: One that the page may ask.
+            rights: What its client may do; names are judged here. A peer's parameters count by their names there.
+
         Raises:
-            RmpaError: There is none; the text says why.
+            RmpaError: There is none, or the client may not; the text says why.
         """
-        return await self._handlers[question.what](question.args)
+        self._check(question, rights)
+        value = await self._handlers[question.what](question.args)
+        if question.what in _WITH_PARAMS:
+            return _with_digest(rights.visible_tree(value), question.args.get("has"))
+        if question.what == "param_names":
+            return {"names": sorted(rights.visible(dict.fromkeys(value)))}
+        return value
+
+    def _check(self, question: Question, rights: Rights) -> None:
+        args = question.args
+        if question.what == "call":
+            rights.check_change(Access.CALL, _name(args, "service"))
+        elif question.what in _RECONFIGURES:
+            rights.check_change(Access.CALL, f"{_name(args, 'resource')}/{_SET_PARAMETERS}")
+        elif question.what in _CHANGES_PARAM:
+            value_of = (lambda _name: None) if _text(args, "peer") else self._hub.params.value
+            rights.check_param_change(_name(args, "name"), value_of, args.get("value"))
 
     def close(self) -> None:
         """End the threads, once what the agent was asked is answered or has timed out."""
@@ -86,12 +124,35 @@ class Answers:
     async def _why(self, args: Args) -> Any:
         kind = args.get("kind")
         if kind not in _KINDS:
-            raise ConfigError("kind", f"{str(kind)[:40]!r} is not a topic or a service")
+            raise ConfigError("kind", f"{str(kind)[:40]!r} is not a topic, a service or a module")
+        if kind == "module":
+            return await self._control_call("why", module=_text(args, "name"))
         name, peer = _name(args, "name"), _text(args, "peer")
+        return await self._control_call("why", name=name, peer=peer or None, service=kind == "service")
+
+    async def _agent_of(self, args: Args) -> Any:
+        return await self._control_call("agent", peer=_text(args, "peer"))
+
+    async def _contract(self, args: Args) -> Any:
+        return await self._control_call("contract", topic=_name(args, "topic"), type_name=_text(args, "type"))
+
+    async def _node(self, args: Args) -> Any:
+        """The facts about a node, with names of nodes as pages have them."""
+        name, peer = _name(args, "name"), _text(args, "peer")
+        if not peer and is_own(name):
+            raise RmpaError(f"{name} belongs to the agent of this module; nothing is asked of it")
+        about = await self._control_call("node", what=INFO, node=name, **({"peer": peer} if peer else {}))
+        for each in about.get("connections") or ():
+            other = str(each["other"])
+            each["other"] = shown_node(other) if not peer or is_own(other) else node_key(peer, other)
+        return about
+
+    async def _control_call(self, op: str, **args: object) -> Any:
+        """Call an operation of the agent, in a thread."""
 
         def ask() -> Any:
             with self._control() as client:
-                return client.call("why", object, name=name, peer=peer or None, service=kind == "service")
+                return client.call(op, object, **args)
 
         return await asyncio.get_running_loop().run_in_executor(self._threads, ask)
 
@@ -111,16 +172,24 @@ class Answers:
     # --- parameters -------------------------------------------------------------------------------------------
 
     async def _params(self, args: Args) -> Any:
+        """All parameters."""
         peer = _text(args, "peer")
-        if not peer:
-            self._hub.link.need()
-            try:
-                async with asyncio.timeout(_READ_TIMEOUT):
-                    await self._hub.params.loaded.wait()
-            except TimeoutError:
-                raise UnreachableError("parameters of the core", "its API", "is it busy? ask again") from None
-            return {"values": _plain(self._hub.params.tree)}
-        return {"values": _plain(await self._of_peer(peer, lambda params: params.get("/")))}
+        if peer:
+            return _plain(await self._of_peer(peer, lambda params: params.get("/")))
+        return _plain(await self._own_params())
+
+    async def _own_params(self) -> Mapping[str, ParamValue]:
+        self._hub.link.need()
+        try:
+            async with asyncio.timeout(_READ_TIMEOUT):
+                await self._hub.params.loaded.wait()
+        except TimeoutError:
+            raise UnreachableError("parameters of the core", "its API", "is it busy? ask again") from None
+        return self._hub.params.tree
+
+    async def _param_names(self, _args: Args) -> Any:
+        await self._own_params()
+        return list(islice(self._hub.params.values((), "/"), limits.PARAMETER_NAMES_SHOWN))
 
     async def _set_param(self, args: Args) -> Any:
         name, peer, value = _name(args, "name"), _text(args, "peer"), args.get("value")
@@ -196,7 +265,7 @@ class Answers:
 
     async def _reconfigure(self, args: Args, config: Args) -> None:
         resource = _name(args, "resource")
-        service = self._service({"service": f"{resource}/set_parameters", "peer": args.get("peer", "")})
+        service = self._service({"service": f"{resource}/{_SET_PARAMETERS}", "peer": args.get("peer", "")})
         kind = self._hub.types.service(SERVICE_TYPE)
         body = codec_for(kind.request).write({"config": config}, time.time_ns()).payload
         await self._hub.calls.call(service, kind.md5sum, body, _CALL_TIMEOUT)
@@ -251,6 +320,12 @@ def _name(args: Args, key: str) -> str:
     if value != "/" and not is_global_name(value):
         raise ConfigError(key, f"{value[:80]!r} is not a name", "write it as /name")
     return value
+
+
+def _with_digest(values: Mapping[str, ParamValue], has: object) -> Args:
+    """Parameters with their ``digest``; where the page ``has`` that digest they are not repeated."""
+    digest = hashlib.sha256(msgspec.json.encode(values, order="sorted")).hexdigest()[:16]
+    return {"digest": digest} if has == digest else {"values": values, "digest": digest}
 
 
 def _json(text: bytes) -> Any:
