@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
+import ssl
 import time
 from functools import partial
 from typing import TYPE_CHECKING
@@ -107,6 +108,23 @@ async def test_refusals_have_their_reason_at_both_ends(lab: Authority, other: st
         assert not low.ups or not low.linked(high)
         if other not in {"clock", "key"}:  # those are refused before the acceptor knows more than an address
             await until(lambda: other in status(high, low).last_error, "the acceptor shows it")
+
+
+@pytest.mark.parametrize("bad", ["foreign", "expired"])
+async def test_a_dialler_learns_why_its_certificate_is_refused(lab: Authority, bad: str) -> None:
+    """By the acceptor's alert, which comes when the dialler's own handshake is done; nobody dials the other way."""
+    mine = _bad(lab, bad)
+    judge = Member(lab, "base")
+    mine.client_context.verify_mode = ssl.CERT_NONE  # so that only the acceptor finds something wrong
+    async with meshes(mine, judge, found=False) as (low, high):
+        low.mesh.peer_found(high.identity)
+        for _ in range(3):
+            await until(lambda: bool(low.mesh.peers()[0].last_error), "refused")
+            assert status(low, high).last_error.startswith(f"{bad}:")
+            assert status(low, high).state == "refused"
+            low.mesh.peer_gone(high.identity.guid)
+            await until(lambda: not low.mesh.peers(), "forgotten")
+            low.mesh.peer_found(high.identity)
 
 
 async def test_a_plain_module_learns_that_the_mesh_is_secured(lab: Authority) -> None:
@@ -213,8 +231,10 @@ async def test_a_flood_of_forged_prefaces_costs_no_message_and_members_still_lin
         await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
         forged = Member(lab, "arm", group_key=GroupKey(1, b"x" * 32)).preface(Purpose.LINK)
         sent = 0
-        while base.mesh.counters["link.paused"] < 3:
-            for _ in range(10):
+        paused = False
+        while base.mesh.counters["link.paused"] < 3 or not paused:
+            paused = paused or base.mesh._acceptor.paused
+            for _ in range(3):
                 sock = socket.socket()
                 sock.setblocking(False)
                 base.hand_made.append(sock)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rmpa.core.open_files import remedy
 from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
@@ -15,6 +15,10 @@ if TYPE_CHECKING:
 
     from rmpa.observe.snapshot import AgentInfo, FilesInfo, PeerInfo, Snapshot, UnreachableInfo
     from rmpa.trust.status import TrustStatus
+
+
+_PERMISSION: Final = "permission."
+"""The counters of what ``[[permission]]`` refused begin so."""
 
 
 def judge_agents(agents: Mapping[str, Snapshot | str], version: str) -> list[Check]:
@@ -49,6 +53,12 @@ def _agent(snapshot: Snapshot, version: str) -> Iterator[Check]:
     shortage = agent.files.problem if agent.files is not None else ""
     shown = {shortage, *(snapshot.trust.problems if snapshot.trust is not None else ())}  # by checks of their own
     yield from (Check("agent", WARN, note, where=here) for note in snapshot.notes if note not in shown)
+    refused = [(n.removeprefix(_PERMISSION), c) for n, c in snapshot.counters.items() if n.startswith(_PERMISSION)]
+    if refused:
+        text = (
+            f"refused so far: {', '.join(f'{count} {access}' for access, count in refused)}; its log names the rules"
+        )
+        yield Check("permissions", OK, text, where=here)
     yield from map(_unreachable, snapshot.unreachable)
     if agent.files is not None:
         yield _files(agent, agent.files)
