@@ -297,6 +297,7 @@ def test_an_agent_without_trust_warns_and_says_that_it_must_be_started_again(
 ) -> None:
     base = machine("base")
     base.up()
+    _until(lambda: "is on the air" in base.log and "trust is off" in base.log)
     assert base.log.count("trust is off: every program that reaches port") == 1
     out = base.run("trust", "init")
     assert "the agent base runs without trust until it is started again" in out[2]

@@ -105,6 +105,18 @@ def invite(
         port=port,
         unattended=unattended,
     )
+    try:
+        _print_token(invited, module, as_json=as_json)
+        if not no_wait:
+            _await_join(place, invited, yes=yes, as_json=as_json)
+    except (KeyboardInterrupt, click.Abort):
+        with contextlib.suppress(RmpaError):
+            if place.call("withdraw", TrustReply, id=invited.id).done:
+                click.echo("\nthe token is withdrawn", err=True)
+        raise
+
+
+def _print_token(invited: InviteReply, module: str | None, *, as_json: bool) -> None:
     if as_json:
         print_json(invited)
     else:
@@ -112,14 +124,6 @@ def invite(
         whom = module or "one module"
         click.echo(f"for {whom}, until {date_of(invited.expires)}; there: rmpa trust join TOKEN", err=True)
     sys.stdout.flush()
-    if not no_wait:
-        try:
-            _await_join(place, invited, yes=yes, as_json=as_json)
-        except (KeyboardInterrupt, click.Abort):
-            with contextlib.suppress(RmpaError):
-                if place.call("withdraw", TrustReply, id=invited.id).done:
-                    click.echo("\nthe token is withdrawn", err=True)
-            raise
 
 
 def _await_join(place: TrustPlace, invited: InviteReply, *, yes: bool, as_json: bool) -> None:
