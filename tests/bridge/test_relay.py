@@ -8,6 +8,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import pytest
 
 from rmpa.bridge import limits
@@ -293,3 +294,29 @@ def test_the_way_is_told_and_what_came_round_is_not_shown() -> None:
     assert not ways.why_not(1, origin(1, 2))
     assert ways.remove(1, origin(1, 2))
     assert list(ways) == []
+
+
+def test_a_peer_that_claims_the_run_of_a_relayed_module_does_not_hide_it() -> None:
+    """Instances are no secret: each member hears them in beacons. In a secured mesh the name alone is proved."""
+    ways = RelayPaths()
+    ways.instance = instance(9)
+    ways.linked(1, LinkedPeer("r", instance(2), Guid(2)))
+    ways.add(1, origin(1, 2))
+    ways.linked(2, LinkedPeer("thief", instance(1), Guid(1)))
+    assert not ways.why_not(1, origin(1, 2))
+    assert list(ways) == [(origin(1, 2), "r")]
+    ways.linked(3, LinkedPeer("m1", instance(1), Guid(1)))
+    assert ways.why_not(1, origin(1, 2)) == "m1 has a link of its own"
+    assert list(ways) == []
+
+
+def test_a_peer_that_may_not_relay_does_not_rename_a_module() -> None:
+    ways = RelayPaths(lambda name: name == "r")
+    ways.instance = instance(9)
+    ways.linked(1, LinkedPeer("r", instance(2), Guid(2)))
+    ways.linked(2, LinkedPeer("liar", instance(3), Guid(3)))
+    renamed = msgspec.structs.replace(origin(1, 3), name="other")
+    ways.add(2, renamed)
+    ways.add(1, origin(1, 2))
+    ways.add(2, renamed)
+    assert list(ways) == [(origin(1, 2), "r")]

@@ -81,6 +81,16 @@ class Identity:
         """
         return self.instance == other.instance and self.name == other.name
 
+    def is_same_module(self, other: Identity, *, secured: bool) -> bool:
+        """Whether two identities are of one module, perhaps of two runs of its agent.
+
+        Args:
+            other: The other identity.
+            secured: Whether the mesh is secured. There the name alone tells, because the certificate proves it;
+                else the same address and port do as well, since a module may have got another name.
+        """
+        return self.name == other.name or (not secured and self.guid.place == other.guid.place)
+
     def __str__(self) -> str:
         """``base (10.0.0.1:40001#7)``."""
         return f"{self.name} ({self.guid})"

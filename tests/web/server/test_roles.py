@@ -122,6 +122,12 @@ def test_a_denied_parameter_cannot_be_changed_by_its_namespace(name: str, after:
     assert "[[permission]] 3 denies param of '/motors/**' to '*'" in str(caught.value)
 
 
+@pytest.mark.parametrize("value", [{"/motors/pid/p": 9}, {"": 9}, {"max": {"a/b": 9}}, {"max/": 2.0}])
+def test_a_namespace_has_no_member_that_would_be_judged_by_another_name(value: ParamValue) -> None:
+    with pytest.raises(PeerRefused, match=r"has the member '.*'; name it without slashes"):
+        ROLES.of("boss").check_param_change("/speed", value_of, value)
+
+
 def test_an_operator_changes_only_parameters_that_a_rule_allows() -> None:
     ROLES.of("tablet").check_param_change("/speed/max", value_of, 2.0)
     with pytest.raises(PeerRefused, match=r"no .*permission.* lets tablet"):

@@ -88,7 +88,7 @@ class Bridge:
         """Takes the data frames of the links."""
         self._parts: list[Part] = [self.rpc]
         self._by_op: dict[str, Part] = {}
-        self.sessions = PeerSessions(self._parts, self.proxy_nodes, self.receiver, kills.proxy)
+        self.sessions = PeerSessions(self._parts, self.proxy_nodes, self.receiver, kills.proxy, self.gate)
         """The sessions of the peers."""
         self.relay = Relay(enabled=relay)
         """Which sources of one peer are offered to others."""

@@ -98,6 +98,7 @@ class Rights:
         if self.change is None:
             return
         name = _resolved(name)
+        _check_keys(name, after)
         changed = {*_leaves(name, value_of(name)), *_leaves(name, after)}
         # A parameter that stands where a namespace is needed is replaced by one.
         above = [name[:at] for at in range(1, len(name)) if name[at] == "/"]
@@ -129,6 +130,19 @@ _HIDDEN: Final[ParamValue] = object()  # type: ignore[assignment] # it is compar
 def _resolved(name: str) -> str:
     """A name as the core resolves it: ``//a/`` is ``/a``, and so is ``a``."""
     return "/" + "/".join(part for part in name.split("/") if part)
+
+
+def _check_keys(name: str, value: ParamValue) -> None:
+    """Check that a namespace has no member whose name is empty or holds a slash: it would be judged as another one.
+
+    Raises:
+        PeerRefused: It has one.
+    """
+    if isinstance(value, Mapping):
+        for key, each in value.items():
+            if not key or "/" in key:
+                raise PeerRefused(_WHO, f"{name} has the member {key!r}", "name it without slashes, and not empty")
+            _check_keys(f"{name.rstrip('/')}/{key}", each)
 
 
 def _leaves(name: str, value: ParamValue) -> Iterator[str]:

@@ -275,3 +275,40 @@ async def test_without_trust_a_withdrawn_connection_is_left_to_the_peers_agent(m
     module.offered.clear()
     module.sut.policy_changed()
     assert (module.granted, module.ended) == ([], [])
+
+
+async def test_a_secured_peer_does_not_learn_when_a_topic_that_it_may_not_have_is_published(module: Module) -> None:
+    module.permit(TrustSettings(direct=True))
+    module.offered.clear()
+    assert (await module.open())["why"] == Condition.OFFERED
+    module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=False)
+    module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=True)
+    module.sut.reload(Contracts((), AUTO.transport))
+    assert module.told == []
+
+
+async def test_a_secured_peer_learns_no_more_of_a_topic_after_it_was_withdrawn(module: Module) -> None:
+    module.permit(TrustSettings(direct=True))
+    await module.open()
+    module.offered.clear()
+    module.sut.policy_changed()
+    assert [what for _, what, _ in module.told] == [requests.CLOSED]
+    module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=True)
+    assert [what for _, what, _ in module.told] == [requests.CLOSED]
+
+
+async def test_a_secured_peer_tries_again_what_it_may_have(module: Module) -> None:
+    module.permit(TrustSettings(direct=True))
+    module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=False)
+    assert (await module.open())["text"] == "/talker has just left"
+    module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=True)
+    assert [(peer, what) for peer, what, _ in module.told] == [(1, requests.RETRY)]
+
+
+async def test_without_trust_a_peer_tries_again_when_a_topic_is_published(module: Module) -> None:
+    offered = dict(module.offered)
+    module.offered.clear()
+    assert (await module.open())["why"] == Condition.OFFERED
+    module.offered.update(offered)
+    module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=True)
+    assert [(peer, what) for peer, what, _ in module.told] == [(1, requests.RETRY)]

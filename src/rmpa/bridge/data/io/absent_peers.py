@@ -6,6 +6,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.mesh import limits
 
 if TYPE_CHECKING:
@@ -41,9 +42,13 @@ class AbsentPeers:
     Args:
         uncount: Called with a peer's number when its missed messages are no longer counted.
         forget: Called with a peer's number when it is forgotten.
+        gate: Whether the mesh is secured.
     """
 
-    def __init__(self, uncount: Callable[[int], None], forget: Callable[[int], None]) -> None:
+    def __init__(
+        self, uncount: Callable[[int], None], forget: Callable[[int], None], gate: PermissionGate = OPEN_GATE
+    ) -> None:
+        self._gate = gate
         self._absent: OrderedDict[int, Absent] = OrderedDict()
         self._uncount = uncount
         self._forget = forget
@@ -65,7 +70,7 @@ class AbsentPeers:
         for peer, absent in self._absent.items():
             if absent.identity.is_same_run(identity):
                 return peer
-            if absent.identity.guid.place == identity.guid.place or absent.identity.name == identity.name:
+            if absent.identity.is_same_module(identity, secured=self._gate.on):
                 return None
         return None
 
@@ -75,7 +80,7 @@ class AbsentPeers:
             was = absent.identity
             if was.is_same_run(identity):
                 return self._absent.pop(peer)
-            if was.guid.place == identity.guid.place or was.name == identity.name:
+            if was.is_same_module(identity, secured=self._gate.on):
                 for past in absent.pasts.values():
                     past.forget_position(missed=past.missed)
                 return self._absent.pop(peer)

@@ -133,7 +133,8 @@ class ParamOwner:
     async def _get(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         key = self._key(args.get("key"))
         found, value = await self._core.get(key)
-        self._refuse(self._why_not_get(key, value) or self._why_denied(session, key, value))
+        # The permissions come first: the error of ``[params]`` may name a parameter that they hide.
+        self._refuse(self._why_denied(session, key, value) or self._why_not_get(key, value))
         if not found:
             raise RmpaError(f"there is no parameter {key}")
         return self._of(session).answer(await write_text(key, value), self._now())
@@ -150,10 +151,12 @@ class ParamOwner:
     async def _set(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         key = self._key(args.get("key"))
         value = await read_text(self._of(session).written(args, self._now()))
-        parameters = list(yielding_to_data(leaves(key, value)))
-        for name, _ in yielding_to_data(parameters):
-            why = key_problem(name) or self.policy.why_not_set(name.rstrip("/") or "/")
-            self._refuse(why or self._why_denied(session, name))
+        parameters: list[tuple[str, XmlRpcValue]] = []
+        for given, one in yielding_to_data(leaves(key, value)):
+            # A member may be named "" or "a/": the core drops the slash at the end, so the name is judged without it.
+            name = given.rstrip("/") or "/"
+            self._refuse(key_problem(given) or self.policy.why_not_set(name) or self._why_denied(session, name))
+            parameters.append((name, one))
         await self._keep_others(session, key, [name for name, _ in parameters])
         for number, (name, one) in enumerate(parameters):
             await self._core.set(name, one, PEERS)

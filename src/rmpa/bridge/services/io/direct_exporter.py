@@ -72,7 +72,7 @@ class DirectServiceExporter:
         """Take new rules, and withdraw the grants that they do not allow."""
         self._rules = rules
         before = {(peer, told.port) for _, peer, told in self.grants if told.port is not None}
-        self._act(self.grants.judge_again(self._unmet))
+        self._act(self.grants.judge_again(self._unmet, secured=self._gate.on))
         if self._gate.on:
             for peer, port in before - {(peer, told.port) for _, peer, told in self.grants}:
                 session = self._sessions.get(peer)
@@ -104,7 +104,9 @@ class DirectServiceExporter:
         asked = requests.read_ask(args)
         found = self._find(session, asked.service, asked.node)
         server = self._exports.offered.get(asked.service)
-        if server is not None:
+        # A peer is not told of a service that it may not have. Of one that it may have, the advertisement tells it.
+        hidden = self._gate.on and self._exports.local(session.peer, asked.service) is None
+        if server is not None and not hidden:
             self.grants.answered(session.peer, asked.service, asked.node, server.uri, found)
         if isinstance(found, Grant):
             self._counters.add("direct.service_granted")

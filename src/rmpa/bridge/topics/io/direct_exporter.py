@@ -78,7 +78,7 @@ class DirectExporter:
         """Take new contracts, and withdraw the grants that they do not allow."""
         self._contracts = contracts
         self._act(self.grants.retry_all())
-        self._act(self.grants.judge_again(self._unmet_by_rules, end=self._gate.on))
+        self._act(self.grants.judge_again(self._unmet_by_rules, secured=self._gate.on))
 
     def graph_changed(self, change: GraphChange) -> None:
         """Compare the grants with a registration that came or went; the exports have not looked at it yet."""
@@ -97,7 +97,7 @@ class DirectExporter:
 
     def policy_changed(self) -> None:
         """Withdraw the grants for sources that are not offered any more to their peers."""
-        self._act(self.grants.judge_again(self._unmet_by_rules, end=self._gate.on))
+        self._act(self.grants.judge_again(self._unmet_by_rules, secured=self._gate.on))
 
     def link_up(self, session: PeerSession) -> None:
         """Let the peer ask again for what it uses; the other grants from before its link end a little later."""
@@ -163,7 +163,9 @@ class DirectExporter:
         return found
 
     def _refused(self, session: PeerSession, asked: requests.OpenDirect, unmet: Unmet) -> Unmet:
-        self._act(self.grants.refused(session.peer, asked.source, asked.subscriber))
+        # A peer is not told of a topic that it may not have. Of one that it may have, the advertisement tells it.
+        hidden = self._gate.on and self._exports.local(session.peer, asked.source) is None
+        self._act(self.grants.refused(session.peer, asked.source, asked.subscriber, hidden=hidden))
         return unmet
 
     def _uri(self, source: Source) -> str:

@@ -147,7 +147,7 @@ class Topics(Part):
             on_idle=self._settled,
         )
         self._act = self._driver.act
-        self._absent = AbsentPeers(lambda peer: self._act(self.exports.unclaimed(peer)), self.outbound.forget)
+        self._absent = AbsentPeers(lambda peer: self._act(self.exports.unclaimed(peer)), self.outbound.forget, gate)
         self._claims = ClaimDeadlines()
         self._claims_timer = MachineTimer(self._claims.next_timer, self._claims_over)
         self._mismatches = Mismatches()
