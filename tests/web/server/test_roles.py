@@ -257,7 +257,8 @@ async def test_a_page_of_the_monitor_gets_no_denied_parameter_and_changes_none()
         await setter.set_param("/motors/pid", 3)
         await setter.set_param("/name", "base")
         await until(lambda: hub.params.value("/name") and hub.params.value("/motors/pid"))
-        answers = Answers(hub, ResourceWatch(hub, MessageValues(hub)), {}, lambda: "")
+        resources = ResourceWatch(hub, MessageValues(hub))
+        answers = Answers(hub, resources, {}, lambda: "")
 
         async def ask(what: str, client: str, **args: object) -> Any:
             return await answers.answer(Question(1, what, args), ROLES.of(client))
@@ -267,6 +268,9 @@ async def test_a_page_of_the_monitor_gets_no_denied_parameter_and_changes_none()
         assert "motors" not in shown["values"]
         assert await ask("params", "boss", has=shown["digest"]) == {"digest": shown["digest"]}
         assert "/motors/pid" not in (await ask("param_names", "boss"))["names"]
+        resources.record("WARN", "the lens is hot", resource="/camera")
+        assert [each["text"] for each in await ask("history", "boss")] == ["the lens is hot"]
+        assert await ask("history", "wall") == []
         for what, args in (
             ("set_param", {"name": "/motors/pid", "value": 4}),
             ("delete_param", {"name": "/motors"}),

@@ -25,6 +25,7 @@ from rmpa.resource.run.dynamic_reconfigure import SERVICE_TYPE
 from rmpa.web.hub.rights import FULL
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.nodes import node_key, shown_node
+from rmpa.web.monitor.visible import visible_history
 from rmpa.web.values.codec import codec_for
 
 if TYPE_CHECKING:
@@ -103,6 +104,8 @@ class Answers:
             return _with_digest(rights.visible_tree(value), question.args.get("has"))
         if question.what == "param_names":
             return {"names": sorted(rights.visible(dict.fromkeys(value)))}
+        if question.what == "history":
+            return visible_history(value, rights)
         return value
 
     def _check(self, question: Question, rights: Rights) -> None:
