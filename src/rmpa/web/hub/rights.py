@@ -97,6 +97,12 @@ class Rights:
         """
         if self.change is None:
             return
+        if (key := _bad_key(after)) is not None:
+            # A core tells /motors/limit of the change where a key below /speed is that name.
+            text = (
+                f"the client {self.change.client} may not set {name}: the key {key[:80]!r} is not one part of a name"
+            )
+            raise PeerRefused(_WHO, text, "write a namespace as a value of values")
         name = _resolved(name)
         changed = {*_leaves(name, value_of(name)), *_leaves(name, after)}
         # A parameter that stands where a namespace is needed is replaced by one.
@@ -138,6 +144,18 @@ def _leaves(name: str, value: ParamValue) -> Iterator[str]:
             yield from _leaves(f"{name.rstrip('/')}/{key}", each)
     elif value is not None:
         yield name
+
+
+def _bad_key(value: ParamValue) -> str | None:
+    """A key in a namespace, at any depth, that a core takes for another name than that of a parameter in it."""
+    if not isinstance(value, Mapping):
+        return None
+    for key, each in value.items():
+        if not key or "/" in key:
+            return key
+        if (inner := _bad_key(each)) is not None:
+            return inner
+    return None
 
 
 def _pruned(name: str, value: ParamValue, rules: ClientRules) -> ParamValue:
