@@ -20,6 +20,7 @@ from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.master.parameters import Parameters
 from rmpa.ros.node.node import Node
 from rmpa.trust.permissions import Permissions
+from rmpa.web.gateways.frame_writer import FrameSocket
 from rmpa.web.gateways.gateways import Gateways
 from rmpa.web.hub.hub import Hub
 from rmpa.web.hub.requests import DeleteParam, ParamsChanged, SetParam
@@ -387,6 +388,45 @@ async def test_a_peers_parameters_are_judged_by_what_the_peer_has(monkeypatch: p
         await ask("delete_param", FULL, name="/motors")
         assert peer.names() == []
         answers.close()
+
+
+@pytest.mark.parametrize("step", ["settling", "handshake"])
+async def test_a_client_that_connects_while_rights_change_keeps_none_of_the_old(
+    step: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waiting, go_on, settled, prepare = asyncio.Event(), asyncio.Event(), Hub.settled, FrameSocket.prepare
+
+    async def slow_settled(self: Hub, timeout: float) -> bool:
+        waiting.set()
+        await go_on.wait()
+        return await settled(self, timeout)
+
+    async def slow_prepare(self: FrameSocket, request: Any) -> Any:
+        waiting.set()
+        await go_on.wait()
+        return await prepare(self, request)
+
+    if step == "settling":
+        monkeypatch.setattr(Hub, "settled", slow_settled)
+    else:
+        monkeypatch.setattr(FrameSocket, "prepare", slow_prepare)
+    site = Site()
+    async with running(site) as (server, gateways, core), aiohttp.ClientSession() as session:
+        connecting = asyncio.ensure_future(connect(session, server, "tablet"))
+        await until(waiting.is_set)
+        site.roles = WebRoles(replace(SETTINGS, web_tokens=()), has_token=True, trusted=True)
+        await gateways.end_changed()
+        go_on.set()
+        tablet = await connecting
+        await tablet.send_json({**TWIST, "topic": "/cmd_vel"})
+        async with asyncio.timeout(DEADLINE):
+            message = await tablet.receive()
+        if step == "settling":
+            assert "may not publish" in json.loads(message.data)["msg"]
+        else:
+            assert (message.type, tablet.close_code) == (aiohttp.WSMsgType.CLOSE, 1012)
+        assert not core.publishers("/cmd_vel")
+        await tablet.close()
 
 
 async def test_clients_whose_rights_change_are_disconnected_and_others_stay() -> None:
