@@ -46,7 +46,7 @@ _FINGERPRINT: Final = 2 * limits.FINGERPRINT_BYTES
     epilog=f"{EXIT_CODES}\n"
     "\b\nExamples:\n"
     "  rmpa trust invite                          print a token, wait, compare the code\n"
-    "  rmpa trust invite --name arm2 --for 2d     for one module, valid for two days\n"
+    "  rmpa trust invite --module arm2 --for 2d   for one module, valid for two days\n"
     "  rmpa trust invite --no-wait | ssh arm2 rmpa trust join --yes -\n"
     "                                             by a script; the token alone decides\n"
     "  rmpa trust invite --sign arm2.csr          answer a join by files\n"

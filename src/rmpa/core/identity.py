@@ -76,8 +76,8 @@ class Identity:
     def is_same_run(self, other: Identity) -> bool:
         """Whether two identities are of one run of one agent.
 
-        The instance alone does not tell: every member of a mesh hears it, and may claim it. In a secured mesh only
-        the name is proved.
+        The instance alone does not tell: each member of a mesh hears it, and may claim it. In a secured mesh only the
+        name is proved.
         """
         return self.instance == other.instance and self.name == other.name
 

@@ -189,10 +189,10 @@ class Membership:
             if keys.number <= self._keys.number:
                 return False
             self._take_keys(keys, data)
-        self._write(_FILES[kind], data)
-        if kind is DocumentKind.DENY:
+        if kind is DocumentKind.DENY:  # before a slow disk is written
             for call in tuple(self.on_denied):
                 call()
+        self._write(_FILES[kind], data)
         return True
 
     def renewed(self, certificate: bytes) -> None:
