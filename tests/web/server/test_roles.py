@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, nullcontext
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +16,16 @@ from rmpa.config.permission_rules import Access, Effect, ModuleGroup, Permission
 from rmpa.config.settings import Settings, TrustSettings, WebSettings
 from rmpa.config.web_tokens import WebRole, WebToken
 from rmpa.core.errors import PeerRefused
+from rmpa.ros.environment import RosEnvironment
+from rmpa.ros.master.parameters import Parameters
+from rmpa.ros.node.node import Node
+from rmpa.trust.permissions import Permissions
+from rmpa.web.gateways.frame_writer import FrameSocket
 from rmpa.web.gateways.gateways import Gateways
-from rmpa.web.hub.rights import FULL, READ_ONLY, Rights
+from rmpa.web.hub.hub import Hub
+from rmpa.web.hub.requests import DeleteParam, ParamsChanged, SetParam
+from rmpa.web.hub.rights import FULL, READ_ONLY, ClientRules, Rights
+from rmpa.web.monitor.io import questions
 from rmpa.web.monitor.io.questions import Answers
 from rmpa.web.monitor.io.resource_watch import ResourceWatch
 from rmpa.web.monitor.io.values import MessageValues
@@ -29,7 +37,7 @@ from rmpa.web.server.hub_setup import make_hub
 from rmpa.web.server.roles import WebRoles
 from rmpa.web.server.server import WebServer
 from tests.ros.node.peers import DEADLINE, until
-from tests.web.hub.client import local_core, node, running_hub
+from tests.web.hub.client import FakeClient, local_core, node, running_hub
 from tests.web.snapshots import FULL as SNAPSHOT
 
 if TYPE_CHECKING:
@@ -54,6 +62,10 @@ SETTINGS = Settings(
     web_tokens=TOKENS, trust=TrustSettings(groups=(ModuleGroup("operators", ("laptop*",)),), rules=RULES)
 )
 ROLES = WebRoles(SETTINGS, has_token=True, trusted=True)
+_LIMIT = PermissionRule(("*",), effect=Effect.DENY, names={"param": ("/motors/limit",)})
+_ALL_BUT_LIMIT = ClientRules("careful", Permissions(TrustSettings(default="allow", rules=(_LIMIT,))))
+CAREFUL = replace(FULL, look=_ALL_BUT_LIMIT, change=_ALL_BUT_LIMIT)
+"""May change every parameter but one, not the namespace around it."""
 TREE: dict[str, ParamValue] = {"speed": {"max": 1.5}, "motors": {"pid": {"p": 3}}, "name": "base"}
 
 
@@ -122,10 +134,14 @@ def test_a_denied_parameter_cannot_be_changed_by_its_namespace(name: str, after:
     assert "[[permission]] 3 denies param of '/motors/**' to '*'" in str(caught.value)
 
 
-@pytest.mark.parametrize("value", [{"/motors/pid/p": 9}, {"": 9}, {"max": {"a/b": 9}}, {"max/": 2.0}])
-def test_a_namespace_has_no_member_that_would_be_judged_by_another_name(value: ParamValue) -> None:
-    with pytest.raises(PeerRefused, match=r"has the member '.*'; name it without slashes"):
-        ROLES.of("boss").check_param_change("/speed", value_of, value)
+@pytest.mark.parametrize("key", ["", "/", "/motors/pid/p", "max/", "a/b"])
+def test_a_key_that_a_core_takes_for_another_name_is_refused(key: str) -> None:
+    for client in ("boss", "tablet"):
+        values: tuple[ParamValue, ...] = ({key: 99}, {"inner": {key: 99}})
+        for value in values:
+            with pytest.raises(PeerRefused, match="is not one part of a name"):
+                ROLES.of(client).check_param_change("/speed", value_of, value)
+    Rights().check_param_change("/speed", value_of, {key: 99})
 
 
 def test_an_operator_changes_only_parameters_that_a_rule_allows() -> None:
@@ -263,7 +279,8 @@ async def test_a_page_of_the_monitor_gets_no_denied_parameter_and_changes_none()
         await setter.set_param("/motors/pid", 3)
         await setter.set_param("/name", "base")
         await until(lambda: hub.params.value("/name") and hub.params.value("/motors/pid"))
-        answers = Answers(hub, ResourceWatch(hub, MessageValues(hub)), {}, lambda: "")
+        resources = ResourceWatch(hub, MessageValues(hub))
+        answers = Answers(hub, resources, {}, lambda: "")
 
         async def ask(what: str, client: str, **args: object) -> Any:
             return await answers.answer(Question(1, what, args), ROLES.of(client))
@@ -273,6 +290,9 @@ async def test_a_page_of_the_monitor_gets_no_denied_parameter_and_changes_none()
         assert "motors" not in shown["values"]
         assert await ask("params", "boss", has=shown["digest"]) == {"digest": shown["digest"]}
         assert "/motors/pid" not in (await ask("param_names", "boss"))["names"]
+        resources.record("WARN", "the lens is hot", resource="/camera")
+        assert [each["text"] for each in await ask("history", "boss")] == ["the lens is hot"]
+        assert await ask("history", "wall") == []
         for what, args in (
             ("set_param", {"name": "/motors/pid", "value": 4}),
             ("delete_param", {"name": "/motors"}),
@@ -283,6 +303,130 @@ async def test_a_page_of_the_monitor_gets_no_denied_parameter_and_changes_none()
                 await ask(what, "boss", **args)
         assert await setter.get_param("/motors/pid") == 3
         answers.close()
+
+
+async def test_a_change_is_judged_by_the_cores_parameters_that_are_still_being_read(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    read, reading, go_on = Node.follow_param, asyncio.Event(), asyncio.Event()
+
+    async def slow(self: Node, key: str) -> Any:
+        reading.set()
+        await go_on.wait()
+        return await read(self, key)
+
+    async def where() -> str:
+        return core.uri
+
+    def made(uri: str, updated: Any) -> Node:
+        return Node("rmpa_web", master_uri=uri, environment=RosEnvironment(), on_param_update=updated)
+
+    monkeypatch.setattr(Node, "follow_param", slow)
+    async with local_core() as core, node(core, "setter") as setter, Hub(where, made) as hub:
+        await setter.set_param("/motors/limit", 3)
+        hub.start()
+        await until(reading.is_set)
+        boss = FakeClient(hub, CAREFUL)
+        answers = Answers(hub, ResourceWatch(hub, MessageValues(hub)), {}, lambda: "")
+        question = Question(1, "delete_param", {"name": "/motors"})
+        page = asyncio.ensure_future(answers.answer(question, CAREFUL))
+        for request in (SetParam(1, "/motors", 5), DeleteParam(2, "/motors"), SetParam(3, "/speed", 1)):
+            boss.ask(request)
+        go_on.set()
+        for handle in (1, 2):
+            assert "the client careful may not param /motors/limit" in (await boss.failure(handle)).error
+        with pytest.raises(PeerRefused, match="the client careful may not param /motors/limit"):
+            await page
+        await boss.answer(ParamsChanged, 3)
+        assert await setter.get_param("/motors") == {"limit": 3}
+        boss.close()
+        answers.close()
+
+
+class Peer:
+    """The parameters of a peer, in the place of ``PeerParams``."""
+
+    def __init__(self) -> None:
+        self.tree = Parameters()
+        self.tree.set("/", {"motors": {"limit": 3}, "speed": {"max": 1.5}})
+
+    def names(self) -> list[str]:
+        return [*self.tree.names()]
+
+    def get(self, key: str) -> Any:
+        return self.tree.get(key)
+
+    def set(self, key: str, value: Any) -> None:
+        self.tree.set(key, value)
+
+    def delete(self, key: str) -> None:
+        self.tree.delete(key)
+
+
+async def test_a_peers_parameters_are_judged_by_what_the_peer_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    peer = Peer()
+    monkeypatch.setattr(questions, "PeerParams", lambda _client, _peer: peer)
+    monkeypatch.setattr(Answers, "_control", lambda _self: nullcontext())
+    async with local_core() as core, running_hub(core) as hub:
+        answers = Answers(hub, ResourceWatch(hub, MessageValues(hub)), {}, lambda: "")
+
+        async def ask(what: str, rights: Rights, **args: object) -> Any:
+            return await answers.answer(Question(1, what, {"peer": "arm", **args}), rights)
+
+        for what, args in (
+            ("delete_param", {"name": "/motors"}),
+            ("set_param", {"name": "/motors", "value": 5}),
+            ("set_param", {"name": "/motors", "value": {"pid": 1}}),
+            ("set_param", {"name": "/motors/limit/x", "value": 1}),
+        ):
+            with pytest.raises(PeerRefused, match="the client careful may not param /motors/limit;"):
+                await ask(what, CAREFUL, **args)
+        assert peer.get("/motors") == {"limit": 3}
+        await ask("set_param", CAREFUL, name="/speed/max", value=2)
+        assert peer.get("/speed/max") == 2.0
+        await ask("delete_param", CAREFUL, name="/speed")
+        await ask("delete_param", FULL, name="/motors")
+        assert peer.names() == []
+        answers.close()
+
+
+@pytest.mark.parametrize("step", ["settling", "handshake"])
+async def test_a_client_that_connects_while_rights_change_keeps_none_of_the_old(
+    step: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waiting, go_on, settled, prepare = asyncio.Event(), asyncio.Event(), Hub.settled, FrameSocket.prepare
+
+    async def slow_settled(self: Hub, timeout: float) -> bool:
+        waiting.set()
+        await go_on.wait()
+        return await settled(self, timeout)
+
+    async def slow_prepare(self: FrameSocket, request: Any) -> Any:
+        waiting.set()
+        await go_on.wait()
+        return await prepare(self, request)
+
+    if step == "settling":
+        monkeypatch.setattr(Hub, "settled", slow_settled)
+    else:
+        monkeypatch.setattr(FrameSocket, "prepare", slow_prepare)
+    site = Site()
+    async with running(site) as (server, gateways, core), aiohttp.ClientSession() as session:
+        connecting = asyncio.ensure_future(connect(session, server, "tablet"))
+        await until(waiting.is_set)
+        site.roles = WebRoles(replace(SETTINGS, web_tokens=()), has_token=True, trusted=True)
+        await gateways.end_changed()
+        go_on.set()
+        tablet = await connecting
+        await tablet.send_json({**TWIST, "topic": "/cmd_vel"})
+        async with asyncio.timeout(DEADLINE):
+            message = await tablet.receive()
+        if step == "settling":
+            assert "may not publish" in json.loads(message.data)["msg"]
+        else:
+            assert (message.type, tablet.close_code) == (aiohttp.WSMsgType.CLOSE, 1012)
+        assert not core.publishers("/cmd_vel")
+        await tablet.close()
 
 
 async def test_clients_whose_rights_change_are_disconnected_and_others_stay() -> None:

@@ -51,6 +51,9 @@ async def test_a_page_comes_over_https_and_its_cookie_stays_there(server: WebSer
         headers = {"Authorization": f"Bearer {TOKEN}", "Origin": f"https://127.0.0.1:{server.port}"}
         async with session.get(f"https://127.0.0.1:{server.port}/api/v1/agent", headers=headers) as response:
             assert response.status == 200
+        forged = headers | {"Origin": f"http://127.0.0.1:{server.port}"}  # whoever is on the way can make that page
+        async with session.get(f"https://127.0.0.1:{server.port}/api/v1/agent", headers=forged) as response:
+            assert response.status == 403
 
 
 async def test_http_at_an_https_port_gets_no_answer_and_harms_nothing(server: WebServer) -> None:

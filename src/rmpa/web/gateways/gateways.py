@@ -48,6 +48,7 @@ _GOING_AWAY: Final = 1001
 """A WebSocket's close code, RFC 6455, section 7.4.1."""
 _SERVICE_RESTART: Final = 1012
 """Likewise, of IANA's registry: the client may connect again."""
+_RIGHTS_CHANGED: Final = "the rights of this client have changed; connect again"
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +117,6 @@ class Gateways:
         offered = [name.strip() for name in request.headers.get("Sec-WebSocket-Protocol", "").split(",")]
         protocol = choose_subprotocol(offered)
         address = request.remote or "?"
-        rights = self._rights_of(request)
         connection: ClientConnection
         if request.path == MONITOR_PATH:
             if self._monitor is None or SUBPROTOCOL not in offered:
@@ -124,9 +124,11 @@ class Gateways:
                 self.refuse(address, "handshake", text)
                 return web.Response(status=400, text=f"{text}\n")
             await self._monitor.ready()
+            rights = self._rights_of(request)
             connection = MonitorConnection(self._hub, rights, self._priority, address, monitor=self._monitor)
             return await self._serve(request, connection, monitor_limits.REQUEST_MAX + 1, rights)
         await self._hub.settled(limits.SETTLE)
+        rights = self._rights_of(request)  # after the last wait: a reload before this is not noticed by end_changed
         if protocol is not None:
             connection = FoxgloveConnection(
                 self._hub, rights, self._priority, address, name=self._name, session_id=self._session_id
@@ -147,10 +149,17 @@ class Gateways:
             max_msg_size=most,
             timeout=limits.CLOSE_TIMEOUT,
         )
+
+        def upgraded(request: web.Request) -> Callable[[], int]:
+            # A WebSocket cannot be closed before this: end_changed leaves it open.
+            if self._rights_of(request) != rights:
+                connection.end(_SERVICE_RESTART, _RIGHTS_CHANGED)
+            return self.upgraded(request)
+
         self._open[connection] = _OpenClient(response, request, rights)
         try:
             refused = functools.partial(self._refuse_client, connection)
-            await connection.run(request, response, self.upgraded, refused)
+            await connection.run(request, response, upgraded, refused)
         except PeerRefused as error:
             self.refuse(connection.address, "clients", str(error))
             return web.Response(status=503, text=f"{error}\n")
@@ -184,7 +193,7 @@ class Gateways:
             How many they were.
         """
         changed = [each for each in self._open.values() if self._rights_of(each.request) != each.rights]
-        await _close(changed, _SERVICE_RESTART, b"the rights of this client have changed; connect again")
+        await _close(changed, _SERVICE_RESTART, _RIGHTS_CHANGED.encode())
         return len(changed)
 
     async def close(self) -> None:

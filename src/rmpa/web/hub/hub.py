@@ -364,9 +364,9 @@ class Hub:
 
     def _set_param(self, client: HubClient, request: requests.SetParam) -> None:
         _check(client.rights.set_parameters, "set parameters")
-        client.rights.check_param_change(request.name, self.params.value, request.value)
 
         async def set_() -> None:
+            await self.check_param_change(client.rights, request.name, request.value)
             await self.params.set(request.name, request.value)
             client.receive(requests.ParamsChanged(request.handle, {request.name: request.value}))
 
@@ -374,13 +374,24 @@ class Hub:
 
     def _delete_param(self, client: HubClient, request: requests.DeleteParam) -> None:
         _check(client.rights.set_parameters, "delete parameters")
-        client.rights.check_param_change(request.name, self.params.value)
 
         async def delete() -> None:
+            await self.check_param_change(client.rights, request.name)
             await self.params.delete(request.name)
             client.receive(requests.ParamsChanged(request.handle, {request.name: None}))
 
         self._run(client, request.handle, delete())
+
+    async def check_param_change(self, rights: Rights, name: str, after: requests.ParamValue = None) -> None:
+        """Check a change as ``Rights.check_param_change`` does, against the core's parameters, once they are known.
+
+        Raises:
+            RmpaError: The client may not, or there is no core.
+        """
+        if rights.change is not None:
+            self.link.need()
+            await self.params.known()
+            rights.check_param_change(name, self.params.value, after)
 
     def _follow_params(self, client: HubClient, request: requests.FollowParams) -> None:
         _check(client.rights.read_parameters, "read parameters", READ_REMEDY)

@@ -62,6 +62,12 @@ class ParamMirror:
         except KeyError:
             return None
 
+    async def known(self) -> None:
+        """Wait until the parameters are known, and no reading of them is under way."""
+        await self.loaded.wait()
+        while self._loading is not None and not self._loading.done():
+            await asyncio.wait([self._loading])
+
     def values(self, names: tuple[str, ...], prefix: str) -> dict[str, ParamValue]:
         """The values of ``names`` that exist; without names those of all parameters below ``prefix``."""
         if names:

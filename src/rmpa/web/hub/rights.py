@@ -97,8 +97,13 @@ class Rights:
         """
         if self.change is None:
             return
+        if (key := _bad_key(after)) is not None:
+            # A core tells /motors/limit of the change where a key below /speed is that name.
+            text = (
+                f"the client {self.change.client} may not set {name}: the key {key[:80]!r} is not one part of a name"
+            )
+            raise PeerRefused(_WHO, text, "write a namespace as a value of values")
         name = _resolved(name)
-        _check_keys(name, after)
         changed = {*_leaves(name, value_of(name)), *_leaves(name, after)}
         # A parameter that stands where a namespace is needed is replaced by one.
         above = [name[:at] for at in range(1, len(name)) if name[at] == "/"]
@@ -132,19 +137,6 @@ def _resolved(name: str) -> str:
     return "/" + "/".join(part for part in name.split("/") if part)
 
 
-def _check_keys(name: str, value: ParamValue) -> None:
-    """Check that a namespace has no member whose name is empty or holds a slash: it would be judged as another one.
-
-    Raises:
-        PeerRefused: It has one.
-    """
-    if isinstance(value, Mapping):
-        for key, each in value.items():
-            if not key or "/" in key:
-                raise PeerRefused(_WHO, f"{name} has the member {key!r}", "name it without slashes, and not empty")
-            _check_keys(f"{name.rstrip('/')}/{key}", each)
-
-
 def _leaves(name: str, value: ParamValue) -> Iterator[str]:
     """The names of the parameters below a name, which is one itself if it is no namespace."""
     if isinstance(value, Mapping):
@@ -152,6 +144,18 @@ def _leaves(name: str, value: ParamValue) -> Iterator[str]:
             yield from _leaves(f"{name.rstrip('/')}/{key}", each)
     elif value is not None:
         yield name
+
+
+def _bad_key(value: ParamValue) -> str | None:
+    """A key in a namespace, at any depth, that a core takes for another name than that of a parameter in it."""
+    if not isinstance(value, Mapping):
+        return None
+    for key, each in value.items():
+        if not key or "/" in key:
+            return key
+        if (inner := _bad_key(each)) is not None:
+            return inner
+    return None
 
 
 def _pruned(name: str, value: ParamValue, rules: ClientRules) -> ParamValue:

@@ -197,6 +197,7 @@ class Routes:
             is_preflight=request.method == "OPTIONS"
             and "Access-Control-Request-Method" in headers
             and request.path not in self._pages,
+            secure=request.secure,
         )
 
     def _sharing(self, request: web.Request) -> dict[str, str]:

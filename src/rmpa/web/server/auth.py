@@ -45,6 +45,7 @@ class RequestFacts:
         is_page: Whether the path is a page for people, for which a cookie is set.
         is_open: Whether the path needs no token.
         is_preflight: Whether a browser asks what a page of another site may send (Fetch standard, "CORS-preflight").
+        secure: Whether it came by HTTPS.
     """
 
     host: tuple[str, ...]
@@ -57,6 +58,7 @@ class RequestFacts:
     is_page: bool = False
     is_open: bool = False
     is_preflight: bool = False
+    secure: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +147,10 @@ class AccessPolicy:
     def _wrong_origin(self, request: RequestFacts) -> AccessRefused | None:
         if request.origin is not None:
             scheme, _, rest = request.origin.partition("://")
-            if scheme in ("http", "https") and rest.lower() == request.host[0].lower():
+            # A page of plain HTTP may be forged on its way, so it is no page of a server of HTTPS. A server of plain
+            # HTTP may be behind a proxy that ends TLS: its own pages are then of HTTPS.
+            schemes = ("https",) if request.secure else ("http", "https")
+            if scheme in schemes and rest.lower() == request.host[0].lower():
                 return None
             if self.lists(request.origin):
                 return None

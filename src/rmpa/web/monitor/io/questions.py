@@ -6,6 +6,7 @@ import asyncio
 import hashlib
 import math
 import time
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, cast
@@ -25,10 +26,11 @@ from rmpa.resource.run.dynamic_reconfigure import SERVICE_TYPE
 from rmpa.web.hub.rights import FULL
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.nodes import node_key, shown_node
+from rmpa.web.monitor.visible import visible_history
 from rmpa.web.values.codec import codec_for
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping
+    from collections.abc import Awaitable, Callable
 
     from rmpa.ros.types.service_types import ServiceType
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
@@ -45,8 +47,7 @@ _KINDS: Final = ("topic", "service", "module")
 _SET_PARAMETERS: Final = "set_parameters"
 """The service of a resource that takes another configuration (wiki.ros.org/dynamic_reconfigure)."""
 _RECONFIGURES: Final = ("profile", "context", "configure")
-_CHANGES_PARAM: Final = ("set_param", "delete_param")
-_WITH_PARAMS: Final = ("params", *_CHANGES_PARAM)
+_WITH_PARAMS: Final = ("params", "set_param", "delete_param")
 """Questions whose answer has all parameters of a module."""
 _LISTS: Final = {"bool": "bools", "int": "ints", "double": "doubles", "str": "strs"}
 """The lists of a ``dynamic_reconfigure/Config`` by the types of parameters."""
@@ -70,6 +71,10 @@ class Answers:
         self._environ = environ
         self._agent = agent
         self._threads = ThreadPoolExecutor(limits.ANSWERS_AT_ONCE, "rmpa-answers")
+        self._changes: Mapping[str, Callable[[Args, Rights], Awaitable[Any]]] = {
+            "set_param": self._set_param,
+            "delete_param": self._delete_param,
+        }
         self._handlers: Mapping[str, Callable[[Args], Awaitable[Any]]] = {
             "why": self._why,
             "history": self._history,
@@ -80,8 +85,6 @@ class Answers:
             "param_names": self._param_names,
             "params": self._params,
             "call": self._call,
-            "set_param": self._set_param,
-            "delete_param": self._delete_param,
             "profile": self._profile,
             "context": self._context,
             "configure": self._configure,
@@ -98,11 +101,15 @@ class Answers:
             RmpaError: There is none, or the client may not; the text says why.
         """
         self._check(question, rights)
-        value = await self._handlers[question.what](question.args)
+        change = self._changes.get(question.what)
+        asked = change(question.args, rights) if change is not None else self._handlers[question.what](question.args)
+        value = await asked
         if question.what in _WITH_PARAMS:
             return _with_digest(rights.visible_tree(value), question.args.get("has"))
         if question.what == "param_names":
             return {"names": sorted(rights.visible(dict.fromkeys(value)))}
+        if question.what == "history":
+            return visible_history(value, rights)
         return value
 
     def _check(self, question: Question, rights: Rights) -> None:
@@ -111,9 +118,6 @@ class Answers:
             rights.check_change(Access.CALL, _name(args, "service"))
         elif question.what in _RECONFIGURES:
             rights.check_change(Access.CALL, f"{_name(args, 'resource')}/{_SET_PARAMETERS}")
-        elif question.what in _CHANGES_PARAM:
-            value_of = (lambda _name: None) if _text(args, "peer") else self._hub.params.value
-            rights.check_param_change(_name(args, "name"), value_of, args.get("value"))
 
     def close(self) -> None:
         """End the threads, once what the agent was asked is answered or has timed out."""
@@ -184,37 +188,52 @@ class Answers:
             async with asyncio.timeout(_READ_TIMEOUT):
                 await self._hub.params.loaded.wait()
         except TimeoutError:
-            raise UnreachableError("parameters of the core", "its API", "is it busy? ask again") from None
+            raise _unknown_params() from None
         return self._hub.params.tree
 
     async def _param_names(self, _args: Args) -> Any:
         await self._own_params()
         return list(islice(self._hub.params.values((), "/"), limits.PARAMETER_NAMES_SHOWN))
 
-    async def _set_param(self, args: Args) -> Any:
+    async def _check_own(self, rights: Rights, name: str, after: ParamValue = None) -> None:
+        try:
+            async with asyncio.timeout(_READ_TIMEOUT):
+                await self._hub.check_param_change(rights, name, after)
+        except TimeoutError:
+            raise _unknown_params() from None
+
+    async def _set_param(self, args: Args, rights: Rights) -> Any:
         name, peer, value = _name(args, "name"), _text(args, "peer"), args.get("value")
         if value is None:
             raise ConfigError("value", "a parameter cannot be null", "delete it instead")
         if peer:
 
             def change(params: PeerParams) -> None:
+                _check_of_peer(params, rights, name, value)
                 present = params.get(name) if name in params.names() else None
                 params.set(name, cast("XmlRpcValue", _as_before(name, present, value)))
 
             await self._of_peer(peer, change)
         else:
+            await self._check_own(rights, name, value)
             kept = _as_before(name, self._hub.params.value(name), value)
             parameters_in(name, cast("XmlRpcValue", kept))
             await self._hub.params.set(name, cast("ParamValue", kept))
         return await self._params(args)
 
-    async def _delete_param(self, args: Args) -> Any:
+    async def _delete_param(self, args: Args, rights: Rights) -> Any:
         name, peer = _name(args, "name"), _text(args, "peer")
         if name == "/":
             raise ConfigError("name", "the root holds every parameter", "name the one that you mean")
         if peer:
-            await self._of_peer(peer, lambda params: params.delete(name))
+
+            def delete(params: PeerParams) -> None:
+                _check_of_peer(params, rights, name)
+                params.delete(name)
+
+            await self._of_peer(peer, delete)
         else:
+            await self._check_own(rights, name)
             await self._hub.params.delete(name)
         return await self._params(args)
 
@@ -294,6 +313,34 @@ class Answers:
     async def _type_of(self, service: str) -> ServiceType:
         found = await self._hub.calls.find(service)
         return await self._hub.types.find_service(found.type)
+
+
+def _unknown_params() -> UnreachableError:
+    return UnreachableError("parameters of the core", "its API", "is it busy? ask again")
+
+
+def _check_of_peer(params: PeerParams, rights: Rights, name: str, after: ParamValue = None) -> None:
+    """Check a change of a peer's parameters as ``Rights.check_param_change`` does, against all that the peer has.
+
+    The peer judges what this module may do, and knows nothing of the client. Where it hides some of its parameters
+    from this module, a client with rules changes none of them: what a namespace holds is not known.
+
+    Raises:
+        RmpaError: The client may not, or the peer does not tell its parameters.
+    """
+    if rights.change is None:
+        return
+    tree = params.get("/")
+
+    def value_of(name: str) -> ParamValue:
+        value: object = tree
+        for part in filter(None, name.split("/")):
+            if not isinstance(value, Mapping) or part not in value:
+                return None
+            value = value[part]
+        return cast("ParamValue", value)
+
+    rights.check_param_change(name, value_of, after)
 
 
 def _as_before(name: str, present: object, value: object) -> object:
