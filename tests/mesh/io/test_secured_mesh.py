@@ -7,6 +7,7 @@ import contextlib
 import socket
 import ssl
 import time
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,8 @@ pytest.importorskip("cryptography")
 
 from rmpa.core.sizes import MIB
 from rmpa.mesh import limits
+from rmpa.mesh.connection import ConnectionRole
+from rmpa.mesh.handshake import Lane
 from rmpa.trust.keyring import GroupKey
 from rmpa.trust.preface import Purpose
 from tests.mesh.io.members import Member, meshes
@@ -174,6 +177,49 @@ async def test_another_modules_run_cannot_be_taken_over(lab: Authority) -> None:
             assert not thief.ups or not thief.linked(base)
         finally:
             await thief.mesh.close()
+
+
+@pytest.mark.parametrize("lane", [Lane.EXPRESS, Lane.BULK])
+async def test_nor_while_its_link_is_silent(lab: Authority, monkeypatch: pytest.MonkeyPatch, lane: Lane) -> None:
+    """A member that claims instance and address of another one, under its own name."""
+    async with meshes(Member(lab, "arm"), Member(lab, "base")) as (arm, base):
+        await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
+        monkeypatch.setattr(base.mesh, "_alive", lambda _: False)
+        thief = Peer(arm.number, name="thief", security=Member(lab, "thief"))
+        try:
+            await thief.mesh.start()
+            await _claim(thief, arm, base, lane)
+            await until(lambda: base.mesh.counters["link.refused.name"] > 0, "refused")
+            assert base.both_lanes(arm)
+            assert not base.downs
+        finally:
+            await thief.mesh.close()
+
+
+async def test_a_bulk_lane_joins_the_link_of_its_own_module_only(
+    lab: Authority, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also if its link came up after its hello was judged."""
+    async with meshes(Member(lab, "arm"), Member(lab, "base")) as (arm, base):
+        await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
+        lane = base.link(arm).bulk_connection
+        monkeypatch.setattr(base.mesh, "connection_prove", lambda *_: None)
+        thief = Peer(arm.number, name="thief", security=Member(lab, "thief"))
+        try:
+            await thief.mesh.start()
+            await _claim(thief, arm, base, Lane.BULK)
+            await until(lambda: not thief.mesh.connections(), "closed")
+            assert base.link(arm).bulk_connection is lane
+        finally:
+            await thief.mesh.close()
+
+
+async def _claim(thief: Peer, victim: Peer, at: Peer, lane: Lane) -> None:
+    """Dial with one's own name and certificate, and the run and address of another module."""
+    thief.mesh.identity = replace(victim.identity, name="thief")
+    sock = await _dial(at)
+    secured = await thief.mesh._secure_dialled(sock)
+    thief.mesh._open(sock, ConnectionRole.DIALLER, ("127.0.0.1", at.port), at.identity.guid, lane, secured=secured)
 
 
 async def test_a_test_of_reachability_is_no_failure(lab: Authority) -> None:

@@ -135,7 +135,7 @@ def refusal(reason: TrustReason, problem: str) -> Refuse:
 
 
 def prove(
-    hello: Hello, certificate: Certificate, security: MeshSecurity, linked: Iterable[Identity]
+    hello: Hello, certificate: Certificate, security: MeshSecurity, linked: Iterable[tuple[Identity, bool]]
 ) -> Refuse | None:
     """Judge whether a hello is of the module that its certificate is of; ``None``: it is.
 
@@ -143,14 +143,16 @@ def prove(
         hello: The remote side's hello or welcome.
         certificate: Its certificate.
         security: This module's membership.
-        linked: The peers with links that are alive, whose runs and addresses no other module may claim.
+        linked: The peers with links, each with whether its link is alive. No other module may claim the run of one of
+            them. Another module may have the address of one whose link is silent: it may have come after it.
     """
     try:
         security.judge_member(certificate, hello.name)
     except TrustError as error:
         return refusal(error.reason, str(error))
-    for peer in linked:
-        if peer.name != hello.name and (peer.instance == hello.instance or peer.guid.place == hello.guid.place):
+    for peer, alive in linked:
+        same_place = alive and peer.guid.place == hello.guid.place
+        if peer.name != hello.name and (same_place or peer.instance == hello.instance):
             return refusal(TrustReason.NAME, f"{hello.name} says that it is the run of {peer}, which is linked")
     return None
 
