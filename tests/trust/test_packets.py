@@ -172,7 +172,7 @@ def _numbered(signer: PacketSigner, number: int) -> bytes:
 
 
 def test_a_revoked_module_cannot_silence_the_run_of_a_member() -> None:
-    """It has the key before, which verifies for an hour more, and then only recognises; it claims the highest number."""
+    """It has the key before, which verifies for an hour and then only recognises, and claims the highest number."""
     revoked, present = KeyRing([KEY], 0.0), KeyRing([KEY], 0.0)
     following = GroupKey(4, b"k" * 32)
     present.add(following, 0.0)

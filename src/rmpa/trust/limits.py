@@ -47,8 +47,8 @@ KEY_SPREAD: Final = 30.0
 KEY_OVERLAP: Final = 3600.0
 """The group key before verifies for this long after the next one began to sign."""
 OLD_KEYS_MAX: Final = 256
-"""Addresses, and runs, of modules with an older group key that are remembered; beyond it they are forgotten, and heard
-again."""
+"""Addresses, and runs, of modules with an older group key that are remembered; beyond it they are forgotten, and
+heard again."""
 OLD_KEY_PACKETS_RATE: Final = 5.0
 """Packets a second with an older group key that are accepted, over all senders: each leads to one dial, 3 ms."""
 

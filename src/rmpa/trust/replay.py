@@ -28,8 +28,8 @@ class Freshness(Enum):
 class ReplayWindow:
     """The numbers that were seen of each run. Only numbers of packets with a valid tag may come here.
 
-    Each group key has numbers of its own here: a revoked module, which has the key before, can claim any run and number
-    with it, and must not touch what is remembered of the present key's packets.
+    Each group key has numbers of its own here: a revoked module, which has the key before, can claim any run and
+    number with it, and must not touch what is remembered of the present key's packets.
 
     Args:
         runs: Runs that are remembered; the one that was silent for longest is forgotten first.

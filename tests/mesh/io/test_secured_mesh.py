@@ -239,8 +239,9 @@ def unproven(peer: Peer) -> int:
     return len(peer.mesh._securing._unproven)
 
 
-async def _dial(peer: Peer) -> socket.socket:
+async def _dial(peer: Peer, source: str = "127.0.0.1") -> socket.socket:
     sock = socket.socket()
+    sock.bind((source, 0))
     sock.setblocking(False)
     await asyncio.get_running_loop().sock_connect(sock, ("127.0.0.1", peer.port))
     return sock
@@ -299,15 +300,22 @@ async def test_a_flood_of_forged_prefaces_costs_no_message_and_members_still_lin
         assert not base.downs
 
 
-async def test_silent_connections_leave_room_for_members(lab: Authority) -> None:
+async def test_silent_connections_leave_room_for_members(lab: Authority, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The oldest ones of the busiest address are closed, so that a member need not wait until they are given up."""
+    monkeypatch.setattr(limits, "PREFACE_TIMEOUT", 1000.0)
+    monkeypatch.setattr(limits, "PENDING_CONNECTIONS_MAX", limits.PENDING_PER_ADDRESS + 2)
     members = Member(lab, "arm"), Member(lab, "base")
     async with meshes(*members, found=False) as (arm, base):
         silent = [await _dial(base) for _ in range(limits.PENDING_PER_ADDRESS + 4)]
         await until(lambda: base.mesh.counters["link.pending_full"] == 4, "four closed")
         assert unproven(base) == limits.PENDING_PER_ADDRESS
+        silent += [await _dial(base, "127.0.0.2") for _ in range(6)]
+        await until(lambda: base.mesh.counters["link.pending_full"] == 8, "the place is shared")
+        for sock in silent[:8]:
+            assert await asyncio.wait_for(asyncio.get_running_loop().sock_recv(sock, 1), DEADLINE) == b""
         introduce([arm, base])
-        await until(lambda: base.linked(arm), "linked once those are given up")
-        assert base.mesh.counters["link.unfinished"] == limits.PENDING_PER_ADDRESS
+        await until(lambda: base.both_lanes(arm), "linked at once")
+        assert base.mesh.counters["link.unfinished"] == 0
         for sock in silent:
             sock.close()
 

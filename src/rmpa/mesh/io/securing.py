@@ -307,18 +307,11 @@ class Securing:
     def accept(self, sock: socket.socket, address: SocketAddress) -> None:
         """Read the preface of a connection, and go on as it says; the socket belongs to this object from here on."""
         host = address[0]
-        if len(self._unproven) >= limits.PENDING_CONNECTIONS_MAX or (
-            self._unproven_there[host] >= limits.PENDING_PER_ADDRESS
-        ):
-            sock.close()
-            text = f"closed a connection from {host}: too many have not shown that they are of this mesh"
-            self._refusals.refuse(self._clock.now(), "link.pending_full", host, text)
-            self._note_bad()
-            return
         one = _Unproven(sock, address, self._clock.now() + limits.PREFACE_TIMEOUT)
         if self._fill(one):
             self._proceed(one)
             return
+        self._make_room(host)
         self._unproven[sock.fileno()] = one
         self._unproven_there[host] += 1
         asyncio.get_running_loop().add_reader(sock.fileno(), self._readable, one)
@@ -339,6 +332,22 @@ class Securing:
         return tasks
 
     # --- the preface ------------------------------------------------------------------------------------------
+
+    def _make_room(self, host: str) -> None:
+        """Close the oldest connection of this address, or of the one with the most, if there is no place for one more.
+
+        A member sends its preface at once, so the oldest one is the least likely to be a member's.
+        """
+        if self._unproven_there[host] < limits.PENDING_PER_ADDRESS:
+            if len(self._unproven) < limits.PENDING_CONNECTIONS_MAX:
+                return
+            host = max(self._unproven_there, key=self._unproven_there.__getitem__)
+        oldest = next(one for one in self._unproven.values() if one.address[0] == host)
+        self._forget(oldest)
+        oldest.sock.close()
+        text = f"closed a connection from {host}: too many have not shown that they are of this mesh"
+        self._refusals.refuse(self._clock.now(), "link.pending_full", host, text)
+        self._note_bad()
 
     def _readable(self, one: _Unproven) -> None:
         if self._fill(one):
