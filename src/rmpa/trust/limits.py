@@ -28,14 +28,14 @@ REPLAY_WINDOW: Final = 64
 """Numbers below the highest one of a run that are still accepted once (RFC 4303, section 3.4.3): multicasts over
 Wi-Fi are overtaken by unicasts."""
 REPLAY_LEAP: Final = 4096
-"""Numbers by which a packet may be ahead of the highest one of its run: else one forged packet, with the highest number
-of all, would make each later one of that run an old one."""
+"""Numbers by which a packet may be ahead of the highest one of its run: else one packet with the highest number
+of all would make each later one of that run an old one."""
 REPLAY_LEAP_RATE: Final = 1024.0
-"""Further such numbers for each second since the run was heard: an agent sends some 600 packets a second at most, so that
-one which was out of reach for days is heard again."""
+"""Further such numbers for each second since the run was heard: an agent sends some 600 packets a second at most, so
+that one which was out of reach for days is heard again."""
 RUNS_MAX: Final = 1024
-"""Runs of agents whose numbers are remembered: two of each member of a full roster, as in a rotation of the group key.
-The one that was silent for longest is forgotten first."""
+"""Runs of agents whose numbers are remembered: two of each member of a full roster, as in a rotation of the group
+key. The one that was silent for longest is forgotten first."""
 CLOCK_TOLERANCE: Final = 30.0
 """Difference of two set clocks above which a packet counts as an old one that is sent again. NTP holds 10 ms, a watch
 set by hand 10 s."""

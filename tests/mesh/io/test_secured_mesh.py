@@ -15,12 +15,16 @@ import pytest
 
 pytest.importorskip("cryptography")
 
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity
 from rmpa.core.sizes import MIB
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionRole
-from rmpa.mesh.handshake import Lane
+from rmpa.mesh.frames import Frame, FrameKind
+from rmpa.mesh.handshake import Lane, Refusal, Refuse
 from rmpa.trust.keyring import GroupKey
-from rmpa.trust.preface import Purpose
+from rmpa.trust.preface import PREFACE_BYTES, Purpose
+from rmpa.trust.reasons import TrustReason
 from tests.mesh.io.members import Member, meshes
 from tests.mesh.io.meshes import DEADLINE, Peer, introduce, until
 from tests.trust.authority import Authority
@@ -146,6 +150,35 @@ async def test_a_member_never_falls_back_to_plain(lab: Authority) -> None:
         assert plain.mesh.counters["link.refused.unsecured"] > 0
         assert not secured.ups
         assert not plain.ups
+
+
+@pytest.mark.parametrize("answer", [Refusal.DUPLICATE, TrustReason.REVOKED, TrustReason.PLAIN, None])
+async def test_a_refusal_without_proof_is_shown_and_sets_no_pause(
+    lab: Authority, monkeypatch: pytest.MonkeyPatch, answer: int | None
+) -> None:
+    """Anything may answer instead of TLS, by a refusal in plain or by other bytes, and is dialled again as before."""
+    monkeypatch.setattr(limits, "REFUSED_RETRY", 1000.0)
+    refuse = Frame(FrameKind.REFUSE, Refuse(answer or 0, "go away").serialize()).serialize()
+    dials = 0
+
+    async def refused(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        nonlocal dials
+        with contextlib.suppress(OSError, asyncio.IncompleteReadError):
+            await reader.readexactly(PREFACE_BYTES)
+            dials += 1
+            writer.write(b"HTTP/1.1 400 Bad Request" if answer is None else refuse)
+            await writer.drain()
+        writer.close()
+
+    server = await asyncio.start_server(refused, "127.0.0.1", 0)
+    async with server, meshes(Member(lab, "arm"), found=False) as (arm,):
+        guid = Guid.of("127.0.0.1", server.sockets[0].getsockname()[1], 0)
+        arm.mesh.peer_found(Identity(guid, b"i" * 16, "base"))
+        await until(lambda: dials >= 3, "dialled again")
+        await until(lambda: arm.mesh.peers()[0].state == "refused", "shown")
+        shown = "plain" if answer == TrustReason.PLAIN else "downgrade"
+        assert arm.mesh.peers()[0].last_error.startswith(shown)
+        assert (answer is None) != ("go away" in arm.mesh.peers()[0].last_error)
 
 
 @pytest.mark.parametrize("dialler", [True, False])

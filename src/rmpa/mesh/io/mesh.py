@@ -461,7 +461,7 @@ class Mesh:
             secured = await self._secure_dialled(sock)
         except SecuringError as error:
             self.counters.add(f"link.refused.{error.refuse.label}")
-            self._peering.dial_refused(dial.guid, error.refuse, self._clock.now(), endpoint)
+            self._peering.dial_refused(dial.guid, error.refuse, self._clock.now(), endpoint, proved=error.by_us)
             self._act()
         except OSError as error:
             self.counters.add("link.dial_failed")

@@ -57,6 +57,17 @@ _ALERTS: Final = {
     "NO_APPLICATION_PROTOCOL": (TrustReason.DOWNGRADE, f"it does not speak {ALPN_LINK}"),
 }
 """TLS alerts, by the ends of their names."""
+_IN_FRONT_OF_TLS: Final = frozenset(
+    {
+        TrustReason.PLAIN,
+        TrustReason.UNSECURED,
+        TrustReason.KEY,
+        TrustReason.CLOCK,
+        TrustReason.DOWNGRADE,
+        TrustReason.FLOOD,
+    }
+)
+"""What an acceptor says in plain, before there is a certificate on which anything else could be said."""
 _FOUND: Final = {
     TrustReason.CLOCK: "its certificate begins in the future",
     TrustReason.EXPIRED: "the time of its certificate is over",
@@ -116,7 +127,7 @@ class SecuringError(ConnectionError):
 
     Args:
         refuse: Why.
-        by_us: Whether this side refused.
+        by_us: Whether this side refused. To a dialler, a refusal by the other side has no proof: TLS was not done.
     """
 
     def __init__(self, refuse: Refuse, *, by_us: bool) -> None:
@@ -211,15 +222,18 @@ async def _received(sock: socket.socket) -> bytes:
 
 
 async def _plain_refusal(sock: socket.socket, data: bytes) -> SecuringError:
-    """The refusal that the acceptor sent instead of TLS."""
+    """The refusal that something sent instead of TLS; one that an acceptor does not send there is a downgrade."""
     try:
         while (parsed := Frame.parse(data)) is None and len(data) <= limits.HELLO_PAYLOAD_MAX:
             data += await _received(sock)
         if parsed is not None and parsed[0].kind is FrameKind.REFUSE:
-            return SecuringError(Refuse.parse(parsed[0].payload), by_us=False)
+            refuse = Refuse.parse(parsed[0].payload)
+            if refuse.code not in _IN_FRONT_OF_TLS:
+                refuse = refusal(TrustReason.DOWNGRADE, f"it refuses without TLS ({refuse})")
+            return SecuringError(refuse, by_us=False)
     except RemoteProtocolError:
         pass
-    return SecuringError(refusal(TrustReason.DOWNGRADE, "it answers by something else than TLS"), by_us=True)
+    return SecuringError(refusal(TrustReason.DOWNGRADE, "it answers by something else than TLS"), by_us=False)
 
 
 # --- both -------------------------------------------------------------------------------------------------------
@@ -334,7 +348,7 @@ class Securing:
     # --- the preface ------------------------------------------------------------------------------------------
 
     def _make_room(self, host: str) -> None:
-        """Close the oldest connection of this address, or of the one with the most, if there is no place for one more.
+        """Close the oldest connection of this address, or of that with the most, if there is no place for one more.
 
         A member sends its preface at once, so the oldest one is the least likely to be a member's.
         """
