@@ -61,6 +61,12 @@ far behind."""
 NONCES_MAX: Final = 4096
 """Nonces that are remembered: 68 handshakes a second for a minute, 512 members that dial twice and again. Beyond it
 prefaces are refused; only members and holders of tokens come so far."""
+NONCES_PER_ADDRESS: Final = 512
+"""Nonces of one address that are remembered, an eighth of all: one member cannot keep the others from linking. A
+machine with 128 modules, each of which dials both lanes twice in a minute, needs as many."""
+OLD_KEY_DIALS_RATE: Final = 50.0
+"""Connections a second with an older group key that may begin TLS, over all addresses: 15 % of a core. Those of one
+address: ``OLD_KEY_PACKETS_RATE``."""
 
 # --- joining ----------------------------------------------------------------------------------------------------
 TOKEN_SECRET_BYTES: Final = 16
@@ -86,7 +92,10 @@ JOIN_ANSWER_MAX: Final = 1 * MIB
 """Bytes of one message of the authority: two signed documents in base64."""
 
 JOINS_AT_ONCE: Final = 16
-"""Joins and renewals that the authority serves at a time; each may wait for a user."""
+"""Joins that the authority serves at a time, each may wait for a user; and as many renewals of modules that were
+away."""
+JOINS_PER_ADDRESS: Final = 4
+"""Of these, those of one address, joins and renewals apart: a user compares one code at a time."""
 JOIN_STEP_TIMEOUT: Final = 10.0
 """For each step of a join or renewal that waits for no user: connecting, the TLS handshake, one answer."""
 ISSUED_MAX: Final = 1024

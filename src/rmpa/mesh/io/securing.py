@@ -104,6 +104,10 @@ class MeshSecurity(Protocol):
         """The first bytes of a connection that is dialled, to a module at this address."""
         ...
 
+    def dial_failed(self, host: str) -> None:
+        """Note that the TLS handshake of a connection to this address failed, perhaps by the key of its preface."""
+        ...
+
     def judge_member(self, certificate: Certificate | bytes, claimed: str | None) -> None:
         """Raise ``TrustError`` if a verified certificate is revoked, or not of the module that its owner claims."""
         ...
@@ -196,16 +200,20 @@ async def secure_dialled(sock: socket.socket, security: MeshSecurity) -> Secured
     handshake = TlsHandshake(security.client_context, server_side=False)
     handshake.receive(b"")
     loop = asyncio.get_running_loop()
+    host = sock.getpeername()[0]
     try:
         async with asyncio.timeout(limits.SECURING_TIMEOUT):
-            preface = security.preface(Purpose.LINK, sock.getpeername()[0])
+            preface = security.preface(Purpose.LINK, host)
             await loop.sock_sendall(sock, preface + handshake.take_output())
             first = await _received(sock)
             if first[0] not in _TLS_RECORDS:
                 raise await _plain_refusal(sock, first)
             await _shake(sock, handshake, first)
-    except TimeoutError:
-        raise TimeoutError(f"no end of the TLS handshake within {limits.SECURING_TIMEOUT:g} s") from None
+    except OSError as error:
+        security.dial_failed(host)
+        if isinstance(error, TimeoutError):
+            raise TimeoutError(f"no end of the TLS handshake within {limits.SECURING_TIMEOUT:g} s") from None
+        raise
     return _secured(sock, handshake)
 
 
@@ -403,7 +411,7 @@ class Securing:
     def _judge(self, one: _Unproven) -> None:
         host = one.address[0]
         try:
-            preface = self._security.guard.admit(one.data, self._clock.now(), self._security.wall())
+            preface = self._security.guard.admit(one.data, self._clock.now(), self._security.wall(), host)
         except PrefaceError as error:
             self._refuse(one.sock, host, refusal(error.reason, str(error)))
             return
