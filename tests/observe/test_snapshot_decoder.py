@@ -13,6 +13,7 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.observe.control import ControlReply
 from rmpa.observe.snapshot import RouteInfo, ServiceInfo, Snapshot, TopicInfo
 from rmpa.observe.snapshot_decoder import SnapshotDecoder
+from rmpa.trust.status import TrustStatus
 from tests.web.snapshots import AGENT, peer
 
 if TYPE_CHECKING:
@@ -76,6 +77,7 @@ def test_all_of_a_snapshot_is_decoded() -> None:
     members = {field.name for field in msgspec.structs.fields(Snapshot)}
     given = dict.fromkeys(members) | {"agent": AGENT, "taken": 1.0, "peers": [peer()], "topics": []}
     given |= {"services": [], "counters": {"a": 1}, "notes": ["n"], "unreachable": []}
+    given |= {"trust": TrustStatus(on=True, module="base", folder="f", agent="secured")}
     assert None not in given.values(), "a new member of Snapshot: SnapshotDecoder needs it too"
     decoded = SnapshotDecoder().decode(msgspec.json.encode({"ok": True, "value": given}))
     assert decoded == msgspec.convert(msgspec.to_builtins(given), Snapshot)

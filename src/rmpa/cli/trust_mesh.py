@@ -49,7 +49,9 @@ def init(label: str, name: str | None, file: str | None, as_json: bool) -> None:
     print_line("Keep a copy of that folder in a safe place: without ca.key no module can join or be renewed.")
     if place.socket is not None:
         warn(_RESTART.format(place.name))
-    print_line("Next: start rmpa up here, and rmpa trust invite for each module.")
+    again = " again" if place.socket is not None else ""
+    print_line(f"Next: start rmpa up here{again}, and rmpa trust invite for each module.")
+    print_line("Modules may do here only what [[permission]] in rmpa.toml allows: docs/permissions.md")
 
 
 @click.command(epilog=f"{EXIT_CODES}\n\b\nExamples:\n  rmpa trust status\n  rmpa trust status --json | jq .expires\n")

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 name_option = click.option(
-    "--name", metavar="NAME", help="The module. [default: the only agent that runs here; else as rmpa up has it]"
+    "--name", metavar="NAME", help="This module. [default: the only agent that runs here; else as rmpa up has it]"
 )
 config_option = click.option(
     "--config", "file", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]"

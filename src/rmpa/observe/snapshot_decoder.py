@@ -8,6 +8,7 @@ import msgspec
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.observe.snapshot import AgentInfo, PeerInfo, ServiceInfo, Snapshot, TopicInfo, UnreachableInfo
+from rmpa.trust.status import TrustStatus  # noqa: TC001 - msgspec reads the annotation
 
 _T = TypeVar("_T")
 
@@ -23,6 +24,7 @@ class _SnapshotParts(msgspec.Struct, kw_only=True, frozen=True):
     counters: dict[str, int] = {}
     notes: tuple[str, ...] = ()
     unreachable: tuple[UnreachableInfo, ...] = ()
+    trust: TrustStatus | None = None
 
 
 class _SnapshotReply(msgspec.Struct, frozen=True):
@@ -82,6 +84,7 @@ class SnapshotDecoder:
                 counters=parts.counters,
                 notes=parts.notes,
                 unreachable=parts.unreachable,
+                trust=parts.trust,
             )
         except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
             raise RemoteProtocolError(f"not a snapshot: {error}") from None
