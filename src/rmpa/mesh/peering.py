@@ -348,8 +348,10 @@ class Peering:
             peer.refused = None
             self._retry(peer, now)
 
-    def dial_refused(self, guid: Guid, refuse: Refuse, now: float, endpoint: SocketAddress | None = None) -> None:
-        """Handle a ``Dial`` whose handshake was refused at this endpoint, by either side."""
+    def dial_refused(
+        self, guid: Guid, refuse: Refuse, now: float, endpoint: SocketAddress | None = None, *, proved: bool = True
+    ) -> None:
+        """Handle a ``Dial`` that was refused at this endpoint, by either side; without a proof it is only shown."""
         peer = self._dial_ended(guid, endpoint)
         if peer is None:
             return
@@ -359,9 +361,9 @@ class Peering:
             if peer.link is None:
                 self._dial_at(peer, now + max(limits.EXPRESS_LEASE, self._pause(peer)))
             return
-        if refuse.code in _UNPROVEN:
+        if refuse.code in _UNPROVEN or not proved:
             peer.refused = refuse
-        if refuse.code in _OTHER_PEER or refuse.code not in _SELDOM_MENDED:
+        if not proved or refuse.code in _OTHER_PEER or refuse.code not in _SELDOM_MENDED:
             self._retry(peer, now)
         elif peer.link is None:
             peer.refused = refuse

@@ -61,8 +61,17 @@ class Verdict(StrEnum):
     """It came before, perhaps by another interface."""
     REPLAYED = "replayed"
     """It is older than the last packets of its run."""
+    LEAP = "leap"
+    """Its number is further ahead than its run can have come: a member claims the run of another one."""
     LIMITED = "limited"
     """It has an older group key, and too many such packets came."""
+
+
+_STALE: Final = {
+    Freshness.REPEATED: Verdict.REPEATED,
+    Freshness.STALE: Verdict.REPLAYED,
+    Freshness.LEAP: Verdict.LEAP,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +128,7 @@ class PacketVerifier:
     def __init__(self, ring: KeyRing) -> None:
         self._ring = ring
         self._window = ReplayWindow()
+        self._old_window = ReplayWindow(limits.OLD_KEYS_MAX)  # so that old keys push no run out of the other one
         self._old_keys = TokenBucket(limits.OLD_KEY_PACKETS_RATE, limits.OLD_KEY_PACKETS_RATE)
 
     def verify(
@@ -151,13 +161,12 @@ class PacketVerifier:
             if abs(skew) > limits.CLOCK_TOLERANCE:
                 return Verification(Verdict.CLOCK, skew=skew)
         old = not self._ring.verifies(key, now)
+        window = self._old_window if old else self._window
+        freshness = window.take((key.number, data[slice(*run)]), number, now)
+        if freshness is not Freshness.NEW:
+            return Verification(_STALE[freshness])
         if old and not self._old_keys.take(now):
             return Verification(Verdict.LIMITED)
-        freshness = self._window.take(data[slice(*run)], number)
-        if freshness is Freshness.REPEATED:
-            return Verification(Verdict.REPEATED)
-        if freshness is Freshness.STALE:
-            return Verification(Verdict.REPLAYED)
         return Verification(Verdict.OLD_KEY if old else Verdict.ACCEPTED, size, skew, short)
 
 

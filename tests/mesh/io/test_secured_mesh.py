@@ -7,6 +7,7 @@ import contextlib
 import socket
 import ssl
 import time
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -14,10 +15,16 @@ import pytest
 
 pytest.importorskip("cryptography")
 
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity
 from rmpa.core.sizes import MIB
 from rmpa.mesh import limits
+from rmpa.mesh.connection import ConnectionRole
+from rmpa.mesh.frames import Frame, FrameKind
+from rmpa.mesh.handshake import Lane, Refusal, Refuse
 from rmpa.trust.keyring import GroupKey
-from rmpa.trust.preface import Purpose
+from rmpa.trust.preface import PREFACE_BYTES, Purpose
+from rmpa.trust.reasons import TrustReason
 from tests.mesh.io.members import Member, meshes
 from tests.mesh.io.meshes import DEADLINE, Peer, introduce, until
 from tests.trust.authority import Authority
@@ -145,6 +152,35 @@ async def test_a_member_never_falls_back_to_plain(lab: Authority) -> None:
         assert not plain.ups
 
 
+@pytest.mark.parametrize("answer", [Refusal.DUPLICATE, TrustReason.REVOKED, TrustReason.PLAIN, None])
+async def test_a_refusal_without_proof_is_shown_and_sets_no_pause(
+    lab: Authority, monkeypatch: pytest.MonkeyPatch, answer: int | None
+) -> None:
+    """Anything may answer instead of TLS, by a refusal in plain or by other bytes, and is dialled again as before."""
+    monkeypatch.setattr(limits, "REFUSED_RETRY", 1000.0)
+    refuse = Frame(FrameKind.REFUSE, Refuse(answer or 0, "go away").serialize()).serialize()
+    dials = 0
+
+    async def refused(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        nonlocal dials
+        with contextlib.suppress(OSError, asyncio.IncompleteReadError):
+            await reader.readexactly(PREFACE_BYTES)
+            dials += 1
+            writer.write(b"HTTP/1.1 400 Bad Request" if answer is None else refuse)
+            await writer.drain()
+        writer.close()
+
+    server = await asyncio.start_server(refused, "127.0.0.1", 0)
+    async with server, meshes(Member(lab, "arm"), found=False) as (arm,):
+        guid = Guid.of("127.0.0.1", server.sockets[0].getsockname()[1], 0)
+        arm.mesh.peer_found(Identity(guid, b"i" * 16, "base"))
+        await until(lambda: dials >= 3, "dialled again")
+        await until(lambda: arm.mesh.peers()[0].state == "refused", "shown")
+        shown = "plain" if answer == TrustReason.PLAIN else "downgrade"
+        assert arm.mesh.peers()[0].last_error.startswith(shown)
+        assert (answer is None) != ("go away" in arm.mesh.peers()[0].last_error)
+
+
 @pytest.mark.parametrize("dialler", [True, False])
 async def test_a_revoked_module_is_gone_at_once_at_both_ends(lab: Authority, dialler: bool) -> None:
     members = Member(lab, "arm"), Member(lab, "base")
@@ -176,6 +212,49 @@ async def test_another_modules_run_cannot_be_taken_over(lab: Authority) -> None:
             await thief.mesh.close()
 
 
+@pytest.mark.parametrize("lane", [Lane.EXPRESS, Lane.BULK])
+async def test_nor_while_its_link_is_silent(lab: Authority, monkeypatch: pytest.MonkeyPatch, lane: Lane) -> None:
+    """A member that claims instance and address of another one, under its own name."""
+    async with meshes(Member(lab, "arm"), Member(lab, "base")) as (arm, base):
+        await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
+        monkeypatch.setattr(base.mesh, "_alive", lambda _: False)
+        thief = Peer(arm.number, name="thief", security=Member(lab, "thief"))
+        try:
+            await thief.mesh.start()
+            await _claim(thief, arm, base, lane)
+            await until(lambda: base.mesh.counters["link.refused.name"] > 0, "refused")
+            assert base.both_lanes(arm)
+            assert not base.downs
+        finally:
+            await thief.mesh.close()
+
+
+async def test_a_bulk_lane_joins_the_link_of_its_own_module_only(
+    lab: Authority, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also if its link came up after its hello was judged."""
+    async with meshes(Member(lab, "arm"), Member(lab, "base")) as (arm, base):
+        await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
+        lane = base.link(arm).bulk_connection
+        monkeypatch.setattr(base.mesh, "connection_prove", lambda *_: None)
+        thief = Peer(arm.number, name="thief", security=Member(lab, "thief"))
+        try:
+            await thief.mesh.start()
+            await _claim(thief, arm, base, Lane.BULK)
+            await until(lambda: not thief.mesh.connections(), "closed")
+            assert base.link(arm).bulk_connection is lane
+        finally:
+            await thief.mesh.close()
+
+
+async def _claim(thief: Peer, victim: Peer, at: Peer, lane: Lane) -> None:
+    """Dial with one's own name and certificate, and the run and address of another module."""
+    thief.mesh.identity = replace(victim.identity, name="thief")
+    sock = await _dial(at)
+    secured = await thief.mesh._secure_dialled(sock)
+    thief.mesh._open(sock, ConnectionRole.DIALLER, ("127.0.0.1", at.port), at.identity.guid, lane, secured=secured)
+
+
 async def test_a_test_of_reachability_is_no_failure(lab: Authority) -> None:
     async with meshes(Member(lab, "base")) as (base,):
         for _ in range(50):
@@ -193,8 +272,9 @@ def unproven(peer: Peer) -> int:
     return len(peer.mesh._securing._unproven)
 
 
-async def _dial(peer: Peer) -> socket.socket:
+async def _dial(peer: Peer, source: str = "127.0.0.1") -> socket.socket:
     sock = socket.socket()
+    sock.bind((source, 0))
     sock.setblocking(False)
     await asyncio.get_running_loop().sock_connect(sock, ("127.0.0.1", peer.port))
     return sock
@@ -253,15 +333,22 @@ async def test_a_flood_of_forged_prefaces_costs_no_message_and_members_still_lin
         assert not base.downs
 
 
-async def test_silent_connections_leave_room_for_members(lab: Authority) -> None:
+async def test_silent_connections_leave_room_for_members(lab: Authority, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The oldest ones of the busiest address are closed, so that a member need not wait until they are given up."""
+    monkeypatch.setattr(limits, "PREFACE_TIMEOUT", 1000.0)
+    monkeypatch.setattr(limits, "PENDING_CONNECTIONS_MAX", limits.PENDING_PER_ADDRESS + 2)
     members = Member(lab, "arm"), Member(lab, "base")
     async with meshes(*members, found=False) as (arm, base):
         silent = [await _dial(base) for _ in range(limits.PENDING_PER_ADDRESS + 4)]
         await until(lambda: base.mesh.counters["link.pending_full"] == 4, "four closed")
         assert unproven(base) == limits.PENDING_PER_ADDRESS
+        silent += [await _dial(base, "127.0.0.2") for _ in range(6)]
+        await until(lambda: base.mesh.counters["link.pending_full"] == 8, "the place is shared")
+        for sock in silent[:8]:
+            assert await asyncio.wait_for(asyncio.get_running_loop().sock_recv(sock, 1), DEADLINE) == b""
         introduce([arm, base])
-        await until(lambda: base.linked(arm), "linked once those are given up")
-        assert base.mesh.counters["link.unfinished"] == limits.PENDING_PER_ADDRESS
+        await until(lambda: base.both_lanes(arm), "linked at once")
+        assert base.mesh.counters["link.unfinished"] == 0
         for sock in silent:
             sock.close()
 

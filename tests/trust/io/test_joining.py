@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("cryptography")
 
 from rmpa.core.errors import LocalProtocolError, PeerRefused, RemoteProtocolError, StartError, UnreachableError
-from rmpa.trust import certificates
+from rmpa.trust import certificates, limits
 from rmpa.trust.certificates import CertificateError, make_request
 from rmpa.trust.documents import DocumentKind
 from rmpa.trust.io import store as files_of
@@ -24,7 +24,7 @@ from rmpa.trust.io.joining import join_mesh, renew_at_authority
 from rmpa.trust.io.membership import Membership
 from rmpa.trust.io.private_keys import private_key
 from rmpa.trust.io.store import MemberFiles, TrustStore
-from rmpa.trust.preface import PREFACE_BYTES, PrefaceError
+from rmpa.trust.preface import PREFACE_BYTES, PrefaceError, Purpose
 from tests.trust.authority import WALL
 from tests.trust.io.member_files import HandClock
 
@@ -274,6 +274,27 @@ async def test_a_flood_of_joins_is_bounded_and_ends_with_the_server(lab: Lab) ->
         await lab.server.close()
         with pytest.raises(PeerRefused, match="the connection ended"):
             await first
+
+
+async def test_idle_renewals_leave_places_to_joins_and_to_other_addresses(lab: Lab) -> None:
+    """A member opens connections for a renewal, and sends nothing behind the prefaces."""
+    async with running(lab):
+        arm = lab.member(await lab.join(lab.invite(unattended=True)))
+        lab.clock.wall_seconds += 30 * DAY
+        lab.authority.renew_own()
+        loop = asyncio.get_running_loop()
+        idle = []
+        for _ in range(limits.JOINS_AT_ONCE + 4):
+            idle.append(sock := socket.socket())
+            sock.setblocking(False)
+            sock.bind(("127.0.0.2", 0))
+            await loop.sock_connect(sock, ("127.0.0.1", lab.port))
+            await loop.sock_sendall(sock, arm.preface(Purpose.RENEWAL))
+        assert await loop.sock_recv(idle[-1], 1) == b"", "it is closed"
+        await lab.join(lab.invite(unattended=True), "gripper")
+        await renew_at_authority(arm, "127.0.0.1", lab.port)
+        for sock in idle:
+            sock.close()
 
 
 def test_a_join_by_files(lab: Lab) -> None:

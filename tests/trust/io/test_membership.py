@@ -16,8 +16,8 @@ from rmpa.trust.documents import DenyList, DocumentError, DocumentKind, KeyList,
 from rmpa.trust.io import store as files_of
 from rmpa.trust.io.membership import Membership
 from rmpa.trust.keyring import GroupKey, KeyPurpose
-from rmpa.trust.packets import Verdict
-from rmpa.trust.preface import PrefaceError, Purpose
+from rmpa.trust.packets import Verdict, Verification
+from rmpa.trust.preface import Preface, PrefaceError, Purpose
 from rmpa.trust.reasons import TrustError, TrustReason
 from tests.trust.authority import WALL
 from tests.trust.io.member_files import KEYS, SecuredMesh
@@ -106,6 +106,26 @@ def test_a_clock_is_set_if_it_is_behind_the_begin_of_the_own_certificate(mesh: S
     assert reason_of(base, mesh.authority.module("arm", WALL - 30 * DAY), "arm") is TrustReason.EXPIRED
     with pytest.raises(PrefaceError, match="behind the acceptor's"):
         base.guard.admit(base.preface(Purpose.LINK), 1.0, WALL + DAY)
+
+
+def test_a_beacon_with_an_old_key_does_not_decide_the_key_of_every_dial(mesh: SecuredMesh) -> None:
+    """A revoked module can send such beacons from the address of a member, again and again."""
+    base = mesh.member("base")
+    old, newer, host = base.ring.newest.short, GroupKey(base.ring.newest.number + 1, b"n" * 32), "10.0.0.2"
+    base.ring.add(newer, -2 * limits.KEY_OVERLAP)
+    base.packets.heard(host, Verification(Verdict.OLD_KEY, key=old))
+
+    def keys(failures: int) -> list[int]:
+        found = []
+        for _ in range(failures):
+            base.packets.heard(host, Verification(Verdict.OLD_KEY, key=old))
+            found.append(Preface.parse(base.preface(Purpose.LINK, host)).key)
+            base.dial_failed(host)
+        return found
+
+    assert keys(4) == [old, newer.short] * 2
+    base.dial_failed("10.0.0.3")
+    assert Preface.parse(base.preface(Purpose.LINK, "10.0.0.3")).key == newer.short
 
 
 def test_a_newer_deny_list_holds_at_once_and_after_a_restart(mesh: SecuredMesh) -> None:

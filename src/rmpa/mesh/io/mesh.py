@@ -223,8 +223,8 @@ class Mesh:
         """Compare a hello with the certificate, and with the names of the links that it would replace or join."""
         if self._security is None or connection.certificate is None:
             return None
-        alive = [link.identity for link in self.links() if self._alive(link.id)]
-        return prove(hello, connection.certificate, self._security, alive)
+        linked = [(link.identity, self._alive(link.id)) for link in self.links()]
+        return prove(hello, connection.certificate, self._security, linked)
 
     def connection_opened(self, connection: Connection) -> None:
         """A handshake succeeded."""
@@ -419,8 +419,7 @@ class Mesh:
             return
 
     def _bulk_opened(self, bulk: Connection) -> None:
-        instance = bulk.identity.instance
-        link = next((link for link in self.links() if link.identity.instance == instance), None)
+        link = next((link for link in self.links() if link.identity.is_same_run(bulk.identity)), None)
         if link is None:
             bulk.close("its express lane is gone")
             return
@@ -462,7 +461,7 @@ class Mesh:
             secured = await self._secure_dialled(sock)
         except SecuringError as error:
             self.counters.add(f"link.refused.{error.refuse.label}")
-            self._peering.dial_refused(dial.guid, error.refuse, self._clock.now(), endpoint)
+            self._peering.dial_refused(dial.guid, error.refuse, self._clock.now(), endpoint, proved=error.by_us)
             self._act()
         except OSError as error:
             self.counters.add("link.dial_failed")

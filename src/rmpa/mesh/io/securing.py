@@ -57,6 +57,17 @@ _ALERTS: Final = {
     "NO_APPLICATION_PROTOCOL": (TrustReason.DOWNGRADE, f"it does not speak {ALPN_LINK}"),
 }
 """TLS alerts, by the ends of their names."""
+_IN_FRONT_OF_TLS: Final = frozenset(
+    {
+        TrustReason.PLAIN,
+        TrustReason.UNSECURED,
+        TrustReason.KEY,
+        TrustReason.CLOCK,
+        TrustReason.DOWNGRADE,
+        TrustReason.FLOOD,
+    }
+)
+"""What an acceptor says in plain, before there is a certificate on which anything else could be said."""
 _FOUND: Final = {
     TrustReason.CLOCK: "its certificate begins in the future",
     TrustReason.EXPIRED: "the time of its certificate is over",
@@ -93,6 +104,10 @@ class MeshSecurity(Protocol):
         """The first bytes of a connection that is dialled, to a module at this address."""
         ...
 
+    def dial_failed(self, host: str) -> None:
+        """Note that the TLS handshake of a connection to this address failed, perhaps by the key of its preface."""
+        ...
+
     def judge_member(self, certificate: Certificate | bytes, claimed: str | None) -> None:
         """Raise ``TrustError`` if a verified certificate is revoked, or not of the module that its owner claims."""
         ...
@@ -116,7 +131,7 @@ class SecuringError(ConnectionError):
 
     Args:
         refuse: Why.
-        by_us: Whether this side refused.
+        by_us: Whether this side refused. To a dialler, a refusal by the other side has no proof: TLS was not done.
     """
 
     def __init__(self, refuse: Refuse, *, by_us: bool) -> None:
@@ -135,7 +150,7 @@ def refusal(reason: TrustReason, problem: str) -> Refuse:
 
 
 def prove(
-    hello: Hello, certificate: Certificate, security: MeshSecurity, linked: Iterable[Identity]
+    hello: Hello, certificate: Certificate, security: MeshSecurity, linked: Iterable[tuple[Identity, bool]]
 ) -> Refuse | None:
     """Judge whether a hello is of the module that its certificate is of; ``None``: it is.
 
@@ -143,14 +158,16 @@ def prove(
         hello: The remote side's hello or welcome.
         certificate: Its certificate.
         security: This module's membership.
-        linked: The peers with links that are alive, whose runs and addresses no other module may claim.
+        linked: The peers with links, each with whether its link is alive. No other module may claim the run of one of
+            them. Another module may have the address of one whose link is silent: it may have come after it.
     """
     try:
         security.judge_member(certificate, hello.name)
     except TrustError as error:
         return refusal(error.reason, str(error))
-    for peer in linked:
-        if peer.name != hello.name and (peer.instance == hello.instance or peer.guid.place == hello.guid.place):
+    for peer, alive in linked:
+        same_place = alive and peer.guid.place == hello.guid.place
+        if peer.name != hello.name and (same_place or peer.instance == hello.instance):
             return refusal(TrustReason.NAME, f"{hello.name} says that it is the run of {peer}, which is linked")
     return None
 
@@ -183,16 +200,20 @@ async def secure_dialled(sock: socket.socket, security: MeshSecurity) -> Secured
     handshake = TlsHandshake(security.client_context, server_side=False)
     handshake.receive(b"")
     loop = asyncio.get_running_loop()
+    host = sock.getpeername()[0]
     try:
         async with asyncio.timeout(limits.SECURING_TIMEOUT):
-            preface = security.preface(Purpose.LINK, sock.getpeername()[0])
+            preface = security.preface(Purpose.LINK, host)
             await loop.sock_sendall(sock, preface + handshake.take_output())
             first = await _received(sock)
             if first[0] not in _TLS_RECORDS:
                 raise await _plain_refusal(sock, first)
             await _shake(sock, handshake, first)
-    except TimeoutError:
-        raise TimeoutError(f"no end of the TLS handshake within {limits.SECURING_TIMEOUT:g} s") from None
+    except OSError as error:
+        security.dial_failed(host)
+        if isinstance(error, TimeoutError):
+            raise TimeoutError(f"no end of the TLS handshake within {limits.SECURING_TIMEOUT:g} s") from None
+        raise
     return _secured(sock, handshake)
 
 
@@ -209,15 +230,18 @@ async def _received(sock: socket.socket) -> bytes:
 
 
 async def _plain_refusal(sock: socket.socket, data: bytes) -> SecuringError:
-    """The refusal that the acceptor sent instead of TLS."""
+    """The refusal that something sent instead of TLS; one that an acceptor does not send there is a downgrade."""
     try:
         while (parsed := Frame.parse(data)) is None and len(data) <= limits.HELLO_PAYLOAD_MAX:
             data += await _received(sock)
         if parsed is not None and parsed[0].kind is FrameKind.REFUSE:
-            return SecuringError(Refuse.parse(parsed[0].payload), by_us=False)
+            refuse = Refuse.parse(parsed[0].payload)
+            if refuse.code not in _IN_FRONT_OF_TLS:
+                refuse = refusal(TrustReason.DOWNGRADE, f"it refuses without TLS ({refuse})")
+            return SecuringError(refuse, by_us=False)
     except RemoteProtocolError:
         pass
-    return SecuringError(refusal(TrustReason.DOWNGRADE, "it answers by something else than TLS"), by_us=True)
+    return SecuringError(refusal(TrustReason.DOWNGRADE, "it answers by something else than TLS"), by_us=False)
 
 
 # --- both -------------------------------------------------------------------------------------------------------
@@ -305,18 +329,11 @@ class Securing:
     def accept(self, sock: socket.socket, address: SocketAddress) -> None:
         """Read the preface of a connection, and go on as it says; the socket belongs to this object from here on."""
         host = address[0]
-        if len(self._unproven) >= limits.PENDING_CONNECTIONS_MAX or (
-            self._unproven_there[host] >= limits.PENDING_PER_ADDRESS
-        ):
-            sock.close()
-            text = f"closed a connection from {host}: too many have not shown that they are of this mesh"
-            self._refusals.refuse(self._clock.now(), "link.pending_full", host, text)
-            self._note_bad()
-            return
         one = _Unproven(sock, address, self._clock.now() + limits.PREFACE_TIMEOUT)
         if self._fill(one):
             self._proceed(one)
             return
+        self._make_room(host)
         self._unproven[sock.fileno()] = one
         self._unproven_there[host] += 1
         asyncio.get_running_loop().add_reader(sock.fileno(), self._readable, one)
@@ -337,6 +354,22 @@ class Securing:
         return tasks
 
     # --- the preface ------------------------------------------------------------------------------------------
+
+    def _make_room(self, host: str) -> None:
+        """Close the oldest connection of this address, or of that with the most, if there is no place for one more.
+
+        A member sends its preface at once, so the oldest one is the least likely to be a member's.
+        """
+        if self._unproven_there[host] < limits.PENDING_PER_ADDRESS:
+            if len(self._unproven) < limits.PENDING_CONNECTIONS_MAX:
+                return
+            host = max(self._unproven_there, key=self._unproven_there.__getitem__)
+        oldest = next(one for one in self._unproven.values() if one.address[0] == host)
+        self._forget(oldest)
+        oldest.sock.close()
+        text = f"closed a connection from {host}: too many have not shown that they are of this mesh"
+        self._refusals.refuse(self._clock.now(), "link.pending_full", host, text)
+        self._note_bad()
 
     def _readable(self, one: _Unproven) -> None:
         if self._fill(one):
@@ -378,7 +411,7 @@ class Securing:
     def _judge(self, one: _Unproven) -> None:
         host = one.address[0]
         try:
-            preface = self._security.guard.admit(one.data, self._clock.now(), self._security.wall())
+            preface = self._security.guard.admit(one.data, self._clock.now(), self._security.wall(), host)
         except PrefaceError as error:
             self._refuse(one.sock, host, refusal(error.reason, str(error)))
             return

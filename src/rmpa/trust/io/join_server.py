@@ -91,19 +91,23 @@ class JoinServer:
         self._membership = membership
         self._clock = clock
         self._is_taken = is_taken
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks: dict[asyncio.Task[None], tuple[Purpose, str]] = {}
+        """Each with what it is for, and the address of the other end."""
         self._joining: dict[bytes, _Joining] = {}
         self._progress: dict[bytes, JoinProgress] = {}
 
     def accept(self, sock: socket.socket, preface: Preface) -> None:
         """Take a connection whose preface asks for a join or a renewal; the socket is owned from here on."""
-        if len(self._tasks) >= limits.JOINS_AT_ONCE or preface.token_id in self._joining:
+        purpose, host = preface.purpose, _host(sock)
+        alike = [there for what, there in self._tasks.values() if what is purpose]
+        full = len(alike) >= limits.JOINS_AT_ONCE or alike.count(host) >= limits.JOINS_PER_ADDRESS
+        if full or preface.token_id in self._joining:
             _log.warning("! a join or renewal is refused: too many at once, or its token is being used just now")
             sock.close()
             return
         task = asyncio.get_running_loop().create_task(self._run(sock, preface), name=str(preface))
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        self._tasks[task] = (purpose, host)
+        task.add_done_callback(self._tasks.pop)
         task.add_done_callback(
             lambda _: sock.close()
         )  # a task that is cancelled before it begins runs no ``finally``
@@ -271,3 +275,11 @@ class JoinServer:
         _log.info("= %s at %s has a new certificate; it was away", before.name, where)
         secrets = self._authority.secrets
         return RenewalGrant(certificate, secrets.keys, secrets.deny)
+
+
+def _host(sock: socket.socket) -> str:
+    """The address of the other end; empty if it is gone."""
+    try:
+        return str(sock.getpeername()[0])
+    except OSError:
+        return ""

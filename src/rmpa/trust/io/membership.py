@@ -69,6 +69,8 @@ class Membership:
         """Called after a newer deny list holds: links that match end at once."""
         self.save: Callable[[str, bytes], None] = store.write
         """Writes one file of the store."""
+        self._old_failed: set[str] = set()
+        """Addresses that are dialled with the present group key next, though their beacons have an older one."""
         self._contexts: dict[tuple[bool, bool], ssl.SSLContext] = {}
         self._context(server_side=True)  # a key of another certificate is an error of the start
 
@@ -125,15 +127,26 @@ class Membership:
         Args:
             purpose: What the connection is for.
             host: The address that is dialled. A module there whose beacons have an older key was away, and does not
-                know the present one: the connection is signed with the older key, and TLS proves the rest.
+                know the present one: the connection is signed with the older key, and TLS proves the rest. If that
+                fails the present key is next, for anything with the older key can send beacons from that address.
         """
         key = self.ring.signing(self._clock.now())
-        if old := self.packets.old_keys.get(host):
+        old = self.packets.old_keys.get(host)
+        if old and host not in self._old_failed:
             key = self.ring.find(old) or key
         wall = self.wall()
         nonce = os.urandom(limits.PREFACE_NONCE_BYTES)
         preface = Preface(purpose, key.short, 0 if wall is None else int(wall * 1000), nonce)
         return preface.serialize(key.key_for(KeyPurpose.PREFACE))
+
+    def dial_failed(self, host: str) -> None:
+        """Note that the TLS handshake with a module at this address failed: the other group key is next."""
+        if host in self._old_failed:
+            self._old_failed.discard(host)
+        elif host in self.packets.old_keys:
+            if len(self._old_failed) >= limits.OLD_KEYS_MAX:
+                self._old_failed.clear()
+            self._old_failed.add(host)
 
     def judge_member(self, certificate: Mapping[str, Any] | bytes, claimed: str | None) -> None:
         """Check the other end's certificate behind a TLS handshake, which has checked the chain.
