@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import socket
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from ipaddress import IPv4Address
 from typing import TYPE_CHECKING
 
@@ -19,12 +19,14 @@ from rmpa.trust.certificates import CertificateError, make_request
 from rmpa.trust.documents import DocumentKind
 from rmpa.trust.io import store as files_of
 from rmpa.trust.io.authority import MeshAuthority, found_mesh, request_der, request_pem
+from rmpa.trust.io.join_connection import JoinConnection, join_client_context
 from rmpa.trust.io.join_server import JoinServer, JoinState
 from rmpa.trust.io.joining import join_mesh, renew_at_authority
 from rmpa.trust.io.membership import Membership
-from rmpa.trust.io.private_keys import private_key
+from rmpa.trust.io.private_keys import new_key, private_key
 from rmpa.trust.io.store import MemberFiles, TrustStore
-from rmpa.trust.preface import PREFACE_BYTES, PrefaceError
+from rmpa.trust.join import JoiningSide, JoinRefused
+from rmpa.trust.preface import PREFACE_BYTES, Preface, PrefaceError, Purpose
 from tests.trust.authority import WALL
 from tests.trust.io.member_files import HandClock
 
@@ -168,6 +170,28 @@ async def test_a_used_token_stays_used_if_the_join_fails_afterwards(lab: Lab) ->
             await lab.join(token)
 
 
+async def test_a_preface_that_was_held_back_lets_nothing_else_join(lab: Lab) -> None:
+    async with running(lab):
+        token = lab.invite(unattended=True)
+        stolen = Preface(Purpose.JOIN, 0, lab.clock.wall_ns() // 1_000_000, b"n" * 16, token.token_id)
+        with socket.create_connection(("127.0.0.1", lab.port)) as sock:
+            sock.setblocking(False)
+            await asyncio.get_running_loop().sock_sendall(sock, stolen.serialize(token.key))
+            connection = JoinConnection(sock, join_client_context(), server_side=False)
+            await connection.handshake()
+            request = make_request(private_key(new_key(), files_of.KEY), "thief")
+            guessed = replace(token, secret=b"x" * 16)
+            side = JoiningSide("thief", request, guessed, connection.certificate(), b"j" * 32, lab.clock.now())
+            while not side.over:
+                side.receive(await connection.receive(), None)
+                await connection.send(side.take_output())
+        end = side.events()[-1]
+        assert isinstance(end, JoinRefused)
+        assert end.reason == "token"
+        assert [each.name for each in lab.authority.issued] == ["base"]
+        await lab.join(token)  # its holder still can
+
+
 async def test_the_authoritys_user_may_refuse(lab: Lab) -> None:
     async with running(lab):
         token = lab.invite()
@@ -205,8 +229,6 @@ async def test_another_authority_at_the_address_is_not_joined(lab: Lab, tmp_path
         # It has the token's key, as something in the middle that has stolen the token would.
         stolen = other.invite(unattended=True)
         other.authority.book.find(stolen.token_id)
-        from dataclasses import replace
-
         forged = replace(token, port=other.port)
         other.authority.book.invite(forged, unattended=True)
         with pytest.raises(PeerRefused, match="does not have the fingerprint of the token"):
@@ -225,8 +247,6 @@ async def test_what_is_no_authority_is_named(lab: Lab) -> None:
 
     server = await asyncio.start_server(answer, "127.0.0.1", 0)
     async with server:
-        from dataclasses import replace
-
         with pytest.raises(RemoteProtocolError, match="not an agent of a secured mesh"):
             await lab.join(replace(token, port=server.sockets[0].getsockname()[1]))
 

@@ -180,6 +180,7 @@ class JoinServer:
             token_id,
             self._authority.book,
             self._authority.secrets,
+            store.load().certificate,  # of the file, as the context has it
             self._authority.new_serial(),
             os.urandom(limits.NONCE_BYTES),
             self._clock.now(),
