@@ -131,6 +131,7 @@ def test_revoking_counts_up_and_replaces() -> None:
     assert twice.denies("arm", 200.0)
     assert not twice.denies("arm", 201.0)
     assert not twice.denies("base", 100.0)
+    assert twice.with_name("arm", 150.0).denies("arm", 200.0)  # the clock went back
     with pytest.raises(ValueError, match="not a ROS base name"):
         once.with_name("my arm", 1.0)
 

@@ -80,14 +80,16 @@ class DenyList(msgspec.Struct, frozen=True):
 
         Args:
             name: The module, whose present certificates are all refused.
-            wall: Seconds since 1970.
+            wall: When the last of them was issued, or later; seconds since 1970. The time of an entry never goes
+                back.
 
         Raises:
             ValueError: No module can have that name, or the list is full.
         """
         if problem := peer_name_problem(name):
             raise ValueError(problem)
-        entries = (*(entry for entry in self.entries if entry.name != name), DenyEntry(name, int(wall)))
+        before = max([int(wall), *(entry.before for entry in self.entries if entry.name == name)])
+        entries = (*(entry for entry in self.entries if entry.name != name), DenyEntry(name, before))
         if len(entries) > limits.DENY_MAX:
             raise ValueError(f"a deny list has at most {limits.DENY_MAX} names; make a new mesh (rmpa trust init)")
         return DenyList(self.number + 1, entries)

@@ -286,6 +286,21 @@ async def test_a_revoked_name_can_be_invited_again_at_once(lab: Lab) -> None:
         lab.base.judge_member(again.files.certificate, "arm")
 
 
+@pytest.mark.parametrize("again", [False, True])
+async def test_a_revocation_holds_also_if_the_clock_went_back(lab: Lab, again: bool) -> None:
+    async with running(lab):
+        lab.clock.wall_seconds += DAY
+        if again:
+            await lab.join(lab.invite(unattended=True))
+            lab.authority.revoke("arm")
+        arm = lab.member(await lab.join(lab.invite(unattended=True)))
+        lab.clock.wall_seconds -= DAY / 2
+        lab.authority.revoke("arm")
+        lab.clock.wall_seconds += DAY / 2
+        with pytest.raises(CertificateError, match="arm was revoked"):
+            lab.base.judge_member(arm.files.certificate, "arm")
+
+
 async def test_a_flood_of_joins_is_bounded_and_ends_with_the_server(lab: Lab) -> None:
     async with running(lab):
         token = lab.invite()

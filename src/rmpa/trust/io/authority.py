@@ -257,7 +257,8 @@ class MeshAuthority:
             StartError: The clock is not set.
             ValueError: No module can have that name, or the list is full.
         """
-        deny = self._membership.deny.with_name(name, self.wall())
+        last = self._issued.get(name)  # later than now, if the clock went back since
+        deny = self._membership.deny.with_name(name, max(self.wall(), last.issued if last is not None else 0.0))
         self._membership.accept_document(DocumentKind.DENY, sign(deny, self._ca_key))
         self._issued.pop(name, None)
         self._store.save_issued(self.issued)
