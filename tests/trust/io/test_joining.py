@@ -19,7 +19,7 @@ from rmpa.trust.certificates import CertificateError, make_request
 from rmpa.trust.documents import DocumentKind
 from rmpa.trust.io import store as files_of
 from rmpa.trust.io.authority import MeshAuthority, found_mesh, request_der, request_pem
-from rmpa.trust.io.join_connection import JoinConnection, join_client_context
+from rmpa.trust.io.join_connection import JoinConnection, join_client_context, renewal_context
 from rmpa.trust.io.join_server import JoinServer, JoinState
 from rmpa.trust.io.joining import join_mesh, renew_at_authority
 from rmpa.trust.io.membership import Membership
@@ -262,6 +262,32 @@ async def test_a_module_that_was_in_a_drawer_asks_again_with_its_key(lab: Lab) -
         assert arm.accept_document(DocumentKind.KEYS, grant.keys)
         lab.base.judge_member(arm.files.certificate, "arm")
         assert arm.ring.newest == lab.base.ring.newest
+
+
+async def test_a_member_cannot_renew_in_the_authoritys_place(lab: Lab) -> None:
+    async with running(lab):
+        arm = lab.member(await lab.join(lab.invite(unattended=True)))
+        thief = lab.member(await lab.join(lab.invite(unattended=True), "thief"), "thief")
+    received: list[bytes] = []
+
+    async def pretend(listener: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        sock, _ = await loop.sock_accept(listener)
+        await loop.sock_recv(sock, PREFACE_BYTES)
+        files = thief.store.path(files_of.CERTIFICATE), thief.store.path(files_of.KEY)
+        connection = JoinConnection(sock, renewal_context(*files, thief.files.ca, server_side=True), server_side=True)
+        await connection.handshake()
+        received.append(await connection.receive())
+        connection.close()
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        listener.setblocking(False)
+        pretending = asyncio.ensure_future(pretend(listener))
+        async with asyncio.timeout(DEADLINE):
+            with pytest.raises(RemoteProtocolError, match="is thief, not the authority"):
+                await renew_at_authority(arm, "127.0.0.1", listener.getsockname()[1])
+            await pretending
+    assert received == [b""]  # it was not even asked
 
 
 async def test_a_revoked_module_and_one_away_too_long_get_nothing(lab: Lab) -> None:

@@ -73,7 +73,7 @@ def found_mesh(store: TrustStore, name: str, label: str, wall: float) -> None:
     ca = certificates.make_ca(ca_key, label, _serial(), wall)
     request = certificates.read_request(certificates.make_request(key, name))
     certificate = certificates.issue(request, ca, ca_key, _serial(), wall)
-    keys = KeyList.of(1, [GroupKey(1, os.urandom(limits.GROUP_KEY_BYTES))])
+    keys = KeyList.of(1, [GroupKey(1, os.urandom(limits.GROUP_KEY_BYTES))], name)
     store.write(files_of.CA_KEY, ca_pem)
     store.save(MemberFiles(key_pem, certificate, ca, sign(keys, ca_key)))
     store.save_issued([_issued(name, wall)])
@@ -270,7 +270,7 @@ class MeshAuthority:
         ring = self._membership.ring
         key = GroupKey(ring.newest.number + 1, os.urandom(limits.GROUP_KEY_BYTES))
         number = self._membership.numbers[DocumentKind.KEYS] + 1
-        keys = KeyList.of(number, [*ring.keys, key][-limits.KEYS_MAX :])
+        keys = KeyList.of(number, [*ring.keys, key][-limits.KEYS_MAX :], self._membership.name)
         self._membership.accept_document(DocumentKind.KEYS, sign(keys, self._ca_key))
         return key.number
 
