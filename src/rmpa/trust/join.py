@@ -202,6 +202,11 @@ class _Side(ABC):
         if not self._over:
             self._refuse("code", "a user says that the codes differ: is something between the two machines?")
 
+    def revoked(self) -> None:
+        """The module that joins was revoked meanwhile; without effect once it is over."""
+        if not self._over:
+            self._refuse("revoked", "the module was revoked while it joined")
+
     def lost(self) -> None:
         """The connection ended."""
         if not self._over:
@@ -373,6 +378,11 @@ class InvitingSide(_Side):
         self._request: certificates.CertificateRequest | None = None
         self._agreed_there = False
         self._send(_Welcome(secrets.ca))
+
+    @property
+    def module(self) -> str:
+        """The name that the joining module has asked for; empty: it has not yet."""
+        return self._request.name if self._request is not None else ""
 
     def agree(self, wall: float) -> None:
         """The user says that the codes are equal.

@@ -327,6 +327,32 @@ async def test_a_revocation_holds_also_if_the_clock_went_back(lab: Lab, again: b
             lab.base.judge_member(arm.files.certificate, "arm")
 
 
+async def test_revoking_ends_invitations_and_joins_of_that_name(lab: Lab) -> None:
+    async with running(lab):
+        await lab.join(lab.invite(unattended=True))
+        named, other, used = lab.invite("arm"), lab.invite("leg"), lab.invite()
+        joining = asyncio.ensure_future(lab.join(used))
+        await code_shown(lab, used)
+        lab.authority.revoke("arm")
+        with pytest.raises(PeerRefused, match=r"\(revoked\)"):
+            await joining
+        with pytest.raises(PeerRefused, match=r"\(token\)"):
+            await lab.join(named)
+        assert lab.authority.book.find(other.token_id) is not None
+        assert lab.store.load_tokens().find(named.token_id) is None
+        assert [each.name for each in lab.authority.issued] == ["base"]
+
+
+def test_a_full_disk_does_not_stop_a_revocation_half_way(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(name: str, _data: bytes) -> None:
+        raise StartError(name, "cannot be written: No space left on device", "is the disk full?")
+
+    monkeypatch.setattr(lab.store, "write", full)
+    lab.base.save = full
+    assert lab.authority.revoke("arm").number == 1
+    assert lab.base.numbers == {DocumentKind.DENY: 1, DocumentKind.KEYS: 2}
+
+
 async def test_a_flood_of_joins_is_bounded_and_ends_with_the_server(lab: Lab) -> None:
     async with running(lab):
         token = lab.invite()

@@ -94,6 +94,7 @@ class JoinServer:
         self._tasks: set[asyncio.Task[None]] = set()
         self._joining: dict[bytes, _Joining] = {}
         self._progress: dict[bytes, JoinProgress] = {}
+        authority.on_revoked.append(self._revoked)
 
     def accept(self, sock: socket.socket, preface: Preface) -> None:
         """Take a connection whose preface asks for a join or a renewal; the socket is owned from here on."""
@@ -141,6 +142,12 @@ class JoinServer:
         else:
             joining.side.reject()
         joining.answered.set()
+
+    def _revoked(self, name: str) -> None:
+        for joining in self._joining.values():
+            if joining.side.module == name:
+                joining.side.revoked()
+                joining.answered.set()
 
     def _step(self, token_id: bytes, state: JoinState, **parts: str) -> None:
         progress = self.progress(token_id)
