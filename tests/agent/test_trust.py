@@ -15,9 +15,9 @@ import pytest
 pytest.importorskip("cryptography")
 
 from rmpa.agent import Agent
-from rmpa.agent.trust import read_refusal, trust_store
+from rmpa.agent.trust import RENEW, read_refusal, trust_store
 from rmpa.config.settings import Multicast, Settings, TrustSettings
-from rmpa.core.errors import ConfigError, PeerRefused, StartError
+from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError
 from rmpa.ros.node.node import Node
 from rmpa.runtime.system_clock import SystemClock
 from rmpa.trust import limits
@@ -25,6 +25,7 @@ from rmpa.trust.documents import DocumentKind
 from rmpa.trust.io import store as files_of
 from rmpa.trust.io.authority import found_mesh
 from rmpa.trust.io.joining import join_mesh
+from rmpa.trust.spreading import Notice
 from rmpa.trust.tokens import Token
 
 if TYPE_CHECKING:
@@ -221,6 +222,25 @@ async def test_a_certificate_is_renewed_over_the_link_and_by_itself_in_time(tmp_
         trust.look_now()
         await until(lambda: trust.membership.certificate.serial not in (serial, before.serial))
         assert peers_of(arm) == {"base"}
+
+
+async def test_a_member_that_says_it_is_the_authority_is_not_believed(tmp_path: Path) -> None:
+    async with a_fleet(tmp_path) as fleet:
+        arm, thief = await fleet.add("arm"), await fleet.add("thief")
+        await fleet.linked("base", "arm", "thief")
+        trust = arm.trust
+        assert trust is not None
+        await until(lambda: trust.authority_name() == "base")
+        await fleet.stop("base")
+        await fleet.linked("arm", "thief")
+        [session] = [each for each in thief.bridge.sessions.linked() if each.link.name == "arm"]
+        thief.bridge.rpc.notify(session, Notice.HAVE, {"deny": 0, "keys": 1, "authority": True})
+        with pytest.raises(RmpaError, match="not the authority"):  # behind this answer the lie was heard
+            await thief.bridge.rpc.request(session, RENEW, {"request": ""}, DEADLINE)
+        assert trust.authority_name() == ""
+        place = trust.membership.store.load_authority()
+        assert place is not None
+        assert place.name == "base"
 
 
 async def test_a_group_key_is_changed_without_a_pause(tmp_path: Path) -> None:

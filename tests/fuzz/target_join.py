@@ -28,7 +28,7 @@ else:
         book = TokenBook()
         book.invite(_TOKEN)
         joining = JoiningSide("arm", _REQUEST, _TOKEN, _SERVER, b"j" * 32, 0.0)
-        return joining, InvitingSide(_TOKEN.token_id, book, _SECRETS, 7, b"i" * 32, 0.0)
+        return joining, InvitingSide(_TOKEN.token_id, book, _SECRETS, _SERVER, 7, b"i" * 32, 0.0)
 
     def _recorded() -> list[bytes]:
         joining, inviting = _sides()

@@ -198,7 +198,10 @@ class AgentTrust(Part):
     def _have(self, session: PeerSession, args: dict[str, Any]) -> None:
         numbers, is_authority = read_have(args)
         if is_authority and self.authority is None:
-            self._authority_found(session)
+            if session.link.name == self.membership.authority:
+                self._authority_found(session)
+            else:
+                _log.warning("! %s says that it is the authority, which it is not", session.link.name)
         self._send(session, self._spreading.have(session.peer, numbers))
 
     def _document(self, session: PeerSession, kind: Notice, args: dict[str, Any]) -> None:

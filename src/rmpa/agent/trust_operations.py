@@ -175,8 +175,10 @@ class TrustOperations:
         """Revoke a module: ``name``; ``force``: also if no certificate of that name is known."""
         name = str(args.get("name", ""))
         linked = {session.link.name for session in self._bridge.sessions.linked()}
-        deny = self._authority().revoke_known(name, linked, force=args.get("force") is True)
-        self._trust.spread()
+        try:
+            deny = self._authority().revoke_known(name, linked, force=args.get("force") is True)
+        finally:
+            self._trust.spread()  # what was made holds here, so it must hold everywhere
         _log.warning("= %s is revoked (deny list %d); there is a new group key", name, deny.number)
         return TrustReply(module=name, done=True, number=deny.number)
 

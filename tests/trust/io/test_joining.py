@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import socket
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from ipaddress import IPv4Address
 from typing import TYPE_CHECKING
 
@@ -19,12 +19,14 @@ from rmpa.trust.certificates import CertificateError, make_request
 from rmpa.trust.documents import DocumentKind
 from rmpa.trust.io import store as files_of
 from rmpa.trust.io.authority import MeshAuthority, found_mesh, request_der, request_pem
+from rmpa.trust.io.join_connection import JoinConnection, join_client_context, renewal_context
 from rmpa.trust.io.join_server import JoinServer, JoinState
 from rmpa.trust.io.joining import join_mesh, renew_at_authority
 from rmpa.trust.io.membership import Membership
-from rmpa.trust.io.private_keys import private_key
+from rmpa.trust.io.private_keys import new_key, private_key
 from rmpa.trust.io.store import MemberFiles, TrustStore
-from rmpa.trust.preface import PREFACE_BYTES, PrefaceError, Purpose
+from rmpa.trust.join import JoiningSide, JoinRefused
+from rmpa.trust.preface import PREFACE_BYTES, Preface, PrefaceError, Purpose
 from tests.trust.authority import WALL
 from tests.trust.io.member_files import HandClock
 
@@ -168,6 +170,28 @@ async def test_a_used_token_stays_used_if_the_join_fails_afterwards(lab: Lab) ->
             await lab.join(token)
 
 
+async def test_a_preface_that_was_held_back_lets_nothing_else_join(lab: Lab) -> None:
+    async with running(lab):
+        token = lab.invite(unattended=True)
+        stolen = Preface(Purpose.JOIN, 0, lab.clock.wall_ns() // 1_000_000, b"n" * 16, token.token_id)
+        with socket.create_connection(("127.0.0.1", lab.port)) as sock:
+            sock.setblocking(False)
+            await asyncio.get_running_loop().sock_sendall(sock, stolen.serialize(token.key))
+            connection = JoinConnection(sock, join_client_context(), server_side=False)
+            await connection.handshake()
+            request = make_request(private_key(new_key(), files_of.KEY), "thief")
+            guessed = replace(token, secret=b"x" * 16)
+            side = JoiningSide("thief", request, guessed, connection.certificate(), b"j" * 32, lab.clock.now())
+            while not side.over:
+                side.receive(await connection.receive(), None)
+                await connection.send(side.take_output())
+        end = side.events()[-1]
+        assert isinstance(end, JoinRefused)
+        assert end.reason == "token"
+        assert [each.name for each in lab.authority.issued] == ["base"]
+        await lab.join(token)  # its holder still can
+
+
 async def test_the_authoritys_user_may_refuse(lab: Lab) -> None:
     async with running(lab):
         token = lab.invite()
@@ -205,8 +229,6 @@ async def test_another_authority_at_the_address_is_not_joined(lab: Lab, tmp_path
         # It has the token's key, as something in the middle that has stolen the token would.
         stolen = other.invite(unattended=True)
         other.authority.book.find(stolen.token_id)
-        from dataclasses import replace
-
         forged = replace(token, port=other.port)
         other.authority.book.invite(forged, unattended=True)
         with pytest.raises(PeerRefused, match="does not have the fingerprint of the token"):
@@ -225,8 +247,6 @@ async def test_what_is_no_authority_is_named(lab: Lab) -> None:
 
     server = await asyncio.start_server(answer, "127.0.0.1", 0)
     async with server:
-        from dataclasses import replace
-
         with pytest.raises(RemoteProtocolError, match="not an agent of a secured mesh"):
             await lab.join(replace(token, port=server.sockets[0].getsockname()[1]))
 
@@ -242,6 +262,32 @@ async def test_a_module_that_was_in_a_drawer_asks_again_with_its_key(lab: Lab) -
         assert arm.accept_document(DocumentKind.KEYS, grant.keys)
         lab.base.judge_member(arm.files.certificate, "arm")
         assert arm.ring.newest == lab.base.ring.newest
+
+
+async def test_a_member_cannot_renew_in_the_authoritys_place(lab: Lab) -> None:
+    async with running(lab):
+        arm = lab.member(await lab.join(lab.invite(unattended=True)))
+        thief = lab.member(await lab.join(lab.invite(unattended=True), "thief"), "thief")
+    received: list[bytes] = []
+
+    async def pretend(listener: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        sock, _ = await loop.sock_accept(listener)
+        await loop.sock_recv(sock, PREFACE_BYTES)
+        files = thief.store.path(files_of.CERTIFICATE), thief.store.path(files_of.KEY)
+        connection = JoinConnection(sock, renewal_context(*files, thief.files.ca, server_side=True), server_side=True)
+        await connection.handshake()
+        received.append(await connection.receive())
+        connection.close()
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        listener.setblocking(False)
+        pretending = asyncio.ensure_future(pretend(listener))
+        async with asyncio.timeout(DEADLINE):
+            with pytest.raises(RemoteProtocolError, match="is thief, not the authority"):
+                await renew_at_authority(arm, "127.0.0.1", listener.getsockname()[1])
+            await pretending
+    assert received == [b""]  # it was not even asked
 
 
 async def test_a_revoked_module_and_one_away_too_long_get_nothing(lab: Lab) -> None:
@@ -264,6 +310,47 @@ async def test_a_revoked_name_can_be_invited_again_at_once(lab: Lab) -> None:
             lab.base.judge_member(before.files.certificate, "arm")
         again = lab.member(await lab.join(lab.invite(unattended=True)))
         lab.base.judge_member(again.files.certificate, "arm")
+
+
+@pytest.mark.parametrize("again", [False, True])
+async def test_a_revocation_holds_also_if_the_clock_went_back(lab: Lab, again: bool) -> None:
+    async with running(lab):
+        lab.clock.wall_seconds += DAY
+        if again:
+            await lab.join(lab.invite(unattended=True))
+            lab.authority.revoke("arm")
+        arm = lab.member(await lab.join(lab.invite(unattended=True)))
+        lab.clock.wall_seconds -= DAY / 2
+        lab.authority.revoke("arm")
+        lab.clock.wall_seconds += DAY / 2
+        with pytest.raises(CertificateError, match="arm was revoked"):
+            lab.base.judge_member(arm.files.certificate, "arm")
+
+
+async def test_revoking_ends_invitations_and_joins_of_that_name(lab: Lab) -> None:
+    async with running(lab):
+        await lab.join(lab.invite(unattended=True))
+        named, other, used = lab.invite("arm"), lab.invite("leg"), lab.invite()
+        joining = asyncio.ensure_future(lab.join(used))
+        await code_shown(lab, used)
+        lab.authority.revoke("arm")
+        with pytest.raises(PeerRefused, match=r"\(revoked\)"):
+            await joining
+        with pytest.raises(PeerRefused, match=r"\(token\)"):
+            await lab.join(named)
+        assert lab.authority.book.find(other.token_id) is not None
+        assert lab.store.load_tokens().find(named.token_id) is None
+        assert [each.name for each in lab.authority.issued] == ["base"]
+
+
+def test_a_full_disk_does_not_stop_a_revocation_half_way(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(name: str, _data: bytes) -> None:
+        raise StartError(name, "cannot be written: No space left on device", "is the disk full?")
+
+    monkeypatch.setattr(lab.store, "write", full)
+    lab.base.save = full
+    assert lab.authority.revoke("arm").number == 1
+    assert lab.base.numbers == {DocumentKind.DENY: 1, DocumentKind.KEYS: 2}
 
 
 async def test_a_flood_of_joins_is_bounded_and_ends_with_the_server(lab: Lab) -> None:

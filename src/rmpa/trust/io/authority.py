@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import ssl
 from typing import TYPE_CHECKING, Final
@@ -22,7 +23,7 @@ from rmpa.trust.reasons import TrustReason
 from rmpa.trust.tokens import Token, fingerprint_of
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Callable, Collection
     from ipaddress import IPv4Address
 
     from cryptography.hazmat.primitives.asymmetric import ec
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from rmpa.trust.io.membership import Membership
     from rmpa.trust.io.store import TrustStore
 
+_log = logging.getLogger(__name__)
 _SERIAL_BITS: Final = 159
 _CLOCK: Final = "set it first (date, timedatectl): certificates with a wrong time are of no use elsewhere"
 
@@ -73,7 +75,7 @@ def found_mesh(store: TrustStore, name: str, label: str, wall: float) -> None:
     ca = certificates.make_ca(ca_key, label, _serial(), wall)
     request = certificates.read_request(certificates.make_request(key, name))
     certificate = certificates.issue(request, ca, ca_key, _serial(), wall)
-    keys = KeyList.of(1, [GroupKey(1, os.urandom(limits.GROUP_KEY_BYTES))])
+    keys = KeyList.of(1, [GroupKey(1, os.urandom(limits.GROUP_KEY_BYTES))], name)
     store.write(files_of.CA_KEY, ca_pem)
     store.save(MemberFiles(key_pem, certificate, ca, sign(keys, ca_key)))
     store.save_issued([_issued(name, wall)])
@@ -100,6 +102,8 @@ class MeshAuthority:
         self._issued = store.load_issued()
         self.book = membership.tokens = store.load_tokens()
         """The tokens."""
+        self.on_revoked: list[Callable[[str], None]] = []
+        """Called with the name of a module that was revoked: its joins under way end."""
 
     @classmethod
     def load(cls, store: TrustStore, membership: Membership) -> MeshAuthority:
@@ -253,15 +257,30 @@ class MeshAuthority:
     def revoke(self, name: str) -> DenyList:
         """Refuse all certificates of a module from now on, and make a new group key; return the new list.
 
+        Its open tokens are withdrawn. A file that cannot be written is only logged.
+
         Raises:
             StartError: The clock is not set.
             ValueError: No module can have that name, or the list is full.
         """
-        deny = self._membership.deny.with_name(name, self.wall())
+        last = self._issued.get(name)  # later than now, if the clock went back since
+        deny = self._membership.deny.with_name(name, max(self.wall(), last.issued if last is not None else 0.0))
         self._membership.accept_document(DocumentKind.DENY, sign(deny, self._ca_key))
         self._issued.pop(name, None)
-        self._store.save_issued(self.issued)
-        self.rotate()
+        self.rotate()  # before files are written: a full disk must not leave the old key in use
+        for call in tuple(self.on_revoked):
+            call(name)
+        unused = [each for each in self.book.invitations if not each.used_by]
+        for invitation in unused:
+            if invitation.name == name:
+                self.book.withdraw(invitation.token_id)
+        if open_to_all := sum(not each.name and each.expires > self.wall() for each in unused):
+            _log.warning("! %d open tokens are for any name: %s can join again with one", open_to_all, name)
+        try:
+            self._store.save_issued(self.issued)
+            self.save_tokens()
+        except StartError as error:
+            _log.error("! %s is revoked, but not all files are written: %s", name, error)
         return deny
 
     def rotate(self) -> int:
@@ -269,7 +288,7 @@ class MeshAuthority:
         ring = self._membership.ring
         key = GroupKey(ring.newest.number + 1, os.urandom(limits.GROUP_KEY_BYTES))
         number = self._membership.numbers[DocumentKind.KEYS] + 1
-        keys = KeyList.of(number, [*ring.keys, key][-limits.KEYS_MAX :])
+        keys = KeyList.of(number, [*ring.keys, key][-limits.KEYS_MAX :], self._membership.name)
         self._membership.accept_document(DocumentKind.KEYS, sign(keys, self._ca_key))
         return key.number
 

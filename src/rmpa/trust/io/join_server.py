@@ -95,6 +95,7 @@ class JoinServer:
         """Each with what it is for, and the address of the other end."""
         self._joining: dict[bytes, _Joining] = {}
         self._progress: dict[bytes, JoinProgress] = {}
+        authority.on_revoked.append(self._revoked)
 
     def accept(self, sock: socket.socket, preface: Preface) -> None:
         """Take a connection whose preface asks for a join or a renewal; the socket is owned from here on."""
@@ -146,6 +147,12 @@ class JoinServer:
             joining.side.reject()
         joining.answered.set()
 
+    def _revoked(self, name: str) -> None:
+        for joining in self._joining.values():
+            if joining.side.module == name:
+                joining.side.revoked()
+                joining.answered.set()
+
     def _step(self, token_id: bytes, state: JoinState, **parts: str) -> None:
         progress = self.progress(token_id)
         progress.state = state
@@ -184,6 +191,7 @@ class JoinServer:
             token_id,
             self._authority.book,
             self._authority.secrets,
+            store.load().certificate,  # of the file, as the context has it
             self._authority.new_serial(),
             os.urandom(limits.NONCE_BYTES),
             self._clock.now(),

@@ -210,6 +210,9 @@ async def renew_at_authority(
     connection = JoinConnection(sock, context, server_side=False)
     try:
         await _secure(connection, read_refusal, ("key", "our group keys are unknown there, or too old"))
+        name = certificates.verify(connection.certificate(), membership.files.ca, None).name
+        if name != membership.authority:
+            raise RemoteProtocolError(f"the module at {address}:{port} is {name}, not the authority")
         try:
             async with asyncio.timeout(limits.JOIN_STEP_TIMEOUT):
                 await connection.send(encode_renewal(Renew(request)))

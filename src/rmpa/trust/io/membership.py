@@ -89,6 +89,11 @@ class Membership:
         return self.certificate.name
 
     @property
+    def authority(self) -> str:
+        """The name of the authority, as the signed list of group keys has it; empty: the list does not say."""
+        return self._keys.authority
+
+    @property
     def deny(self) -> DenyList:
         """The deny list that holds."""
         return self._deny

@@ -44,6 +44,7 @@ _SIGNS: Final = (*_MEMBER, DENY, CA_KEY, TOKENS, ISSUED)
 _ALL: Final = (*_SIGNS, AUTHORITY, REQUEST_KEY)
 _FILE_MAX: Final = limits.DOCUMENT_MAX
 _JOIN: Final = "join again: rmpa trust invite at the authority, rmpa trust join TOKEN here; or rmpa trust leave"
+_USER: Final = "run it as the user of the agent, or give the files and their folder back to that user"
 _OPEN: Final = os.O_CLOEXEC | os.O_NOFOLLOW
 
 
@@ -112,12 +113,12 @@ class TrustStore:
     @property
     def exists(self) -> bool:
         """Whether trust is on here: there is any of the files, whole or not."""
-        return any(os.path.lexists(self.path(name)) for name in _SIGNS)
+        return any(_is_there(self.path(name)) for name in _SIGNS)
 
     @property
     def is_authority(self) -> bool:
         """Whether this module has the CA's key."""
-        return os.path.lexists(self.path(CA_KEY))
+        return _is_there(self.path(CA_KEY))
 
     def load(self) -> MemberFiles:
         """The files of a member.
@@ -126,7 +127,7 @@ class TrustStore:
             StartError: One is missing, cannot be read, belongs to another user, or others may read it.
         """
         found = {name: self._read(name) for name in _MEMBER}
-        deny = self._read(DENY) if os.path.lexists(self.path(DENY)) else b""
+        deny = self._read(DENY) if _is_there(self.path(DENY)) else b""
         return MemberFiles(found[KEY], self._der(CERTIFICATE, found), self._der(CA, found), found[KEYS], deny)
 
     def save(self, files: MemberFiles) -> None:
@@ -151,7 +152,7 @@ class TrustStore:
         Raises:
             StartError: The file cannot be read or is broken.
         """
-        if not os.path.lexists(self.path(TOKENS)):
+        if not _is_there(self.path(TOKENS)):
             return TokenBook()
         remedy = "remove it: open tokens are then void"
         try:
@@ -228,7 +229,7 @@ class TrustStore:
         Raises:
             StartError: One cannot be removed.
         """
-        removed = [name for name in _ALL if os.path.lexists(self.path(name))]
+        removed = [name for name in _ALL if _is_there(self.path(name))]
         for name in removed:
             try:
                 self.path(name).unlink()
@@ -246,6 +247,8 @@ class TrustStore:
                 data = b"" if problem else file.read(_FILE_MAX + 1)
         except FileNotFoundError:
             raise StartError(str(path), "is missing", remedy) from None
+        except PermissionError as error:
+            raise StartError(str(path), f"cannot be read: {error.strerror}", _USER) from None
         except OSError as error:
             raise StartError(str(path), f"cannot be read: {error.strerror}", remedy) from None
         if problem:
@@ -259,6 +262,17 @@ class TrustStore:
             return ssl.PEM_cert_to_DER_cert(found[name].decode("ascii"))
         except ValueError:
             raise StartError(str(self.path(name)), "is broken: not a certificate in PEM", _JOIN) from None
+
+
+def _is_there(path: Path) -> bool:
+    """Whether there is a file; ``True`` also if that cannot be known, so that an error never turns trust off."""
+    try:
+        os.lstat(path)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError:
+        return True
+    return True
 
 
 def _pem(certificate: bytes) -> bytes:
