@@ -40,6 +40,7 @@ ARGS: Final[dict[str, dict[str, Any]]] = {
     "param": {"peer": "b", "what": "param.names", "args": {}},
     "followed": {},
     "graph": {},
+    "trust": {"what": "status"},
     "agent": {"peer": "b"},
     "contract": {"topic": "/chatter", "type_name": "std_msgs/String"},
     "node": {"what": "node.list", "peer": "b"},
