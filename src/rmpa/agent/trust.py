@@ -324,7 +324,8 @@ class AgentTrust(Part):
         return self._authority_peer.link.name if self._authority_peer is not None else ""
 
     def _is_linked(self, name: str) -> bool:
-        return name == self.membership.name or any(s.link.name == name for s in self._bridge.sessions.linked())
+        names = (self.membership.name, *(session.link.name for session in self._bridge.sessions.linked()))
+        return name.casefold() in {each.casefold() for each in names}
 
 
 def _bytes(args: object, key: str) -> bytes:

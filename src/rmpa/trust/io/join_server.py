@@ -93,17 +93,21 @@ class JoinServer:
         self._is_taken = is_taken
         self._tasks: set[asyncio.Task[None]] = set()
         self._joining: dict[bytes, _Joining] = {}
+        self._reserved: set[bytes] = set()  # ids of tokens, from the moment in which a connection is taken
         self._progress: dict[bytes, JoinProgress] = {}
         authority.on_revoked.append(self._revoked)
 
     def accept(self, sock: socket.socket, preface: Preface) -> None:
         """Take a connection whose preface asks for a join or a renewal; the socket is owned from here on."""
-        if len(self._tasks) >= limits.JOINS_AT_ONCE or preface.token_id in self._joining:
+        if len(self._tasks) >= limits.JOINS_AT_ONCE or preface.token_id in self._reserved:
             _log.warning("! a join or renewal is refused: too many at once, or its token is being used just now")
             sock.close()
             return
         task = asyncio.get_running_loop().create_task(self._run(sock, preface), name=str(preface))
         self._tasks.add(task)
+        if preface.purpose is Purpose.JOIN:
+            self._reserved.add(preface.token_id)
+            task.add_done_callback(lambda _: self._reserved.discard(preface.token_id))
         task.add_done_callback(self._tasks.discard)
         task.add_done_callback(
             lambda _: sock.close()
@@ -191,7 +195,7 @@ class JoinServer:
             self._authority.new_serial(),
             os.urandom(limits.NONCE_BYTES),
             self._clock.now(),
-            self._is_taken,
+            lambda name: self._taken(token_id, name),
         )
         joining = self._joining[token_id] = _Joining(side)
         try:
@@ -199,6 +203,21 @@ class JoinServer:
             await self._converse(connection, joining, token_id, where)
         finally:
             del self._joining[token_id]
+
+    def _taken(self, token_id: bytes, name: str) -> bool:
+        """Whether a member has a name, present or not; an invitation for the name itself lets it join again.
+
+        Names that differ in case alone would have the same names for browsers.
+        """
+        if self._is_taken(name):
+            return True
+        invitation = self._authority.book.find(token_id)
+        again = name if invitation is not None and invitation.name == name else ""
+        now, folded = self._authority.wall(), name.casefold()
+        return any(
+            each.name.casefold() == folded and each.expires > now and each.name != again
+            for each in self._authority.issued
+        )
 
     async def _converse(self, connection: JoinConnection, joining: _Joining, token_id: bytes, where: str) -> None:
         """Drive one side of a join to its end."""
