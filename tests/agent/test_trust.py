@@ -224,6 +224,19 @@ async def test_a_certificate_is_renewed_over_the_link_and_by_itself_in_time(tmp_
         assert peers_of(arm) == {"base"}
 
 
+async def test_a_member_cannot_keep_the_authority_busy_with_renewals(tmp_path: Path) -> None:
+    async with a_fleet(tmp_path) as fleet:
+        arm = await fleet.add("arm")
+        await fleet.linked("base", "arm")
+        trust = arm.trust
+        assert trust is not None
+        await until(lambda: trust.authority_name() == "base")
+        for _ in range(limits.RENEWALS_BURST):
+            await fleet.command("arm", "renew")
+        with pytest.raises(RmpaError, match="asks for certificates too often"):
+            await fleet.command("arm", "renew")
+
+
 async def test_a_member_that_says_it_is_the_authority_is_not_believed(tmp_path: Path) -> None:
     async with a_fleet(tmp_path) as fleet:
         arm, thief = await fleet.add("arm"), await fleet.add("thief")

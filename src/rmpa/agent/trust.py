@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.bridge.session.part import Part
 from rmpa.core.backoff import Backoff
 from rmpa.core.errors import RemoteProtocolError, RmpaError, StartError, UnreachableError
+from rmpa.core.token_bucket import TokenBucket
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Refuse
 from rmpa.runtime.state_dir import state_dir
@@ -130,6 +131,7 @@ class AgentTrust(Part):
             self.joins = JoinServer(self.authority, membership, clock, self._is_linked)
         self._backoff = Backoff(limits.RENEWAL_RETRY_FIRST, limits.RENEWAL_RETRY_CAP, rng)
         self._retry_at = 0.0
+        self._renewals: dict[str, TokenBucket] = {}
         self._wake = asyncio.Event()
         self._renewing: asyncio.Task[None] | None = None
         self._problem = ""
@@ -313,7 +315,16 @@ class AgentTrust(Part):
         """Renew the certificate of a linked module."""
         if self.authority is None:
             raise RmpaError(NOT_AUTHORITY)
-        _, certificate = self.authority.issue(_bytes(args, "request"), session.link.name)
+        name = session.link.name
+        presented = session.link.connection.certificate
+        if presented is not None:
+            self.membership.judge_member(presented, name)  # it may have been revoked, and its link is ending
+        while len(self._renewals) >= limits.ISSUED_MAX and name not in self._renewals:
+            del self._renewals[next(iter(self._renewals))]
+        bucket = self._renewals.setdefault(name, TokenBucket(limits.RENEWALS_RATE, limits.RENEWALS_BURST))
+        if not bucket.take(self._clock.now()):
+            raise RmpaError(f"{name} asks for certificates too often: once a minute is allowed")
+        _, certificate = self.authority.issue(_bytes(args, "request"), name)
         _log.info("= %s has a new certificate", session.link.name)
         return {"certificate": base64.b64encode(certificate).decode()}
 
@@ -324,7 +335,8 @@ class AgentTrust(Part):
         return self._authority_peer.link.name if self._authority_peer is not None else ""
 
     def _is_linked(self, name: str) -> bool:
-        return name == self.membership.name or any(s.link.name == name for s in self._bridge.sessions.linked())
+        names = (self.membership.name, *(session.link.name for session in self._bridge.sessions.linked()))
+        return name.casefold() in {each.casefold() for each in names}
 
 
 def _bytes(args: object, key: str) -> bytes:

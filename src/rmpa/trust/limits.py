@@ -117,6 +117,10 @@ RENEWAL_RETRY_FIRST: Final = 60.0
 """Until a renewal that failed is tried again; each further time it is twice as long."""
 RENEWAL_RETRY_CAP: Final = 3600.0
 """The longest such time."""
+RENEWALS_RATE: Final = 1 / 60
+"""Renewals a second of one linked module at the authority: each is a signature and a file that is synced."""
+RENEWALS_BURST: Final = 4
+"""Renewals of one linked module at once: a user may call ``rmpa trust renew`` again."""
 RENEWAL_LOOK: Final = 30.0
 """How often an agent looks whether its certificate is to be renewed: the wall clock may be set at any time."""
 EXPIRY_NEAR: Final = 2 * 86_400

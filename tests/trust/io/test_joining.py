@@ -27,6 +27,7 @@ from rmpa.trust.io.private_keys import new_key, private_key
 from rmpa.trust.io.store import MemberFiles, TrustStore
 from rmpa.trust.join import JoiningSide, JoinRefused
 from rmpa.trust.preface import PREFACE_BYTES, Preface, PrefaceError, Purpose
+from rmpa.trust.renewal import RenewalRefused
 from tests.trust.authority import WALL
 from tests.trust.io.member_files import HandClock
 
@@ -329,7 +330,6 @@ async def test_a_revocation_holds_also_if_the_clock_went_back(lab: Lab, again: b
 
 async def test_revoking_ends_invitations_and_joins_of_that_name(lab: Lab) -> None:
     async with running(lab):
-        await lab.join(lab.invite(unattended=True))
         named, other, used = lab.invite("arm"), lab.invite("leg"), lab.invite()
         joining = asyncio.ensure_future(lab.join(used))
         await code_shown(lab, used)
@@ -351,6 +351,44 @@ def test_a_full_disk_does_not_stop_a_revocation_half_way(lab: Lab, monkeypatch: 
     lab.base.save = full
     assert lab.authority.revoke("arm").number == 1
     assert lab.base.numbers == {DocumentKind.DENY: 1, DocumentKind.KEYS: 2}
+
+
+async def test_the_name_of_an_absent_member_is_not_given_to_another(lab: Lab) -> None:
+    async with running(lab):
+        await lab.join(lab.invite(unattended=True))
+        for token, name in ((lab.invite(), "arm"), (lab.invite(), "ARM"), (lab.invite("ARM"), "ARM")):
+            with pytest.raises(PeerRefused, match=r"is a member.*\(taken\); .*rmpa trust invite --module NAME"):
+                await lab.join(token, name)
+        await lab.join(lab.invite("arm", unattended=True))  # the user means this one
+        lab.clock.wall_seconds += 8 * DAY
+        await lab.join(lab.invite(unattended=True))  # its certificate has ended
+
+
+async def test_two_connections_with_one_token_at_once_are_one_join(
+    lab: Lab, caplog: pytest.LogCaptureFixture
+) -> None:
+    lab.port = 1
+    token = lab.invite()
+    preface = Preface(Purpose.JOIN, 0, 0, b"n" * 16, token.token_id)
+    pairs = [socket.socketpair() for _ in range(2)]
+    for ours, _ in pairs:
+        lab.server.accept(ours, preface)
+    await asyncio.sleep(0)
+    assert [ours.fileno() == -1 for ours, _ in pairs] == [False, True]
+    await lab.server.close()
+    for _, theirs in pairs:
+        theirs.close()
+    assert "KeyError" not in caplog.text
+
+
+async def test_the_text_of_a_refused_renewal_is_safe_to_show(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with running(lab):
+        arm = lab.member(await lab.join(lab.invite(unattended=True)))
+        refusal = RenewalRefused("a\nb", "\x1b[2Jgone\nnext")
+        monkeypatch.setattr(lab.server, "_renewed", lambda *_: refusal)
+        with pytest.raises(PeerRefused) as caught:
+            await renew_at_authority(arm, "127.0.0.1", lab.port)
+        assert str(caught.value).isprintable()
 
 
 async def test_a_flood_of_joins_is_bounded_and_ends_with_the_server(lab: Lab) -> None:

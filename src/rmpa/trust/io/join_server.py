@@ -94,6 +94,7 @@ class JoinServer:
         self._tasks: dict[asyncio.Task[None], tuple[Purpose, str]] = {}
         """Each with what it is for, and the address of the other end."""
         self._joining: dict[bytes, _Joining] = {}
+        self._reserved: set[bytes] = set()  # ids of tokens, from the moment in which a connection is taken
         self._progress: dict[bytes, JoinProgress] = {}
         authority.on_revoked.append(self._revoked)
 
@@ -102,12 +103,15 @@ class JoinServer:
         purpose, host = preface.purpose, _host(sock)
         alike = [there for what, there in self._tasks.values() if what is purpose]
         full = len(alike) >= limits.JOINS_AT_ONCE or alike.count(host) >= limits.JOINS_PER_ADDRESS
-        if full or preface.token_id in self._joining:
+        if full or preface.token_id in self._reserved:
             _log.warning("! a join or renewal is refused: too many at once, or its token is being used just now")
             sock.close()
             return
         task = asyncio.get_running_loop().create_task(self._run(sock, preface), name=str(preface))
         self._tasks[task] = (purpose, host)
+        if purpose is Purpose.JOIN:
+            self._reserved.add(preface.token_id)
+            task.add_done_callback(lambda _: self._reserved.discard(preface.token_id))
         task.add_done_callback(self._tasks.pop)
         task.add_done_callback(
             lambda _: sock.close()
@@ -195,7 +199,7 @@ class JoinServer:
             self._authority.new_serial(),
             os.urandom(limits.NONCE_BYTES),
             self._clock.now(),
-            self._is_taken,
+            lambda name: self._taken(token_id, name),
         )
         joining = self._joining[token_id] = _Joining(side)
         try:
@@ -203,6 +207,21 @@ class JoinServer:
             await self._converse(connection, joining, token_id, where)
         finally:
             del self._joining[token_id]
+
+    def _taken(self, token_id: bytes, name: str) -> bool:
+        """Whether a member has a name, present or not; an invitation for the name itself lets it join again.
+
+        Names that differ in case alone would have the same names for browsers.
+        """
+        if self._is_taken(name):
+            return True
+        invitation = self._authority.book.find(token_id)
+        again = name if invitation is not None and invitation.name == name else ""
+        now, folded = self._authority.wall(), name.casefold()
+        return any(
+            each.name.casefold() == folded and each.expires > now and each.name != again
+            for each in self._authority.issued
+        )
 
     async def _converse(self, connection: JoinConnection, joining: _Joining, token_id: bytes, where: str) -> None:
         """Drive one side of a join to its end."""

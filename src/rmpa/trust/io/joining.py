@@ -42,7 +42,7 @@ _REMEDIES: Final = {
     "used": "each token lets one module join; ask for a new one: rmpa trust invite at the authority",
     "late": "ask for a new one: rmpa trust invite at the authority",
     "name": "join with the --name that it is for",
-    "taken": "choose another --name, or rmpa trust revoke it at the authority",
+    "taken": "choose another --name; or at the authority: rmpa trust invite --module NAME, or rmpa trust revoke NAME",
     "code": "begin again with a new token; if the codes differ once more, something is between the machines",
     "foreign": "is the token of this mesh? ask for a new one",
     "clock": "set the clock of both machines",
@@ -222,10 +222,15 @@ async def renew_at_authority(
     finally:
         connection.close()
     if isinstance(answer, RenewalRefused):
-        raise refused(answer.reason[:32], answer.text[:300])
+        raise refused(_safe(answer.reason[:32]), _safe(answer.text[:300]))
     if not isinstance(answer, RenewalGrant):
         raise RemoteProtocolError("the authority answers a renewal with something else")
     return answer
+
+
+def _safe(text: str) -> str:
+    """A text of the other side, fit for a terminal and a log: one line, nothing unprintable."""
+    return "".join(c if c.isprintable() else " " for c in text)
 
 
 async def one_message(connection: JoinConnection) -> RenewalMessage:
