@@ -305,8 +305,9 @@ class JoinServer:
 
 
 def _host(sock: socket.socket) -> str:
-    """The address of the other end; empty if it is gone."""
+    """The address of the other end; empty if it is gone, or of this machine by a Unix socket."""
     try:
-        return str(sock.getpeername()[0])
+        peer = sock.getpeername()
     except OSError:
         return ""
+    return str(peer[0]) if isinstance(peer, tuple) else ""
