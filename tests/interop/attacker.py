@@ -435,7 +435,10 @@ def join_as(token: StolenToken, name: str, address: str, port: int) -> Iterator[
             yield welcome
             ca = base64.b64decode(welcome["ca"])
             commitment = hashlib.sha256(b"rmpa commit 1" + nonce + key_hash).digest()
-            talk.send(op="hello", request=request_of(key, name), commitment=commitment)
+            request, server = request_of(key, name), sock.getpeercert(binary_form=True) or b""
+            signed = b"rmpa join hello 1" + request + commitment + hashlib.sha256(server).digest()
+            proof = hmac.digest(token.key, signed, hashlib.sha256)
+            talk.send(op="hello", request=request, commitment=commitment, proof=proof)
             challenge = talk.receive()
             yield challenge
             if challenge["op"] != "challenge":
