@@ -1,0 +1,23 @@
+"""Every bound of the gateway, with unit and reason."""
+
+from __future__ import annotations
+
+from typing import Final
+
+KEY_MAX: Final = 2048
+"""Characters of a key expression or a liveliness token that another site or a ROS 2 node sent. Longer ones are not
+read; the longest that ROS names and types make is some 900."""
+GID_MAX: Final = 255
+"""Bytes of the source's GID in an attachment of ROS 2: its length is one byte."""
+QOS_NUMBER_MAX: Final = 2**63 - 1
+"""The largest number in a QoS of ROS 2: they are 64-bit there."""
+ENTITY_ID_MAX: Final = 2**64 - 1
+"""The largest number of a node or an endpoint in a liveliness token."""
+DOMAIN_MAX: Final = 2**32 - 1
+"""The largest ROS domain id in a key; ROS 2 uses 0 to 232."""
+PATH_MAX: Final = 8
+"""Sites that a message passes at most; more mean a loop."""
+SITE_NAME_MAX: Final = 63
+"""Characters of a site's name, as for a module's name and for a label of DNS."""
+NODE_NAME_MAX: Final = 255
+"""Bytes of a node's name in an attachment."""
