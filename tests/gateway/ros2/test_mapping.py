@@ -28,6 +28,7 @@ RULES = """
   ros2_service_name: GoHome
   request_fields_1_to_2: {fast: quick}
 """
+PAIR = "ros1_package_name: a, ros2_package_name: b, ros1_message_name: C, ros2_message_name: D"
 KNOWN = {
     "arm_interfaces/msg/Grip",
     "std_msgs/msg/String",
@@ -85,7 +86,7 @@ def test_the_way_back(mapping: TypeMapping) -> None:
         ("- {ros1_package_name: a, ros2_package_name: b, field: C}", "unknown key 'field'"),
         ("- {ros1_package_name: a, ros2_package_name: b, fields_1_to_2: {a: b}}", "names no message"),
         (
-            "- {ros1_package_name: a, ros2_package_name: b, ros1_message_name: C, ros2_message_name: D, fields_1_to_2: 3}",
+            f"- {{{PAIR}, fields_1_to_2: 3}}",
             "no mapping of fields",
         ),
         ("- {ros1_package_name: '', ros2_package_name: b, ros1_message_name: C, ros2_message_name: D}", "not a name"),
