@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := venv
-.PHONY: venv demo demo-kill demo-start test test-bare tests style format types imports reference fuzz soak soak-web bench experiment wheel ros chromium clean
+.PHONY: venv demo demo-kill demo-start test test-bare tests style format types imports reference fuzz soak soak-web bench experiment wheel ros chromium clients clean
 
 $(STAMP): pyproject.toml constraints.txt scripts/bootstrap
 	scripts/bootstrap $(PYTHON) $(VENV)
@@ -19,13 +19,16 @@ demo: $(STAMP)  ## the paper's set-up (Fig. 7) on this machine: make demo [SECON
 demo-kill demo-start: $(STAMP)  ## kill -9 a module of the running demo, start it again: make demo-kill MODULE=base
 	@$(BIN)/python examples/turtlebot/demo.py $(@:demo-%=%) $(or $(MODULE),$(error name one: make $@ MODULE=base))
 
-test: $(STAMP) ros chromium style types imports tests  ## everything, with Debian's ROS 1 and Chromium where they can be installed
+test: $(STAMP) ros chromium clients style types imports tests  ## everything, with Debian's ROS 1, Chromium, npm and promtool where they can be installed
 
 test-bare:  ## make test on a bare Debian in a chroot, which has almost nothing; some of it: make test-bare ARGS="make demo SECONDS=5"
 	scripts/test-in-chroot $(ARGS)
 
 chromium:  ## install Chromium for the tests of the monitor's pages (only where apt and root are there; else says so)
 	scripts/install-chromium
+
+clients:  ## install npm and promtool for the tests of rmpa web against other people's clients (only where apt and root are there; else says so)
+	scripts/install-clients
 
 ros:  ## install Debian's ROS 1 for the interop tests (only where apt and root are there; else says so)
 	scripts/install-ros

@@ -30,6 +30,7 @@ from lab.bench import (
     storm,
     tasks,
     throughput,
+    trust,
     web,
 )
 from lab.bench.contenders import ENTRIES
@@ -103,6 +104,7 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
         partial(tasks.measure, realtime=True),
     ),
     "decision": Measurement("how long a resource takes to decide", decision.measure, needs=()),
+    "trust": Measurement("what TLS on the links costs, and what attacks cost a secured agent", trust.measure),
     "bookkeeping": Measurement("what measuring quality costs, and how soon a resource adapts", bookkeeping.measure),
     "web": Measurement(
         "rmpa web beside rosbridge_suite's server and foxglove-sdk's",

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, cast
 
+import msgspec
 import pytest
 
+import rmpa
 from rmpa.config.sources import Loaded
+from rmpa.core.contract import ContractRule, Reliability
 from rmpa.core.errors import PeerRefused
+from rmpa.observe.graph_changes import GraphRevision, TopicRow
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.observe.io.control_operations import OPERATIONS
-from rmpa.observe.snapshot import GraphRevision
-from rmpa.ros.node_info import PeerNodes
+from rmpa.observe.peer_agent import PeerAgent
+from rmpa.ros.environment import RosEnvironment
+from rmpa.ros.node.node import Node
+from rmpa.ros.node_info import NodeFacts, PeerNodes
+from rmpa.ros.types.messages import MessageType
 from tests.agent.test_agent import running, settings, until
 from tests.ros.node.peers import DEADLINE
 
@@ -32,6 +40,9 @@ ARGS: Final[dict[str, dict[str, Any]]] = {
     "param": {"peer": "b", "what": "param.names", "args": {}},
     "followed": {},
     "graph": {},
+    "trust": {"what": "status"},
+    "agent": {"peer": "b"},
+    "contract": {"topic": "/chatter", "type_name": "std_msgs/String"},
     "node": {"what": "node.list", "peer": "b"},
 }
 
@@ -63,6 +74,8 @@ async def test_each_operation_replies_with_its_type(settings: Callable[..., Sett
         ("param", {"peer": "b", "what": "param.names"}, "is no table"),
         ("graph", {"wait": -1}, "is not between 0 and"),
         ("node", {"what": "node.lst"}, r"did you mean node\.list\?"),
+        ("agent", {"peer": "c"}, "linked peer"),
+        ("contract", {"topic": "chatter"}, "is not a topic"),
         ("snapshots", {}, "did you mean snapshot?"),
     ],
 )
@@ -88,6 +101,61 @@ async def test_nodes_of_all_peers_are_listed(settings: Callable[..., Settings]) 
     assert (nodes.peer, nodes.problem) == ("b", "")
 
 
+async def test_a_node_tells_its_connections_here_and_at_a_peer(settings: Callable[..., Settings]) -> None:
+    text = MessageType("std_msgs/String")
+    async with (
+        running(settings("a"), settings("b")) as (a, b),
+        Node("/talker", master_uri=a.core.uri, environment=RosEnvironment()) as talker,
+        Node("/listener", master_uri=a.core.uri, environment=RosEnvironment()) as listener,
+    ):
+        await until(lambda: list(b.bridge.sessions.linked()))
+        await talker.advertise("/chatter", text)
+        await listener.subscribe("/chatter", text, lambda _: None)
+
+        async def connections(node: str) -> set[tuple[str, bool, str]]:
+            own = await a.operations.node({"what": "node.info", "node": node})
+            theirs = msgspec.convert(
+                await b.operations.node({"what": "node.info", "peer": "a", "node": node}), NodeFacts
+            )
+            assert isinstance(own, NodeFacts)
+            assert own.connections is not None
+            assert own.connections == theirs.connections
+            return {(each.topic, each.inbound, each.other) for each in own.connections}
+
+        async with asyncio.timeout(DEADLINE):
+            while ("/chatter", False, "/listener") not in await connections("/talker"):
+                await asyncio.sleep(0)
+            assert ("/chatter", True, "/talker") in await connections("/listener")
+
+
+async def test_a_peer_tells_of_itself_and_a_module_is_diagnosed(settings: Callable[..., Settings]) -> None:
+    async with running(settings("a"), settings("b")) as (a, b):
+        await until(lambda: list(a.bridge.sessions.linked()) and list(b.bridge.sessions.linked()))
+        told = msgspec.convert(await a.operations.agent({"peer": "b"}), PeerAgent)
+        assert (told.version, told.core_uri) == (rmpa.__version__, b.core.uri)
+        assert told.rss
+        (peer,) = a.operations.snapshot({}).peers
+        assert peer.link is not None
+        assert [lane.name for lane in peer.link.lanes] == ["express", "bulk"]
+        assert peer.link.lanes[0].bytes_in > 0
+        (why,) = await a.operations.why({"module": "b"})
+        assert (why.kind, why.flows) == ("module", True)
+        assert [stage.name for stage in why.stages][:4] == ["peer", "link", "lanes", "answer"]
+        b.bridge.rpc._handlers.pop("agent.info")  # as an agent of an earlier release
+        (why,) = await a.operations.why({"module": "b"})
+        assert [stage.level.value for stage in why.stages if stage.name == "answer"] == ["unknown"]
+
+
+async def test_the_contract_of_a_topic_without_a_route_is_that_of_the_rules(
+    settings: Callable[..., Settings],
+) -> None:
+    rule = ContractRule(("/cmd/**",), (), {"reliability": Reliability.RELIABLE})
+    async with running(replace(settings("a"), contracts=(rule,))) as (a,):
+        terms = a.operations.contract({"topic": "/cmd/vel"})
+        assert (terms["reliability"].value, terms["reliability"].rule) == ("reliable", "rule 1: topics /cmd/**")
+        assert terms["depth"].rule == "default"
+
+
 async def test_a_change_of_the_graph_ends_the_wait_for_it(settings: Callable[..., Settings], tmp_path: Path) -> None:
     async with running(settings("a")) as (a,):
 
@@ -102,3 +170,24 @@ async def test_a_change_of_the_graph_ends_the_wait_for_it(settings: Callable[...
         changed = await asyncio.wait_for(waiting, DEADLINE)
         assert changed != known
         assert await asyncio.to_thread(ask, after=known, wait=20.0) == changed  # it has changed before: at once
+
+
+async def test_the_agent_tells_what_has_changed_in_its_own_core(
+    settings: Callable[..., Settings], tmp_path: Path
+) -> None:
+    async with running(settings("a")) as (a,):
+
+        def ask(**args: object) -> GraphRevision:
+            with ControlClient(tmp_path / "a.sock") as client:
+                return client.call("graph", GraphRevision, rows=True, **args)
+
+        first = await asyncio.to_thread(ask)
+        assert first.core_uri == a.core.uri
+        assert first.rows is not None
+        assert first.rows.whole
+        waiting = asyncio.create_task(asyncio.to_thread(ask, after=first.revision, wait=20.0))
+        a.core.call("registerPublisher", "/talker", "/chatter", "std_msgs/String", "http://127.0.0.1:9/")
+        changed = await asyncio.wait_for(waiting, DEADLINE)
+        assert changed.rows is not None
+        assert not changed.rows.whole
+        assert TopicRow("/chatter", "std_msgs/String", ("/talker",), ()) in changed.rows.topics

@@ -17,7 +17,8 @@ import pytest
 
 from rmpa.agent import reload
 from rmpa.agent.reload import Reloader, SighupHandler
-from rmpa.config.settings import HostPort, PeerRule, PolicySettings, Settings
+from rmpa.config.permission_rules import ModuleGroup, PermissionRule
+from rmpa.config.settings import HostPort, PeerRule, PolicySettings, Settings, TrustSettings
 from rmpa.config.sources import Loaded, load_settings
 from rmpa.core.contract import ContractRule
 from rmpa.core.errors import ConfigError
@@ -59,6 +60,18 @@ async def test_what_can_be_taken_is_taken_and_the_rest_is_named() -> None:
     assert reply.restart == made.waiting == waiting
     assert reply.notes == ("doubtful",)
     assert applied == [replace(NEW, port=0, seeds=(), core_port=11311)]
+
+
+async def test_permissions_are_taken_and_what_waits_beside_them_goes_on_waiting() -> None:
+    rule = PermissionRule(("arm",), names={"publish": ("/x",)})
+    trust = TrustSettings(groups=(ModuleGroup("arms", ("arm*",)),), rules=(rule,), require=True)
+    applied: list[Settings] = []
+    made = reloader(lambda: Loaded(replace(OLD, trust=trust)), applied)
+    reply = await made.reload()
+    assert (reply.changed, reply.restart) == (("trust.groups", "[[permission]]"), made.waiting)
+    assert applied == [replace(OLD, trust=replace(trust, require=False))]
+    assert (await made.reload()).changed == ()
+    assert made.waiting == ("trust.require (true instead of false)",)
 
 
 async def test_a_second_time_only_what_waits_is_left() -> None:

@@ -8,11 +8,13 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import pytest
 
 from rmpa.bridge import limits
 from rmpa.bridge.actions import Action, Publish, Retract, Send
 from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, Source, decode, encode
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.relay import LinkedPeer, Relay, RelayPaths, may_have
 from rmpa.bridge.services.exports import ExportAction, LocalService, ServiceExports
@@ -24,7 +26,7 @@ from rmpa.config.settings import PolicySettings, ServiceSettings
 from rmpa.core.guid import Guid
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
 TYPE = "std_msgs/String"
 
@@ -43,6 +45,7 @@ class Module:
 
     number: int
     relays: bool
+    gate: PermissionGate = field(default_factory=PermissionGate)
     exports: Exports = field(init=False)
     imports: Imports = field(init=False)
     service_exports: ServiceExports = field(init=False)
@@ -59,10 +62,12 @@ class Module:
 
     def __post_init__(self) -> None:
         policy = Policy(PolicySettings())
-        self.exports, self.imports = Exports(policy), Imports(policy, rng=lambda: 0.5)
+        self.exports = Exports(policy, gate=self.gate)
+        self.imports = Imports(policy, rng=lambda: 0.5, gate=self.gate)
         self.relay = Relay(enabled=self.relays)
         rules = ServiceRules(ServiceSettings(), policy)
-        self.service_exports, self.service_imports = ServiceExports(rules), ServiceImports(rules)
+        self.service_exports = ServiceExports(rules, gate=self.gate)
+        self.service_imports = ServiceImports(rules, gate=self.gate)
         self.relay.instance = self.imports.ways.instance = instance(self.number)
         self.service_imports.ways.instance = instance(self.number)
         self.look()
@@ -112,9 +117,11 @@ class Module:
 class Map:
     """Modules and the links between them; what is on its way on each, in order."""
 
-    def __init__(self, count: int, relays: set[int], seed: int) -> None:
+    def __init__(
+        self, count: int, relays: set[int], seed: int, gate: Callable[[int], PermissionGate] = lambda _: OPEN_GATE
+    ) -> None:
         self.rng = random.Random(seed)
-        self.modules = {n: Module(n, n in relays) for n in range(1, count + 1)}
+        self.modules = {n: Module(n, n in relays, gate(n)) for n in range(1, count + 1)}
         self.wires: dict[tuple[int, int], deque[bytes]] = {}
 
     def link(self, one: int, other: int) -> None:
@@ -287,3 +294,29 @@ def test_the_way_is_told_and_what_came_round_is_not_shown() -> None:
     assert not ways.why_not(1, origin(1, 2))
     assert ways.remove(1, origin(1, 2))
     assert list(ways) == []
+
+
+def test_a_peer_that_claims_the_run_of_a_relayed_module_does_not_hide_it() -> None:
+    """Instances are no secret: each member hears them in beacons. In a secured mesh the name alone is proved."""
+    ways = RelayPaths()
+    ways.instance = instance(9)
+    ways.linked(1, LinkedPeer("r", instance(2), Guid(2)))
+    ways.add(1, origin(1, 2))
+    ways.linked(2, LinkedPeer("thief", instance(1), Guid(1)))
+    assert not ways.why_not(1, origin(1, 2))
+    assert list(ways) == [(origin(1, 2), "r")]
+    ways.linked(3, LinkedPeer("m1", instance(1), Guid(1)))
+    assert ways.why_not(1, origin(1, 2)) == "m1 has a link of its own"
+    assert list(ways) == []
+
+
+def test_a_peer_that_may_not_relay_does_not_rename_a_module() -> None:
+    ways = RelayPaths(lambda name: name == "r")
+    ways.instance = instance(9)
+    ways.linked(1, LinkedPeer("r", instance(2), Guid(2)))
+    ways.linked(2, LinkedPeer("liar", instance(3), Guid(3)))
+    renamed = msgspec.structs.replace(origin(1, 3), name="other")
+    ways.add(2, renamed)
+    ways.add(1, origin(1, 2))
+    ways.add(2, renamed)
+    assert list(ways) == [(origin(1, 2), "r")]

@@ -51,7 +51,14 @@ def test_each_command_but_those_without_an_answer_has_json(path: str, command: c
 
 
 WORDS = {"values": "{}", "value": "1"}
-QUIET = {"rmpa doctor", "rmpa multicast send", "rmpa multicast receive", "rmpa web"}
+QUIET = {
+    "rmpa doctor",
+    "rmpa multicast send",
+    "rmpa multicast receive",
+    "rmpa trust init",
+    "rmpa trust status",
+    "rmpa web",
+}
 """These need neither an agent nor a master."""
 
 

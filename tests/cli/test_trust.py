@@ -69,7 +69,19 @@ def test_json_has_the_decision(capsys: pytest.CaptureFixture[str], file: str) ->
         "rule": "[[permission]] 1 allows publish of '/cmd_vel' to group 'operators'",
         "number": 1,
         "groups": ["operators"],
+        "files": [file],
     }
+
+
+def test_the_answer_says_that_no_file_was_found(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.delenv("XDG_CONFIG_HOME", raising=False)
+    code, out, error = _run(capsys, "check", "arm", "publish", "/cmd_vel")
+    assert (code, out) == (1, "no: no [[permission]] lets arm publish /cmd_vel\n")
+    assert "no rmpa.toml was found here" in error
 
 
 @pytest.mark.parametrize(

@@ -130,6 +130,29 @@ def test_beyond_this_machine_a_token_is_made_and_told_once(place: Place) -> None
     assert told[0]["token_file"] == told[1]["token_file"] == str(file)
 
 
+def test_rmpa_reload_takes_a_clients_token_away(place: Place) -> None:
+    port, config = free_port(), place.path / "rmpa.toml"
+    web = f"[web]\nenabled = true\nport = {port}\n"
+    tokens = place.path / ".local" / "state" / "rmpa" / "base" / "web-tokens"
+
+    def write(*clients: str) -> None:
+        config.write_text(web + "".join(f'[[web_token]]\nname = "{name}"\n' for name in clients))
+
+    write("wall", "tablet")
+    with running(place, *agent_options("--config", str(config))):
+        until(lambda: get(port, "/healthz")[0] == 200)
+        wall, tablet = ((tokens / name).read_text().strip() for name in ("wall", "tablet"))
+        assert (tokens / "wall").stat().st_mode & 0o777 == 0o600
+        assert [get(port, "/metrics", token)[0] for token in (wall, tablet, "x" * 43)] == [200, 200, 401]
+        write("wall")
+        assert place.run("reload")[0] == 0
+        until(lambda: get(port, "/metrics", tablet)[0] == 401)
+        assert get(port, "/metrics", wall)[0] == 200
+        write("wall", "wall")
+        assert place.run("reload")[0] != 0
+        assert get(port, "/metrics", wall)[0] == 200
+
+
 def test_without_the_extra_it_says_what_to_install(place: Place) -> None:
     block = "import sys; sys.modules['aiohttp'] = None; from rmpa.cli.main import main; sys.exit(main(['web']))"
     done = subprocess.run(

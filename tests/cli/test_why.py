@@ -71,6 +71,21 @@ def test_what_flows(place: Place, answers: Callable[[Handler], None]) -> None:
     ]
 
 
+def test_a_module_is_asked_about_by_its_name_alone(place: Place, answers: Callable[[Handler], None]) -> None:
+    asked: list[dict[str, object]] = []
+
+    def handler(args: dict[str, object]) -> tuple[Diagnosis, ...]:
+        asked.append(args)
+        stages = (Check("link", CheckLevel.OK, "linked by 10.0.0.2:40002"),)
+        return (Diagnosis.of(stages, name="joystick", peer="joystick", to="base", kind="module"),)
+
+    answers(handler)
+    code, out, err = place.run("why", "--module", "joystick")
+    assert (code, err) == (0, "")
+    assert out.splitlines() == ["joystick to base:", "  ok       link  linked by 10.0.0.2:40002", "it is linked"]
+    assert asked == [{"module": "joystick"}]
+
+
 def test_what_does_not(place: Place, answers: Callable[[Handler], None]) -> None:
     asked: list[dict[str, object]] = []
 

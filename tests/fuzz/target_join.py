@@ -28,11 +28,12 @@ else:
         book = TokenBook()
         book.invite(_TOKEN)
         joining = JoiningSide("arm", _REQUEST, _TOKEN, _SERVER, b"j" * 32, 0.0)
-        return joining, InvitingSide(_TOKEN.token_id, book, _SECRETS, 7, b"i" * 32, 0.0)
+        return joining, InvitingSide(_TOKEN.token_id, book, _SECRETS, _SERVER, 7, b"i" * 32, 0.0)
 
     def _recorded() -> list[bytes]:
         joining, inviting = _sides()
-        seeds = [b"", b"\x00\x00\x00\x02{}", b"\xff\xff\xff\xff"]
+        deep = b'{"op":"agree","x":' + b"[" * 2000
+        seeds = [b"", b"\x00\x00\x00\x02{}", b"\xff\xff\xff\xff", len(deep).to_bytes(4, "big") + deep]
         for _ in range(3):
             seeds.append(inviting.take_output())
             joining.receive(seeds[-1], WALL)

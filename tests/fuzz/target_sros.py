@@ -1,4 +1,4 @@
-"""Fuzz target: SROS 2's permissions."""
+"""Fuzz target: SROS 2's permissions and policies."""
 
 from __future__ import annotations
 
@@ -20,6 +20,11 @@ SEEDS: list[bytes] = [
     + b"<allow_rule><publish><topics><topic>*</topic><topic>rt/a*b/?</topic>"
     + b"<topic>rq/m/_action/send_goalRequest</topic></topics></publish></allow_rule>"
     + _END,
+    (
+        b"<policy><enclaves><enclave path='/lab/talker'><profiles><profile ns='/x' node='n'><topics publish='ALLOW'>"
+        b"<topic>~/y</topic><topic>z*</topic></topics><services reply='DENY'><service>s</service></services>"
+        b"<actions call='ALLOW'><action>/a</action></actions></profile></profiles></enclave></enclaves></policy>"
+    ),
     b"<!DOCTYPE d [<!ENTITY a 'b'>]><dds>&a;</dds>",
 ]
 

@@ -5,50 +5,25 @@ from __future__ import annotations
 import random
 import socket
 import ssl
-import tempfile
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 import pytest
 
 pytest.importorskip("cryptography")
 
-from cryptography.hazmat.primitives import serialization
-
 from rmpa.core.errors import LocalProtocolError
-from rmpa.runtime.record_layer import Buffer, DataSocket, RecordIncomplete, SecureSocket, TlsHandshake
+from rmpa.runtime.record_layer import RecordIncomplete, SecureSocket, TlsHandshake
 from rmpa.runtime.segments import SegmentedSocket
-from tests.trust.authority import Authority, new_key
+from tests.runtime.secure_pairs import Slow, make_context, make_contexts, secure_pair
+from tests.trust.authority import Authority
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-NOW = datetime.now(UTC).timestamp()
-
-
-def _context(ca: Authority, *, server_side: bool) -> ssl.SSLContext:
-    key = new_key()
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if server_side else ssl.PROTOCOL_TLS_CLIENT)
-    context.minimum_version = ssl.TLSVersion.TLSv1_3
-    context.check_hostname = False
-    context.verify_mode = ssl.CERT_REQUIRED
-    context.load_verify_locations(cadata=ca.certificate)
-    if server_side:
-        context.num_tickets = 0
-    pem = key.private_bytes(
-        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-    )
-    with tempfile.NamedTemporaryFile() as file:
-        file.write(pem + ssl.DER_cert_to_PEM_cert(ca.module("arm", NOW, key)).encode())
-        file.flush()
-        context.load_cert_chain(file.name)
-    return context
+    from collections.abc import Iterator
 
 
 @pytest.fixture(scope="module")
 def contexts() -> tuple[ssl.SSLContext, ssl.SSLContext]:
-    lab = Authority()
-    return _context(lab, server_side=False), _context(lab, server_side=True)
+    return make_contexts()
 
 
 Sockets = tuple[socket.socket, socket.socket]
@@ -65,41 +40,6 @@ def sockets() -> Iterator[Sockets]:
     yield one, other
     one.close()
     other.close()
-
-
-def _shake(contexts: tuple[ssl.SSLContext, ssl.SSLContext]) -> tuple[TlsHandshake, TlsHandshake]:
-    client, server = TlsHandshake(contexts[0], server_side=False), TlsHandshake(contexts[1], server_side=True)
-    client.receive(b"")
-    while not (client.done and server.done):
-        server.receive(client.take_output())
-        client.receive(server.take_output())
-    return client, server
-
-
-def _pair(
-    contexts: tuple[ssl.SSLContext, ssl.SSLContext], one: DataSocket, other: DataSocket
-) -> tuple[SecureSocket, SecureSocket]:
-    client, server = _shake(contexts)
-    return client.secure(one), server.secure(other)
-
-
-class Slow:
-    """A socket that takes and gives only a few bytes a call."""
-
-    def __init__(self, sock: socket.socket, most: int) -> None:
-        self._sock, self._most = sock, most
-
-    def sendmsg(self, buffers: Sequence[Buffer], /) -> int:
-        return self._sock.send(b"".join(buffers)[: self._most])
-
-    def recv_into(self, buffer: memoryview, /) -> int:
-        return self._sock.recv_into(buffer[: self._most])
-
-    def shutdown(self, how: int, /) -> None:
-        self._sock.shutdown(how)
-
-    def close(self) -> None:
-        self._sock.close()
 
 
 def _transfer(sender: SecureSocket, receiver: SecureSocket, messages: list[list[bytes]], room: int) -> bytes:
@@ -128,7 +68,7 @@ def _transfer(sender: SecureSocket, receiver: SecureSocket, messages: list[list[
 
 
 def test_a_message_is_one_record(contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets) -> None:
-    one, other = _pair(contexts, *sockets)
+    one, other = secure_pair(contexts, *sockets)
     assert one.sendmsg((b"h" * 24, memoryview(b"x" * 64))) == 88
     assert not one.pending
     assert len(sockets[1].recv(4096, socket.MSG_PEEK)) == 88 + 22
@@ -141,7 +81,7 @@ def test_a_message_is_one_record(contexts: tuple[ssl.SSLContext, ssl.SSLContext]
 
 
 def test_nothing_is_readable_on_the_way(contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets) -> None:
-    one, _ = _pair(contexts, *sockets)
+    one, _ = secure_pair(contexts, *sockets)
     one.sendmsg((b"a secret text that is long enough",))
     assert b"secret" not in sockets[1].recv(4096)
 
@@ -154,7 +94,7 @@ def test_bytes_survive_slow_sockets_and_small_buffers(
     rng = random.Random(f"{most} {room}")
     sizes = (1, 24, 88, 5000, 16384, 16385, 40000) if min(most, room) > 7 else (1, 24, 88, 500)
     messages = [[rng.randbytes(size)] for size in sizes]
-    one, other = _pair(contexts, Slow(sockets[0], most), Slow(sockets[1], most))
+    one, other = secure_pair(contexts, Slow(sockets[0], most), Slow(sockets[1], most))
     for sender, receiver in ((one, other), (other, one)):
         assert _transfer(sender, receiver, messages, room) == b"".join(part for parts in messages for part in parts)
 
@@ -162,11 +102,11 @@ def test_bytes_survive_slow_sockets_and_small_buffers(
 def test_parts_are_taken_in_order_and_at_most_so_many(
     contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets
 ) -> None:
-    one, other = _pair(contexts, *sockets)
+    one, other = secure_pair(contexts, *sockets)
     parts = [bytes([n]) * size for n, size in enumerate((24, 100_000, 24, 16_000, 3, 200_000))]
     whole = b"".join(parts)
     taken = one.sendmsg(parts)
-    assert taken == 256 * 1024
+    assert taken == 128 * 1024
     got, view = bytearray(), memoryview(bytearray(65536))
     while len(got) < taken:
         if one.pending:
@@ -181,7 +121,7 @@ def test_parts_are_taken_in_order_and_at_most_so_many(
 def test_a_peer_that_does_not_read_is_not_written_to(
     contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets
 ) -> None:
-    one, _ = _pair(contexts, *sockets)
+    one, _ = secure_pair(contexts, *sockets)
     taken = 0
     while not one.pending:
         taken += one.sendmsg((bytes(65536),))
@@ -192,7 +132,7 @@ def test_a_peer_that_does_not_read_is_not_written_to(
 
 
 def test_what_epoll_does_not_see_is_said(contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets) -> None:
-    one, other = _pair(contexts, *sockets)
+    one, other = secure_pair(contexts, *sockets)
     one.sendmsg((b"x" * 1000,))
     view = memoryview(bytearray(400))
     assert other.recv_into(view) == 400
@@ -205,7 +145,7 @@ def test_what_epoll_does_not_see_is_said(contexts: tuple[ssl.SSLContext, ssl.SSL
 def test_a_part_of_a_record_is_a_sign_of_life(
     contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets
 ) -> None:
-    one, other = _pair(contexts, Slow(sockets[0], 10), sockets[1])
+    one, other = secure_pair(contexts, Slow(sockets[0], 10), sockets[1])
     one.sendmsg((b"x" * 100,))
     view = memoryview(bytearray(4096))
     with pytest.raises(RecordIncomplete):
@@ -216,7 +156,7 @@ def test_a_part_of_a_record_is_a_sign_of_life(
 
 
 def test_the_end_is_the_end(contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets) -> None:
-    one, other = _pair(contexts, *sockets)
+    one, other = secure_pair(contexts, *sockets)
     one.sendmsg((b"bye",))
     one.shutdown(socket.SHUT_WR)
     view = memoryview(bytearray(100))
@@ -227,8 +167,25 @@ def test_the_end_is_the_end(contexts: tuple[ssl.SSLContext, ssl.SSLContext], soc
     assert one.recv_into(view) == 10
 
 
+@pytest.mark.parametrize("room", [3, 100])
+@pytest.mark.parametrize("before", [b"", b"bye"])
+def test_what_follows_the_end_is_not_read(
+    contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets, before: bytes, room: int
+) -> None:
+    one, other = secure_pair(contexts, *sockets)
+    if before:
+        one.sendmsg((before,))
+    with pytest.raises(ssl.SSLError):
+        one._tls.unwrap()
+    sockets[0].send(one._outgoing.read() + bytes(500))
+    view = memoryview(bytearray(room))
+    if before:
+        assert other.recv_into(view) == len(before)
+    assert other.recv_into(view) == 0
+
+
 def test_an_end_in_the_middle_is_the_end(contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets) -> None:
-    one, other = _pair(contexts, Slow(sockets[0], 10), sockets[1])
+    one, other = secure_pair(contexts, Slow(sockets[0], 10), sockets[1])
     one.sendmsg((b"x" * 100,))
     one.close()
     view = memoryview(bytearray(100))
@@ -238,21 +195,21 @@ def test_an_end_in_the_middle_is_the_end(contexts: tuple[ssl.SSLContext, ssl.SSL
 
 
 def test_changed_bytes_end_the_connection(contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets) -> None:
-    _, other = _pair(contexts, *sockets)
+    _, other = secure_pair(contexts, *sockets)
     sockets[0].send(b"\x17\x03\x03\x00\x20" + bytes(32))
     with pytest.raises(ssl.SSLError):
         other.recv_into(memoryview(bytearray(100)))
 
 
 def test_plain_bytes_end_the_connection(contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets) -> None:
-    _, other = _pair(contexts, *sockets)
+    _, other = secure_pair(contexts, *sockets)
     sockets[0].send(bytes(100))
     with pytest.raises(ssl.SSLError):
         other.recv_into(memoryview(bytearray(100)))
 
 
 def test_small_packets_below(contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets) -> None:
-    one, other = _pair(contexts, SegmentedSocket(sockets[0], 512), SegmentedSocket(sockets[1], 512))
+    one, other = secure_pair(contexts, SegmentedSocket(sockets[0], 512), SegmentedSocket(sockets[1], 512))
     message = random.Random(7).randbytes(100_000)
     assert _transfer(one, other, [[message]], 65536) == message
 
@@ -280,7 +237,7 @@ def test_bytes_behind_the_handshake_are_read_first(
 
 
 def test_a_foreign_ca_is_told_to_the_other_side(contexts: tuple[ssl.SSLContext, ssl.SSLContext]) -> None:
-    foreign = _context(Authority(), server_side=False)
+    foreign = make_context(Authority(), server_side=False)
     client, server = TlsHandshake(foreign, server_side=False), TlsHandshake(contexts[1], server_side=True)
     client.receive(b"")
     server.receive(client.take_output())

@@ -69,6 +69,13 @@ def test_a_certificate_says_what_openssl_needs() -> None:
     assert names.get_values_for_type(x509.UniformResourceIdentifier) == ["urn:rmpa:arm"]
 
 
+def test_browsers_find_the_hosts_that_follow_from_the_modules_name() -> None:
+    certificate = x509.load_der_x509_certificate(LAB.module("left_Arm"))
+    names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert names.get_values_for_type(x509.DNSName) == ["left-arm", "left-arm.local", "localhost"]
+    assert [str(each) for each in names.get_values_for_type(x509.IPAddress)] == ["127.0.0.1"]
+
+
 def test_tls_accepts_members_and_refuses_others(tmp_path: object) -> None:
     assert _tls(LAB, LAB) == ("", "")
     here, there = _tls(LAB, OTHER)
@@ -100,7 +107,7 @@ def _tls(server_ca: Authority, client_ca: Authority) -> tuple[str, str]:
                 continue
             except ssl.SSLError as error:
                 return (error.reason or "", "") if end is client else ("", error.reason or "")
-    assert client.getpeercert()["subjectAltName"] == (("URI", "urn:rmpa:arm"),)  # type: ignore[index] # there is one
+    assert client.getpeercert()["subjectAltName"][0] == ("URI", "urn:rmpa:arm")  # type: ignore[index] # there is one
     return "", ""
 
 

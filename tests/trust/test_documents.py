@@ -29,7 +29,7 @@ from tests.trust.authority import WALL, Authority, new_key
 LAB = Authority()
 PUBLIC = LAB.key.public_key()
 DENY = DenyList(7, (DenyEntry("arm", 1_790_000_000), DenyEntry("base", 5)))
-KEYS = KeyList.of(3, [GroupKey(2, b"a" * 32), GroupKey(3, b"b" * 32)])
+KEYS = KeyList.of(3, [GroupKey(2, b"a" * 32), GroupKey(3, b"b" * 32)], "base")
 
 
 def _signed(text: str, label: bytes = b"rmpa deny 1", key: ec.EllipticCurvePrivateKey = LAB.key) -> bytes:
@@ -50,6 +50,10 @@ def test_the_text_is_golden() -> None:
     )
     assert set(envelope) == {"signed", "signature"}
     assert read_deny_list(_signed(envelope["signed"]), PUBLIC) == DENY
+    assert msgspec.json.decode(sign(KEYS, LAB.key))["signed"] == (
+        '{"number":3,"keys":[{"number":2,"key":"YWFhYWFhYWFhYWFhYWFhYWFhYWFhYWFhYWFhYWFhYWE="},'
+        '{"number":3,"key":"YmJiYmJiYmJiYmJiYmJiYmJiYmJiYmJiYmJiYmJiYmI="}],"authority":"base"}'
+    )
 
 
 def test_keys_of_later_versions_are_ignored() -> None:
@@ -109,6 +113,11 @@ def test_key_lists_that_cannot_be_are_refused(keys: str) -> None:
         read_key_list(_signed('{"number":1,"keys":' + keys + "}", b"rmpa keys 1"), PUBLIC)
 
 
+def test_an_authority_with_a_name_that_cannot_be_is_refused() -> None:
+    with pytest.raises(DocumentError, match="not a ROS base name"):
+        read_key_list(sign(KeyList.of(3, KEYS.group_keys, "my base"), LAB.key), PUBLIC)
+
+
 def test_long_documents_are_refused_before_they_are_read() -> None:
     with pytest.raises(LimitExceeded):
         read_deny_list(b" " * (limits.DOCUMENT_MAX + 1), PUBLIC)
@@ -131,6 +140,7 @@ def test_revoking_counts_up_and_replaces() -> None:
     assert twice.denies("arm", 200.0)
     assert not twice.denies("arm", 201.0)
     assert not twice.denies("base", 100.0)
+    assert twice.with_name("arm", 150.0).denies("arm", 200.0)  # the clock went back
     with pytest.raises(ValueError, match="not a ROS base name"):
         once.with_name("my arm", 1.0)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from ipaddress import IPv4Address
 from typing import TYPE_CHECKING
 
@@ -18,7 +18,7 @@ from rmpa.core.errors import LocalProtocolError
 from rmpa.trust import limits
 from rmpa.trust.certificates import make_request, verify
 from rmpa.trust.documents import DenyList, KeyList, read_deny_list, read_key_list, sign
-from rmpa.trust.join import CodeShown, InvitingSide, Joined, JoiningSide, JoinRefused, MeshSecrets
+from rmpa.trust.join import CodeShown, InvitingSide, Joined, JoiningSide, JoinRefused, MeshSecrets, proof_of
 from rmpa.trust.keyring import GroupKey
 from rmpa.trust.tokens import Token, TokenBook, fingerprint_of
 from tests.fuzz import target_join
@@ -48,14 +48,26 @@ class Pair:
     server: bytes = SERVER
     request: bytes = REQUEST
     taken: str = ""
+    secret: bytes = b""
+    """Of the token that the joining side signs with, if it is another one."""
+    session: bytes = b""
+    """The certificate of the authority, if the joining side sees another one."""
 
     def __post_init__(self) -> None:
         self.book = TokenBook()
         self.book.invite(self.token, self.name)
-        self.joining = JoiningSide("arm", self.request, self.token, self.server, b"j" * 32, 0.0)
+        token = replace(self.token, secret=self.secret or self.token.secret)
+        self.joining = JoiningSide("arm", self.request, token, self.server, b"j" * 32, 0.0)
         secrets = MeshSecrets(LAB.certificate, LAB.key, KEYS, DENY)
         self.inviting = InvitingSide(
-            self.token.token_id, self.book, secrets, 77, b"i" * 32, 0.0, lambda name: name == self.taken
+            self.token.token_id,
+            self.book,
+            secrets,
+            self.session or self.server,
+            77,
+            b"i" * 32,
+            0.0,
+            lambda name: name == self.taken,
         )
         self.seen: list[tuple[str, JoinEvent]] = []
 
@@ -159,11 +171,31 @@ def test_a_token_is_good_for_one_attempt() -> None:
         (Pair(token=_token(OTHER)), "foreign"),
         (Pair(server=OTHER.module("base")), "foreign"),
         (Pair(server=b"nonsense"), "foreign"),
+        (Pair(secret=b"x" * 16), "token"),  # it has the preface alone
+        (Pair(session=LAB.module("arm2")), "token"),  # a member is in the middle
     ],
 )
 def test_each_refusal_has_its_reason_at_both_sides(pair: Pair, reason: str) -> None:
     pair.run()
     assert pair.reasons() == (reason, reason)
+
+
+@pytest.mark.parametrize("part", ["request", "commitment", "proof"])
+def test_no_part_of_a_hello_can_be_exchanged(part: str) -> None:
+    pair = Pair()
+    pair.joining.receive(pair.inviting.take_output(), WALL)
+    hello = msgspec.json.decode(pair.joining.take_output()[4:])
+    other = {"request": make_request(new_key(), "arm"), "commitment": b"x" * 32, "proof": b"x" * 32}
+    pair.inviting.receive(_message(hello | {part: msgspec.to_builtins(other[part])}), WALL)
+    end = pair.inviting.events()[-1]
+    assert isinstance(end, JoinRefused)
+    assert end.reason == "token"
+    assert not pair.book.invitations[0].used_by  # the right module can still join with it
+
+
+def test_the_proof_is_golden() -> None:
+    proof = proof_of(b"k" * 32, b"request", b"c" * 32, b"server")
+    assert proof.hex() == "b46242e61c03ed5eb3efb00c34dbebb4f0b3b6cc9b1d437b1f611460cb383f26"
 
 
 def test_an_unknown_token_is_refused() -> None:
@@ -211,6 +243,7 @@ def _message(value: object) -> bytes:
         _message({"op": "agree"}),
         _message({"op": "reveal", "nonce": "AAAA"}),
         _message({"op": "hello", "request": "AAAA", "commitment": "AAAA"}),
+        _message({"op": "hello", "request": "AAAA", "commitment": "AAAA", "proof": "AAAA"}),
         _message({"op": "grant", "certificate": "", "keys": ""}),
         _message({"op": "unknown"}),
         _message([]),

@@ -165,6 +165,55 @@ def test_a_module_that_was_away_is_recognised_at_a_low_rate() -> None:
     assert _verify(verifier, later, now=NOW + 1).verdict is Verdict.OLD_KEY
 
 
+def _numbered(signer: PacketSigner, number: int) -> bytes:
+    """A packet of this number, which a module with the group key can make for any run."""
+    signer._number = number - 1
+    return signer.sign(BEACON, KeyPurpose.BEACON, NOW, WALL)
+
+
+def test_a_revoked_module_cannot_silence_the_run_of_a_member() -> None:
+    """It has the key before, which verifies for an hour and then only recognises, and claims the highest number."""
+    revoked, present = KeyRing([KEY], 0.0), KeyRing([KEY], 0.0)
+    following = GroupKey(4, b"k" * 32)
+    present.add(following, 0.0)
+    member, verifier = PacketSigner(present), PacketVerifier(present)
+    for now in (limits.KEY_SPREAD, limits.KEY_SPREAD + limits.KEY_OVERLAP + 1):
+        forged = _numbered(PacketSigner(revoked), (1 << 64) - 1 - int(now))
+        assert _verify(verifier, forged, now=now).verdict in {Verdict.ACCEPTED, Verdict.OLD_KEY}
+        signed = member.sign(BEACON, KeyPurpose.BEACON, now, WALL)
+        assert _verify(verifier, signed, now=now).verdict is Verdict.ACCEPTED
+
+
+def test_a_member_cannot_silence_another_run_by_one_packet() -> None:
+    verifier, member = _verifier(), _signer()
+    assert _verify(verifier, _numbered(member, 1)).verdict is Verdict.ACCEPTED
+    assert _verify(verifier, _numbered(_signer(), (1 << 64) - 1)).verdict is Verdict.LEAP
+    assert _verify(verifier, _numbered(member, 2)).verdict is Verdict.ACCEPTED
+
+
+def test_packets_with_old_keys_push_no_run_out() -> None:
+    verifier = PacketVerifier(KeyRing([KEY, GroupKey(4, b"k" * 32)], 0.0))
+    fresh = _signer(GroupKey(4, b"k" * 32)).sign(BEACON, KeyPurpose.BEACON, NOW, WALL)
+    assert _verify(verifier, fresh).verdict is Verdict.ACCEPTED
+    for number in range(limits.RUNS_MAX):
+        run = number.to_bytes(len(BEACON), "little")
+        old = _signer(KEY).sign(run, KeyPurpose.BEACON, NOW, WALL)
+        verifier.verify(old, KeyPurpose.BEACON, (0, 16), NOW + number, WALL)
+    assert _verify(verifier, fresh).verdict is Verdict.REPEATED
+
+
+def test_old_packets_take_nothing_from_modules_that_were_away() -> None:
+    """Repeated, or with an old time, by something without any key."""
+    verifier = PacketVerifier(KeyRing([KEY, GroupKey(4, b"k" * 32)], 0.0))
+    away = _signer(KEY)
+    first = away.sign(BEACON, KeyPurpose.BEACON, NOW, WALL)
+    assert _verify(verifier, first).verdict is Verdict.OLD_KEY
+    for _ in range(20):
+        assert _verify(verifier, first).verdict is Verdict.REPEATED
+        assert _verify(verifier, first, WALL + 60).verdict is Verdict.CLOCK
+    assert _verify(verifier, away.sign(BEACON, KeyPurpose.BEACON, NOW, WALL)).verdict is Verdict.OLD_KEY
+
+
 def test_the_number_is_of_the_run_not_of_the_purpose() -> None:
     signer = _signer()
     beacon = signer.sign(BEACON, KeyPurpose.BEACON, NOW, WALL)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import hmac
 
@@ -137,13 +138,48 @@ def test_old_keys_are_admitted_at_a_low_rate() -> None:
     guard.admit(_link(100), NOW + 1, WALL)
 
 
+def test_old_keys_of_one_address_take_nothing_from_others() -> None:
+    """Nor do prefaces that are sent again, or late, by something without any key."""
+    guard = _guard(KEY, GroupKey(4, b"n" * 32))
+    guard.admit(_link(0), NOW, WALL, "10.0.0.9")
+    for _ in range(100):
+        with pytest.raises(PrefaceError, match="came before"):
+            guard.admit(_link(0), NOW, WALL, "10.0.0.2")
+        with pytest.raises(PrefaceError, match="clock"):
+            guard.admit(_link(1), NOW, WALL + 60, "10.0.0.2")
+    for nonce in range(100, 200):
+        with contextlib.suppress(PrefaceError):
+            guard.admit(_link(nonce), NOW, WALL, "10.0.0.9")
+    guard.admit(_link(2), NOW, WALL, "10.0.0.2")
+
+
+def test_old_keys_are_bounded_over_all_addresses() -> None:
+    guard = _guard(KEY, GroupKey(4, b"n" * 32))
+    admitted = 0
+    for nonce in range(3 * limits.OLD_KEYS_MAX):
+        with contextlib.suppress(PrefaceError):
+            guard.admit(_link(nonce), NOW, WALL, f"10.0.{nonce // 256}.{nonce % 256}")
+            admitted += 1
+    assert admitted == limits.OLD_KEY_DIALS_RATE
+    assert len(guard._old_keys_there) == limits.OLD_KEYS_MAX
+
+
 def test_nonces_are_bounded_and_forgotten() -> None:
     guard = _guard()
     for nonce in range(limits.NONCES_MAX):
-        guard.admit(_link(nonce), NOW, WALL)
+        guard.admit(_link(nonce), NOW, WALL, f"10.0.0.{nonce % 9}")
     assert _refused(guard, _link(limits.NONCES_MAX)) is TrustReason.FLOOD
     guard.admit(_link(limits.NONCES_MAX), NOW + limits.NONCE_KEPT, WALL)
     assert len(guard._nonces) == 1
+    assert guard._nonces_there.total() == len(guard._nonces_there) == 1
+
+
+def test_one_address_leaves_places_to_others() -> None:
+    guard = _guard()
+    for nonce in range(limits.NONCES_MAX):
+        with contextlib.suppress(PrefaceError):
+            guard.admit(_link(nonce), NOW, WALL, "10.0.0.9")
+    guard.admit(_link(limits.NONCES_MAX), NOW, WALL, "10.0.0.2")
 
 
 def test_refused_prefaces_leave_no_nonce() -> None:

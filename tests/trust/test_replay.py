@@ -8,12 +8,13 @@ from hypothesis import strategies as st
 from rmpa.trust import limits
 from rmpa.trust.replay import Freshness, ReplayWindow
 
-RUN = bytes(16)
+RUN = (1, bytes(16))
+NOW = 5.0
 
 
 def test_each_number_is_new_once() -> None:
     window = ReplayWindow()
-    assert [window.take(RUN, n) for n in (1, 2, 2, 1, 5, 3)] == [
+    assert [window.take(RUN, n, NOW) for n in (1, 2, 2, 1, 5, 3)] == [
         Freshness.NEW,
         Freshness.NEW,
         Freshness.REPEATED,
@@ -25,33 +26,54 @@ def test_each_number_is_new_once() -> None:
 
 def test_what_is_behind_the_window_is_stale() -> None:
     window = ReplayWindow()
-    window.take(RUN, 1000)
-    assert window.take(RUN, 1001 - limits.REPLAY_WINDOW) is Freshness.NEW
-    assert window.take(RUN, 1000 - limits.REPLAY_WINDOW) is Freshness.STALE
-    assert window.take(RUN, 0) is Freshness.STALE
+    window.take(RUN, 1000, NOW)
+    assert window.take(RUN, 1001 - limits.REPLAY_WINDOW, NOW) is Freshness.NEW
+    assert window.take(RUN, 1000 - limits.REPLAY_WINDOW, NOW) is Freshness.STALE
+    assert window.take(RUN, 0, NOW) is Freshness.STALE
 
 
 def test_zero_is_never_new() -> None:
-    assert ReplayWindow().take(RUN, 0) is Freshness.STALE
+    assert ReplayWindow().take(RUN, 0, NOW) is Freshness.STALE
 
 
 def test_the_highest_number_leaves_nothing_above_it() -> None:
     window = ReplayWindow()
-    assert window.take(RUN, (1 << 64) - 1) is Freshness.NEW
-    assert window.take(RUN, (1 << 64) - 1) is Freshness.REPEATED
-    assert window.take(RUN, 1) is Freshness.STALE
+    assert window.take(RUN, (1 << 64) - 1, NOW) is Freshness.NEW
+    assert window.take(RUN, (1 << 64) - 1, NOW) is Freshness.REPEATED
+    assert window.take(RUN, 1, NOW) is Freshness.STALE
+
+
+def test_a_leap_is_refused_and_leaves_nothing_behind() -> None:
+    window = ReplayWindow()
+    window.take(RUN, 10, NOW)
+    assert window.take(RUN, (1 << 64) - 1, NOW) is Freshness.LEAP
+    assert window.take(RUN, 11 + limits.REPLAY_LEAP, NOW) is Freshness.LEAP
+    assert window.take(RUN, 11, NOW) is Freshness.NEW
+    assert window.take(RUN, 11 + limits.REPLAY_LEAP, NOW) is Freshness.NEW
+
+
+def test_a_run_that_was_out_of_reach_for_days_is_heard_again() -> None:
+    window, days = ReplayWindow(), 3 * 86_400
+    window.take(RUN, 1, NOW)
+    assert window.take(RUN, 600 * days, NOW + days) is Freshness.NEW
+
+
+def test_each_group_key_has_numbers_of_its_own() -> None:
+    window = ReplayWindow()
+    assert window.take((1, RUN[1]), (1 << 64) - 1, NOW) is Freshness.NEW
+    assert window.take((2, RUN[1]), 7, NOW) is Freshness.NEW
 
 
 def test_runs_are_apart_and_the_silent_one_is_forgotten() -> None:
     window = ReplayWindow(2)
-    runs = [bytes([n]) * 16 for n in range(3)]
+    runs = [(1, bytes([n]) * 16) for n in range(3)]
     for run in runs[:2]:
-        assert window.take(run, 7) is Freshness.NEW
-    window.take(runs[0], 8)
-    assert window.take(runs[2], 7) is Freshness.NEW
+        assert window.take(run, 7, NOW) is Freshness.NEW
+    window.take(runs[0], 8, NOW)
+    assert window.take(runs[2], 7, NOW) is Freshness.NEW
     assert len(window) == 2
-    assert window.take(runs[0], 8) is Freshness.REPEATED
-    assert window.take(runs[1], 7) is Freshness.NEW  # it was forgotten
+    assert window.take(runs[0], 8, NOW) is Freshness.REPEATED
+    assert window.take(runs[1], 7, NOW) is Freshness.NEW  # it was forgotten
 
 
 @given(st.lists(st.integers(1, 200), max_size=100))
@@ -63,4 +85,4 @@ def test_beside_a_model(numbers: list[int]) -> None:
         else:
             expected = Freshness.REPEATED if number in seen else Freshness.NEW
             seen.add(number)
-        assert window.take(RUN, number) is expected
+        assert window.take(RUN, number, NOW) is expected

@@ -14,7 +14,10 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.agent.core_choice import make_core
 from rmpa.agent.network import Network
+from rmpa.agent.permission_notes import permission_notes
 from rmpa.agent.reload import Reloader, SighupHandler
+from rmpa.agent.trust import AgentTrust, open_membership
+from rmpa.agent.trust_operations import PlainOperations, TrustOperations
 from rmpa.agent.web_process import WebProcess, web_command, web_environment
 from rmpa.bridge.io.bridge import Bridge
 from rmpa.bridge.io.limit_reports import LimitReports
@@ -27,11 +30,13 @@ from rmpa.bridge.services.rules import ServiceRules
 from rmpa.core.counters import Counters
 from rmpa.core.errors import StartError
 from rmpa.core.open_files import remedy
+from rmpa.observe.io.agent_requests import AgentRequests
 from rmpa.observe.io.control_operations import ControlOperations
 from rmpa.observe.io.control_server import ControlServer
 from rmpa.observe.io.diagnostics import Diagnostics
 from rmpa.observe.io.graph_revision import GraphRevisions
 from rmpa.observe.io.peer_clocks import PeerClocks
+from rmpa.observe.io.peer_credentials import control_access
 from rmpa.observe.io.runtime_dir import runtime_dir
 from rmpa.observe.io.snapshot_builder import SnapshotBuilder, SnapshotSources
 from rmpa.observe.why.io.why import WhyService
@@ -42,12 +47,15 @@ from rmpa.runtime.descriptors import is_shortage, raise_file_limit
 from rmpa.runtime.event_loop import AgentLoop
 from rmpa.runtime.garbage_collector import GarbageCollector
 from rmpa.runtime.service_manager import notify_service_manager
+from rmpa.runtime.system_clock import SystemClock
+from rmpa.trust.permissions import Permissions
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator
 
     from rmpa.config.settings import Settings
     from rmpa.config.sources import Loaded
+    from rmpa.core.identity import Identity
     from rmpa.ros.core.api import Core
 
 _log = logging.getLogger(__name__)
@@ -74,6 +82,8 @@ class Agent:
         load: Callable[[], Loaded] | None = None,
     ) -> None:
         self._settings = settings
+        clock = SystemClock()
+        membership = open_membership(settings, clock)
         policy, names = Policy(settings.policy, settings.peers, settings.time), Names(settings.peers)
         self.core: Core = make_core(settings)
         self.bridge = Bridge(
@@ -84,6 +94,7 @@ class Agent:
             names=names,
             relay=settings.relay,
             limit_settings=settings.limits,
+            permissions=Permissions(settings.trust) if membership is not None else None,
         )
         self.params = Params(
             self.core,
@@ -94,6 +105,7 @@ class Agent:
             settings.params,
             settings.time,
             settings.limits.params,
+            self.bridge.gate,
         )
         rules = ServiceRules(settings.services, policy, names)
         self.services = Services(
@@ -104,14 +116,22 @@ class Agent:
             rules,
             settings.limits,
             self.bridge.counters,
+            self.bridge.gate,
         )
         reports = LimitReports(
             self.bridge.sessions, self.bridge.rpc, self.bridge.topics, self.services, settings.limits
         )
         for part in (self.params, self.services, reports):
             self.bridge.add(part)
-        self.network = Network(settings, self.bridge)
+        self.trust: AgentTrust | None = None
+        """This module's part in a secured mesh; ``None``: trust is off."""
+        if membership is not None:
+            self.trust = AgentTrust(membership, self.bridge, clock, random.random)
+            self.bridge.add(self.trust)
+        self.network = Network(settings, self.bridge, self.trust)
         self.reloader = Reloader(settings, load, self.apply_settings)
+        self.reloaded: Callable[[], None] = lambda: None
+        """Called when changed settings hold."""
         counters = Counters()
         self._collector = GarbageCollector(self._bytes_carried, counters)
         self._clocks = PeerClocks(self.bridge)
@@ -126,9 +146,11 @@ class Agent:
             notes=self._notes,
             started=time.time(),
             requests=requests,
+            trust=self.trust.status if self.trust is not None else lambda: None,
         )
         self.snapshots = SnapshotBuilder(settings, sources)
-        self._nodes = NodeRequests(settings, self.core, self.bridge.rpc)
+        self._nodes = NodeRequests(settings, self.core, self.bridge.rpc, self.bridge.gate)
+        AgentRequests(self.bridge.rpc, self.snapshots)
         self._why = WhyService(settings, self.core, self.bridge, self.services, self.snapshots)
         self.operations = ControlOperations(
             settings.name,
@@ -137,13 +159,16 @@ class Agent:
             self.snapshots,
             self._why,
             self.reloader.reload,
-            GraphRevisions(self.core),
+            GraphRevisions(self.core, rows=settings.core_mode == "embedded"),
+            self._trust_operations(),
+            self._nodes,
         )
         self._control = ControlServer(
             runtime_dir(os.environ, settings.runtime_dir),
             settings.name,
             self.operations.handlers(),
             counters=counters,
+            access=control_access(settings.control_group),
         )
 
     async def start(self) -> None:
@@ -152,6 +177,8 @@ class Agent:
         Raises:
             StartError: The name, the core's port or the mesh's port is taken.
         """
+        for note in permission_notes(self._settings, secured=self.bridge.gate.on):
+            _log.warning("! %s", note)
         async with contextlib.AsyncExitStack() as undo:
             self._control.lock()
             undo.push_async_callback(self._control.close)
@@ -174,6 +201,14 @@ class Agent:
             self._undo = undo.pop_all()
         _log.info("= ROS_MASTER_URI=%s", self.core.uri)
 
+    def _trust_operations(self) -> PlainOperations | TrustOperations:
+        if self.trust is None:
+            return PlainOperations(self._settings)
+        return TrustOperations(self.trust, self.bridge, self._identity)
+
+    def _identity(self) -> Identity | None:
+        return self.network.endpoint.identity if self.network.endpoint is not None else None
+
     async def close(self) -> None:
         """Close every part: the goodbye comes first, then the proxies leave the local graph, the core is last."""
         await self._undo.aclose()
@@ -185,6 +220,9 @@ class Agent:
     def _notes(self) -> Iterator[str]:
         yield from (f"{key} waits for a restart" for key in self.reloader.waiting)
         yield from self.params.notes()
+        yield from permission_notes(self._settings, secured=self.bridge.gate.on)
+        if self.trust is not None:
+            yield from self.trust.notes()
 
     def apply_settings(self, settings: Settings) -> None:
         """Take settings that were read again; only those of ``agent.reload.LIVE`` differ."""
@@ -192,6 +230,7 @@ class Agent:
         logging.getLogger().setLevel(settings.log_level.upper())
         for part in (self.bridge, self.snapshots, self._why, self._nodes):
             part.reload(settings)
+        self.reloaded()
 
 
 async def _serve(
@@ -208,6 +247,7 @@ async def _serve(
         loop.add_signal_handler(number, stop.set)
     sighup = SighupHandler(agent.reloader, stop.set)
     web = WebProcess(web_command(settings), random.random, environ=web_environment(settings, os.environ), cpus=cpus)
+    agent.reloaded = web.reload
     await agent.start()
     sighup.start()
     if settings.web.enabled:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from ipaddress import IPv4Address
 
+    from rmpa.agent.trust import AgentTrust
     from rmpa.bridge.io.bridge import Bridge
     from rmpa.config.settings import Settings
     from rmpa.discovery.events import Event
@@ -48,12 +49,21 @@ class NetworkEndpoint:
         bridge: Gets links, their messages and their end.
         port: The mesh port; 0 lets the system choose.
         on_displaced: Called when the machine has lost the address in the GUID.
+        trust: This module's part in a secured mesh; ``None``: trust is off.
 
     Raises:
         StartError: The port cannot be bound.
     """
 
-    def __init__(self, settings: Settings, bridge: Bridge, *, port: int, on_displaced: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        bridge: Bridge,
+        *,
+        port: int,
+        on_displaced: Callable[[], None],
+        trust: AgentTrust | None = None,
+    ) -> None:
         clock = SystemClock()
         self._settings = settings
         self._bridge = bridge
@@ -82,9 +92,17 @@ class NetworkEndpoint:
             handlers=LinkHandlers(receiver.data, receiver.part, receiver.mark, sessions.clock, sessions.lane_lost),
             lanes=settings.lanes,
             clock=clock,
+            security=trust.membership if trust is not None else None,
+            on_join=trust.on_join if trust is not None else None,
         )
         self.discovery = Discovery(
-            self.identity, settings, udp, on_event=self._event, on_interfaces=self._interfaces, clock=clock
+            self.identity,
+            settings,
+            udp,
+            on_event=self._event,
+            on_interfaces=self._interfaces,
+            clock=clock,
+            trust=trust.membership.packets if trust is not None else None,
         )
         self._udp = udp
 
@@ -141,11 +159,13 @@ class Network:
     Args:
         settings: The agent's settings.
         bridge: Its bridge.
+        trust: This module's part in a secured mesh; ``None``: trust is off.
     """
 
-    def __init__(self, settings: Settings, bridge: Bridge) -> None:
+    def __init__(self, settings: Settings, bridge: Bridge, trust: AgentTrust | None = None) -> None:
         self._settings = settings
         self._bridge = bridge
+        self._trust = trust
         self._moving: asyncio.Task[None] | None = None
         self.endpoint: NetworkEndpoint | None = None
         """The place now; ``None`` before the start, and while the agent moves."""
@@ -157,6 +177,9 @@ class Network:
             StartError: The mesh's port is taken.
         """
         await self._join(self._settings.port)
+        if self._trust is None and self.endpoint is not None:
+            text = "! trust is off: every program that reaches port %d may join this mesh; rmpa trust init"
+            _log.warning(text, self.endpoint.port)
 
     async def close(self) -> None:
         """Leave the network."""
@@ -165,7 +188,9 @@ class Network:
         await self._leave()
 
     async def _join(self, port: int) -> None:
-        self.endpoint = NetworkEndpoint(self._settings, self._bridge, port=port, on_displaced=self._displaced)
+        self.endpoint = NetworkEndpoint(
+            self._settings, self._bridge, port=port, on_displaced=self._displaced, trust=self._trust
+        )
         await self.endpoint.start()
 
     async def _leave(self) -> None:

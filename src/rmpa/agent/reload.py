@@ -8,7 +8,7 @@ import os
 import signal
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.config.settings import SETTINGS
 from rmpa.core.errors import ConfigError
@@ -87,11 +87,8 @@ class Reloader:
         )
 
     def _take(self, settings: Settings, reply: ReloadReply) -> None:
-        self._settings = replace(
-            self._settings,
-            config_file=settings.config_file,
-            **{name: getattr(settings, name) for name in LIVE},
-        )
+        tables = {name: _taken(name, getattr(self._settings, name), getattr(settings, name)) for name in LIVE}
+        self._settings = replace(self._settings, config_file=settings.config_file, **tables)
         self.waiting = reply.restart
         if reply.changed:
             self._apply(self._settings)
@@ -164,6 +161,12 @@ def _differences(old: Settings, new: Settings) -> Iterator[tuple[Setting, object
         before, after = setting.value_in(old), setting.value_in(new)
         if before != after:
             yield setting, before, after
+
+
+def _taken(name: str, old: Any, new: Any) -> Any:
+    """A field of ``Settings`` as it holds from now on: of a table, what is not live stays as it was."""
+    kept = [setting.path[1] for setting in SETTINGS if setting.path[0] == name and not setting.live]
+    return replace(new, **{key: getattr(old, key) for key in kept}) if kept else new
 
 
 def _shown(value: object) -> str:

@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import logging
 import os
+import signal
 import subprocess
 import sys
 from typing import TYPE_CHECKING, Final
@@ -73,6 +74,12 @@ class WebProcess:
     def start(self) -> None:
         """Start the child, and look after it until ``close()``."""
         self._task = asyncio.create_task(self._supervise(), name="rmpa web")
+
+    def reload(self) -> None:
+        """Have the child read its tokens and rules again; one that is not there reads them when it starts."""
+        if self.pid is not None:
+            with contextlib.suppress(OSError):
+                os.kill(self.pid, signal.SIGHUP)
 
     async def close(self) -> None:
         """End the child, and wait until it has ended."""

@@ -183,3 +183,7 @@ DIRECT_LIST_AGAIN: Final = 3.0
 is known up to 1.3 s late, and a call to a busy node may fail."""
 DIRECT_LOOK: Final = 0.02
 """Seconds between two looks while a move waits."""
+
+# --- permissions ----------------------------------------------------------------------------------------------
+REFUSALS_LOGGED: Final = 1024
+"""Refusals (module, kind of access and rule) that are known to be logged; then all are forgotten and logged again."""

@@ -21,7 +21,7 @@ from rmpa.bridge import limits
 from rmpa.bridge.messages import Origin
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from rmpa.bridge.messages import Source
     from rmpa.core.guid import Guid
@@ -117,7 +117,7 @@ class _Origin:
     """One module that relays offer.
 
     Args:
-        origin: Its origin in the last offer.
+        origin: Its origin in the last offer of a peer that may relay; in the first offer if there is none.
         ways: By relay: the number of its sources that the relay offers, and the length of the path in relays.
     """
 
@@ -129,9 +129,13 @@ class RelayPaths:
     """The receiving side: selects the path to each module, its own link first, else the best relay.
 
     The best relay has the shortest path; among equal ones, the lowest GUID. All sources of a module use one path.
+
+    Args:
+        may_relay: Whether a peer, by its name, may be a relay at all.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, may_relay: Callable[[str], bool] = lambda _: True) -> None:
+        self._may_relay = may_relay
         self.instance = ""
         """Our own, as 32 hexadecimal digits."""
         self._linked: dict[int, LinkedPeer] = {}
@@ -141,7 +145,7 @@ class RelayPaths:
         """Each module that is reached by a relay, and that relay's name."""
         for instance, known in self._origins.items():
             best = self._best(instance)
-            if best is not None and not self._direct(instance):
+            if best is not None and not self._direct(known.origin):
                 yield known.origin, self._linked[best].name
 
     def __contains__(self, instance: str) -> bool:
@@ -169,7 +173,8 @@ class RelayPaths:
             return False
         before = self._best(origin.instance)
         known = self._origins.setdefault(origin.instance, _Origin(origin))
-        known.origin = origin
+        if self._may_relay(self._linked[peer].name):
+            known.origin = origin
         count, _ = known.ways.get(peer, (0, 0))
         known.ways[peer] = [count + 1, len(origin.path)]
         return self._best(origin.instance) != before
@@ -193,7 +198,7 @@ class RelayPaths:
             return "it is ours, and came back by a relay"
         if self.instance in origin.path:
             return "we passed it on ourselves"
-        if self._direct(origin.instance):
+        if self._direct(origin):
             return f"{origin.name} has a link of its own"
         best = self._best(origin.instance)
         if best is not None and best != peer:
@@ -203,12 +208,16 @@ class RelayPaths:
     def _ours(self, origin: Origin) -> bool:
         return origin.instance == self.instance or self.instance in origin.path
 
-    def _direct(self, instance: str) -> bool:
-        return any(one.instance == instance for one in self._linked.values())
+    def _direct(self, origin: Origin) -> bool:
+        # Every member of a mesh hears the instances of the others, and may claim one; see Identity.is_same_run.
+        return any((one.instance, one.name) == (origin.instance, origin.name) for one in self._linked.values())
 
     def _best(self, instance: str) -> int | None:
         known = self._origins.get(instance)
-        return min(known.ways, key=lambda peer: self._rank(known, peer), default=None) if known is not None else None
+        if known is None:
+            return None
+        ways = (peer for peer in known.ways if self._may_relay(self._linked[peer].name))
+        return min(ways, key=lambda peer: self._rank(known, peer), default=None)
 
     def _rank(self, known: _Origin, peer: int) -> tuple[int, int, int]:
         guid = self._linked[peer].guid

@@ -149,13 +149,25 @@ alarm: Final = _group(
     _RESOURCE,
 )
 trust: Final = _group(
-    "See what other modules may do here.",
+    "Secure the mesh: who may join, and what other modules may do here.",
     {
+        "trust_mesh": {
+            "init": "Make a secured mesh, with this module as its authority.",
+            "status": "Show certificate, keys and deny list; at the authority members and tokens.",
+            "renew": "Renew the certificate now, or the group key of all.",
+            "revoke": "Throw a module out of the mesh, at the authority.",
+            "leave": "Remove this module's keys and certificate.",
+        },
+        "trust_join": {
+            "invite": "Invite a module, at the authority: print a token, compare the code.",
+            "join": "Join a secured mesh with a token, or by files.",
+        },
         "trust": {
             "check": "Say whether a peer may do something here, and by which rule.",
             "import": "Print the rules for the permissions of SROS 2.",
-        }
+        },
     },
+    "\b\nA walk-through, a fleet's provisioning, and what to do when keys are lost: docs/trust.md\n",
 )
 multicast: Final = _group(
     "Send and receive multicast packets by hand.",

@@ -37,7 +37,7 @@ COMMANDS = {
     "profile": (_GROUPS, "See and choose the System Profile of a resource."),
     "context": (_GROUPS, "See and choose the context of a resource."),
     "alarm": (_GROUPS, "See the alarms of resources."),
-    "trust": (_GROUPS, "See what other modules may do here."),
+    "trust": (_GROUPS, "Secure the mesh: who may join, and what other modules may do here."),
     "why": ("rmpa.cli.why", "Say why a topic of a peer does not arrive, and what to do."),
     "doctor": ("rmpa.cli.doctor", "Check this machine: network, clock, rights, ROS environment."),
     "web": ("rmpa.cli.web", "Serve this module's state over HTTP: metrics, REST."),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from rmpa.cli.options import json_option
-from rmpa.cli.output import print_json, printable
+from rmpa.cli.output import print_json, printable, warn
 from rmpa.config.permission_rules import ACTION_CLIENT, ACTION_SERVER, Access
 from rmpa.config.sources import load_settings
 from rmpa.core.errors import ConfigError
@@ -44,11 +44,12 @@ def check(ctx: click.Context, peer: str, what: str, name: str, file: str | None,
         raise ConfigError("PEER", problem)
     if not is_global_name(name):
         raise ConfigError("NAME", f"{name!r} is not a global name", "one looks like /cmd_vel")
-    settings = load_settings({"config": file}, dict(os.environ), host_name=socket.gethostname()).settings
-    permissions = Permissions(settings.trust)
+    loaded = load_settings({"config": file}, dict(os.environ), host_name=socket.gethostname())
+    permissions = Permissions(loaded.settings.trust)
     decisions = [permissions.judge(access, peer, each) for access, each in _asked(what, name)]
     decision = next((each for each in decisions if not each.allowed), decisions[0])
-    _show(decision, permissions.groups_of(peer), as_json=as_json)
+    files = sorted({str(given.path) for given in loaded.given.values() if given.path is not None})
+    _show(decision, permissions.groups_of(peer), files, as_json=as_json)
     ctx.exit(0 if decision.allowed else 1)
 
 
@@ -59,13 +60,14 @@ def _asked(what: str, name: str) -> list[tuple[Access, str]]:
     return [(Access(what), name)]
 
 
-def _show(decision: PermissionDecision, groups: tuple[str, ...], *, as_json: bool) -> None:
+def _show(decision: PermissionDecision, groups: tuple[str, ...], files: list[str], *, as_json: bool) -> None:
     if as_json:
-        print_json(
-            {"allowed": decision.allowed, "rule": decision.rule, "number": decision.number, "groups": list(groups)}
-        )
+        told = {"allowed": decision.allowed, "rule": decision.rule, "number": decision.number}
+        print_json({**told, "groups": list(groups), "files": files})
         return
     click.echo(f"{'yes' if decision.allowed else 'no'}: {printable(decision.rule)}")
+    if not files:
+        warn("no rmpa.toml was found here; --config names the file that rmpa up was started with")
 
 
 @click.command(
@@ -74,7 +76,7 @@ def _show(decision: PermissionDecision, groups: tuple[str, ...], *, as_json: boo
 @click.argument("file", type=click.Path(path_type=Path))
 @json_option
 def import_(file: Path, as_json: bool) -> None:
-    """Print the [[permission]] tables for the grants of a permissions.xml of SROS 2.
+    """Print the [[permission]] tables for a permissions.xml, or policy.xml, of SROS 2.
 
     Put them into the rmpa.toml of the modules that the grants' subject talks to. Comments say what does not fit.
     """

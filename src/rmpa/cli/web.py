@@ -21,7 +21,9 @@ from rmpa.core.errors import ConfigError
 from rmpa.core.log import configure_logging
 
 if TYPE_CHECKING:
-    from rmpa.web.server.process import Address
+    from rmpa.config.settings import Settings
+    from rmpa.config.sources import Loaded
+    from rmpa.web.server.process import Address, WebSetup
 
 _log = logging.getLogger("rmpa.web")
 _LIBRARIES = ("aiohttp", "cbor2", "prometheus_client")
@@ -85,33 +87,52 @@ def web(
     It is a process of its own: the agent does not depend on it. It starts without an agent too, and finds it later.
     """
     _check_libraries()
-    loaded = load_settings({"config": config}, dict(os.environ), host_name=socket.gethostname())
+
+    def read() -> Loaded:
+        return load_settings({"config": config}, dict(os.environ), host_name=socket.gethostname())
+
+    def with_options(given: WebSettings) -> WebSettings:
+        return replace(
+            given,
+            port=given.port if port is None else port,
+            listen=given.listen if listen is None else _host("--listen", listen),
+            token_file=given.token_file if token_file is None else token_file,
+            control=given.control or control,
+            cert=given.cert if cert is None else cert,
+            key=given.key if key is None else key,
+            drive=given.drive or drive,
+            hosts=(*given.hosts, *(_host("--host", name) for name in hosts)),
+        )
+
+    def setup_of(loaded: Loaded) -> WebSetup:
+        return _setup(replace(loaded.settings, web=with_options(loaded.settings.web)), agent)
+
+    loaded = read()
     configure_logging(loaded.settings.log_level, sys.stderr, as_json=loaded.settings.log_json)
     for note in loaded.notes:
         _log.warning("%s", note)
-    given = loaded.settings.web
-    settings = replace(
-        given,
-        port=given.port if port is None else port,
-        listen=given.listen if listen is None else _host("--listen", listen),
-        token_file=given.token_file if token_file is None else token_file,
-        control=given.control or control,
-        cert=given.cert if cert is None else cert,
-        key=given.key if key is None else key,
-        drive=given.drive or drive,
-        hosts=(*given.hosts, *(_host("--host", name) for name in hosts)),
-    )
-    from rmpa.web.server.process import access_of, serve
-
-    module = agent or os.environ.get("RMPA_AGENT") or loaded.settings.name
-    access = access_of(settings, module, os.environ, loaded.settings.state_dir)
+    from rmpa.web.server.process import serve
 
     def announce(address: Address) -> None:
         _announce(address, as_json=as_json)
 
-    contracts = loaded.settings.make_contracts()
-    asyncio.run(serve(settings, access, agent, announce, with_agent=with_agent, contracts=contracts))
+    work = serve(setup_of(loaded), agent, announce, with_agent=with_agent, load=lambda: setup_of(read()))
+    asyncio.run(work)
     return 0
+
+
+def _setup(settings: Settings, agent: str | None) -> WebSetup:
+    from rmpa.runtime.state_dir import state_dir
+    from rmpa.trust.io.store import TrustStore
+    from rmpa.web.server.process import WebSetup, access_of
+    from rmpa.web.server.tls import certificate_files
+
+    module = agent or os.environ.get("RMPA_AGENT") or settings.name
+    state = state_dir(os.environ, settings.state_dir or None)
+    files = certificate_files(settings.web.cert, settings.web.key, state, module)
+    trusted = state is not None and TrustStore(state, module).exists
+    access = access_of(settings.web, module, os.environ, settings.state_dir, settings.web_tokens)
+    return WebSetup(settings, access, files, trusted)
 
 
 def _check_libraries() -> None:
@@ -138,11 +159,13 @@ def _announce(address: Address, *, as_json: bool) -> None:
     if as_json:
         from rmpa.cli.output import print_json
 
-        print_json({"url": address.url, "token_file": address.token_file})
+        print_json({"url": address.url, "token_file": address.token_file, "clients": dict(address.clients)})
     else:
         click.echo(address.url)
         if address.is_new:
             click.echo(f"the token is kept in {address.token_file}; it is not printed again")
         elif address.token_file:
             click.echo(f"clients need the token of {address.token_file}")
+        for name, file in address.clients:
+            click.echo(f"the token of {name} is in {file}")
     sys.stdout.flush()

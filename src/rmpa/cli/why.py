@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import click
 
@@ -29,26 +29,35 @@ Examples:
   rmpa why joystick:/cmd          why /cmd of joystick does not come here
   rmpa why /odom                  every way of /odom, in and out
   rmpa why arm:/move              why the service /move of arm cannot be called here
+  rmpa why --module arm           why the module arm is not linked, or slow
   rmpa why joystick:/cmd --json | jq '.[].stages[-1]'
 """
+
+_WELL: Final = {"service": "it can be called", "module": "it is linked"}
+"""What is said of a thing by its kind when no stage fails."""
 
 
 @click.command(epilog=EPILOG)
 @click.argument("name", metavar="[PEER:]NAME")
 @click.option("-s", "--service", is_flag=True, help="A service is meant, though a topic has that name.")
+@click.option("-m", "--module", is_flag=True, help="NAME is a module: its link is checked.")
 @json_option
 @agent_option
-def why(name: str, service: bool, as_json: bool, agent: str | None) -> int:
-    """Say why a topic of a peer does not arrive here, or a service cannot be called, and what to do.
+def why(name: str, service: bool, module: bool, as_json: bool, agent: str | None) -> int:
+    """Say why a topic of a peer does not arrive here, a service cannot be called, or a module is not linked.
 
     Both agents are asked, stage by stage from the publisher to the reader; messages are watched for a second, and
     a service's server is probed.
     PEER is a name or a GUID. Without PEER every module that publishes the topic is checked, and for one of this
     module's own topics every peer says how it arrives there.
     """
-    wanted = read_name(name)
+    if module:
+        args: dict[str, object] = {"module": name}
+    else:
+        wanted = read_name(name)
+        args = {"name": wanted.name, "peer": wanted.peer, "service": service}
     with ControlClient(choose_agent(os.environ, agent).path, timeout=limits.CONTROL_HANDLER_TIMEOUT) as client:
-        found = client.call("why", tuple[Diagnosis, ...], name=wanted.name, peer=wanted.peer, service=service)
+        found = client.call("why", tuple[Diagnosis, ...], **args)
     if as_json:
         print_json(found)
     else:
@@ -67,14 +76,14 @@ def exit_code(diagnoses: Sequence[Diagnosis]) -> int:
 
 def _lines(diagnosis: Diagnosis) -> list[str]:
     of = f" of {diagnosis.node}" if diagnosis.node else ""
-    way = f" from {diagnosis.peer}" if diagnosis.peer else ""
+    way = f" from {diagnosis.peer}" if diagnosis.peer and diagnosis.kind != "module" else ""
     to = f" to {diagnosis.to}" if diagnosis.to else ""
     lines = [printable(f"{diagnosis.name}{of}{way}{to}:")]
     width = max((len(stage.name) for stage in diagnosis.stages), default=0)
     lines += [_line(stage, width) for stage in diagnosis.stages]
     failed = diagnosis.failed
     if failed is None:
-        lines.append(_paint("it can be called" if diagnosis.kind == "service" else "it flows", OK))
+        lines.append(_paint(_WELL.get(diagnosis.kind, "it flows"), OK))
     else:
         lines.append(_paint(printable(f"it stops at: {failed.name}"), FAIL))
         if failed.remedy:

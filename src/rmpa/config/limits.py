@@ -35,6 +35,8 @@ PERMISSION_RULES_MAX: Final = 4096
 """Tables ``[[permission]]`` in a file; each decision compares a name with all that are about one module."""
 GROUPS_MAX: Final = 256
 """Groups of modules in ``[trust.groups]``: as many as a large network has modules."""
+WEB_TOKENS_MAX: Final = 64
+"""Tables ``[[web_token]]``: each request is compared with the token of each."""
 BOUND_MAX: Final = 1_000_000
 """Highest value of a setting in ``[limits]``: such a graph takes some gigabytes."""
 CPU_MAX: Final = 1023

@@ -112,7 +112,7 @@ def _read_group_name(raw: object) -> str:
     return name
 
 
-_GROUP_NAME: Final = ValueType(_read_group_name, {"type": "string", "examples": ["operators"]})
+GROUP_NAME: Final = ValueType(_read_group_name, {"type": "string", "examples": ["operators"]})
 
 
 def _with_peer(glob: ValueType[str]) -> ValueType[str]:
@@ -156,7 +156,7 @@ _KEYS: Final = (
     ),
     RuleKey(
         "groups",
-        list_of(_GROUP_NAME, if_empty="leave groups out, or name some"),
+        list_of(GROUP_NAME, if_empty="leave groups out, or name some"),
         "The groups of [trust.groups] whose modules it is about, too.",
     ),
     RuleKey(
@@ -199,7 +199,7 @@ def _read_groups(raw: object) -> tuple[ModuleGroup, ...]:
     if len(raw) > limits.GROUPS_MAX:
         raise BadValue(f"{len(raw)} groups", f"at most {limits.GROUPS_MAX}")
     return tuple(
-        ModuleGroup(read_at((name,), _GROUP_NAME.read, name), read_at((name,), _GROUP.read, modules))
+        ModuleGroup(read_at((name,), GROUP_NAME.read, name), read_at((name,), _GROUP.read, modules))
         for name, modules in raw.items()
     )
 

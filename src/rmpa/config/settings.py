@@ -53,6 +53,7 @@ from rmpa.config.values import (
     Multicast,
     list_of,
 )
+from rmpa.config.web_tokens import WEB_TOKENS, WebToken
 from rmpa.core.contract import DEFAULT_TRANSPORT, Contracts, Transport
 
 if TYPE_CHECKING:
@@ -323,6 +324,13 @@ class TrustSettings:
         env="RMPA_TRUST_RELAYS",
         live=True,
     )
+    direct: bool = setting(
+        False,
+        BOOL,
+        "Let nodes connect directly to those of other machines although nothing protects these connections.",
+        env="RMPA_TRUST_DIRECT",
+        live=True,
+    )
     require: bool = setting(
         False, BOOL, "Refuse to start while this module has not joined a secured mesh.", env="RMPA_TRUST_REQUIRE"
     )
@@ -449,6 +457,13 @@ class Settings:
     lanes: LaneSettings = table(LaneSettings, "lanes")
     realtime: RealtimeSettings = table(RealtimeSettings, "realtime")
     web: WebSettings = table(WebSettings, "web")
+    web_tokens: tuple[WebToken, ...] = setting(
+        (),
+        WEB_TOKENS,
+        "Clients of rmpa web with a token and a role of their own.",
+        key="web_token",
+        live=True,
+    )
     trust: TrustSettings = table(TrustSettings, "trust")
     relay: bool = setting(
         False,
@@ -456,6 +471,14 @@ class Settings:
         "Offer what comes from one peer to others that do not reach it themselves.",
         key="relay.enabled",
         env="RMPA_RELAY",
+    )
+    control_group: str = setting(
+        "",
+        TEXT,
+        "A group (its name or number) whose users may use the control socket, besides this user and root.",
+        key="control.group",
+        env="RMPA_CONTROL_GROUP",
+        shown_default="none",
     )
     log_level: str = setting(
         "info",
@@ -520,6 +543,7 @@ TABLES: Final = {
     "web": "Where the module's state is served over HTTP (docs/web.md).",
     "trust": "What the modules of a secured mesh may do here (docs/design/trust.md).",
     "relay": "Whether this module joins networks that are not routed to each other.",
+    "control": "Who on this machine may use the agent's control socket, which the commands ask.",
     "log": "What the log says, and how.",
 }
 """The tables of ``rmpa.toml``, each with its description."""

@@ -46,6 +46,10 @@ class RefusalLog:
         # By name: the start of the interval, the lines written in it, and the lines suppressed in it.
         self._lines: dict[str, tuple[float, int, int]] = {}
 
+    def count(self, name: str) -> None:
+        """Count ``name`` without a line in the log."""
+        self._counters.add(name)
+
     def refuse(self, now: float, name: str, who: str, text: str) -> None:
         """Count ``name``, and log ``text`` within the limits.
 

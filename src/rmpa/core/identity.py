@@ -73,6 +73,24 @@ class Identity:
         port = self.guid.port
         return tuple(dict.fromkeys([self.guid.endpoint, *((str(a), port) for a in self.addresses)]))
 
+    def is_same_run(self, other: Identity) -> bool:
+        """Whether two identities are of one run of one agent.
+
+        The instance alone does not tell: each member of a mesh hears it, and may claim it. In a secured mesh only the
+        name is proved.
+        """
+        return self.instance == other.instance and self.name == other.name
+
+    def is_same_module(self, other: Identity, *, secured: bool) -> bool:
+        """Whether two identities are of one module, perhaps of two runs of its agent.
+
+        Args:
+            other: The other identity.
+            secured: Whether the mesh is secured. There the name alone tells, because the certificate proves it;
+                else the same address and port do as well, since a module may have got another name.
+        """
+        return self.name == other.name or (not secured and self.guid.place == other.guid.place)
+
     def __str__(self) -> str:
         """``base (10.0.0.1:40001#7)``."""
         return f"{self.name} ({self.guid})"

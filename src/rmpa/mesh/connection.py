@@ -32,6 +32,8 @@ from rmpa.mesh.handshake import HandshakeError, Hello, Lane, Refuse, judge_welco
 from rmpa.mesh.keepalive import Keepalive
 from rmpa.mesh.remote_clock import RemoteClock
 from rmpa.runtime import limits as runtime_limits
+from rmpa.trust.preface import is_preface
+from rmpa.trust.reasons import TrustReason
 
 if TYPE_CHECKING:
     from rmpa.core.guid import Guid
@@ -210,6 +212,7 @@ class ConnectionProtocol:
         lane: Dialler: what the connection is for.
         lease: Seconds after which the silence of this side means that it is dead.
         label: For log lines, until the remote side's name is known.
+        prove: Judges whether the remote side is the module that its hello or welcome says; ``None`` accepts it.
     """
 
     def __init__(
@@ -226,12 +229,14 @@ class ConnectionProtocol:
         lane: Lane = Lane.EXPRESS,
         lease: float = limits.EXPRESS_LEASE,
         label: str = "?",
+        prove: Callable[[Hello], Refuse | None] | None = None,
     ) -> None:
         self.role = role
         self.clock = RemoteClock()
         self.remote: Hello | None = None
         """The remote side's hello or welcome; ``None`` before it is received."""
         self.on_event = on_event
+        self.prove = prove
         self.on_data = on_data
         self.on_part = on_part if on_part is not None else _no_parts
         self._ours = ours
@@ -316,6 +321,10 @@ class ConnectionProtocol:
                 else:
                     self.on_part(route, sequence, stamp_ns, flags, view[start:end])
         except RemoteProtocolError as error:
+            if self.role is ConnectionRole.ACCEPTOR and self.remote is None and is_preface(view):
+                text = f"{self._ours.name} is not secured, but the dialler is; {TrustReason.UNSECURED.remedy}"
+                self._refuse(Refuse(TrustReason.UNSECURED, text), now)
+                return size, 0
             self._end(f"{self._name} broke the protocol: {error}")
             raise
         return (size if self._state is ConnectionState.CLOSED else offset), 0
@@ -340,6 +349,16 @@ class ConnectionProtocol:
             LocalProtocolError: No hello was received, or it was answered already.
         """
         self._unanswered()
+        self._refuse(refuse, now)
+
+    def expel(self, refuse: Refuse, now: float) -> None:
+        """Secured mesh: refuse a connection that is up, and close it, because its peer was revoked.
+
+        Raises:
+            LocalProtocolError: The connection is not up.
+        """
+        if self._state is not ConnectionState.UP:
+            raise LocalProtocolError(f"no revocation on a link that is {self._state.name}")
         self._refuse(refuse, now)
 
     def control(self, payload: bytes) -> bytes:
@@ -412,6 +431,8 @@ class ConnectionProtocol:
         """
         if self._state in (ConnectionState.CLOSING, ConnectionState.CLOSED):
             return False
+        if kind == FrameKind.REFUSE and self._state is ConnectionState.UP and self.prove is not None:
+            return True  # of a dialler that does not trust this acceptor, and once this module is revoked
         if kind not in _ALLOWED[self.role, self._state] or (
             self.remote is not None and self._state is not ConnectionState.UP
         ):
@@ -461,8 +482,12 @@ class ConnectionProtocol:
         except HandshakeError as error:
             self._refuse(error.refuse, now)
             return
+        refuse = self.prove(hello) if self.prove is not None else None
         if self.role is ConnectionRole.ACCEPTOR:
             self.remote = hello
+        if refuse is not None:
+            self._refuse(refuse, now)
+        elif self.role is ConnectionRole.ACCEPTOR:
             self.on_event(HelloReceived(hello))
         elif refuse := judge_welcome(hello, self._ours, self._expected):
             self._refuse(refuse, now)
@@ -487,12 +512,13 @@ class ConnectionProtocol:
         self.on_event(HandshakeDone(hello))
 
     def _refuse(self, refuse: Refuse, now: float) -> None:
+        up = self._state is ConnectionState.UP
         self._send(
             Frame(FrameKind.REFUSE, refuse.serialize())
-            if self.role is ConnectionRole.ACCEPTOR
+            if self.role is ConnectionRole.ACCEPTOR or self.prove is not None
             else Frame(FrameKind.BYE, frames.text_payload(refuse.text))
         )
-        self._close(_Step.REFUSING, f"refused: {refuse}", now)
+        self._close(_Step.LEAVING if up else _Step.REFUSING, f"refused: {refuse}", now)
         self.on_event(Refused(refuse, by_us=True))
 
     def _close(self, step: _Step, reason: str, now: float) -> None:

@@ -16,6 +16,7 @@ from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity, peer_name_problem
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Buffer, parse_text, text_payload
+from rmpa.trust.reasons import TrustReason
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -40,7 +41,7 @@ LANES: Final = frozenset({Lane.EXPRESS, Lane.BULK})
 
 
 class Refusal(IntEnum):
-    """Why a connection was refused; the numbers are those on the wire."""
+    """Why a connection was refused; the numbers are those on the wire, which ``TrustReason`` continues."""
 
     VERSION = 1
     DOMAIN = 2
@@ -59,7 +60,7 @@ class Refuse:
     """A refusal with its reason: the payload of a refuse frame.
 
     Args:
-        code: One of ``Refusal``, or a number of a later version.
+        code: One of ``Refusal`` or ``TrustReason``, or a number of a later version.
         text: For people: what is wrong and what to do.
     """
 
@@ -84,15 +85,15 @@ class Refuse:
 
     @property
     def label(self) -> str:
-        """The code for the names of counters: ``version``, ``already_linked``, ``code 17``."""
-        try:
-            return Refusal(self.code).name.lower()
-        except ValueError:
-            return f"code {self.code}"
+        """The code for the names of counters: ``version``, ``already_linked``, ``code 27``."""
+        return _LABELS.get(self.code, f"code {self.code}")
 
     def __str__(self) -> str:
         """``domain: …``."""
         return f"{self.label}: {self.text}"
+
+
+_LABELS: Final = {code.value: code.name.lower() for kind in (Refusal, TrustReason) for code in kind}
 
 
 class HandshakeError(RemoteProtocolError):

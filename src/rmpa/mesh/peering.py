@@ -22,6 +22,7 @@ from rmpa.core.timer_queue import TimerQueue
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.mesh import limits
 from rmpa.mesh.handshake import Hello, KnownLink, Refusal, Refuse, judge
+from rmpa.trust.reasons import TrustReason
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,9 +35,23 @@ _log = logging.getLogger(__name__)
 SocketAddress = tuple[str, int]
 
 _SELDOM_MENDED: Final = frozenset(
-    {Refusal.VERSION, Refusal.DOMAIN, Refusal.DUPLICATE, Refusal.MALFORMED, Refusal.LANE}
+    {
+        Refusal.VERSION,
+        Refusal.DOMAIN,
+        Refusal.DUPLICATE,
+        Refusal.MALFORMED,
+        Refusal.LANE,
+        TrustReason.PLAIN,
+        TrustReason.FOREIGN,
+        TrustReason.EXPIRED,
+        TrustReason.REVOKED,
+        TrustReason.NAME,
+        TrustReason.DOWNGRADE,
+    }
 )
 """Refusals for reasons that seldom pass by themselves."""
+_UNPROVEN: Final = frozenset({TrustReason.UNSECURED, TrustReason.KEY, TrustReason.CLOCK})
+"""Refusals that a secured agent receives without proof of the sender: they are shown, and change no pause."""
 _OTHER_PEER: Final = frozenset({Refusal.MYSELF, Refusal.WRONG_PEER})
 """Refusals that concern one endpoint only, because another agent, or this agent itself, answered there."""
 
@@ -333,8 +348,10 @@ class Peering:
             peer.refused = None
             self._retry(peer, now)
 
-    def dial_refused(self, guid: Guid, refuse: Refuse, now: float, endpoint: SocketAddress | None = None) -> None:
-        """Handle a ``Dial`` whose handshake was refused at this endpoint, by either side."""
+    def dial_refused(
+        self, guid: Guid, refuse: Refuse, now: float, endpoint: SocketAddress | None = None, *, proved: bool = True
+    ) -> None:
+        """Handle a ``Dial`` that was refused at this endpoint, by either side; without a proof it is only shown."""
         peer = self._dial_ended(guid, endpoint)
         if peer is None:
             return
@@ -344,7 +361,9 @@ class Peering:
             if peer.link is None:
                 self._dial_at(peer, now + max(limits.EXPRESS_LEASE, self._pause(peer)))
             return
-        if refuse.code in _OTHER_PEER or refuse.code not in _SELDOM_MENDED:
+        if refuse.code in _UNPROVEN or not proved:
+            peer.refused = refuse
+        if not proved or refuse.code in _OTHER_PEER or refuse.code not in _SELDOM_MENDED:
             self._retry(peer, now)
         elif peer.link is None:
             peer.refused = refuse
@@ -353,6 +372,18 @@ class Peering:
         if refuse.code not in _OTHER_PEER and refuse.code not in peer.reported:
             peer.reported.add(refuse.code)
             self._outputs.append(LinkRefused(peer.identity, refuse))
+
+    def link_refused(self, guid: Guid, refuse: Refuse) -> None:
+        """Note why there is no link with a peer, which was found on a connection that the peer dialled."""
+        peer = self._peers.get(guid.place)
+        if peer is not None and peer.link is None:
+            peer.refused, peer.last_error = refuse, str(refuse)
+
+    def refused_from(self, host: str, refuse: Refuse) -> None:
+        """Note a refusal before the peer said its name, if only one unlinked peer can have dialled from there."""
+        there = [p for p in self._peers.values() if p.link is None and any(e[0] == host for e in p.endpoints())]
+        if len(there) == 1:
+            self.link_refused(there[0].identity.guid, refuse)
 
     # --- time and outputs -----------------------------------------------------------------------------------
 

@@ -35,6 +35,7 @@ def agent_values(snapshot: Snapshot, linked: int) -> dict[str, str]:
         "proxies": str(agent.proxies),
         "proxies' listening sockets": str(agent.proxy_sockets),
         "real time": "; ".join(agent.realtime),
+        "certificate (h left)": number(snapshot.trust.expires - snapshot.taken, 1 / 3600) if snapshot.trust else "",
     }
     return _known(known) | {f"count {name}": str(count) for name, count in snapshot.counters.items()}
 

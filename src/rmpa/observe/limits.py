@@ -22,6 +22,8 @@ CONTROL_CALL_TIMEOUT: Final = 10.0
 """Time-out of one call of a client: a stopped agent must not block the command line."""
 CONTROL_LOOK_TIMEOUT: Final = 1.0
 """Time-out of a connection that only tests whether an agent runs; the kernel accepts it even for a stopped agent."""
+CONTROL_REFUSED_TIMEOUT: Final = 1.0
+"""A client that is turned away has this long to read why; it holds its place among the clients for so long."""
 CONTROL_BACKLOG: Final = 128
 """Connections that wait to be accepted; the kernel refuses further ones at once."""
 CONTROL_PINGS_MAX: Final = 100
@@ -30,6 +32,9 @@ CONTROL_HANDLER_TIMEOUT: Final = 30.0
 """Time-out of an operation in the agent; ``rmpa why`` waits for peers."""
 CONTROL_WAIT_MAX: Final = 25.0
 """The longest wait for a change of the graph in one request: it must end within ``CONTROL_HANDLER_TIMEOUT``."""
+GRAPH_HISTORY: Final = 4096
+"""Changes of the graph that are kept for clients of ``graph``: the start of a large graph makes fewer while a slow
+client does not ask. A client that is further behind gets the whole graph. Some 0.5 MB."""
 CONTROL_PATH_MAX: Final = 107
 """Bytes in a UNIX socket's path: Linux's sun_path less its final zero."""
 CPU_INTERVAL: Final = 1.0
@@ -89,3 +94,7 @@ WHY_PROBE: Final = 2.0
 """Time-out of a probe of a service's server, which is on the same machine as the agent that asks."""
 WHY_SOURCES_MAX: Final = 64
 """Publishers of one topic in one module that ``rmpa why`` reports."""
+DOCTOR_NODES_TIMEOUT: Final = 2.0
+"""Seconds in which a core tells the addresses of its nodes; each takes a millisecond."""
+DOCTOR_NODES_MAX: Final = 500
+"""Nodes of one core whose ports are looked at, so that the check ends in time."""

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Self
 
 import msgspec
 
+from rmpa.trust.status import TrustStatus  # noqa: TC001 - msgspec needs it to decode
+
 if TYPE_CHECKING:
     from rmpa.core.stats import SampleSummary
 
@@ -88,6 +90,26 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
     end_connections: str | None = None
 
 
+class LaneInfo(msgspec.Struct, kw_only=True, frozen=True):
+    """One of the two lanes of a link.
+
+    Attributes:
+        name: ``express`` (control and small messages) or ``bulk`` (large ones).
+        connected: Whether it has its TCP connection; messages for a lane without one wait.
+        bytes_in: Bytes that its present connection has received.
+        bytes_out: Bytes that its present connection has sent.
+        queued: Bytes that wait in its send queue.
+        dropped: Messages dropped because it was too slow, since the link came up.
+    """
+
+    name: str
+    connected: bool
+    bytes_in: int = 0
+    bytes_out: int = 0
+    queued: int = 0
+    dropped: int = 0
+
+
 class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
     """The live link to a peer.
 
@@ -106,6 +128,7 @@ class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
         packet: Bytes of the largest packets that are sent, headers included.
         path_problem: What is wrong with the network path, ready to read; empty if nothing is known.
         path_remedy: What to do about that.
+        lanes: Its lanes, ``express`` first; empty from an agent that does not report them.
     """
 
     remote: str
@@ -122,6 +145,7 @@ class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
     packet: int | None = None
     path_problem: str = ""
     path_remedy: str = ""
+    lanes: tuple[LaneInfo, ...] = ()
 
 
 class BoundInfo(msgspec.Struct, kw_only=True, frozen=True):
@@ -525,6 +549,7 @@ class Snapshot(msgspec.Struct, kw_only=True, frozen=True):
         counters: What was refused or dropped, by name: ``beacon.malformed`` …
         notes: What the user should know (a port taken, no multicast), each ready to read.
         unreachable: Nodes of the local graph to which no connection can be made, by name.
+        trust: The module's membership of a secured mesh; ``None``: trust is off.
     """
 
     agent: AgentInfo
@@ -535,6 +560,7 @@ class Snapshot(msgspec.Struct, kw_only=True, frozen=True):
     counters: dict[str, int] = {}
     notes: tuple[str, ...] = ()
     unreachable: tuple[UnreachableInfo, ...] = ()
+    trust: TrustStatus | None = None
 
 
 class FollowedInfo(msgspec.Struct, kw_only=True, frozen=True):
@@ -555,16 +581,6 @@ class FollowedInfo(msgspec.Struct, kw_only=True, frozen=True):
     state: str
     size: int | None = None
     problem: str = ""
-
-
-class GraphRevision(msgspec.Struct, kw_only=True, frozen=True):
-    """The value of the operation ``graph``.
-
-    Attributes:
-        revision: Stands for the present local graph; another number stands for another graph.
-    """
-
-    revision: int
 
 
 class PingReply(msgspec.Struct, kw_only=True, frozen=True):

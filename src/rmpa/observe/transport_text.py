@@ -19,6 +19,7 @@ _REMEDIES: Final = {
     "caller_id": "give one of both nodes another name",
     "reachable": "see that TCP gets through from this machine to the ports of nodes over there (a firewall?)",
     "latched": "start the subscriber again",
+    "trust": "trust.direct = true in both modules allows it, where the network is trusted (docs/permissions.md)",
 }
 """What a user may do about some of the conditions; the others say it themselves, or pass."""
 REMEDY: Final = "docs/contracts.md explains the conditions"

@@ -242,3 +242,5 @@ NODE_KILL_WAIT: Final = 3.0
 """Seconds for a node to end after it was asked to; one with much to save takes a second or two."""
 NODE_KILL_LOOK: Final = 0.2
 """Seconds between two checks whether a node that was asked to end has ended."""
+NODE_CONNECTIONS_SHOWN: Final = 500
+"""Connections of one node that are told: some 80 kB in one answer, and more than can be read."""

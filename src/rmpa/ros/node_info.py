@@ -30,6 +30,22 @@ class NodeLine(msgspec.Struct, kw_only=True, frozen=True):
     problem: str = ""
 
 
+class NodeConnection(msgspec.Struct, kw_only=True, frozen=True):
+    """One connection of a node over which messages of a topic go, as the node tells it (``getBusInfo``).
+
+    Attributes:
+        topic: The topic.
+        inbound: Whether it is from a publisher; else it is to a subscriber.
+        other: The node at its other end; that node's slave API where the name is not known.
+        connected: Whether messages can flow, as far as the node knows.
+    """
+
+    topic: str
+    inbound: bool
+    other: str
+    connected: bool = True
+
+
 class NodeFacts(msgspec.Struct, kw_only=True, frozen=True):
     """Everything known of one node.
 
@@ -41,6 +57,7 @@ class NodeFacts(msgspec.Struct, kw_only=True, frozen=True):
         publications: Types by topic; ``*`` for an unknown type.
         subscriptions: Types by topic.
         services: The names of its services.
+        connections: What it tells of its connections; ``None`` where it does not, or an earlier release answers.
     """
 
     name: str
@@ -50,6 +67,7 @@ class NodeFacts(msgspec.Struct, kw_only=True, frozen=True):
     publications: dict[str, str] = {}
     subscriptions: dict[str, str] = {}
     services: tuple[str, ...] = ()
+    connections: tuple[NodeConnection, ...] | None = None
 
 
 class NodePing(msgspec.Struct, kw_only=True, frozen=True):

@@ -81,7 +81,7 @@ class Acceptor:
 
     @property
     def paused(self) -> bool:
-        """Whether accepting is paused because a connection waits for a descriptor."""
+        """Whether accepting is paused: a connection waits for a descriptor, or ``pause`` was called."""
         return self._timer is not None
 
     def start(self) -> None:
@@ -90,6 +90,12 @@ class Acceptor:
         if not self._listening and not self._closed:
             asyncio.get_running_loop().add_reader(self._sock.fileno(), self._acceptable)
             self._listening = True
+
+    def pause(self, seconds: float) -> None:
+        """Leave connections to the kernel, which refuses those that its queue does not hold, for so long."""
+        if not self._closed and self._timer is None:
+            self._stop()
+            self._timer = asyncio.get_running_loop().call_later(seconds, self._again)
 
     def close(self) -> None:
         """Stop accepting, and close the listening socket; may be called twice."""
@@ -107,8 +113,8 @@ class Acceptor:
 
     def _acceptable(self) -> None:
         for _ in range(self._at_once):
-            if self._closed:
-                return  # ``on_accept`` closed this acceptor
+            if self._closed or self._timer is not None:
+                return  # ``on_accept`` closed or paused this acceptor
             if not self._has_room():
                 self._wait_for_room(None)
                 return

@@ -11,21 +11,24 @@ from __future__ import annotations
 
 import contextlib
 import ssl
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol, cast
 
 from rmpa.core.errors import LocalProtocolError
 from rmpa.core.sizes import KIB
+from rmpa.runtime.segments import SegmentedSocket
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    import socket
+    from collections.abc import Callable, Sequence
 
 Buffer = bytes | bytearray | memoryview
 
 _RECORD: Final = 16 * KIB
 """Plain bytes of the largest record (RFC 8446, section 5.1)."""
-_WRITE: Final = 256 * KIB
-"""Plain bytes that are encrypted at once, as many as a fragment and its header may have: 0.3 ms."""
-_READ: Final = 256 * KIB
+_WRITE_MAX: Final = 128 * KIB
+"""Plain bytes that are encrypted at once at most, 0.1 ms. Twice as many are no faster, and OpenSSL keeps buffers of
+the largest size for each connection."""
+_READ: Final = 128 * KIB
 """Bytes that are read from the socket at once."""
 _scratch: Final = memoryview(bytearray(_READ))
 """Where every connection reads ciphertext: one loop, one thread, and nothing stays in it."""
@@ -119,10 +122,17 @@ class SecureSocket:
         self, sock: DataSocket, tls: ssl.SSLObject, incoming: ssl.MemoryBIO, outgoing: ssl.MemoryBIO
     ) -> None:
         self._sock = sock
+        self._transmit = _sender(sock)
+        self._receive = sock.recv_into
         self._tls = tls
+        self._write = tls.write
+        self._read = cast("Callable[[int, memoryview], int]", tls.read)
         self._incoming = incoming
         self._outgoing = outgoing
         self._unsent: memoryview | None = None
+        self._most = _WRITE_MAX
+        """Plain bytes that are encrypted at once: one record once the socket was full, as neither the drop policy
+        nor more urgent messages reach what is encrypted; more again as long as the socket takes all."""
         self.readable = incoming.pending > 0
         """Whether there may be bytes for ``recv_into`` that epoll does not know of."""
 
@@ -140,31 +150,44 @@ class SecureSocket:
         """
         if self._unsent is not None and not self.flush():
             raise BlockingIOError
-        taken = 0
-        small: list[Buffer] = []
-        waiting = 0
+        size = 0
         for part in parts:
-            size = len(part)
-            if size > _WRITE - taken:
-                part = memoryview(part)[: _WRITE - taken]  # noqa: PLW2901 - the rest is for the next call
-                size = len(part)
+            size += len(part)
+        if size > _RECORD:
+            size = self._encrypt(parts)
+        elif size:
+            self._write(b"".join(parts))
+        else:
+            return 0
+        self._send(self._outgoing.read())
+        if self._unsent is not None:
+            self._most = _RECORD
+        elif size == self._most < _WRITE_MAX:
+            self._most *= 2
+        return size
+
+    def _encrypt(self, parts: Sequence[Buffer]) -> int:
+        """Encrypt more than one record, at most ``_most`` bytes; return how many were taken."""
+        most = self._most
+        taken = waiting = 0
+        small: list[Buffer] = []
+        for part in parts:
+            view = memoryview(part)[: most - taken]
+            size = len(view)
             taken += size
             if waiting + size <= _RECORD:
-                small.append(part)
+                small.append(view)
                 waiting += size
-                continue
-            # The first record is filled up, so that a header is none of its own; OpenSSL makes records of the rest.
-            view = memoryview(part)
-            room = _RECORD - waiting
-            self._tls.write(b"".join((*small, view[:room])))
-            self._tls.write(view[room:])
-            small, waiting = [], 0
-            if taken == _WRITE:
+            else:
+                # The first record is filled up, so that a header is none of its own; OpenSSL divides the rest.
+                room = _RECORD - waiting
+                self._write(b"".join((*small, view[:room])))
+                self._write(view[room:])
+                small, waiting = [], 0
+            if taken == most:
                 break
         if waiting:
-            self._tls.write(b"".join(small))
-        if taken:
-            self._send(self._outgoing.read())
+            self._write(b"".join(small))
         return taken
 
     def flush(self) -> bool:
@@ -187,20 +210,60 @@ class SecureSocket:
             OSError: The connection is gone, or (``ssl.SSLError``) its bytes are not TLS, or an alert came.
         """
         if self.readable:
-            count = self._decrypt(buffer)
-            if count:
-                return count
-        received = self._sock.recv_into(_scratch)
+            return self._read_held(buffer)
+        received = self._receive(_scratch)
         if not received:
             return 0
-        self._incoming.write(_scratch[:received])
+        incoming = self._incoming
+        incoming.write(_scratch[:received])
         try:
-            count = self._decrypt(buffer)
+            count = self._read(len(buffer), buffer)
+        except ssl.SSLWantReadError:
+            raise RecordIncomplete from None
         except ssl.SSLZeroReturnError:
             return 0
-        if not count:
-            raise RecordIncomplete
+        # A buffer with room left has the whole record; OpenSSL reads no further than the end of a record.
+        if not count or (count < len(buffer) and not incoming.pending):
+            return count
+        return self._read_more(buffer, count)
+
+    def _read_held(self, buffer: memoryview) -> int:
+        """Read what is held alone, without the socket, so that a fast sender does not keep the loop busy."""
+        self.readable = False
+        try:
+            count = self._read(len(buffer), buffer)
+        except ssl.SSLWantReadError:
+            raise BlockingIOError from None
+        except ssl.SSLZeroReturnError:
+            return 0
+        return self._read_more(buffer, count) if count else 0
+
+    def _read_more(self, buffer: memoryview, count: int) -> int:
+        """Read further records until the buffer is full or there is none; return the number of all bytes."""
+        size = len(buffer)
+        try:
+            # Asking first: the error by which OpenSSL says that there is no more takes a quarter of a message's time.
+            while (pending := self._incoming.pending) and count < size:
+                got = self._read(size - count, buffer[count:])
+                if not got:
+                    self.readable = True  # the next call says the end; nothing behind it is read, whatever follows
+                    return count
+                count += got
+        except ssl.SSLWantReadError:
+            return count
+        except ssl.SSLZeroReturnError:
+            self.readable = True
+            return count
+        self.readable = count == size and (pending > 0 or self._tls.pending() > 0)
         return count
+
+    def segment(self, size: int) -> None:
+        """Send in packets of at most ``size`` bytes from now on."""
+        if isinstance(self._sock, SegmentedSocket):
+            self._sock.segment(size)
+        else:
+            self._sock = SegmentedSocket(cast("socket.socket", self._sock), size)
+            self._transmit = _sender(self._sock)
 
     def shutdown(self, how: int) -> None:
         """Say the end of the stream, and close one direction of the socket."""
@@ -215,30 +278,16 @@ class SecureSocket:
         self._unsent = None
         self._sock.close()
 
-    def _decrypt(self, buffer: memoryview) -> int:
-        """Read records into a buffer until it is full or there is none; return the number of bytes."""
-        count, size = 0, len(buffer)
-        more = True
-        try:
-            # Asking first: the error by which OpenSSL says that there is no more takes a quarter of a message's time.
-            while more and count < size:
-                got: int = self._tls.read(size - count, buffer[count:])  # type: ignore[assignment] # with a buffer
-                count += got
-                more = got > 0 and (self._incoming.pending > 0 or self._tls.pending() > 0)
-        except ssl.SSLWantReadError:
-            pass
-        except ssl.SSLZeroReturnError:
-            if not count:
-                raise
-        self.readable = more and count == size
-        if self._outgoing.pending and self._unsent is None:
-            self._send(self._outgoing.read())  # the answer to an update of keys
-        return count
-
     def _send(self, ciphertext: Buffer) -> None:
         try:
-            sent = self._sock.sendmsg((ciphertext,))
+            sent = self._transmit(ciphertext)
         except (BlockingIOError, InterruptedError):
             sent = 0
         if sent < len(ciphertext):
             self._unsent = memoryview(ciphertext)[sent:]
+
+
+def _sender(sock: DataSocket) -> Callable[[Buffer], int]:
+    """What sends the bytes of one buffer by a socket; ``send`` is 0.3 µs faster than ``sendmsg``."""
+    send: Callable[[Buffer], int] | None = getattr(sock, "send", None)
+    return send if send is not None else lambda data: sock.sendmsg((data,))

@@ -72,6 +72,10 @@ class SegmentedSocket:
         if piece:
             yield piece, filled
 
+    def segment(self, size: int) -> None:
+        """Send in segments of ``size`` bytes from now on."""
+        self.size = size
+
     def recv_into(self, buffer: memoryview) -> int:
         """Read into a buffer, as ``socket.recv_into``."""
         return self._sock.recv_into(buffer)

@@ -24,6 +24,7 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST, URGENT, Framer, Outbox, QueuedMessage
 from rmpa.core.sizes import KIB, MIB
 from rmpa.runtime import limits
+from rmpa.runtime.record_layer import RecordIncomplete, SecureSocket
 from rmpa.runtime.segments import SegmentedSocket
 
 _log = logging.getLogger(__name__)
@@ -62,6 +63,7 @@ class Stream:
             messages are sent without headers.
         keep: Whether entries stay in the outbox when the socket is gone, for the next stream.
         segment: Bytes that one packet may carry; ``None``: the kernel decides; see ``segments``.
+        secure: Encrypts and decrypts what ``sock`` carries; bytes that it holds already are delivered soon.
     """
 
     def __init__(
@@ -74,9 +76,13 @@ class Stream:
         frame: Framer | None = None,
         keep: bool = False,
         segment: int | None = None,
+        secure: SecureSocket | None = None,
     ) -> None:
         self._loop = asyncio.get_running_loop()
-        self._sock: socket.socket | SegmentedSocket = sock if segment is None else SegmentedSocket(sock, segment)
+        self._secure = secure
+        self._sock: socket.socket | SegmentedSocket | SecureSocket = sock if secure is None else secure
+        if segment is not None:
+            self.segment(segment)
         self._on_bytes = on_bytes
         self._on_close = on_close
         self._outbox = outbox
@@ -91,6 +97,7 @@ class Stream:
         self._kept: list[tuple[Sequence[Buffer], int, bool]] = []
         self._kept_bytes = 0
         self._closed = False
+        self._reading_held = False
         self._drained: asyncio.Future[None] | None = None
         self._report: asyncio.Handle | None = None
         self.bytes_in = 0
@@ -107,6 +114,8 @@ class Stream:
         add_reader(self._fd, self._readable)
         if outbox:
             self._wait_for_room()
+        if secure is not None and secure.readable:
+            self._loop.call_soon(self._read_held)
 
     @property
     def closed(self) -> bool:
@@ -132,8 +141,8 @@ class Stream:
 
     def segment(self, size: int) -> None:
         """Send in packets of at most ``size`` bytes from now on."""
-        if isinstance(self._sock, SegmentedSocket):
-            self._sock.size = size
+        if isinstance(self._sock, SecureSocket | SegmentedSocket):
+            self._sock.segment(size)
         else:
             self._sock = SegmentedSocket(self._sock, size)
 
@@ -203,10 +212,13 @@ class Stream:
         for buffer in parts:
             size += len(buffer)
         if sent == size:
+            if self._secure is not None:
+                self._flush_later()
             return 0
         if sent:
             sent = self._send_rest(parts, sent, size)
             if sent == size or self._closed:
+                self._flush_later()
                 return 0
         self._wait_for_room()
         if not sent and not part:
@@ -233,6 +245,11 @@ class Stream:
             sent += more
             self.bytes_out += more
         return sent
+
+    def _flush_later(self) -> None:
+        """Wait for room if the socket has not taken all ciphertext of messages that count as sent."""
+        if self._secure is not None and self._secure.pending and not self._closed:
+            self._wait_for_room()
 
     def _wait_for_room(self) -> None:
         self._writing = True
@@ -352,6 +369,8 @@ class Stream:
             sent = self._send_rest([buffer for parts, _, _ in kept for buffer in parts], sent, size)
         if sent < size and not self._closed:
             self._keep_rest(kept, sent)
+        else:
+            self._flush_later()
 
     def _keep_rest(self, kept: list[tuple[Sequence[Buffer], int, bool]], sent: int) -> None:
         """Queue the part of a batch that ``sendmsg`` did not take: the rest of one message, if any, then whole ones.
@@ -449,9 +468,14 @@ class Stream:
             self._buffer = buffer
             self._view = memoryview(buffer)
 
-    def _readable(self) -> None:
+    def _readable(self, *, held: bool = False) -> None:
+        if self._reading_held and not held:
+            return  # within ``_read_held``, whose handlers yield to data: its bytes come first
         try:
             count = self._sock.recv_into(self._view[self._filled :])
+        except RecordIncomplete:
+            self._heard()  # a large record on a slow network is no silence
+            return
         except (BlockingIOError, InterruptedError):
             return
         except OSError as error:
@@ -460,6 +484,30 @@ class Stream:
         if count == 0:
             self._lost(None)
             return
+        self._heard()
+        self.bytes_in += count
+        self._filled += count
+        if self._filled == _FIRST_BUFFER == len(self._buffer):
+            self._reserve(_BUSY_BUFFER)  # more bytes wait, so messages are large: read more at once from now on
+        if self._filled >= self._wanted or self._filled == len(self._buffer):
+            self._deliver()
+        if self._secure is not None and self._secure.readable and not held:
+            self._read_held()
+
+    def _read_held(self) -> None:
+        """Read the bytes that were received with a record but found no room, as the loop does not see them."""
+        self._reading_held = True
+        try:
+            while self._is_holding():
+                self._readable(held=True)
+        finally:
+            self._reading_held = False
+
+    def _is_holding(self) -> bool:
+        return self._secure is not None and self._secure.readable and not self._closed
+
+    def _heard(self) -> None:
+        """Note that bytes came now."""
         now = self._loop.time()
         if now - self.last_in > limits.STALE_AGE:
             # Only a silence during which the socket was polled counts: not one in which this process got no CPU.
@@ -467,12 +515,6 @@ class Stream:
             if polled - self.last_in > limits.STALE_AGE:
                 self.resumed_at = polled
         self.last_in = now
-        self.bytes_in += count
-        self._filled += count
-        if self._filled == _FIRST_BUFFER == len(self._buffer):
-            self._reserve(_BUSY_BUFFER)  # more bytes wait, so messages are large: read more at once from now on
-        if self._filled >= self._wanted or self._filled == len(self._buffer):
-            self._deliver()
 
     def _deliver(self) -> None:
         global _corked  # noqa: PLW0603 - one loop, one thread: one read at a time
@@ -517,7 +559,7 @@ class Stream:
             # Without parts: all entries were too old, and were dropped.
             parts = self._outbox.head(_IOV, self._loop.time())
             try:
-                sent = self._sock.sendmsg(parts) if parts else 0
+                sent = self._sock.sendmsg(parts) if parts or self._secure is not None else 0
             except (BlockingIOError, InterruptedError):
                 return
             except OSError as error:
@@ -526,7 +568,8 @@ class Stream:
             self.bytes_out += sent
             self._outbox.consumed(sent)
             if not self._outbox:
-                self._all_sent()
+                if self._secure is None or not self._secure.pending:
+                    self._all_sent()
                 return
             if sent < sum(map(len, parts)):
                 return

@@ -97,6 +97,30 @@ def listening_addresses(port: int) -> frozenset[str] | None:
     return frozenset(_text(of.family, of.source) for of in sockets)
 
 
+@dataclass(frozen=True, slots=True)
+class ListeningSocket:
+    """A TCP socket in state LISTEN.
+
+    Args:
+        address: Its local address, numeric; ``0.0.0.0`` and ``::`` for any.
+        port: Its port.
+        inode: As in the links of ``/proc/PID/fd``.
+    """
+
+    address: str
+    port: int
+    inode: int
+
+
+def listening_sockets() -> list[ListeningSocket] | None:
+    """All TCP sockets in state LISTEN; ``None`` where the kernel does not report them. It takes some 0.1 ms."""
+    found = _dump(_LISTEN)
+    if found is None:
+        return None
+    sockets = map(InetSocket.parse, found)
+    return [ListeningSocket(_text(of.family, of.source), of.source_port, of.inode) for of in sockets]
+
+
 def connections(
     *, local_port: int | None = None, remote: tuple[str, int | None] | None = None
 ) -> list[TcpConnection] | None:

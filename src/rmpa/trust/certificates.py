@@ -2,16 +2,18 @@
 
 Keys are P-256. A module's certificate has its name as CN and as SAN ``urn:rmpa:<name>``; the SAN decides. This module
 needs the library ``cryptography`` (extra ``rmpa[trust]``); links do without it, as OpenSSL checks the chain there.
+For browsers, which ``rmpa web`` serves with it, it has host names too (``server_names``).
 
 Errors::
 
-    RemoteProtocolError
+    TrustError
     └── CertificateError    a certificate or a request is refused; ``reason`` is the word for it
 """
 
 from __future__ import annotations
 
 import hashlib
+import ipaddress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Final
@@ -22,10 +24,9 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import peer_name_problem
 from rmpa.trust import limits
-from rmpa.trust.reasons import TrustReason
+from rmpa.trust.reasons import TrustError, TrustReason
 
 if TYPE_CHECKING:
     from rmpa.trust.documents import DenyList
@@ -46,17 +47,8 @@ _UNREADABLE: Final = (
 """What ``cryptography`` raises about malformed input."""
 
 
-class CertificateError(RemoteProtocolError):
-    """A certificate or a request is refused.
-
-    Args:
-        reason: The word for it; a request that is malformed is ``foreign``.
-        text: What is wrong.
-    """
-
-    def __init__(self, reason: TrustReason, text: str) -> None:
-        super().__init__(text)
-        self.reason = reason
+class CertificateError(TrustError):
+    """A certificate or a request is refused; a request that is malformed is ``foreign``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +176,7 @@ def issue(
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(_key_usage(signs_certificates=False), critical=True)
         .add_extension(x509.ExtendedKeyUsage(_PURPOSES), critical=False)
-        .add_extension(_subject_alternative(request.name), critical=False)
+        .add_extension(_subject_alternative(request.name, server=True), critical=False)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(_authority_key(authority)), critical=False)
         .sign(ca_key, hashes.SHA256())
@@ -349,8 +341,22 @@ def _name(common: str) -> x509.Name:
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
 
 
-def _subject_alternative(name: str) -> x509.SubjectAlternativeName:
-    return x509.SubjectAlternativeName([x509.UniformResourceIdentifier(URN + name)])
+def _subject_alternative(name: str, *, server: bool = False) -> x509.SubjectAlternativeName:
+    names: list[x509.GeneralName] = [x509.UniformResourceIdentifier(URN + name)]
+    if server:
+        names += map(x509.DNSName, server_names(name))
+        names.append(x509.IPAddress(ipaddress.IPv4Address("127.0.0.1")))
+    return x509.SubjectAlternativeName(names)
+
+
+def server_names(name: str) -> tuple[str, ...]:
+    """The hosts that a browser finds in a module's certificate, besides 127.0.0.1 (RFC 9525).
+
+    They follow from the module's name and are not asked for, so that no module gets those of another. A host's name
+    has ``-`` where the module's name, which is made of it, has ``_``.
+    """
+    host = name.replace("_", "-").lower()
+    return (host, f"{host}.local", "localhost")
 
 
 def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:

@@ -80,14 +80,16 @@ class DenyList(msgspec.Struct, frozen=True):
 
         Args:
             name: The module, whose present certificates are all refused.
-            wall: Seconds since 1970.
+            wall: When the last of them was issued, or later; seconds since 1970. The time of an entry never goes
+                back.
 
         Raises:
             ValueError: No module can have that name, or the list is full.
         """
         if problem := peer_name_problem(name):
             raise ValueError(problem)
-        entries = (*(entry for entry in self.entries if entry.name != name), DenyEntry(name, int(wall)))
+        before = max([int(wall), *(entry.before for entry in self.entries if entry.name == name)])
+        entries = (*(entry for entry in self.entries if entry.name != name), DenyEntry(name, before))
         if len(entries) > limits.DENY_MAX:
             raise ValueError(f"a deny list has at most {limits.DENY_MAX} names; make a new mesh (rmpa trust init)")
         return DenyList(self.number + 1, entries)
@@ -107,15 +109,17 @@ class KeyList(msgspec.Struct, frozen=True):
     Args:
         number: Grows with each change.
         keys: By number.
+        authority: The name of the authority, so that no other member can pass for it; empty: not known.
     """
 
     number: int
     keys: tuple[_KeyEntry, ...]
+    authority: str = ""
 
     @classmethod
-    def of(cls, number: int, keys: Iterable[GroupKey]) -> KeyList:
-        """The list of these keys."""
-        return cls(number, tuple(_KeyEntry(key.number, key.secret) for key in keys))
+    def of(cls, number: int, keys: Iterable[GroupKey], authority: str = "") -> KeyList:
+        """The list of these keys; arguments as for the class."""
+        return cls(number, tuple(_KeyEntry(key.number, key.secret) for key in keys), authority)
 
     @property
     def group_keys(self) -> tuple[GroupKey, ...]:
@@ -162,6 +166,8 @@ def read_key_list(data: bytes, key: ec.EllipticCurvePublicKey) -> KeyList:
     found = _read(data, key, DocumentKind.KEYS, KeyList)
     if not 0 < len(found.keys) <= limits.KEYS_MAX:
         raise DocumentError(f"{len(found.keys)} group keys")
+    if found.authority and (problem := peer_name_problem(found.authority)):
+        raise DocumentError(problem)
     try:
         numbers = [each.number for each in found.group_keys]
     except ValueError as error:
@@ -180,7 +186,7 @@ def _read(data: bytes, key: ec.EllipticCurvePublicKey, kind: DocumentKind, form:
         document = msgspec.json.decode(envelope.signed, type=form)
     except InvalidSignature:
         raise DocumentError("the document is not signed by our authority") from None
-    except (msgspec.MsgspecError, UnicodeError) as error:
+    except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
         raise DocumentError(f"the document cannot be read: {error!s:.200}") from None
     if not 0 <= document.number <= UINT32_MAX:
         raise DocumentError(f"the document's number is {document.number}")

@@ -4,13 +4,16 @@
 
     JoiningSide                                        InvitingSide
                 ◄─────────────────────── welcome {ca}
-    hello {request, commitment} ────────────────────►
+    hello {request, commitment, proof} ─────────────►
                 ◄───────────────────── challenge {nonce}
     reveal {nonce} ─────────────────────────────────►  the token is used
             both show the code; each user says whether it is the same
     agree {} ───────────────────────────────────────►
                 ◄── grant {certificate, keys, deny}
     either side at any time: refuse {reason, text}
+
+The proof is made with the token's key over the request, the commitment and the server's certificate (``proof_of``):
+only a holder of the token's secret can have sent the hello, in this TLS session.
 
 A message is a JSON object with its length in front (4 bytes, big-endian); bytes in it are base64. Times are
 arguments, and so are random bytes. A machine that is over ignores what comes, and its driver closes the connection.
@@ -19,6 +22,7 @@ arguments, and so are random bytes. A machine that is over ignores what comes, a
 from __future__ import annotations
 
 import hashlib
+import hmac
 import struct
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
@@ -39,6 +43,7 @@ if TYPE_CHECKING:
     from rmpa.trust.tokens import Token, TokenBook
 
 _LENGTH: Final = struct.Struct(">I")
+_PROOF: Final = b"rmpa join hello 1"
 _TEXT_MAX: Final = 300
 """Characters of the other side's text that are kept."""
 
@@ -50,6 +55,7 @@ class _Welcome(msgspec.Struct, frozen=True, tag="welcome", tag_field="op"):
 class _Hello(msgspec.Struct, frozen=True, tag="hello", tag_field="op"):
     request: bytes
     commitment: bytes
+    proof: bytes
 
 
 class _Challenge(msgspec.Struct, frozen=True, tag="challenge", tag_field="op"):
@@ -196,6 +202,11 @@ class _Side(ABC):
         if not self._over:
             self._refuse("code", "a user says that the codes differ: is something between the two machines?")
 
+    def revoked(self) -> None:
+        """The module that joins was revoked meanwhile; without effect once it is over."""
+        if not self._over:
+            self._refuse("revoked", "the module was revoked while it joined")
+
     def lost(self) -> None:
         """The connection ended."""
         if not self._over:
@@ -223,7 +234,7 @@ class _Side(ABC):
             self._refuse(error.reason, error.text)
         except certificates.CertificateError as error:
             self._refuse(error.reason.label, str(error))
-        except (msgspec.MsgspecError, UnicodeError, RemoteProtocolError) as error:
+        except (msgspec.MsgspecError, UnicodeError, RecursionError, RemoteProtocolError) as error:
             self._refuse("malformed", f"{error!s:.200}")
 
     @abstractmethod
@@ -300,7 +311,8 @@ class JoiningSide(_Side):
         self._ca, self._key = welcome.ca, own.public_key
         context = CodeContext(self._name, own.key_hash, _hash(welcome.ca), self._token.token_id)
         self._machine = self._code = JoiningCode(context, self._nonce, self._now)
-        self._send(_Hello(self._request, self._code.commitment))
+        proof = proof_of(self._token.key, self._request, self._code.commitment, self._server)
+        self._send(_Hello(self._request, self._code.commitment, proof))
 
     def _granted(self, grant: _Grant, wall: float | None) -> None:
         found = certificates.verify(grant.certificate, self._ca, wall, name=self._name)
@@ -337,6 +349,7 @@ class InvitingSide(_Side):
         token_id: The token of the preface, whose tag was right.
         book: The tokens.
         secrets: What a member gets.
+        server: The server's certificate of the TLS connection (DER).
         serial: A random number for the certificate.
         nonce: ``limits.NONCE_BYTES`` random bytes.
         now: Monotonic seconds.
@@ -348,6 +361,7 @@ class InvitingSide(_Side):
         token_id: bytes,
         book: TokenBook,
         secrets: MeshSecrets,
+        server: bytes,
         serial: int,
         nonce: bytes,
         now: float,
@@ -358,11 +372,17 @@ class InvitingSide(_Side):
         self._token_id = token_id
         self._book = book
         self._secrets = secrets
+        self._server = server
         self._serial = serial
         self._is_taken = is_taken
         self._request: certificates.CertificateRequest | None = None
         self._agreed_there = False
         self._send(_Welcome(secrets.ca))
+
+    @property
+    def module(self) -> str:
+        """The name that the joining module has asked for; empty: it has not yet."""
+        return self._request.name if self._request is not None else ""
 
     def agree(self, wall: float) -> None:
         """The user says that the codes are equal.
@@ -399,6 +419,10 @@ class InvitingSide(_Side):
         request = certificates.read_request(hello.request)
         if problem := self._book.judge(self._token_id, request.name, wall):
             raise _Refused(problem.value, f"the token cannot be used by {request.name}: {problem.value}")
+        # The preface proves nothing here: what is between the two machines may have held it back and sent it itself.
+        proof = proof_of(self._book.key_of(self._token_id) or b"", hello.request, hello.commitment, self._server)
+        if not hmac.compare_digest(proof, hello.proof):
+            raise _Refused("token", "the hello is not signed with the token's key")
         if self._is_taken(request.name):
             raise _Refused("taken", f"a module named {request.name} is a member: choose another --name, or revoke it")
         context = CodeContext(request.name, request.key_hash, _hash(self._secrets.ca), self._token_id)
@@ -414,6 +438,18 @@ class InvitingSide(_Side):
         certificate = certificates.issue(self._request, secrets.ca, secrets.ca_key, self._serial, wall)
         self._send(_Grant(certificate, secrets.keys, secrets.deny))
         self._end(Joined(self._request.name, certificate, secrets.ca, secrets.keys, secrets.deny))
+
+
+def proof_of(key: bytes, request: bytes, commitment: bytes, server: bytes) -> bytes:
+    """The proof in a hello: that the holder of the token makes this request in this TLS session.
+
+    Args:
+        key: The token's.
+        request: The request for a certificate (DER).
+        commitment: Of the joining side, 32 bytes.
+        server: The server's certificate of the TLS connection (DER).
+    """
+    return hmac.digest(key, _PROOF + request + commitment + _hash(server), hashlib.sha256)
 
 
 def _hash(data: bytes) -> bytes:

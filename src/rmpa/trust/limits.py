@@ -27,9 +27,15 @@ GROUP_KEY_BYTES: Final = 32
 REPLAY_WINDOW: Final = 64
 """Numbers below the highest one of a run that are still accepted once (RFC 4303, section 3.4.3): multicasts over
 Wi-Fi are overtaken by unicasts."""
+REPLAY_LEAP: Final = 4096
+"""Numbers by which a packet may be ahead of the highest one of its run: else one packet with the highest number
+of all would make each later one of that run an old one."""
+REPLAY_LEAP_RATE: Final = 1024.0
+"""Further such numbers for each second since the run was heard: an agent sends some 600 packets a second at most, so
+that one which was out of reach for days is heard again."""
 RUNS_MAX: Final = 1024
-"""Runs of agents whose numbers are remembered: two of each member of a full roster. The one that was silent for
-longest is forgotten first."""
+"""Runs of agents whose numbers are remembered: two of each member of a full roster, as in a rotation of the group
+key. The one that was silent for longest is forgotten first."""
 CLOCK_TOLERANCE: Final = 30.0
 """Difference of two set clocks above which a packet counts as an old one that is sent again. NTP holds 10 ms, a watch
 set by hand 10 s."""
@@ -40,6 +46,9 @@ KEY_SPREAD: Final = 30.0
 """A new group key signs this long after it was made; by then it has reached every linked module."""
 KEY_OVERLAP: Final = 3600.0
 """The group key before verifies for this long after the next one began to sign."""
+OLD_KEYS_MAX: Final = 256
+"""Addresses, and runs, of modules with an older group key that are remembered; beyond it they are forgotten, and
+heard again."""
 OLD_KEY_PACKETS_RATE: Final = 5.0
 """Packets a second with an older group key that are accepted, over all senders: each leads to one dial, 3 ms."""
 
@@ -52,6 +61,12 @@ far behind."""
 NONCES_MAX: Final = 4096
 """Nonces that are remembered: 68 handshakes a second for a minute, 512 members that dial twice and again. Beyond it
 prefaces are refused; only members and holders of tokens come so far."""
+NONCES_PER_ADDRESS: Final = 512
+"""Nonces of one address that are remembered, an eighth of all: one member cannot keep the others from linking. A
+machine with 128 modules, each of which dials both lanes twice in a minute, needs as many."""
+OLD_KEY_DIALS_RATE: Final = 50.0
+"""Connections a second with an older group key that may begin TLS, over all addresses: 15 % of a core. Those of one
+address: ``OLD_KEY_PACKETS_RATE``."""
 
 # --- joining ----------------------------------------------------------------------------------------------------
 TOKEN_SECRET_BYTES: Final = 16
@@ -76,6 +91,16 @@ JOIN_REQUEST_MAX: Final = 16 * KIB
 JOIN_ANSWER_MAX: Final = 1 * MIB
 """Bytes of one message of the authority: two signed documents in base64."""
 
+JOINS_AT_ONCE: Final = 16
+"""Joins that the authority serves at a time, each may wait for a user; and as many renewals of modules that were
+away."""
+JOINS_PER_ADDRESS: Final = 4
+"""Of these, those of one address, joins and renewals apart: a user compares one code at a time."""
+JOIN_STEP_TIMEOUT: Final = 10.0
+"""For each step of a join or renewal that waits for no user: connecting, the TLS handshake, one answer."""
+ISSUED_MAX: Final = 1024
+"""Modules whose last certificate the authority remembers, two for each member of a full roster."""
+
 # --- certificates -----------------------------------------------------------------------------------------------
 CERTIFICATE_LIFETIME: Final = 7 * 86_400
 """Validity of a module's certificate. It bounds how long a stolen key is of use where no deny list arrives."""
@@ -88,6 +113,20 @@ RENEWAL_SHARE: Final = 0.5
 be there."""
 RENEWAL_GRACE: Final = 365 * 86_400
 """A certificate that ended less than this long ago is renewed without a new invitation: a robot was in a drawer."""
+RENEWAL_RETRY_FIRST: Final = 60.0
+"""Until a renewal that failed is tried again; each further time it is twice as long."""
+RENEWAL_RETRY_CAP: Final = 3600.0
+"""The longest such time."""
+RENEWALS_RATE: Final = 1 / 60
+"""Renewals a second of one linked module at the authority: each is a signature and a file that is synced."""
+RENEWALS_BURST: Final = 4
+"""Renewals of one linked module at once: a user may call ``rmpa trust renew`` again."""
+RENEWAL_LOOK: Final = 30.0
+"""How often an agent looks whether its certificate is to be renewed: the wall clock may be set at any time."""
+EXPIRY_NEAR: Final = 2 * 86_400
+"""A certificate that ends within this time is a warning: renewals have failed for a day and a half."""
+EARLIEST_TIME: Final = 1_735_689_600
+"""A clock before 2025 is not set: a new mesh would have certificates that no other machine accepts."""
 CSR_MAX: Final = 4 * KIB
 """Bytes of a request for a certificate (DER); one has some 250."""
 CERTIFICATE_MAX: Final = 8 * KIB

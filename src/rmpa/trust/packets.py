@@ -18,7 +18,7 @@ from __future__ import annotations
 import hashlib
 import hmac
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
@@ -61,8 +61,17 @@ class Verdict(StrEnum):
     """It came before, perhaps by another interface."""
     REPLAYED = "replayed"
     """It is older than the last packets of its run."""
+    LEAP = "leap"
+    """Its number is further ahead than its run can have come: a member claims the run of another one."""
     LIMITED = "limited"
     """It has an older group key, and too many such packets came."""
+
+
+_STALE: Final = {
+    Freshness.REPEATED: Verdict.REPEATED,
+    Freshness.STALE: Verdict.REPLAYED,
+    Freshness.LEAP: Verdict.LEAP,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,12 +81,14 @@ class Verification:
     Args:
         verdict: Only of an accepted packet (or one with an older key) anything may be used.
         size: Bytes of the packet without its trailer.
+        key: The low 16 bits of the number of its group key, if its tag is right.
         skew: By how many seconds the sender's clock is ahead of ours; 0 if either is not set.
     """
 
     verdict: Verdict
     size: int = 0
     skew: int = 0
+    key: int = field(default=0, compare=False)
 
 
 class PacketSigner:
@@ -117,6 +128,7 @@ class PacketVerifier:
     def __init__(self, ring: KeyRing) -> None:
         self._ring = ring
         self._window = ReplayWindow()
+        self._old_window = ReplayWindow(limits.OLD_KEYS_MAX)  # so that old keys push no run out of the other one
         self._old_keys = TokenBucket(limits.OLD_KEY_PACKETS_RATE, limits.OLD_KEY_PACKETS_RATE)
 
     def verify(
@@ -149,14 +161,13 @@ class PacketVerifier:
             if abs(skew) > limits.CLOCK_TOLERANCE:
                 return Verification(Verdict.CLOCK, skew=skew)
         old = not self._ring.verifies(key, now)
+        window = self._old_window if old else self._window
+        freshness = window.take((key.number, data[slice(*run)]), number, now)
+        if freshness is not Freshness.NEW:
+            return Verification(_STALE[freshness])
         if old and not self._old_keys.take(now):
             return Verification(Verdict.LIMITED)
-        freshness = self._window.take(data[slice(*run)], number)
-        if freshness is Freshness.REPEATED:
-            return Verification(Verdict.REPEATED)
-        if freshness is Freshness.STALE:
-            return Verification(Verdict.REPLAYED)
-        return Verification(Verdict.OLD_KEY if old else Verdict.ACCEPTED, size, skew)
+        return Verification(Verdict.OLD_KEY if old else Verdict.ACCEPTED, size, skew, short)
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,3 +183,14 @@ class PacketTrust:
     signer: PacketSigner
     verifier: PacketVerifier
     wall: Callable[[], float | None]
+    old_keys: dict[str, int] = field(default_factory=dict)
+    """By address: the group key of a module that was away, so that it is dialled with one that it knows."""
+
+    def heard(self, host: str, found: Verification) -> None:
+        """Remember which key the sender of a usable packet has."""
+        if found.verdict is Verdict.OLD_KEY:
+            if len(self.old_keys) >= limits.OLD_KEYS_MAX:
+                self.old_keys.clear()
+            self.old_keys[host] = found.key
+        elif self.old_keys:
+            self.old_keys.pop(host, None)

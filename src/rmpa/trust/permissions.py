@@ -73,9 +73,19 @@ class Permissions:
     """
 
     def __init__(self, settings: TrustSettings) -> None:
+        self._known: dict[str, dict[Access, tuple[_Pattern, ...]]] = {}
+        self.reload(settings)
+
+    def reload(self, settings: TrustSettings) -> None:
+        """Judge by other rules from now on."""
         self._settings = settings
         self._groups = {group.name: group.modules for group in settings.groups}
-        self._known: dict[str, dict[Access, tuple[_Pattern, ...]]] = {}
+        self._known.clear()
+
+    @property
+    def direct(self) -> bool:
+        """Whether nodes may connect to those of other machines directly, in plain text (``trust.direct``)."""
+        return self._settings.direct
 
     def judge(self, access: Access, module: str, name: str) -> PermissionDecision:
         """Decide whether a module may do something.
@@ -145,6 +155,16 @@ class Permissions:
             if _first(self._groups.get(name, ()), module) is not None:
                 return f"group {name!r}"
         return None
+
+
+def refusal(access: Access, module: str, name: str, where: str = "there") -> str:
+    """What a refused module is told: that it may not, and nothing of the rules."""
+    return f"the permissions {where} do not let {module} {_DONE[access]} {name}"
+
+
+def prohibition(access: Access, module: str, name: str) -> str:
+    """That a module may not do something: ``arm2 may not publish /cmd_vel``."""
+    return f"{module} may not {_DONE[access]} {name}"
 
 
 def action_topics(key: str, name: str) -> Iterator[tuple[Access, str]]:

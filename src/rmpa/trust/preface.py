@@ -20,16 +20,15 @@ from __future__ import annotations
 import hashlib
 import hmac
 import struct
-from collections import deque
+from collections import Counter, OrderedDict, deque
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.trust import limits
 from rmpa.trust.keyring import KeyPurpose
-from rmpa.trust.reasons import TrustReason
+from rmpa.trust.reasons import TrustError, TrustReason
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -57,17 +56,8 @@ class Purpose(IntEnum):
     """A member whose certificate has ended asks for another."""
 
 
-class PrefaceError(RemoteProtocolError):
-    """Bytes that are not the preface of a secured mesh; the connection is closed.
-
-    Args:
-        reason: What is answered, where the dialler can read an answer.
-        text: What is wrong.
-    """
-
-    def __init__(self, reason: TrustReason, text: str) -> None:
-        super().__init__(text)
-        self.reason = reason
+class PrefaceError(TrustError):
+    """Bytes that are not the preface of a secured mesh; ``reason`` is answered where the dialler can read it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,50 +148,73 @@ class PrefaceGuard:
         self._ring = ring
         self._token_key = token_key
         self._nonces: set[bytes] = set()
-        self._order: deque[tuple[float, bytes]] = deque()
-        self._old_keys = TokenBucket(limits.OLD_KEY_PACKETS_RATE, limits.OLD_KEY_PACKETS_RATE)
+        self._nonces_there: Counter[str] = Counter()
+        self._order: deque[tuple[float, bytes, str]] = deque()
+        self._old_keys = TokenBucket(limits.OLD_KEY_DIALS_RATE, limits.OLD_KEY_DIALS_RATE)
+        self._old_keys_there: OrderedDict[str, TokenBucket] = OrderedDict()
 
-    def admit(self, data: Buffer, now: float, wall: float | None) -> Preface:
+    def admit(self, data: Buffer, now: float, wall: float | None, host: str = "") -> Preface:
         """The preface of a connection that may go on.
 
         Args:
             data: Its first bytes, ``PREFACE_BYTES`` or more.
             now: Monotonic seconds.
             wall: Seconds since 1970; ``None`` if this machine's clock is not set.
+            host: The address of the dialler: none of them can use up the rates and places of all.
 
         Raises:
-            PrefaceError: The connection is refused.
+            PrefaceError: The connection is refused; then nothing is remembered of it.
         """
         preface = Preface.parse(data)
-        self._check_tag(preface, data, now)
+        old = self._check_tag(preface, data, now)
         if wall is not None and preface.time_ms:
             skew = preface.time_ms / 1000 - wall
             if abs(skew) > limits.CLOCK_TOLERANCE:
                 ahead = "ahead of" if skew > 0 else "behind"
-                raise PrefaceError(TrustReason.CLOCK, f"its clock is {abs(skew):.0f} s {ahead} ours")
-        self._check_nonce(preface.nonce, now)
+                raise PrefaceError(
+                    TrustReason.CLOCK, f"the dialler's clock is {abs(skew):.0f} s {ahead} the acceptor's"
+                )
+        self._check_nonce(preface.nonce, now, host)
+        if old and not self._take_old(host, now):
+            raise PrefaceError(TrustReason.FLOOD, "too many connections with an old group key")
+        self._nonces.add(preface.nonce)
+        self._nonces_there[host] += 1
+        self._order.append((now + limits.NONCE_KEPT, preface.nonce, host))
         return preface
 
-    def _check_tag(self, preface: Preface, data: Buffer, now: float) -> None:
+    def _check_tag(self, preface: Preface, data: Buffer, now: float) -> bool:
+        """Check the tag, and return whether it is of a group key that only recognises."""
         if preface.purpose is Purpose.JOIN:
             key = self._token_key(preface.token_id)
             if key is None or not signed_with(data, key):
-                raise PrefaceError(TrustReason.KEY, "its token is unknown here, was used or has ended")
-            return
+                raise PrefaceError(TrustReason.KEY, "the dialler's token is unknown here, was used or has ended")
+            return False
         group = self._ring.find(preface.key)
         if group is None:
-            raise PrefaceError(TrustReason.KEY, f"its group key {preface.key} is unknown here")
+            raise PrefaceError(TrustReason.KEY, f"the dialler's group key {preface.key} is unknown to the acceptor")
         if not signed_with(data, group.key_for(KeyPurpose.PREFACE)):
-            raise PrefaceError(TrustReason.KEY, f"it does not have our group key {preface.key}")
-        if not self._ring.verifies(group, now) and not self._old_keys.take(now):
-            raise PrefaceError(TrustReason.FLOOD, "too many connections with an old group key")
+            raise PrefaceError(TrustReason.KEY, f"the dialler does not have the acceptor's group key {preface.key}")
+        return not self._ring.verifies(group, now)
 
-    def _check_nonce(self, nonce: bytes, now: float) -> None:
+    def _take_old(self, host: str, now: float) -> bool:
+        """Whether one more connection with an old group key is within the rates of its address and of all."""
+        there = self._old_keys_there.get(host)
+        if there is None:
+            there = TokenBucket(limits.OLD_KEY_PACKETS_RATE, limits.OLD_KEY_PACKETS_RATE)
+            self._old_keys_there[host] = there
+            if len(self._old_keys_there) > limits.OLD_KEYS_MAX:
+                self._old_keys_there.popitem(last=False)
+        self._old_keys_there.move_to_end(host)
+        return there.take(now) and self._old_keys.take(now)
+
+    def _check_nonce(self, nonce: bytes, now: float, host: str) -> None:
         while self._order and self._order[0][0] <= now:
-            self._nonces.discard(self._order.popleft()[1])
+            _, old, there = self._order.popleft()
+            self._nonces.discard(old)
+            self._nonces_there[there] -= 1
+            if not self._nonces_there[there]:
+                del self._nonces_there[there]
         if nonce in self._nonces:
             raise PrefaceError(TrustReason.FLOOD, "the same preface came before")
-        if len(self._nonces) >= limits.NONCES_MAX:
+        if len(self._nonces) >= limits.NONCES_MAX or self._nonces_there[host] >= limits.NONCES_PER_ADDRESS:
             raise PrefaceError(TrustReason.FLOOD, "too many handshakes at present")
-        self._nonces.add(nonce)
-        self._order.append((now + limits.NONCE_KEPT, nonce))

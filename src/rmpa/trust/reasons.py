@@ -5,6 +5,8 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Final
 
+from rmpa.core.errors import RemoteProtocolError
+
 
 class TrustReason(IntEnum):
     """Why a connection is refused; the numbers continue those of ``mesh.handshake.Refusal`` on the wire."""
@@ -42,14 +44,27 @@ class TrustReason(IntEnum):
 
 
 _REMEDIES: Final = {
-    TrustReason.PLAIN: "let that module join: rmpa trust invite here, rmpa trust join there",
-    TrustReason.UNSECURED: "let that module join this mesh, or leave it here with rmpa trust leave",
-    TrustReason.KEY: "is it of this mesh? if it was away for long, rmpa trust renew there",
+    TrustReason.PLAIN: "it joins by rmpa trust join TOKEN, with a token of rmpa trust invite at the authority",
+    TrustReason.UNSECURED: "it joins by rmpa trust join TOKEN, with a token of rmpa trust invite at the authority",
+    TrustReason.KEY: "are both of one mesh? the one that was away for long: rmpa trust renew there",
     TrustReason.CLOCK: "set both clocks: date, timedatectl",
-    TrustReason.FOREIGN: "that module has joined another mesh: rmpa trust join there, with a token of this one",
+    TrustReason.FOREIGN: "they have joined different meshes: rmpa trust join on one, with a token of the other's",
     TrustReason.EXPIRED: "rmpa trust renew on the module whose certificate it is, while the authority is reachable",
-    TrustReason.REVOKED: "if that module is to come back: rmpa trust invite at the authority, rmpa trust join there",
-    TrustReason.NAME: "start that module with the name that it joined with, or let it join again",
+    TrustReason.REVOKED: "it can come back by rmpa trust invite at the authority, and rmpa trust join there",
+    TrustReason.NAME: "start the module with the name that it joined with, or let it join again",
     TrustReason.DOWNGRADE: "install the same release of rmpa on both",
     TrustReason.FLOOD: "it is tried again; is something else connecting to this port?",
 }
+
+
+class TrustError(RemoteProtocolError):
+    """A secured mesh refuses a connection, a certificate or a request.
+
+    Args:
+        reason: The word for it.
+        text: What is wrong.
+    """
+
+    def __init__(self, reason: TrustReason, text: str) -> None:
+        super().__init__(text)
+        self.reason = reason

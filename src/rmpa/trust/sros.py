@@ -33,11 +33,12 @@ from rmpa.core.errors import ConfigError
 from rmpa.core.identity import peer_name_from
 from rmpa.core.names import NEVER_CROSSING, matches
 from rmpa.trust import limits
+from rmpa.trust.sros_policy import policy_rules
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-_REMEDY: Final = "name the permissions.xml of an enclave, as `ros2 security` made it"
+_REMEDY: Final = "name the permissions.xml of an enclave, as `ros2 security` made it, or a policy.xml"
 _COMMON_NAME: Final = re.compile(r"(?:^|[,/])\s*CN\s*=\s*(/?[^,]+)")
 _PARAMETER_SERVICES: Final = re.compile(
     r"/(?:get_parameters|get_parameter_types|list_parameters|describe_parameters|set_parameters"
@@ -83,7 +84,7 @@ class _BoundedBuilder(TreeBuilder):
 
 
 def read_sros(data: bytes) -> SrosImport:
-    """Read a ``permissions.xml``.
+    """Read a ``permissions.xml``, or the ``policy.xml`` that one is made of.
 
     Args:
         data: The file. The signed form (``permissions.p7s``) has the same text within; it is not checked here.
@@ -99,15 +100,18 @@ def read_sros(data: bytes) -> SrosImport:
         root = parser.close()
     except (ParseError, DefusedXmlException, ValueError, LookupError) as error:
         raise _bad(f"not XML that can be read: {error!s:.200}") from None
-    if root.tag != "dds" or root.find("permissions") is None:
-        raise _bad("no permissions of DDS Security")
     notes: dict[str, None] = {}
+    if root.tag == "policy" and root.find("enclaves") is not None:
+        found = policy_rules(root, notes)
+    elif root.tag == "dds" and root.find("permissions") is not None:
+        found = (rule for grant in root.iterfind("permissions/grant") for rule in _grant(grant, notes))
+    else:
+        raise _bad("no permissions of DDS Security, and no policy of SROS 2")
     rules: list[PermissionRule] = []
-    for grant in root.iterfind("permissions/grant"):
-        for rule in _grant(grant, notes):
-            rules.append(rule)
-            if len(rules) > limits.SROS_RULES_MAX:
-                raise _bad(f"more than {limits.SROS_RULES_MAX} rules")
+    for rule in found:
+        rules.append(rule)
+        if len(rules) > limits.SROS_RULES_MAX:
+            raise _bad(f"more than {limits.SROS_RULES_MAX} rules")
     return SrosImport(tuple(rules), tuple(notes))
 
 

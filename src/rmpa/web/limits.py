@@ -15,10 +15,19 @@ CLIENT_QUEUE_BYTES: Final = 16 * MIB
 always fits where no other waits."""
 SUBSCRIPTION_QUEUE_BYTES: Final = 8 * MIB
 """Bytes that wait for one subscription of one client; its newest message always fits."""
+PAYLOAD_BUFFER_MIN: Final = 64 * KIB
+"""Bytes from which on a received message is copied into a buffer that was used before; smaller ones cost little."""
+PAYLOAD_BUFFERS_BYTES: Final = 16 * MIB
+"""Bytes of these buffers that are kept, used and unused: what waits for one slow client."""
+PAYLOAD_BUFFERS_MAX: Final = 64
+"""Such buffers; each is looked at until one is unused."""
 CLIENTS_MAX: Final = 256
 """Clients of both gateways together."""
 SUBSCRIPTION_LINGER: Final = 2.0
 """Time that the hub stays subscribed to a topic without a client: pages reload, and panels move."""
+SUBSCRIBED_TOPICS_MAX: Final = 4000
+"""Topics that the hub subscribes to for all clients; beyond, only those with a publisher are added. Each name is
+registered with the master, which takes a millisecond and some kilobytes."""
 UNADVERTISE_DELAY: Final = 10.0
 """Time until a topic is withdrawn that no client advertises any more, as rosbridge_suite does."""
 PUBLISHERS_MAX: Final = 2000
@@ -90,6 +99,8 @@ CLOSE_TIMEOUT: Final = 2.0
 PING_INTERVAL: Final = 20.0
 """Time without a sign of life of a client, half of it after a ping; after half of it more it is disconnected, as it
 may have left the Wi-Fi."""
+MESSAGE_TIMEOUT: Final = 120.0
+"""Time for a client's message to arrive, all its fragments: the largest one at 5 Mbit/s."""
 SEND_TIMEOUT: Final = 30.0
 """Time in which the client's machine must acknowledge what was sent (TCP_USER_TIMEOUT)."""
 WRITE_BUFFER: Final = 64 * KIB
@@ -157,7 +168,8 @@ REST_NAMES_COMPARED: Final = 1000
 
 # --- HTTP server --------------------------------------------------------------------------------------------------
 WEB_CONNECTIONS_MAX: Final = 256
-"""Connections at one time: a browser has six, Prometheus one. Each takes some 10 KiB and a file descriptor."""
+"""Connections at one time: a browser has six, Prometheus one. Each takes some 10 KiB and a file descriptor, and
+a WebSocket one more."""
 WEB_LINE_MAX: Final = 4096
 """Bytes of a request line: twice the longest path of the API, for a token behind it."""
 WEB_FIELD_MAX: Final = 8 * KIB
@@ -188,3 +200,5 @@ WEB_TOKEN_LENGTH_MIN: Final = 16
 """Characters of a token that the user chose."""
 WEB_TOKEN_FILE_MAX: Final = 4096
 """Bytes of a token's file; a larger one is no token."""
+CERTIFICATE_LOOK_PERIOD: Final = 5.0
+"""Seconds between two looks at the files of the certificate: a renewed one is served long before the old one ends."""

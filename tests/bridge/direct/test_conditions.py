@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, read_unmet, reply_of
+from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, read_unmet, reply_of, unmet_by_trust
+from rmpa.bridge.permission_gate import PermissionGate
+from rmpa.config.settings import TrustSettings
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.trust.permissions import Permissions
 
 GRANT = Grant(45225, "/talker", "/talker/get_loggers")
 
@@ -72,3 +75,14 @@ def test_only_passing_conditions_are_tried_again_by_time() -> None:
         Condition.STABLE,
         Condition.LIMIT,
     }
+
+
+def test_a_secured_mesh_relays_between_machines_unless_the_user_allows_plain_connections() -> None:
+    secured = PermissionGate(Permissions(TrustSettings()))
+    unmet = unmet_by_trust(secured, "this module", same_machine=False)
+    assert unmet is not None
+    assert (unmet.condition, unmet.lasting) == (Condition.TRUST, True)
+    assert unmet_by_trust(secured, "this module", same_machine=True) is None
+    allowed = PermissionGate(Permissions(TrustSettings(direct=True)))
+    assert unmet_by_trust(allowed, "this module", same_machine=False) is None
+    assert unmet_by_trust(PermissionGate(), "this module", same_machine=False) is None

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.bridge.params.rules import ParamPolicy, follow_rules, key_problem, leaves
+from rmpa.bridge.params.rules import ParamPolicy, follow_rules, key_problem, leaves, replaced
 from rmpa.config.settings import FollowRule, ParamSettings, TimeSettings
 
 if TYPE_CHECKING:
@@ -68,3 +68,22 @@ def test_leaves() -> None:
     assert list(leaves("/x", value)) == [("/x/a", 1), ("/x/b/c", [1]), ("/x/e/f", "x")]
     assert list(leaves("/", {"a": 1})) == [("/a", 1)]
     assert list(leaves("/x", 5)) == [("/x", 5)]
+
+
+@pytest.mark.parametrize(
+    ("names", "at", "present", "lost"),
+    [
+        (["/a/b"], "/a", {"b": 1}, []),
+        (["/a/b"], "/a", {"b": {"x": 1, "y": {"z": 2}}}, ["/a/b/x", "/a/b/y/z"]),
+        (["/a/b/c"], "/a", {"b": 7, "d": 8}, ["/a/b"]),
+        (["/a/b"], "/a", 7, ["/a"]),
+        (["/a"], "/a", {"b": 1}, ["/a/b"]),
+        (["/a/new/x"], "/a", {"b": 1}, []),
+        (["/x/y", "/b"], "/", {"x": 1, "b": {"c": 2}}, ["/x", "/b/c"]),
+        (["/a"], "/a", None, []),
+    ],
+)
+def test_what_is_lost_when_a_value_takes_the_place_of_a_namespace_or_the_other_way_round(
+    names: list[str], at: str, present: XmlRpcValue, lost: list[str]
+) -> None:
+    assert list(replaced(names, at, present)) == lost

@@ -21,9 +21,9 @@ from rmpa.bridge.services.imports import (
     OpenedService,
     Provide,
     ServiceImports,
-    ServiceRouteState,
     Withdraw,
 )
+from rmpa.bridge.services.remote_service import ServiceRouteState
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from tests.bridge.services.test_rules import apply_rules, rules

@@ -38,9 +38,9 @@ from rmpa.bridge.services.imports import (
     OpenedService,
     Provide,
     ServiceImports,
-    ServiceRouteState,
     Withdraw,
 )
+from rmpa.bridge.services.remote_service import ServiceRouteState
 from rmpa.config.settings import ServiceSettings
 from rmpa.core.errors import RemoteProtocolError
 from tests.bridge.services.test_rules import apply_rules, rules

@@ -6,12 +6,17 @@ import asyncio
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
+import pytest
+
+from rmpa.bridge.permission_gate import PermissionGate
 from rmpa.bridge.session.part import Part
 from rmpa.bridge.session.peer_session import PeerSession, PeerState
 from rmpa.bridge.session.peer_sessions import PeerSessions
+from rmpa.config.settings import TrustSettings
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.mesh import limits as mesh_limits
+from rmpa.trust.permissions import Permissions
 from tests.bridge.io.virtual import VirtualLoop, run
 
 if TYPE_CHECKING:
@@ -65,7 +70,8 @@ class Scene:
     def __init__(self, *outages: float) -> None:
         self.part = Keeper(*outages)
         nodes, receiver = SimpleNamespace(), SimpleNamespace(link_up=lambda *_: None, link_down=lambda _: None)
-        self.sessions = PeerSessions([self.part], cast("Any", nodes), cast("Any", receiver), self._killed)
+        self.gate = PermissionGate()
+        self.sessions = PeerSessions([self.part], cast("Any", nodes), cast("Any", receiver), self._killed, self.gate)
 
     async def _killed(self, *_: object) -> RosReply:
         raise NotImplementedError
@@ -104,6 +110,36 @@ def test_a_short_silence_goes_unnoticed() -> None:
         assert made.states() == [PeerState.LINKED]
 
     assert play(scene) == ["up 1", "down", "up 1"]
+
+
+def test_another_module_that_claims_a_run_does_not_get_its_session() -> None:
+    """Instances are no secret: each member hears them in beacons. In a secured mesh the name alone is proved."""
+
+    async def scene(made: Scene) -> None:
+        made.sessions.link_down(made.link())
+        thief = Link(1, silent=True)
+        thief.name = "thief"
+        thief.identity = Identity(thief.guid, thief.identity.instance, "thief")
+        made.sessions.link_up(cast("PeerLink", thief))
+        assert [(session.peer, session.link.name) for session in made.sessions] == [(2, "thief")]
+
+    assert play(scene) == ["up 1", "down", "gone", "up 2"]
+
+
+@pytest.mark.parametrize("secured", [True, False])
+def test_a_module_at_the_address_of_another_ends_its_session_in_a_plain_mesh_alone(*, secured: bool) -> None:
+    """In a secured mesh the address is a claim, and the name is proved. In a plain one the module was renamed."""
+
+    async def scene(made: Scene) -> None:
+        made.gate.permissions = Permissions(TrustSettings()) if secured else None
+        made.sessions.link_down(made.link())
+        other = Link(2, silent=True)
+        other.name = "other"
+        other.identity = Identity(other.guid, other.identity.instance, "other")
+        made.sessions.link_up(cast("PeerLink", other))
+        assert [session.link.name for session in made.sessions] == (["far"] if secured else []) + ["other"]
+
+    assert play(scene) == ["up 1", "down", *([] if secured else ["gone"]), "up 2"]
 
 
 def test_a_session_that_nothing_waits_for_ends_after_the_grace() -> None:

@@ -391,6 +391,17 @@ def test_what_is_offered_no_more_goes_when_the_whole_offer_is_there(flowing: Imp
     assert actions == [Detach(1, CMD, 0), Retract(1, CMD)]
 
 
+def test_a_peer_that_is_back_is_no_problem_any_more(flowing: Imports) -> None:
+    flowing.demand(1, CMD, 0.0, wanted=False)
+    flowing.demand(1, ODOM.source, 0.0, wanted=False)
+    entries = [flowing.get(1, source) for source in (CMD, ODOM.source)]
+    flowing.link_away(1, briefly=True)
+    assert {entry.problem for entry in entries if entry} == {"its peer is away"}
+    flowing.link_up(1)
+    flowing.advertised(1, Advertise(added=(OFFER, ODOM)), 10.0)
+    assert {entry.problem for entry in entries if entry} == {""}
+
+
 def test_who_leaves_while_the_peer_is_away_ends_what_waits(flowing: Imports, positions: Positions) -> None:
     flowing.link_away(1)
     assert flowing.demand(1, CMD, 1.0, wanted=False) == [Detach(1, CMD, 0)]

@@ -168,6 +168,33 @@ async def test_a_flood_is_cut_off(agents: list[Agent], settings: Settings, caplo
     assert "too many packets" in caplog.text
 
 
+async def test_a_flood_without_proofs_pauses_the_reading_and_members_still_meet(
+    agents: list[Agent], settings: Settings
+) -> None:
+    rings = [KeyRing([GroupKey(1, bytes(32))], 0.0) for _ in range(2)]
+    base, arm = (
+        Agent(name, settings, trust=PacketTrust(PacketSigner(ring), PacketVerifier(ring), time.time))
+        for name, ring in zip(("base", "arm"), rings, strict=True)
+    )
+    await start(agents, base)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+
+        async def flood() -> None:
+            while True:
+                for _ in range(100):
+                    sock.sendto(bytes(200), ("127.0.0.1", base.port))
+                await asyncio.sleep(0)
+
+        flooding = asyncio.create_task(flood())
+        try:
+            await until(lambda: base.discovery.counters["beacon.paused"] > 1)
+            await start(agents, arm)
+            await until(lambda: base.names() == {"arm"})
+        finally:
+            flooding.cancel()
+    assert base.discovery.counters["beacon.untagged"] >= limits.BEACONS_UNPROVED_BURST
+
+
 async def test_other_domains_do_not_meet(agents: list[Agent], settings: Settings) -> None:
     base = Agent("base", settings)
     # The port moves with the domain; a wrong setting could still bring both to one port.

@@ -146,6 +146,18 @@ def test_a_flood_under_the_address_of_a_member_does_not_silence_it() -> None:
     assert door.counters["beacon.flood"] == 0
 
 
+def test_more_forged_packets_than_can_be_looked_at_ask_for_a_pause() -> None:
+    door = SecuredDoor()
+    forged_beacon = packet(FRIEND, 1) + bytes(32)
+    asked = []
+    for _ in range(2 * limits.BEACONS_UNPROVED_BURST):
+        door.hears(forged_beacon)
+        asked.append(door.intake.overrun)
+    assert asked.index(True) == limits.BEACONS_UNPROVED_BURST
+    door.hears(forged_beacon, now=10.0 + limits.BEACONS_UNPROVED_PAUSE)
+    assert not door.intake.overrun, "the pause is over"
+
+
 def test_refused_packets_are_logged_with_what_to_do(caplog: pytest.LogCaptureFixture) -> None:
     door = SecuredDoor()
     door.hears(packet(FRIEND, 1))

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from rmpa.config.settings import LaneSettings
     from rmpa.mesh.io.link import PeerLink
+    from rmpa.mesh.io.securing import MeshSecurity, OnJoin
 
 DEADLINE = 20.0
 
@@ -44,6 +45,9 @@ class Peer:
         port: int = 0,
         lanes: LaneSettings | None = None,
         host: str = "127.0.0.1",
+        name: str | None = None,
+        security: MeshSecurity | None = None,
+        on_join: OnJoin | None = None,
     ) -> None:
         sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -53,7 +57,7 @@ class Peer:
         self.port = sock.getsockname()[1]
         instance_id = bytes([number, instance]) + bytes(14)
         guid = Guid.of("127.0.0.1", self.port, instance)
-        self.identity = Identity(guid, instance_id, f"peer{number}")
+        self.identity = Identity(guid, instance_id, name or f"peer{number}")
         self.ups: list[PeerLink] = []
         self.downs: list[tuple[PeerLink, str]] = []
         """Links that went down, and the reasons."""
@@ -73,6 +77,8 @@ class Peer:
             on_control=lambda _link, payload: self.controls.append(payload),
             handlers=LinkHandlers(self.on_data, self.on_part, self.on_mark, self.clocks.append, self.on_lane_lost),
             lanes=lanes,
+            security=security,
+            on_join=on_join,
         )
 
     def on_data(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:

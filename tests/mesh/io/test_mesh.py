@@ -143,9 +143,9 @@ async def test_link_that_ends_during_a_bulk_dial_leaks_no_socket(
         opened: list[socket.socket] = []
         open_link = one.mesh._open
 
-        def note(sock: socket.socket, *args: Any) -> None:
+        def note(sock: socket.socket, *args: Any, **options: Any) -> None:
             opened.append(sock)
-            open_link(sock, *args)
+            open_link(sock, *args, **options)
 
         monkeypatch.setattr(one.mesh.dialler, "connect", late)
         monkeypatch.setattr(one.mesh, "_open", note)

@@ -37,6 +37,16 @@ def test_peers_clocks_and_notes() -> None:
     assert "shares its name" in texts["peer", "base-pc", CheckLevel.FAIL]
 
 
+def test_what_permissions_refused() -> None:
+    counters = {"link.up": 3, "permission.call": 1, "permission.publish": 4}
+    shown = msgspec.structs.replace(SNAPSHOT, counters=counters)
+    (found,) = [f for f in judge_agents({"base": shown}, "0.1.0") if f.name == "permissions"]
+    assert (found.level, found.text) == (
+        CheckLevel.OK,
+        "refused so far: 1 call, 4 publish; its log names the rules",
+    )
+
+
 def test_nodes_that_cannot_be_reached() -> None:
     cam = UnreachableInfo(node="/cam", uri="http://nosuch:1/", problem="no such name", ago=3.0)
     gone = UnreachableInfo(node="/gone", uri="http://10.9.9.9:1/", problem="no answer", ago=60.0, withdrawn=True)

@@ -282,6 +282,16 @@ def test_updates_have_slashes_and_deletion_is_an_empty_dict(master: Master) -> N
     assert master.effects == [ParamUpdate(B, "/a/b/", 3)]
 
 
+def test_a_member_with_a_slash_in_its_name_is_no_news_of_another_parameter(master: Master) -> None:
+    """Rosmaster answers with an error instead, and sends no notification: it does not find the value for the key."""
+    master("setParam", "/x", "/motors/limit", 1)
+    master("subscribeParam", "/s", B, "/motors/limit")
+    master("subscribeParam", "/s", B, "/speed/max")
+    master("setParam", "/x", "/speed", {"/motors/limit": 99, "max": 2})
+    assert master.effects == [ParamUpdate(B, "/speed/max/", 2)]
+    assert master.value("getParam", "/x", "/motors/limit") == 1
+
+
 @pytest.mark.trap(35)
 def test_empty_namespaces_exist_but_have_no_names(master: Master) -> None:
     master("setParam", "/x", "/empty", {})

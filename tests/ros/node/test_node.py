@@ -128,6 +128,18 @@ async def test_a_failing_callback_is_logged_and_called_again(core: RosCore, capl
     assert "the user's mistake" in caplog.text
 
 
+async def test_a_subscriber_may_take_the_bytes_themselves(core: RosCore) -> None:
+    taken: list[tuple[bytes, str]] = []
+    async with node(core, "talker") as talker, node(core, "listener") as listener:
+        publisher = await talker.advertise("/t", STRING)
+        await listener.subscribe("/t", on_bytes=lambda data, header: taken.append((bytes(data), header["callerid"])))
+        await publisher.wait_for_subscriber()
+        publisher.publish_raw(b"1")
+        publisher.publish_raw(b"x" * 300_000)
+        await until(lambda: len(taken) == 2)
+    assert taken == [(b"1", "/talker"), (b"x" * 300_000, "/talker")]
+
+
 @pytest.mark.trap(17)
 async def test_a_bad_message_is_one_error_and_the_next_is_read(
     core: RosCore, caplog: pytest.LogCaptureFixture

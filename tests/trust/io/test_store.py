@@ -90,6 +90,41 @@ def test_links_and_pipes_are_not_followed(trust: TrustStore) -> None:
         trust.load()
 
 
+def test_a_folder_that_cannot_be_entered_never_turns_trust_off(trust: TrustStore) -> None:
+    trust.save(FILES)
+    hidden = trust.folder.rename(trust.folder.with_name("hidden"))
+    trust.folder.symlink_to(trust.folder)  # an error also for root, who may enter every folder
+    seen = [trust.exists, trust.is_authority]
+    for read in (trust.load, trust.load_ca_key, trust.load_tokens):
+        with pytest.raises(StartError, match="cannot be read"):
+            read()
+    trust.folder.unlink()
+    seen.append(trust.exists)
+    trust.folder.write_bytes(b"")
+    seen.append(trust.exists)  # a file in place of the folder: there is nothing in it
+    assert seen == [True, True, False, False]
+    trust.folder.unlink()
+    hidden.rename(trust.folder)
+    trust.path(store.DENY).unlink()
+    trust.path(store.DENY).symlink_to(store.DENY)
+    with pytest.raises(StartError, match=r"deny\.json: cannot be read"):
+        trust.load()
+
+
+def test_a_file_of_another_user_names_the_remedy(trust: TrustStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    trust.save(FILES)
+
+    def refuse(path: Path, *_args: object) -> int:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "open", refuse)
+        patch.setattr(os, "lstat", refuse)
+        assert trust.exists
+        with pytest.raises(StartError, match="cannot be read: Permission denied; run it as the user of the agent"):
+            trust.load()
+
+
 def test_a_huge_file_is_not_read(trust: TrustStore) -> None:
     trust.save(FILES)
     trust.write(store.KEYS, bytes(limits.DOCUMENT_MAX + 1))

@@ -24,6 +24,8 @@ PAGES = {
     "topics": "/velocity_order",
     "topic/%2Fodom": "bridge.allow has",
     "services": "/base/set_parameters",
+    "nodes": "Of peers, the nodes",
+    "node/base%3A%2Fbase": "Node of base",
     "service/base%3A%2Fbase%2Fset_parameters": "std_srvs/SetBool",
     "params": "rosdistro",
     "resources": "a simulated Turtlebot",
@@ -257,6 +259,127 @@ async def test_why_says_where_the_way_ends(site: Site) -> None:
     await page.press("w")
     await page.wait_text("no linked peer publishes it")
     await page.wait_text("start the module base")
+
+
+async def test_a_module_tells_its_agents_figures_its_lanes_and_why(site: Site) -> None:
+    page = await site.open("module/base")
+    await page.wait_text("4.2")
+    await page.wait_text("large messages")
+    text = await page.run("document.querySelector('main').innerText")
+    assert "of a core" in text
+    assert "61 of 1,024" in text
+    assert await page.run("[...document.querySelectorAll('main a')].some((each) => each.textContent === '/base')")
+    await page.press("w")
+    await page.wait_text("It is reached")
+    assert site.server.asked[-1].args == {"kind": "module", "name": "base"}
+
+
+async def test_an_agent_of_an_earlier_release_does_not_tell_its_figures_and_the_page_says_so(site: Site) -> None:
+    page = await site.open("module/joystick")
+    await page.wait_text("not told by this peer")
+
+
+async def test_a_lane_without_a_connection_is_seen(site: Site) -> None:
+    page = await site.open("module/velocity", "sick")
+    await page.wait_text("no connection")
+
+
+async def test_a_node_shows_its_topics_services_connections_and_log(site: Site) -> None:
+    page = await site.open("node/base%3A%2Fbase")
+    await page.wait_text("4711")
+    await page.wait_text("connected")
+    text = await page.run("document.querySelector('main').innerText")
+    assert "/odom" in text
+    assert "set_parameters" in text
+    assert "stay in their module" in text
+    await page.run("location.hash = '#/topic/%2Fodom'")
+    await page.wait("[...document.querySelectorAll('main a')].some((each) => each.hash === '#/node/base%3A%2Fbase')")
+    assert (site.server.reports, page.errors) == ([], [])
+
+
+async def test_a_node_of_this_module_shows_its_lines_of_the_log_alone(site: Site) -> None:
+    own = site.server.logger = "/pc"
+    page = await site.open("node/%2Fpc")
+    await page.wait_text("turn ")
+    site.server.logger = "/somebody_else"
+    await page.run("location.hash = '#/log'")
+    await page.wait_text("/somebody_else")
+    site.server.logger = own
+    await page.run("location.hash = '#/node/%2Fpc'")
+    await page.wait_text("turn ")
+    assert "somebody_else" not in await page.run("document.querySelector('main').innerText")
+
+
+async def test_topics_that_carry_data_come_first_and_the_filter_looks_among_all(site: Site) -> None:
+    page = await site.open("topics")
+    await page.wait_text("are left out")
+    rows = "[...document.querySelectorAll('tbody th')].map((each) => each.innerText.trim())"
+    assert await page.run(rows) == ["/command_information", "/odom", "/velocity_order"]
+    await page.run("(() => { const field = document.querySelector('main input'); field.value = 'base/qual';"
+                   " field.dispatchEvent(new Event('input', {bubbles: true})); })()")  # fmt: skip
+    await page.wait(f"{rows}.join() === '/base/quality'")
+    page = await site.open("module/base")
+    await page.wait("document.querySelector('details')")
+    assert "/base/quality" not in await page.run("document.querySelector('main').innerText")
+
+
+async def test_one_trouble_of_many_topics_is_one_line(site: Site) -> None:
+    page = await site.open()
+    lost = {"problem": "its peer is away"}
+    await receive(page, {"topics": dict.fromkeys(("/odom", "/velocity_order"), lost)})
+    await page.wait_text("2 topics")
+    assert await page.run("document.querySelectorAll('.concerns li').length") == 1
+
+
+async def test_the_contract_of_a_topic_shows_before_it_has_a_route(site: Site) -> None:
+    page = await site.open("topic/%2Fvelocity_order")
+    await page.wait_text("rule 1: topics /velocity")
+    page = await site.open("topic/%2Fodom")
+    await page.wait_text("the defaults hold")
+
+
+async def test_a_parameter_that_another_node_changes_shows_by_itself(site: Site) -> None:
+    page = await site.open("params")
+    await page.wait_text("noetic")
+    site.server.params["/rosdistro"] = "melodic"
+    await page.wait_text("melodic")
+    await click(page, "base")
+    await page.wait("document.querySelector('.kind').textContent === 'Of the core of base'")
+    await page.wait_text("melodic")
+    site.server.params["/rosdistro"] = "kinetic"
+    await page.wait_text("kinetic")
+
+
+async def test_an_edit_that_was_begun_is_kept_when_other_parameters_change(site: Site) -> None:
+    page = await site.open("params")
+    await click(page, '"noetic"')
+    await page.wait("document.querySelector('form.row input')")
+    await page.run("(() => { const field = document.querySelector('form.row input'); field.value = 'half';"
+                   " field.dispatchEvent(new Event('input', {bubbles: true})); })()")  # fmt: skip
+    site.server.params["/fresh"] = "come"
+    await page.wait_text("come")
+    assert await page.run("document.querySelector('form.row input').value") == "half"
+
+
+@pytest.mark.parametrize(
+    ("words", "address"),
+    [
+        ("node base", "#/node/base%3A%2Fbase"),
+        ("wheel", "#/params/%2Fbase%2Fwheel%2Fradius"),
+        ("smart vel", "#/resource/velocity%3A%2Fvelocity"),
+    ],
+)
+async def test_the_search_finds_nodes_parameters_and_resources(site: Site, words: str, address: str) -> None:
+    page = await site.open()
+    await page.press("/")
+    await page.wait("document.activeElement.type === 'search'")
+    for key in words:
+        await page.press(key)
+    await page.wait("document.querySelector('.found [aria-selected=true] .kind')")
+    kind = {"w": "parameter", "n": "node", "s": "resource"}[words[0]]
+    await page.wait(f"document.querySelector('.found [aria-selected=true] .kind').textContent === '{kind}'")
+    await page.press("Enter")
+    await page.wait(f"location.hash === '{address}'")
 
 
 async def test_a_service_is_called(site: Site) -> None:

@@ -77,8 +77,14 @@ def described(asked: requests.DescribeType) -> requests.Answer:
     if asked.service:
         service = ServiceType(asked.type)
         return requests.Described(asked.handle, asked.type, service.request.definition, service.response.definition)
-    return requests.Described(asked.handle, asked.type, MessageType(asked.type).definition)
+    kind = MessageType(asked.type)
+    if asked.md5sum and asked.md5sum != kind.md5sum:
+        text = f"string data # as {asked.md5sum} has it"
+        return requests.Described(asked.handle, asked.type, text, md5sum=asked.md5sum)
+    return requests.Described(asked.handle, asked.type, kind.definition, md5sum=kind.md5sum)
 
 
-def message(subscription: int, topic: str, payload: bytes, stamp: int = 5) -> requests.ReceivedMessage:
-    return requests.ReceivedMessage(subscription, topic, "std_msgs/String", memoryview(payload), stamp)
+def message(
+    subscription: int, topic: str, payload: bytes, stamp: int = 5, md5sum: str = ""
+) -> requests.ReceivedMessage:
+    return requests.ReceivedMessage(subscription, topic, "std_msgs/String", memoryview(payload), stamp, md5sum=md5sum)

@@ -17,6 +17,7 @@ from tests.ros.node.peers import DEADLINE
 from tests.web.hub.client import running_hub
 
 if TYPE_CHECKING:
+    import ssl
     from collections.abc import AsyncIterator, Callable
 
     from rmpa.ros.core.embedded import RosCore
@@ -61,11 +62,12 @@ class Server:
         self.hub = hub
         self.port = port
         self.session = session
+        self.scheme = "ws"
 
     @contextlib.asynccontextmanager
     async def client(self, *protocols: str, path: str = "/") -> AsyncIterator[Client]:
         """A client that offers subprotocols."""
-        url = f"ws://127.0.0.1:{self.port}{path}"
+        url = f"{self.scheme}://127.0.0.1:{self.port}{path}"
         async with self.session.ws_connect(url, protocols=protocols, max_msg_size=0) as socket:
             yield Client(socket)
 
@@ -78,8 +80,13 @@ async def running_server(
     *,
     port: int = 0,
     watch: AgentWatch | None = None,
+    tls: tuple[ssl.SSLContext, ssl.SSLContext] | None = None,
 ) -> AsyncIterator[Server]:
-    """The gateways; with ``watch``, which asks an agent, also the monitor."""
+    """The gateways; with ``watch``, which asks an agent, also the monitor; with ``tls`` by WSS.
+
+    Args:
+        tls: The contexts of the server and of its clients.
+    """
     async with running_hub(core) as hub:
         monitor = Monitor(hub, watch, {}) if watch is not None else None
         if monitor is not None:
@@ -90,12 +97,15 @@ async def running_server(
             app.router.add_get(path, gateways.handle)
         runner = web.AppRunner(app, shutdown_timeout=1)
         await runner.setup()
-        site = web.TCPSite(runner, "127.0.0.1", port)
+        site = web.TCPSite(runner, "127.0.0.1", port, ssl_context=tls[0] if tls else None)
         await site.start()
         port = runner.addresses[0][1]
         try:
-            async with aiohttp.ClientSession() as session:
-                yield Server(gateways, hub, port, session)
+            connector = aiohttp.TCPConnector(ssl=tls[1]) if tls else None
+            async with aiohttp.ClientSession(connector=connector) as session:
+                server = Server(gateways, hub, port, session)
+                server.scheme = "wss" if tls else "ws"
+                yield server
         finally:
             await gateways.close()
             await runner.cleanup()

@@ -6,6 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING, Any
 
 from rmpa.web.gateways.connection import ClientConnection, OutFrame
+from rmpa.web.gateways.frame_writer import FrameWriter
 from rmpa.web.hub.clients import HubClient
 from rmpa.web.hub.rights import READ_ONLY
 from tests.ros.node.peers import DEADLINE
@@ -49,6 +50,9 @@ class Transport:
     def is_closing(self) -> bool:
         return self.aborted
 
+    def get_extra_info(self, _: str) -> None:
+        return None
+
     def write(self, data: bytes) -> None:
         self.written += data
 
@@ -56,11 +60,16 @@ class Transport:
         self.aborted = True
 
 
+async def forever() -> None:
+    await asyncio.Event().wait()
+
+
 async def watched(transport: Transport) -> None:
     hub: Any = None
     connection = Silent(hub, READ_ONLY, lambda _: 0, "here", unadvertise_delay=0.0)
     played: Any = transport
     connection._transport = played
+    connection._out = FrameWriter(played, forever)
     connection._client = HubClient(1, "test", READ_ONLY, lambda _: None, 0.0)
     await asyncio.wait_for(connection._watch(), DEADLINE)
 

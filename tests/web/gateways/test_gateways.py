@@ -6,17 +6,23 @@ import asyncio
 import contextlib
 import json
 import socket
+import ssl
 import struct
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import aiohttp
 
 from rmpa.ros.types.messages import MessageType
 from rmpa.web.hub.rights import READ_ONLY
+from rmpa.web.server.tls import tls_context
 from tests.ros.node.peers import DEADLINE, LATCHED, STRING, until
-from tests.web.gateways.server import Client, running_server
+from tests.web.gateways.server import Client, Server, running_server
 from tests.web.hub.client import node
 
 if TYPE_CHECKING:
     from rmpa.ros.core.embedded import RosCore
+    from rmpa.ros.node.topics import Publisher
 
 ONE, TWO = b"\x03\0\0\0one", b"\x03\0\0\0two"
 FOXGLOVE = "foxglove.websocket.v1"
@@ -178,6 +184,33 @@ async def test_large_messages_arrive_whole_at_every_client(core: RosCore) -> Non
             assert bytes(payload) in await bridge.next_bytes()
 
 
+async def test_large_messages_arrive_whole_by_tls_at_a_client_that_reads_late(core: RosCore) -> None:
+    files = Path(__file__).parents[1] / "server" / "tls"
+    tls = tls_context(str(files / "cert.pem"), str(files / "key.pem"))
+    assert tls is not None
+    trusted = ssl.create_default_context(cafile=files / "cert.pem")
+    payload = bytes(BYTES.serialize(BYTES.make({"data": bytes(range(250)) * 40_000})))
+    async with (
+        running_server(core, tls=(tls, trusted)) as server,
+        node(core, "mapper") as mapper,
+        server.client(FOXGLOVE) as client,
+    ):
+        publisher = await mapper.advertise("/map", BYTES)
+        channel = await channel_of(client, "/map")
+        await client.send("subscribe", subscriptions=[{"id": 1, "channelId": channel["id"]}])
+        await publisher.wait_for_subscriber()
+        await until(lambda: all(each.subscriptions for each in server.hub.clients))
+        client.socket._reader._protocol.pause_reading()
+        (connection,) = server.gateways.connections
+        before = connection.sent
+        publisher.publish_raw(payload)
+        await until(lambda: connection.sent > before)
+        publisher.publish_raw(payload[:100])
+        client.socket._reader._protocol.resume_reading()
+        assert (await client.next_bytes())[13:] == payload
+        assert (await client.next_bytes())[13:] == payload[:100]
+
+
 async def test_a_client_that_stops_reading_costs_its_bound_and_no_other_a_message(core: RosCore) -> None:
     payload = bytes(BYTES.serialize(BYTES.make({"data": [7] * 500_000})))
     async with running_server(core) as server, node(core, "camera") as camera:
@@ -201,6 +234,46 @@ async def test_a_client_that_stops_reading_costs_its_bound_and_no_other_a_messag
             figures = server.gateways.figures()["foxglove"]
             assert (figures.clients, figures.queued, figures.dropped) == (2, *queues[1])
             stuck.socket._response.connection.transport.abort()  # type: ignore[union-attr]
+
+
+async def _under_way(server: Server, publisher: Publisher, client: Client, payload: bytes) -> None:
+    """Have the client subscribe, stop reading, and be sent a message that the kernel does not take whole."""
+    channel = await channel_of(client, "/map")
+    await client.send("subscribe", subscriptions=[{"id": 1, "channelId": channel["id"]}])
+    await until(lambda: all(each.subscriptions for each in server.hub.clients))
+    await publisher.wait_for_subscriber()
+    client.socket._reader._protocol.pause_reading()
+    publisher.publish_raw(payload)
+    (connection,) = server.gateways.connections
+    await until(lambda: connection.unsent - connection.queue.bytes > 1_000_000)
+
+
+async def test_the_server_s_close_frame_comes_behind_a_large_message_under_way(core: RosCore) -> None:
+    payload = bytes(BYTES.serialize(BYTES.make({"data": bytes(range(250)) * 80_000})))
+    async with running_server(core) as server, node(core, "mapper") as mapper, server.client(FOXGLOVE) as client:
+        await _under_way(server, await mapper.advertise("/map", BYTES), client, payload)
+        closing = asyncio.ensure_future(server.gateways.close())
+        await asyncio.sleep(0)
+        client.socket._reader._protocol.resume_reading()
+        assert (await client.next_bytes())[13:] == payload
+        async with asyncio.timeout(DEADLINE):
+            while (message := await client.socket.receive()).type != aiohttp.WSMsgType.CLOSE:
+                assert message.type == aiohttp.WSMsgType.TEXT
+        assert message.data == 1001
+        await closing
+
+
+async def test_a_client_that_closes_amid_a_large_message_gets_its_close_frame(core: RosCore) -> None:
+    payload = bytes(BYTES.serialize(BYTES.make({"data": bytes(range(250)) * 80_000})))
+    async with running_server(core) as server, node(core, "mapper") as mapper, server.client(FOXGLOVE) as client:
+        await _under_way(server, await mapper.advertise("/map", BYTES), client, payload)
+        await client.socket._writer.close(4000)
+        await until(lambda: not server.gateways.connections)
+        client.socket._reader._protocol.resume_reading()
+        assert (await client.next_bytes())[13:] == payload
+        async with asyncio.timeout(DEADLINE):
+            message = await client.socket.receive()
+        assert (message.type, message.data) == (aiohttp.WSMsgType.CLOSE, 1000)
 
 
 async def test_the_hub_has_nothing_left_of_a_client_that_went(core: RosCore, monkeypatch: Any) -> None:

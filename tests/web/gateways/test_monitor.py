@@ -206,6 +206,22 @@ async def test_parameters_are_read_and_set(core: RosCore) -> None:
         assert "no agent" in (await page.ask(4, "params", peer="arm"))["error"]
 
 
+async def test_a_parameter_that_another_node_sets_is_told(core: RosCore) -> None:
+    async with page_of(core) as (page, agent):
+        await page.sees(lambda: "parameters" in page.state)
+        known = (await page.ask(1, "params", peer=""))["value"]
+        before = page.state["parameters"]
+        core.call("setParam", "/other", "/gain/p", 2.5)
+        # The agent's snapshot stays the same one: what is counted is of the core.
+        agent.snapshot = msgspec.structs.replace(agent.snapshot, taken=agent.snapshot.taken + 1)
+        await page.sees(lambda: page.state["parameters"] != before)
+        fresh = (await page.ask(2, "params", peer="", has=known["digest"]))["value"]
+        assert fresh["values"]["gain"] == {"p": 2.5}
+        same = (await page.ask(3, "params", peer="", has=fresh["digest"]))["value"]
+        assert same == {"digest": fresh["digest"]}
+        assert "/gain/p" in (await page.ask(4, "param_names"))["value"]["names"]
+
+
 async def test_a_service_is_described_and_called(core: RosCore) -> None:
     kind = ServiceType("std_srvs/SetBool")
 
@@ -236,7 +252,9 @@ async def described(page: Page, service: str) -> Any:
 
 async def test_a_page_that_may_only_look_changes_nothing(core: RosCore) -> None:
     async with page_of(core, READ_ONLY) as (page, _):
-        for number, what in enumerate(("params", "set_param", "delete_param", "call", "profile", "context"), 1):
+        for number, what in enumerate(
+            ("params", "param_names", "set_param", "delete_param", "call", "profile", "context"), 1
+        ):
             answer = await page.ask(number, what, name="/speed", value=1, service="/light", resource="/arm")
             assert "may" in answer["error"]
         await page.send("drive", topic="/cmd_vel", linear=1, angular=0)

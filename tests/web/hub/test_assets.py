@@ -47,6 +47,8 @@ def test_nothing_outside_of_the_package_is_read(workspace: Path, path: str) -> N
         ("package://../secret", "is not found"),
         ("file:///etc/passwd", "write package://NAME/PATH"),
         ("package://arm", "write package://NAME/PATH"),
+        (f"package://{'a' * 300}/link.stl", "cannot be read: File name too long"),
+        (f"package://arm/{'a' * 300}", "cannot be read: File name too long"),
     ],
 )
 def test_what_cannot_be_had_is_told(workspace: Path, uri: str, text: str) -> None:

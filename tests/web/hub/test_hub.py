@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import time
+import warnings
 from typing import TYPE_CHECKING, Any
 
 from rmpa.core.errors import RmpaError
 from rmpa.ros.types.definitions import parse_definition
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.types.service_types import ServiceType
+from rmpa.web import limits
 from rmpa.web.hub.requests import (
     AdvertiseTopic,
     CallService,
@@ -17,6 +20,7 @@ from rmpa.web.hub.requests import (
     Described,
     DescribeType,
     EndService,
+    Failed,
     FindService,
     FollowGraph,
     FollowParams,
@@ -84,6 +88,56 @@ async def test_the_last_client_ends_the_subscription_after_a_while(core: RosCore
         three = FakeClient(hub)
         three.ask(Subscribe(1, "/t"))
         await publisher.wait_for_subscriber()
+
+
+async def test_beyond_a_bound_only_topics_with_a_publisher_are_subscribed_to(
+    core: RosCore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "SUBSCRIBED_TOPICS_MAX", 3)
+    async with running_hub(core) as hub, node(core, "talker") as talker:
+        publisher = await talker.advertise("/t", STRING)
+        client, other = FakeClient(hub), FakeClient(hub)
+        await until(lambda: "/t" in hub.graph.topics and hub.graph.topics["/t"].publishers)
+        for handle in range(1, 5):
+            client.ask(Subscribe(handle, f"/none{handle}"))
+        (refused,) = client.of(Failed)
+        assert refused.handle == 4
+        assert "/none4 has no publisher" in refused.error
+        other.ask(Subscribe(1, "/none1"))
+        other.ask(Subscribe(2, "/t"))
+        assert not other.of(Failed)
+        await publisher.wait_for_subscriber()
+        client.ask(Unsubscribe(4))
+        client.close()
+
+
+async def test_a_storm_of_subscriptions_leaves_nothing_registered(
+    core: RosCore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "SUBSCRIPTION_LINGER", 0.0)
+    async with running_hub(core) as hub, node(core, "talker") as talker:
+        publisher = await talker.advertise("/t", STRING)
+        client = FakeClient(hub)
+        for handle in range(1, 300):
+            client.ask(Subscribe(handle, "/t" if handle % 2 else f"/none{handle}"))
+            client.ask(AdvertiseTopic(handle, "/out", "std_msgs/String", latch=bool(handle % 2)))
+            if handle % 3:
+                await asyncio.sleep(0)
+            client.ask(Unsubscribe(handle))
+            client.ask(UnadvertiseTopic(handle))
+        client.ask(Subscribe(300, "/t"))
+        await publisher.wait_for_subscriber()
+        publisher.publish_raw(ONE)
+        await until(lambda: client.payloads(300) == [ONE])
+        client.ask(Unsubscribe(300))
+
+        async def registered() -> list[str]:
+            state: Any = await talker.call_master("getSystemState")
+            return [name for part in state[:2] for name, nodes in part if "/rmpa_web" in nodes and name != "/rosout"]
+
+        async with asyncio.timeout(DEADLINE):
+            while await registered():
+                await asyncio.sleep(0.05)
 
 
 async def test_newcomers_get_the_latched_message_of_each_source_once(core: RosCore) -> None:
@@ -289,6 +343,8 @@ async def test_calls_share_a_connection_and_errors_are_told(core: RosCore) -> No
 
     async with running_hub(core) as hub, node(core, "server") as server:
         service = await server.advertise_service("/set", SET_BOOL, serve)
+        # The first news of a service closes the connections to one that had its name before.
+        await until(lambda: "/set" in hub.graph.services)
         client = FakeClient(hub)
         for handle in range(1, 4):
             client.ask(CallService(handle, "/set", SET_BOOL, b"\x01"))
@@ -304,6 +360,48 @@ async def test_calls_share_a_connection_and_errors_are_told(core: RosCore) -> No
         client.ask(FindService(6, "/set"))
         assert (await client.answer(ServiceFound, 6)).type == SET_BOOL
         await until(lambda: "/set" in hub.graph.services and hub.graph.services["/set"].type == SET_BOOL)
+
+
+async def test_a_client_that_goes_right_after_its_requests_leaves_no_coroutine_behind(core: RosCore) -> None:
+    async with running_hub(core) as hub:
+        client = FakeClient(hub)
+        client.ask(GetParams(1))
+        client.ask(FindService(2, "/rosout/get_loggers"))
+        client.ask(CallService(3, "/rosout/get_loggers", None, b""))
+        client.close()
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always")
+            for _ in range(3):
+                await asyncio.sleep(0)
+            gc.collect()
+        assert not [str(each.message) for each in warned if each.category is RuntimeWarning]
+        assert not client.answers
+
+
+async def test_clients_that_leave_in_the_middle_of_their_calls_keep_no_connection_of_the_server(
+    core: RosCore,
+) -> None:
+    asked = 0
+
+    async def slow(_: Any) -> dict[str, object]:
+        nonlocal asked
+        asked += 1
+        if asked <= limits.CALLS_AT_ONCE:
+            await asyncio.Event().wait()
+        return {"success": True, "message": "done"}
+
+    async with running_hub(core) as hub, node(core, "server") as server:
+        await server.advertise_service("/slow", SET_BOOL, slow)
+        leaving, staying = FakeClient(hub), FakeClient(hub)
+        for handle in range(1, limits.CALLS_AT_ONCE + 5):
+            leaving.ask(CallService(handle, "/slow", SET_BOOL, b"\x01"))
+        await until(lambda: asked == limits.CALLS_AT_ONCE)
+        staying.ask(CallService(1, "/slow", SET_BOOL, b"\x01"))
+        leaving.close()
+        await until(lambda: staying.of(ServiceResult))
+        assert staying.of(ServiceResult)[0].ok
+        assert not leaving.answers
+        assert asked == limits.CALLS_AT_ONCE + 1
 
 
 async def test_a_call_ends_in_time(core: RosCore) -> None:

@@ -19,16 +19,20 @@ import struct
 import time
 import zlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 from aiohttp import WSMsgType, web
 
-from rmpa.observe.snapshot import Snapshot
+from rmpa.core.contract import ContractRule, Contracts
+from rmpa.observe.peer_agent import PeerAgent
+from rmpa.observe.snapshot import LaneInfo, Snapshot
+from rmpa.observe.why.modules import diagnose_module
 from rmpa.web.hub import requests
 from rmpa.web.hub.rights import FULL
 from rmpa.web.monitor import session as monitor
 from rmpa.web.monitor.messages import SUBPROTOCOL
+from rmpa.web.monitor.nodes import node_detail, node_key
 from rmpa.web.monitor.resources import ResourceFacts
 from rmpa.web.monitor.view import StateBuilder, details
 
@@ -108,6 +112,10 @@ class FakeAgent:
                 bytes_out=int(link.bytes_out / 90 * age),
                 rtt=(link.rtt or 3e-4) * (1 + 0.1 * math.sin(now * 5)),
                 up_ago=age,
+                lanes=(
+                    LaneInfo(name="express", connected=True, bytes_in=int(400 * age), bytes_out=int(300 * age)),
+                    LaneInfo(name="bulk", connected=self.scene != "sick", queued=0 if self.scene != "sick" else 9000),
+                ),
             )
         return msgspec.structs.replace(peer, link=link, since_ago=age if link else peer.since_ago)
 
@@ -219,6 +227,9 @@ class FakeServer:
             "/use_sim_time": False,
             "/base": {"rate": 50.0, "wheel": {"radius": 0.035, "track": 0.23}, "topics": ["odom", "imu"]},
         }
+        self.logger = "/base"
+        self._params_told: dict[str, Any] = {}
+        self._param_changes = 0
         self._builder = StateBuilder("pc")
         self._snapshot = self.agent.snapshot()
         self._state: Tree = {}
@@ -261,7 +272,12 @@ class FakeServer:
             )
         self._mute_since = 0.0
         self._snapshot = self.agent.snapshot()
-        return self._builder.build(self._snapshot, self.agent.facts(), self.agent.alarms())
+        if self.params != self._params_told:
+            self._params_told = dict(self.params)
+            self._param_changes += 1
+        return self._builder.build(
+            self._snapshot, self.agent.facts(), self.agent.alarms(), parameters=self._param_changes
+        )
 
     def _details(self, kind: str, name: str) -> Tree | None:
         return details(self._snapshot, {one.key: one for one in self.agent.facts()}, kind, name)
@@ -309,7 +325,10 @@ class FakeServer:
             raise LookupError(question.what)
         return answer(question.args)
 
-    def _answer_why(self, _args: dict[str, Any]) -> Any:
+    def _answer_why(self, args: dict[str, Any]) -> Any:
+        if args["kind"] == "module":
+            told = msgspec.convert(self._answer_agent({"peer": args["name"]}), PeerAgent)
+            return msgspec.to_builtins((diagnose_module(self._snapshot, args["name"], told),))
         flows = self._why[0]
         if self.agent.scene == "demo":
             return [flows]
@@ -317,16 +336,52 @@ class FakeServer:
         failed = {"name": "publisher", "verdict": "fail", "text": text, "remedy": "start the module base"}
         return [{**flows, "flows": False, "stages": [*flows["stages"][:2], failed]}]
 
-    def _answer_params(self, _args: dict[str, Any]) -> Any:
-        return {"values": self.params}
+    def _answer_params(self, args: dict[str, Any]) -> Any:
+        digest = str(hash(json.dumps(self.params)))
+        return {"digest": digest} if args.get("has") == digest else {"values": self.params, "digest": digest}
 
     def _answer_set_param(self, args: dict[str, Any]) -> Any:
         self.params[str(args["name"])] = args["value"]
-        return {"values": self.params}
+        return self._answer_params({})
 
     def _answer_delete_param(self, args: dict[str, Any]) -> Any:
         self.params.pop(str(args["name"]), None)
-        return {"values": self.params}
+        return self._answer_params({})
+
+    def _answer_param_names(self, _args: dict[str, Any]) -> Any:
+        return {"names": ["/base/rate", "/base/wheel/radius", "/rosdistro", "/use_sim_time"]}
+
+    def _answer_agent(self, args: dict[str, Any]) -> Any:
+        if args["peer"] == "joystick":
+            raise LookupError("agent, as one of an earlier release")
+        return {"version": self._snapshot.agent.version, "uptime": 3725.0, "core_uri": "http://127.0.0.1:11311/",
+                "cpu": 4.2, "rss": 61_000_000, "files_open": 61, "files_limit": 1024, "proxies": 7}  # fmt: skip
+
+    def _answer_contract(self, args: dict[str, Any]) -> Any:
+        terms = Contracts((ContractRule(("/velocity*",), (), {"max_rate": 20.0}),)).explain(args["topic"], "")
+        return {key: {"value": value, "rule": rule} for key, (value, rule) in terms.items()}
+
+    def _answer_node(self, args: dict[str, Any]) -> Any:
+        known = node_detail(self._snapshot, node_key(args["peer"], args["name"]))
+        if known is None:
+            raise LookupError(args["name"])
+        types = {topic.name: topic.type for topic in self._snapshot.topics}
+        publishes, subscribes, services = (
+            [str(each) for each in cast("list[object]", known[part])]
+            for part in ("publishes", "subscribes", "services")
+        )
+        return {
+            "name": args["name"],
+            "uri": "http://127.0.0.1:34567/",
+            "pid": 4711,
+            "problem": "",
+            "publications": {each: types[each] for each in publishes},
+            "subscriptions": {each: types[each] for each in subscribes},
+            "services": [each.rpartition(":")[2] for each in services],
+            "connections": [
+                {"topic": each, "inbound": False, "other": "/rosout", "connected": True} for each in publishes
+            ],
+        }
 
     def _answer_describe(self, _args: dict[str, Any]) -> Any:
         text = "bool data\n---\nbool success\nstring message"
@@ -392,9 +447,8 @@ class _Client:
                 received = requests.ReceivedMessage(handle, topic, kind, memoryview(b"\0" * 712), time.time_ns())
                 await self.act(self.session.receive_message(received, now))
             if self._log and tick % 10 == 0:
-                await self.act(
-                    self.session.log([{"at": time.time(), "level": "INFO", "node": "/base", "text": f"turn {tick}"}])
-                )
+                line = {"n": tick, "at": time.time(), "level": "INFO", "node": self._server.logger}
+                await self.act(self.session.log([line | {"text": f"turn {tick}"}]))
             await self.act(self.session.handle_timer(now))
             await asyncio.sleep(TICK)
 

@@ -7,16 +7,19 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo, UnreachableInfo
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.patch import Tree, apply, difference
 from rmpa.web.monitor.resources import ResourceFacts
 from rmpa.web.monitor.view import StateBuilder, details, module_state
 from tests.web.monitor.fake_server import resources, snapshots
-from tests.web.snapshots import FULL, LINK, peer
+from tests.web.snapshots import AGENT, FULL, LINK, peer
 
 if TYPE_CHECKING:
-    from rmpa.observe.snapshot import PeerInfo, Snapshot
+    from rmpa.observe.snapshot import PeerInfo
 
 RECORDED = snapshots()
 RESOURCES = resources()
@@ -199,3 +202,80 @@ def test_a_strange_descriptor_of_a_peer_breaks_nothing() -> None:
     )
     state = build(RECORDED[0], resources=[strange])
     assert state["resources"]["y:/x"]["module"] == "y"
+
+
+_PEERS = st.sampled_from(("arm", "base", "gate"))
+_ROUTES = st.builds(
+    lambda peer, direction, state, rate, lost, problem: RouteInfo(
+        peer=peer, node="/n", direction=direction, state=state, rate=rate, bandwidth=rate, lost=lost, problem=problem
+    ),
+    _PEERS,
+    st.sampled_from(("in", "out")),
+    st.sampled_from(("open", "idle")),
+    st.sampled_from((None, 0.0, 10.0, 10.1, 20.0)),
+    st.integers(0, 1),
+    st.sampled_from(("", "broken")),
+)
+_TOPIC = st.builds(
+    lambda name, type_, publishers, crosses, routes: TopicInfo(
+        name=name, type=type_, publishers=publishers, crosses=crosses, routes=tuple(routes)
+    ),
+    st.sampled_from(("/a", "/b", "/c")),
+    st.sampled_from(("", "std_msgs/String")),
+    st.sampled_from(((), ("/talker",))),
+    st.booleans(),
+    st.lists(_ROUTES, max_size=3),
+)
+_FIGURES = ("rate", "bandwidth", "latency")
+
+
+@given(st.lists(st.lists(_TOPIC, max_size=3, unique_by=lambda topic: topic.name), max_size=6))
+def test_a_state_made_of_the_last_one_says_what_one_made_anew_says(history: list[list[TopicInfo]]) -> None:
+    builder = StateBuilder("pc")
+    for number, topics in enumerate(history):
+        snapshot = Snapshot(agent=AGENT, taken=1000.0 + number, topics=tuple(topics))
+        state: Any = builder.build(snapshot)
+        fresh: Any = StateBuilder("pc").build(snapshot)
+        assert state.keys() == fresh.keys()
+        assert state["topics"].keys() == fresh["topics"].keys()
+        assert state["flows"].keys() == fresh["flows"].keys()
+        assert state["nodes"] == fresh["nodes"]
+        for name, entry in fresh["topics"].items():
+            shown = state["topics"][name]
+            assert shown.keys() == entry.keys()
+            for member, value in entry.items():
+                # Figures may be kept for a change that cannot be seen: up to 10 % of the bandwidth.
+                assert shown[member] == (pytest.approx(value, rel=0.12) if member in _FIGURES else value)
+        for key, flow in fresh["flows"].items():
+            assert state["flows"][key]["topics"] == flow["topics"]
+            assert state["flows"][key]["rate"] == pytest.approx(flow["rate"], rel=0.05)
+
+
+def test_nodes_of_all_modules_are_listed_and_each_has_its_topics_and_services() -> None:
+    nodes = build(RECORDED[0], resources=RESOURCES)["nodes"]
+    assert nodes["base:/base"]["module"] == "base"
+    assert "/odom" in details_of("node", "base:/base")["publishes"]
+    own = next(name for name, one in nodes.items() if "module" not in one and one.get("subscribes"))
+    assert nodes[own]["subscribes"] == len(details_of("node", own)["subscribes"])
+    served = next(name for name, one in nodes.items() if one.get("serves") and one.get("module") == "base")
+    assert all(each.startswith("base:/") for each in details_of("node", served)["services"])
+    assert details(RECORDED[0], {}, "node", "base:/nothing") is None
+
+
+def details_of(kind: str, name: str) -> Any:
+    return details(RECORDED[0], {}, kind, name)
+
+
+def test_a_node_that_cannot_be_reached_says_so() -> None:
+    gone = UnreachableInfo(node="/talker", uri="http://robot:1/", problem="no route", ago=3.0)
+    topic = TopicInfo(name="/chatter", publishers=("/talker",))
+    snapshot = msgspec.structs.replace(FULL, topics=(topic,), services=(), unreachable=(gone,))
+    assert build(snapshot)["nodes"]["/talker"]["problem"] == "no route"
+    assert "no route" in str((details(snapshot, {}, "node", "/talker") or {})["problem"])
+
+
+def test_nodes_beyond_the_limit_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "NODES_SHOWN", 2)
+    state = build(RECORDED[0])
+    assert len(state["nodes"]) == 2
+    assert state["hidden"]["nodes"] > 0

@@ -76,6 +76,21 @@ def test_only_our_own_pages_may_read(origin: str, expected: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("origin", "expected"),
+    [
+        ("https://base.local:8480", "Granted"),
+        ("https://BASE.local:8480", "Granted"),
+        ("http://base.local:8480", "origin"),  # whoever is on the way can forge that page
+        ("HTTP://base.local:8480", "origin"),
+        ("null", "origin"),
+    ],
+)
+def test_a_server_of_https_takes_no_page_of_plain_http_for_its_own(origin: str, expected: str) -> None:
+    assert reason(OPEN.judge(RequestFacts(HERE, origin=origin, secure=True))) == expected
+    assert reason(CLOSED.judge(RequestFacts(HERE, origin=origin, cookie=TOKEN, secure=True))) == expected
+
+
+@pytest.mark.parametrize(
     ("origin", "is_preflight", "expected"),
     [
         ("https://app.example", True, "Preflight"),

@@ -11,13 +11,14 @@ import aiohttp
 import msgspec
 import pytest
 
+from rmpa.config.settings import Settings, WebSettings
 from rmpa.core.contract import ContractRule, Contracts, Priority
 from rmpa.web import limits
 from rmpa.web.gateways.gateways import Gateways
-from rmpa.web.hub.rights import FULL, READ_ONLY
 from rmpa.web.server.agent_watch import AgentWatch
 from rmpa.web.server.auth import AccessPolicy, own_names
-from rmpa.web.server.hub_setup import make_hub, priority_of, rights_of
+from rmpa.web.server.hub_setup import make_hub, priority_of
+from rmpa.web.server.roles import WebRoles
 from rmpa.web.server.server import WebServer
 from tests.ros.node.peers import DEADLINE, LATCHED, until
 from tests.web.hub.client import local_core, node
@@ -36,7 +37,8 @@ async def running(token: str = "", **policy: Any) -> AsyncIterator[tuple[WebServ
         agent = msgspec.structs.replace(SNAPSHOT.agent, core_uri=core.uri)
         watch = AgentWatch(lambda: msgspec.structs.replace(SNAPSHOT, agent=agent))
         hub = make_hub(watch, 8480)
-        rights = rights_of(has_token=bool(token), control=bool(token))
+        settings = Settings(web=WebSettings(control=bool(token)))
+        rights = WebRoles(settings, has_token=bool(token), trusted=False).of("")
         gateways = Gateways(hub, "test", lambda _: rights)
         access = AccessPolicy(0, own_names(("base",)), token, **policy)
         server = WebServer(watch, access, "127.0.0.1", gateways, (0,))
@@ -134,17 +136,6 @@ async def test_the_server_ends_while_clients_are_connected() -> None:
     )
 
 
-def test_rights_need_a_token() -> None:
-    assert rights_of(has_token=False, control=True) is READ_ONLY
-    assert rights_of(has_token=True, control=True) == FULL
-    readers = rights_of(has_token=True, control=False)
-    assert readers.read_parameters
-    assert (readers.publish, readers.call_services, readers.set_parameters, readers.serve_services) == (False,) * 4
-    assert not readers.drive
-    assert rights_of(has_token=True, control=False, drive=True).drive
-    assert not rights_of(has_token=False, control=True, drive=True).drive
-
-
 async def test_contracts_give_priorities() -> None:
     rules = (
         ContractRule(("/cmd_vel",), (), {"priority": Priority.HIGH}),
@@ -153,3 +144,39 @@ async def test_contracts_give_priorities() -> None:
     hub = make_hub(AgentWatch(lambda: SNAPSHOT), 8480)
     priority = priority_of(hub, Contracts(rules))
     assert [priority(topic) for topic in ("/cmd_vel", "/odom", "/image")] == [1, 0, -1]
+
+
+def fragment(opcode: int, payload: bytes, *, last: bool = False) -> bytes:
+    """A client's frame, with a mask that changes nothing."""
+    return bytes([0x80 * last | opcode, 0x80 | len(payload)]) + bytes(4) + payload
+
+
+async def test_a_message_whose_fragments_never_end_disconnects_its_client_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(limits, "PING_INTERVAL", 0.2)
+    monkeypatch.setattr(limits, "MESSAGE_TIMEOUT", 1.0)
+    async with (
+        running() as (server, _),
+        aiohttp.ClientSession() as session,
+        connect(session, server) as other,
+        connect(session, server) as socket,
+    ):
+        reading = asyncio.ensure_future(other.receive())  # answers pings
+        transport = socket._writer.transport
+        transport.write(fragment(1, b"{"))
+
+        async def go_on() -> None:
+            while True:
+                transport.write(fragment(0, b" ") + fragment(10, b"alive", last=True))
+                await asyncio.sleep(0.05)
+
+        going_on = asyncio.ensure_future(go_on())
+        async with asyncio.timeout(DEADLINE):
+            message = await socket.receive()
+        going_on.cancel()
+        assert (message.type, message.data) == (aiohttp.WSMsgType.CLOSE, 1008)
+        assert server._gateways is not None
+        assert server._gateways.counters["message"] == 1
+        await other.send_json({"op": "call_service", "service": "/rosapi/get_time", "id": "1"})
+        assert json.loads((await asyncio.wait_for(reading, DEADLINE)).data)["result"]

@@ -16,6 +16,7 @@ from tests.web.hub.client import local_core, node, running_hub
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from rmpa.observe.graph_changes import GraphRevision
     from rmpa.web.hub.hub import Hub
 
 
@@ -29,19 +30,80 @@ async def test_a_new_topic_is_seen_by_the_agents_word_and_again_after_its_restar
         changes = GraphSignal(environ, lambda: "base", hub.graph)
         changes.start()
         for name in ("/first", "/second"):
-            server = ControlServer(tmp_path, "base", {"graph": GraphRevisions(core).after})
+            server = ControlServer(tmp_path, "base", {"graph": GraphRevisions(core, rows=True).after})
             await server.start()
-            await until(lambda: hub.graph.told)
+            await until(lambda: hub.graph.taken)
             reads = hub.graph.reads
             async with asyncio.timeout(DEADLINE):
                 await talker.advertise(name, LATCHED)
                 await until(functools.partial(_has_topic, hub, name))
-            assert hub.graph.reads > reads
+            assert hub.graph.taken
+            assert hub.graph.reads == reads, "the change itself was told"
             await server.close()
             await until(lambda: not hub.graph.told)
             await talker.advertise(f"{name}_{secrets.token_hex(2)}", LATCHED)
             await until(lambda: len(hub.graph.topics) > 2)
         await changes.close()
+
+
+async def test_an_agent_that_tells_only_that_there_is_a_change_has_the_master_read(tmp_path: Path) -> None:
+    async with local_core() as core, running_hub(core) as hub, node(core, "talker") as talker:
+        server = ControlServer(tmp_path, "base", {"graph": GraphRevisions(core, rows=False).after})
+        await server.start()
+        changes = GraphSignal({"RMPA_RUNTIME_DIR": str(tmp_path)}, lambda: "base", hub.graph)
+        changes.start()
+        await until(lambda: hub.graph.told)
+        reads = hub.graph.reads
+        async with asyncio.timeout(DEADLINE):
+            await talker.advertise("/told", LATCHED)
+            await until(functools.partial(_has_topic, hub, "/told"))
+        assert hub.graph.reads > reads
+        assert not hub.graph.taken
+        await changes.close()
+        await server.close()
+
+
+async def test_the_graph_of_another_core_is_not_taken(tmp_path: Path) -> None:
+    async with local_core() as core, local_core() as other, running_hub(core) as hub, node(other) as stranger:
+        await stranger.advertise("/strange", LATCHED)
+        asked = asyncio.Event()
+        revisions = GraphRevisions(other, rows=True)
+
+        async def answer(args: Any) -> GraphRevision:
+            asked.set()
+            return await revisions.after(args)
+
+        server = ControlServer(tmp_path, "base", {"graph": answer})
+        await server.start()
+        changes = GraphSignal({"RMPA_RUNTIME_DIR": str(tmp_path)}, lambda: "base", hub.graph)
+        changes.start()
+        await asked.wait()
+        asked.clear()
+        await asked.wait()  # the first answer was refused, and the question is asked anew
+        assert not hub.graph.taken
+        assert "/strange" not in hub.graph.topics
+        await changes.close()
+        await server.close()
+
+
+async def test_a_master_that_goes_while_the_agent_tells_the_graph_is_noticed(tmp_path: Path) -> None:
+    async with local_core() as core, running_hub(core) as hub:
+        server = ControlServer(tmp_path, "base", {"graph": GraphRevisions(core, rows=True).after})
+        await server.start()
+        changes = GraphSignal({"RMPA_RUNTIME_DIR": str(tmp_path)}, lambda: "base", hub.graph)
+        changes.start()
+        await until(lambda: hub.graph.taken)
+        checked = asyncio.Event()
+
+        async def check() -> None:
+            checked.set()
+
+        hub.link.check_master = check  # type: ignore[method-assign]
+        await core.close()
+        async with asyncio.timeout(DEADLINE):
+            await checked.wait()
+        await changes.close()
+        await server.close()
 
 
 async def test_an_agent_that_does_not_know_the_question_is_no_error(tmp_path: Path) -> None:

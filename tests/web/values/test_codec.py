@@ -17,11 +17,12 @@ from rmpa.ros.types.definitions import SEPARATOR, DefinitionError, known_specifi
 from rmpa.ros.types.messages import MessageError, MessageType
 from rmpa.web.values import limits
 from rmpa.web.values.codec import MessageCodec, codec_for
+from tests.web.values.filled import filled
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rmpa.ros.types.definitions import Field, Specification
+    from rmpa.ros.types.definitions import Specification
 
 NOW_NS = 5_000_000_007
 
@@ -48,25 +49,6 @@ def test_every_shipped_type_comes_back_from_json_and_cbor(name: str) -> None:
     assert not codec.write(_json(codec, raw), NOW_NS).missing
 
 
-def _filled(known: Mapping[str, Specification], name: str, seed: int) -> dict[str, Any]:
-    """Values other than zero for all fields of a type."""
-    values: dict[str, Any] = {}
-    for number, field in enumerate(known[name].fields):
-        mark = (seed + number) % 90 + 1
-
-        def one(mark: int, field: Field = field) -> Any:
-            if not field.primitive:
-                return _filled(known, field.type, mark)
-            made: dict[str, Any] = {"string": f"é{mark}", "bool": bool(mark % 2)}
-            if field.type in ("time", "duration"):
-                return {"secs": mark, "nsecs": mark + 1}
-            return made.get(field.type, mark / 4 if field.type.startswith("float") else mark)
-
-        count = field.size or mark % 3 + 1
-        values[field.name] = [one(mark + index) for index in range(count)] if field.array else one(mark)
-    return values
-
-
 def _with_base64(values: Any, known: Mapping[str, Specification], name: str) -> Any:
     """The values as JSON has them: arrays of bytes in base64."""
     made = dict(values)
@@ -83,7 +65,7 @@ def _with_base64(values: Any, known: Mapping[str, Specification], name: str) -> 
 @pytest.mark.parametrize("name", known_types())
 def test_bytes_of_another_serializer_are_read_and_written_alike(name: str) -> None:
     kind, known = MessageType(name), known_specifications(name)
-    values = _filled(known, name, 1)
+    values = filled(known, name, 1)
     raw = kind.serialize(kind.make(values))
     codec = codec_for(kind)
     assert _json(codec, raw) == _with_base64(values, known, name)

@@ -14,6 +14,7 @@ from rmpa.core.contract import Transport, needs_agents
 from rmpa.core.errors import RemoteProtocolError
 
 if TYPE_CHECKING:
+    from rmpa.bridge.permission_gate import PermissionGate
     from rmpa.core.contract import Contract
 
 _TEXT_MAX: Final = 300
@@ -57,6 +58,8 @@ class Condition(StrEnum):
     """Direct connections of this subscriber have not broken repeatedly."""
     LIMIT = "limit"
     """The peer's direct connections are within ``limits.DIRECT_MAX``."""
+    TRUST = "trust"
+    """The mesh is not secured, or both modules let plain connections cross (``trust.direct``), or share a machine."""
     CORE = "core"
     """The local core can answer each node by itself: services only."""
 
@@ -130,6 +133,20 @@ def reply_of(found: Grant | Unmet) -> dict[str, object]:
     if isinstance(found, Grant):
         return {"port": found.port, "probe": found.probe}
     return {"why": found.condition.value, "text": found.text}
+
+
+def unmet_by_trust(gate: PermissionGate, where: str, *, same_machine: bool) -> Unmet | None:
+    """The condition that a secured mesh does not meet, if any.
+
+    Args:
+        gate: Whether the mesh is secured, and whether plain connections are let all the same.
+        where: Whose setting that is, as text.
+        same_machine: Whether both modules are on one machine, so that the connection does not leave it.
+    """
+    if gate.plain or same_machine:
+        return None
+    text = f"the mesh is secured, and nothing would protect the connection; trust.direct is false in {where}"
+    return Unmet(Condition.TRUST, text)
 
 
 def unmet_by_contract(contract: Contract, where: str) -> Unmet | None:

@@ -62,7 +62,10 @@ class Retry:
 
 @dataclass(frozen=True, slots=True)
 class EndConnections:
-    """End the connections from a local publisher's port to a peer's address: the peer cannot be reached."""
+    """End the connections from a local publisher's port to a peer's address.
+
+    The peer cannot be reached, or may not have them any more.
+    """
 
     peer: int
     port: int
@@ -127,13 +130,22 @@ class DirectGrants:
         if len(refusals) > limits.DIRECT_MAX:
             self._forget_refusal(peer, next(iter(refusals)))
 
-    def refused(self, peer: int, source: Source, subscriber: str) -> list[GrantAction]:
-        """Refuse a subscriber: an earlier grant of it ends, and others that were refused may try again."""
-        self.refuse(peer, source)
-        if not self._drop(peer, source, subscriber):
-            return []
-        actions = [one for one in self.changed(source) if one.peer != peer]
-        self.refuse(peer, source)
+    def refused(self, peer: int, source: Source, subscriber: str, *, hidden: bool = False) -> list[GrantAction]:
+        """Refuse a subscriber: an earlier grant of it ends, and others that were refused may try again.
+
+        Args:
+            peer: The peer.
+            source: The source.
+            subscriber: The subscriber's name, in the peer's graph.
+            hidden: Whether the peer must not learn of changes of the source: no ``Retry`` follows.
+        """
+        actions: list[GrantAction] = []
+        if self._drop(peer, source, subscriber):
+            actions += [one for one in self.changed(source) if one.peer != peer]
+        if hidden:
+            self._forget_refusal(peer, source)
+        else:
+            self.refuse(peer, source)
         return actions
 
     def grant(self, peer: int, source: Source, subscriber: str, granted: Granted) -> None:
@@ -221,18 +233,26 @@ class DirectGrants:
         away = self._away.pop(source, {})
         return [*(WithdrawGrant(peer, source, "", unmet) for peer in away), *self.changed(source)]
 
-    def judge_again(self, unmet: Callable[[Source, int, Granted], Unmet | None]) -> list[GrantAction]:
+    def judge_again(
+        self, unmet: Callable[[Source, int, Granted], Unmet | None], *, secured: bool = False
+    ) -> list[GrantAction]:
         """Withdraw the grants that the rules do not allow any more.
 
         Args:
             unmet: ``(source, peer, grant)``: the condition that does not hold by the new rules, if any.
+            secured: Whether the mesh is secured: the connections end at once, which is not left to the peer's agent,
+                and no ``Retry`` follows for a source that is not offered any more.
         """
         actions: list[GrantAction] = []
         for source, peer, subscriber, granted in list(self):
             why = unmet(source, peer, granted)
             if why is not None:
+                if secured:
+                    actions.append(EndConnections(peer, granted.port))
+                hidden = secured and why.condition is Condition.OFFERED
                 self._drop(peer, source, subscriber)
-                self.refuse(peer, source)
+                if not hidden:
+                    self.refuse(peer, source)
                 actions.append(WithdrawGrant(peer, source, subscriber, why))
         return actions
 

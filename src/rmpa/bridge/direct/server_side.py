@@ -105,11 +105,13 @@ class ServiceGrants:
                 actions.append(ReofferService(peer, service, node))
         return actions
 
-    def judge_again(self, unmet: Callable[[str, int], Unmet | None]) -> list[ServerAction]:
+    def judge_again(self, unmet: Callable[[str, int], Unmet | None], *, secured: bool = False) -> list[ServerAction]:
         """Judge by other rules: withdraw what they forbid, and let peers ask again for what they may allow.
 
         Args:
             unmet: ``(service, peer)``: the condition that does not hold by the new rules, if any.
+            secured: Whether the mesh is secured: the answers about services that are not offered any more are
+                forgotten, so that their peers do not learn of changes.
         """
         actions: list[ServerAction] = []
         for service, peer, told in self:
@@ -120,6 +122,8 @@ class ServiceGrants:
             elif why is None and told.port is None:
                 self._drop(service, peer)
                 actions.append(ReofferService(peer, service, told.node))
+            if secured and why is not None and why.condition is Condition.OFFERED:
+                self._drop(service, peer)
         return actions
 
     def peer_gone(self, peer: int) -> None:

@@ -10,6 +10,7 @@ from rmpa.bridge.data.io.receiver import DataReceiver
 from rmpa.bridge.io.proxy_kills import ProxyKills
 from rmpa.bridge.messages import decode, op_of
 from rmpa.bridge.naming import Names
+from rmpa.bridge.permission_gate import PermissionGate
 from rmpa.bridge.policy import OWN_NODE, Policy
 from rmpa.bridge.relay import Relay
 from rmpa.bridge.session.peer_rpc import PeerRpc
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from rmpa.ros.core.api import Core
     from rmpa.ros.master.effects import GraphChange
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
+    from rmpa.trust.permissions import Permissions
 
 
 class Bridge:
@@ -47,6 +49,7 @@ class Bridge:
         relay: Whether this module offers the sources of one peer to others.
         limit_settings: Bounds what is taken from one peer, and what is offered.
         rng: Uniform numbers in [0, 1) for back-off jitter.
+        permissions: What each peer may do here; ``None``: the mesh is not secured.
     """
 
     def __init__(
@@ -59,9 +62,12 @@ class Bridge:
         names: Names | None = None,
         relay: bool = False,
         limit_settings: LimitSettings | None = None,
+        permissions: Permissions | None = None,
     ) -> None:
         self._core = core
         self.counters = Counters()
+        self.gate = PermissionGate(permissions, self.counters)
+        """Decides what each peer may do."""
         self.rpc = PeerRpc(self.counters)
         """The requests and notifications to and from the peers."""
         kills = ProxyKills(self.rpc)
@@ -82,7 +88,7 @@ class Bridge:
         """Takes the data frames of the links."""
         self._parts: list[Part] = [self.rpc]
         self._by_op: dict[str, Part] = {}
-        self.sessions = PeerSessions(self._parts, self.proxy_nodes, self.receiver, kills.proxy)
+        self.sessions = PeerSessions(self._parts, self.proxy_nodes, self.receiver, kills.proxy, self.gate)
         """The sessions of the peers."""
         self.relay = Relay(enabled=relay)
         """Which sources of one peer are offered to others."""
@@ -98,6 +104,7 @@ class Bridge:
             limit_settings=limit_settings if limit_settings is not None else LimitSettings(),
             rng=rng,
             counters=self.counters,
+            gate=self.gate,
         )
         self.add(self.topics)
         self._reconciler: asyncio.TimerHandle | None = None
@@ -114,6 +121,7 @@ class Bridge:
 
     def reload(self, settings: Settings) -> None:
         """Take new settings; unchanged sources and routes go on, changes follow in later turns of the loop."""
+        self.gate.reload(settings.trust)
         for part in self._parts:
             part.reload(settings)
 

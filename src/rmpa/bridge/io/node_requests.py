@@ -9,17 +9,21 @@ import msgspec
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.io.proxy_kills import KILL
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.policy import OWN_NODE, is_own
 from rmpa.bridge.proxy_names import proxied_node
 from rmpa.config import limits as config_limits
+from rmpa.config.permission_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import RmpaError
 from rmpa.core.names import is_global_name, matches
-from rmpa.ros.core.node_calls import end_node, ping_node
+from rmpa.ros.core.node_calls import end_node, node_connections, ping_node
 from rmpa.ros.node_info import NodeEnd, NodeFacts, NodeLine, NodePing, describe_node, list_nodes
 from rmpa.runtime.event_loop import yielding_to_data
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from rmpa.bridge.session.peer_rpc import PeerRpc
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import Settings
@@ -44,9 +48,11 @@ class NodeRequests:
         settings: The agent's settings.
         core: The local core.
         asks: Receives the requests.
+        gate: Decides which nodes each peer may end.
     """
 
-    def __init__(self, settings: Settings, core: Core, asks: PeerRpc) -> None:
+    def __init__(self, settings: Settings, core: Core, asks: PeerRpc, gate: PermissionGate = OPEN_GATE) -> None:
+        self._gate = gate
         self._settings = settings
         self._core = core
         asks.on_request(LIST, self._list)
@@ -65,7 +71,15 @@ class NodeRequests:
         found = list_nodes(*tables, state.nodes, problems, yielding_to_data)
         return tuple(line for line in found if not is_own(line.name))
 
-    async def _info(self, _asker: PeerSession, args: dict[str, Any]) -> NodeFacts:
+    async def _info(self, asker: PeerSession, args: dict[str, Any]) -> NodeFacts:
+        return self._permitted(asker.link.name, await self.info(args))
+
+    async def info(self, args: Mapping[str, object]) -> NodeFacts:
+        """The facts about the ``node`` of this module that a request names.
+
+        Raises:
+            RmpaError: There is no such node.
+        """
         node, uri = self._own(args)
         state = self._core.state()
         facts = describe_node(node, uri, state.publishers, state.subscribers, state.services, state.types)
@@ -73,7 +87,27 @@ class NodeRequests:
             answer = await ping_node(node, uri, OWN_NODE)
         except RmpaError as error:
             return msgspec.structs.replace(facts, problem=str(error))
-        return msgspec.structs.replace(facts, pid=answer.pid)
+        names = {address: name for name, address in state.nodes.items()}
+        connections = await node_connections(uri, OWN_NODE, names)
+        return msgspec.structs.replace(facts, pid=answer.pid, connections=connections)
+
+    def _permitted(self, asker: str, facts: NodeFacts) -> NodeFacts:
+        """The facts about a node, without the names of what a peer may not have."""
+
+        def may(access: Access, name: str) -> bool:
+            return self._gate.judge(access, asker, name).allowed
+
+        connections = facts.connections
+        if connections is not None:
+            needed = {True: Access.PUBLISH, False: Access.SUBSCRIBE}
+            connections = tuple(one for one in connections if may(needed[one.inbound], one.topic))
+        return msgspec.structs.replace(
+            facts,
+            publications={name: kind for name, kind in facts.publications.items() if may(Access.SUBSCRIBE, name)},
+            subscriptions={name: kind for name, kind in facts.subscriptions.items() if may(Access.PUBLISH, name)},
+            services=tuple(name for name in facts.services if may(Access.CALL, name)),
+            connections=connections,
+        )
 
     async def _ping(self, _asker: PeerSession, args: dict[str, Any]) -> NodePing:
         node, uri = self._own(args)
@@ -81,6 +115,8 @@ class NodeRequests:
 
     async def _kill(self, asker: PeerSession, args: dict[str, Any]) -> NodeEnd:
         node, uri = self._own(args)
+        if why := self._gate.why_not(Access.KILL, asker.link.name, node):
+            raise RmpaError(why)
         who = f"{asker.link.name}'s {str(args.get('by', ''))[: bridge_limits.ASK_NAME_MAX]}"
         here = self._settings.name
         if not any(matches(glob, node) for glob in self._settings.nodes.kill):
@@ -91,7 +127,7 @@ class NodeRequests:
         self._core.suspect(node)  # roscpp does not unregister when it ends in a hurry
         return NodeEnd(gone=gone)
 
-    def _own(self, args: dict[str, Any]) -> tuple[str, str]:
+    def _own(self, args: Mapping[str, object]) -> tuple[str, str]:
         """The node of this module that a request names, and its slave API.
 
         Raises:

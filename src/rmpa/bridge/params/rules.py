@@ -30,6 +30,29 @@ def leaves(key: str, value: XmlRpcValue) -> Iterator[tuple[str, XmlRpcValue]]:
             yield at, part
 
 
+def replaced(names: Iterable[str], at: str, present: XmlRpcValue) -> Iterator[str]:
+    """Yield the parameters that are lost if others are set: a value becomes a namespace, or a namespace a value.
+
+    Args:
+        names: The parameters that are set; all are ``at``, or below it.
+        at: The name of the present value, a namespace around them all.
+        present: The value; empty if there is none.
+    """
+    for name in names:
+        where, value = at, present
+        for part in filter(None, name[len(at) :].split("/")):
+            if not isinstance(value, dict):
+                yield where
+                break
+            where = f"{where.rstrip('/')}/{part}"
+            if part not in value:
+                break
+            value = value[part]
+        else:
+            if isinstance(value, dict):
+                yield from (lost for lost, _ in leaves(name, value))
+
+
 def key_problem(key: object) -> str:
     """Why a key from a peer is not a parameter's global name; empty if it is one."""
     if not isinstance(key, str) or not key.startswith("/"):

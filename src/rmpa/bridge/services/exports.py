@@ -25,7 +25,9 @@ from rmpa.bridge.messages import (
     ServiceOpened,
     is_crossing_name,
 )
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.relay import may_have
+from rmpa.config.permission_rules import Access
 from rmpa.config.settings import LimitSettings
 from rmpa.core.errors import RemoteProtocolError
 
@@ -143,9 +145,16 @@ class ServiceExports:
     Args:
         rules: What may cross, and under which names.
         limit_settings: How many services are offered.
+        gate: Decides which services each peer may call.
     """
 
-    def __init__(self, rules: ServiceRules, limit_settings: LimitSettings = _DEFAULT_LIMITS) -> None:
+    def __init__(
+        self,
+        rules: ServiceRules,
+        limit_settings: LimitSettings = _DEFAULT_LIMITS,
+        gate: PermissionGate = OPEN_GATE,
+    ) -> None:
+        self._gate = gate
         self._rules = rules
         self._catalogue: OfferCatalogue[str, LocalService, ServiceOffer, str] = OfferCatalogue(
             "services",
@@ -178,7 +187,10 @@ class ServiceExports:
         """The local service that is offered to a peer by a name on the wire; ``None`` if there is none."""
         known = self._catalogue.peer(peer)
         service = known.by_wire.get(wire) if known is not None else None
-        return service if service is not None and service in self.offered else None
+        if known is None or service is None or service not in self.offered:
+            return None
+        # After new rules, the peer is told of the services a little later.
+        return service if self._gate.judge(Access.CALL, known.name, service).allowed else None
 
     def about(self, service: str) -> ServiceAbout | None:
         """What a service's server has said of it; ``None`` while that is unknown."""
@@ -225,7 +237,24 @@ class ServiceExports:
         self._rules, self._catalogue.limit = rules, limit_settings.services
         for known in self._catalogue.peers():
             self._catalogue.note_all(known)
-        return (self._judge(service) for service in tuple(self._seen))
+        return self._rejudge()
+
+    def _rejudge(self) -> Iterator[list[ExportAction]]:
+        yield self._end_denied()
+        for service in tuple(self._seen):
+            yield self._judge(service)
+
+    def _end_denied(self) -> list[ExportAction]:
+        """End the routes that no permission allows any more."""
+        actions: list[ExportAction] = []
+        for number, peer in self._peers.items():
+            known = self._catalogue.peer(number)
+            if known is None or not self._gate.on:
+                continue
+            for route, session in list(peer.sessions.items()):
+                if why := self._gate.why_not(Access.CALL, known.name, session.service):
+                    actions += self._drop(number, peer, route, why)
+        return actions
 
     def _judge(self, service: str) -> list[ExportAction]:
         server, before = self._seen.get(service), self.offered.get(service)
@@ -304,6 +333,8 @@ class ServiceExports:
         wire = self._rules.wire_name(known.name, service)
         if not is_crossing_name(wire) or not self._rules.judge_for(known.name, service, wire).allowed:
             return None
+        if not self._gate.admits(Access.CALL, known.name, service):
+            return None
         return ServiceOffer(wire, server.node, server.origin)
 
     # --- their calls -------------------------------------------------------------------------------------------
@@ -320,10 +351,10 @@ class ServiceExports:
         if len(peer.sessions) >= self._catalogue.limit:
             text = f"more services are open on one link than limits.services = {self._catalogue.limit} over there"
             return [Send(number, ServiceClosed(message.route, text))]
-        known = self._catalogue.peer(number)
-        service = known.by_wire.get(message.service) if known is not None else None
+        service = self.local(number, message.service)
         server = self.offered.get(service) if service is not None else None
         if service is None or server is None:
+            self._report_denied(number, message.service)
             text = f"{message.service} is not provided here, or policy keeps it home"
             return [Send(number, ServiceClosed(message.route, text))]
         waiting = any(
@@ -333,6 +364,12 @@ class ServiceExports:
         if service in self._about:
             return self._start(service)
         return [] if waiting else [Probe(service, server)]
+
+    def _report_denied(self, number: int, wire: str) -> None:
+        """Report a service that a peer asks for without permission; the answer is as if there were none."""
+        known = self._catalogue.peer(number)
+        if known is not None and self._gate.on:
+            self._gate.admits(Access.CALL, known.name, self._rules.own_name(known.name, wire))
 
     def closed(self, number: int, message: CloseService) -> list[ExportAction]:
         """Handle a peer's message that it will not call a service any more.

@@ -18,7 +18,6 @@ Until then a client's probe is answered without a message to the peer.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import Enum, auto
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Final
 
@@ -36,8 +35,11 @@ from rmpa.bridge.messages import (
     ServiceOpened,
     is_crossing_name,
 )
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.relay import LinkedPeer, RelayPaths
 from rmpa.bridge.services.exports import ServiceAbout
+from rmpa.bridge.services.remote_service import TRANSITIONS, RemoteService, ServiceRouteState
+from rmpa.config.permission_rules import Access
 from rmpa.config.settings import LimitSettings
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from rmpa.core.guid import Guid
@@ -46,27 +48,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
 
     from rmpa.bridge.catalogue.peer_offers import Change
-    from rmpa.bridge.messages import Origin
     from rmpa.bridge.services.rules import ServiceRules
-
-
-class ServiceRouteState(Enum):
-    """Whether a service of a peer can be called now."""
-
-    IDLE = auto()
-    """No route is open or asked for."""
-    OPENING = auto()
-    """The route is asked for, and the peer has not answered."""
-    OPEN = auto()
-    """The service can be called."""
-
-
-_S = ServiceRouteState
-TRANSITIONS: Final[Mapping[ServiceRouteState, frozenset[ServiceRouteState]]] = {
-    _S.IDLE: frozenset({_S.OPENING}),
-    _S.OPENING: frozenset({_S.OPEN, _S.IDLE}),
-    _S.OPEN: frozenset({_S.IDLE}),
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,39 +109,6 @@ class ForgetAbout:
 ImportAction = Send | Warn | Provide | Withdraw | OpenedService | EndedService | ForgetAbout
 
 
-@dataclass(slots=True)
-class RemoteService:
-    """One service of one peer.
-
-    Args:
-        wire: Its name on the wire.
-        node: Its node, in the peer's graph.
-        name: Its name here.
-        shown: Whether it is in the local graph.
-        hidden: Why it is not in the local graph, or empty.
-        state: Whether it can be called now.
-        route: The route of its replies while it is asked for or open; else 0.
-        requests: The route of its requests while it is open; else 0.
-        due: While it is asked for: when the peer's answer is overdue, in monotonic seconds.
-        about: What its server said of it; ``None`` while that is unknown.
-        problem: Why it could not be opened or was closed last, or empty.
-        origin: Its module and node, if the peer relays it.
-    """
-
-    wire: str
-    node: str
-    name: str
-    shown: bool = False
-    hidden: str = ""
-    state: ServiceRouteState = ServiceRouteState.IDLE
-    route: int = 0
-    requests: int = 0
-    due: float = 0.0
-    about: ServiceAbout | None = None
-    problem: str = ""
-    origin: Origin | None = None
-
-
 @dataclass(slots=True, kw_only=True)
 class _ServiceImportPeer(PeerOffers[str, RemoteService, ServiceOffer]):
     """The services that one run of a peer offers; the things in ``nodes`` are the services' names here.
@@ -185,13 +134,20 @@ class ServiceImports:
     Args:
         rules: What may cross, and under which names; they apply at the receiving module too.
         limit_settings: How many services and nodes of one peer are taken.
+        gate: Decides which services each module may have here.
     """
 
-    def __init__(self, rules: ServiceRules, limit_settings: LimitSettings = _DEFAULT_LIMITS) -> None:
+    def __init__(
+        self,
+        rules: ServiceRules,
+        limit_settings: LimitSettings = _DEFAULT_LIMITS,
+        gate: PermissionGate = OPEN_GATE,
+    ) -> None:
+        self._gate = gate
         self._rules = rules
         self._limit_settings = limit_settings
         self._peers: dict[int, _ServiceImportPeer] = {}
-        self.ways = RelayPaths()
+        self.ways = RelayPaths(gate.may_relay)
         """The path by which each relayed module is reached."""
         self._local: dict[str, str] = {}
         # By the name here, then by peer: the services that have this name.
@@ -455,7 +411,8 @@ class ServiceImports:
         for number in sorted(claims, key=lambda number: (self._peers[number].rank, number)):
             remote = claims[number]
             nodes = self._peers[number].nodes
-            hidden = seen or self._objection(service, number, remote)
+            objection = self._objection(service, number, remote)
+            hidden = seen or objection
             nodes.leave(remote.node, service)
             if hidden is None and not nodes.free(remote.node):
                 nodes.wait(remote.node, service)
@@ -478,6 +435,7 @@ class ServiceImports:
 
     def _objection(self, service: str, number: int, remote: RemoteService) -> str | None:
         origin = remote.origin
+        before, remote.denied = remote.denied, False
         if origin is not None and (why := self.ways.why_not(number, origin)):
             return why
         decision = self._rules.judge(service, remote.node if origin is None else origin.node)
@@ -486,7 +444,15 @@ class ServiceImports:
                 decision = self._rules.judge_for(name, service, remote.wire)
         if not decision.allowed:
             return f"policy: {decision.rule}"
-        return None
+        name = self._peers[number].name
+        module, relay = (name, "") if origin is None else (origin.name, name)
+        permission = self._gate.judge(Access.SERVE, module, service, relay=relay)
+        if permission.allowed:
+            return None
+        remote.denied = True
+        if not before:
+            self._gate.refused(Access.SERVE, module, service, permission, relay=relay)
+        return permission.rule
 
     def _hide(self, number: int, remote: RemoteService, reason: str) -> list[ImportAction]:
         actions = self._release(number, remote, reason)

@@ -79,6 +79,10 @@ class ServiceRules:
         """The name on the wire, to this peer, of a service of this module."""
         return self._names.wire_name(peer, service)
 
+    def own_name(self, peer: str, wire: str) -> str:
+        """The name in the local graph of a service of this module that this peer knows as ``wire``."""
+        return next(iter(self._names.of(peer).locals_of(wire)), wire)
+
     def timeout(self, service: str) -> float:
         """The time-out of a call of a service, in seconds.
 

@@ -6,6 +6,7 @@ import asyncio
 import itertools
 from typing import TYPE_CHECKING
 
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.session.peer_proxies import PeerProxies
 from rmpa.bridge.session.peer_session import PeerSession, PeerState
 from rmpa.bridge.session.proxy_namespaces import ProxyNamespaces
@@ -32,6 +33,7 @@ class PeerSessions:
         nodes: Makes the proxies.
         receiver: Passes the data of links to the handlers of routes.
         on_kill: ``(session, node, caller id, reason) -> reply``: called when a node's proxy is asked to end.
+        gate: Whether the mesh is secured.
     """
 
     def __init__(
@@ -40,7 +42,9 @@ class PeerSessions:
         nodes: ProxyNodes,
         receiver: DataReceiver,
         on_kill: Callable[[PeerSession, str, str, str], Awaitable[RosReply]],
+        gate: PermissionGate = OPEN_GATE,
     ) -> None:
+        self._gate = gate
         self._parts = parts
         self._nodes = nodes
         self._receiver = receiver
@@ -107,9 +111,9 @@ class PeerSessions:
         for session in self:
             if session.linked:
                 continue
-            if session.link.identity.instance == link.identity.instance:
+            if session.link.identity.is_same_run(link.identity):
                 return session
-            if session.link.guid.place == link.guid.place or session.link.name == link.name:
+            if session.link.identity.is_same_module(link.identity, secured=self._gate.on):
                 self._end(session)
         return None
 

@@ -41,7 +41,9 @@ from rmpa.bridge.messages import (
     is_crossing_type,
 )
 from rmpa.bridge.naming import Names
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.relay import may_have
+from rmpa.config.permission_rules import Access
 from rmpa.config.settings import LimitSettings
 from rmpa.core.contract import Contract, Contracts, Durability, Reliability, combine
 
@@ -71,6 +73,7 @@ class _Route:
     Args:
         contract: The contract in force: the stronger terms of both ends.
         asked: The contract that the peer asked for.
+        name: The peer's name.
         live: Whether data is sent on it yet.
         epoch: Identifies the numbering of a reliable route; 0 for best effort.
         after: Sequence of the last message that the peer has, if this continues a suspended route; else ``None``.
@@ -79,6 +82,7 @@ class _Route:
 
     contract: Contract
     asked: Contract
+    name: str = ""
     live: bool = False
     epoch: int = 0
     after: int | None = None
@@ -131,6 +135,7 @@ class Exports:
         names: Translates local names to the names at the peers.
         limit_settings: Bounds the number of offered topics.
         kept: Knows the kept and lost messages of reliable routes.
+        gate: Decides which topics each peer may have.
     """
 
     def __init__(
@@ -140,7 +145,9 @@ class Exports:
         names: Names = _NO_NAMES,
         limit_settings: LimitSettings = _DEFAULT_LIMITS,
         kept: KeptMessages = NOTHING_KEPT,
+        gate: PermissionGate = OPEN_GATE,
     ) -> None:
+        self._gate = gate
         self._kept = kept
         self._policy = policy
         self._limit_settings = limit_settings
@@ -186,6 +193,8 @@ class Exports:
         if known is None:
             return None
         source = known.by_wire.get(wire)
+        if source is not None and not self._gate.judge(Access.SUBSCRIBE, known.name, source.topic).allowed:
+            return None  # the rules have changed, and the peer is told so in a moment
         local = self.offered.get(wire if source is None else source)
         if source is None and local is not None and not known.judged and self._offer(known, wire, local) is not None:
             return wire  # its advertisement is on its way
@@ -238,7 +247,7 @@ class Exports:
             before, known.judged = known.judged, self._is_judged(known.name)
             if before or known.judged:
                 self._catalogue.note_all(known)
-        actions: list[Action] = []
+        actions = self._end_denied()
         for source, flow in list(self._flows.items()):
             offered = contracts.of(source.topic, self.offered[source].type)
             for (peer_number, _), route in list(flow.routes.items()):
@@ -247,6 +256,23 @@ class Exports:
                     route.contract = contract
                 else:
                     actions += self._end_for(source, peer_number, "its contract has changed here")
+        return actions
+
+    def _end_denied(self) -> list[Action]:
+        """Ends the routes that no permission allows any more, at once: a slow peer is told of the topics later."""
+        actions: list[Action] = []
+        for peer, routes in self._routes.items():
+            known = self._catalogue.peer(peer)
+            if known is None or not self._gate.on:
+                continue
+            for source in dict.fromkeys(routes.values()):
+                if why := self._gate.why_not(Access.SUBSCRIBE, known.name, source.topic):
+                    actions += self._end_for(source, peer, why)
+        for source, flow in list(self._flows.items()):
+            for peer, route in list(flow.away.items()):
+                if not self._gate.judge(Access.SUBSCRIBE, route.name, source.topic).allowed:
+                    del flow.away[peer]
+                    actions += [RemoveRoute(source, peer, 0), *self._disconnect(source, flow)]
         return actions
 
     def graph(self, topic: str, publishers: Mapping[str, LocalSource]) -> list[Action]:
@@ -332,6 +358,8 @@ class Exports:
             return None
         if not self._policy.judge_for(known.name, source.topic, local.type, wire).allowed:
             return None
+        if not self._gate.admits(Access.SUBSCRIBE, known.name, source.topic):
+            return None
         return TopicOffer(wire, source.node, local.type, local.origin)
 
     def link_up(self, peer: int, name: str = "", instance: str = "") -> list[Action]:
@@ -347,7 +375,7 @@ class Exports:
         return self._told_portion(peer, first, full=True)
 
     def _is_judged(self, name: str) -> bool:
-        return not self._names.of(name).plain or self._policy.has_rules_for(name)
+        return self._gate.on or not self._names.of(name).plain or self._policy.has_rules_for(name)
 
     def link_down(self, peer: int, *, counting: bool = False) -> list[Action]:
         """Ends a peer's open routes, and its suspended ones too unless ``counting``.
@@ -430,6 +458,7 @@ class Exports:
             return [Send(peer, RouteClosed(message.route, text))]
         source = self.local(peer, message.source)
         if source is None:
+            self._report_denied(peer, message.source.topic)
             text = f"{message.source}: not published here, or policy keeps it home"
             return [Send(peer, RouteClosed(message.route, text))]
         local = self.offered[source]
@@ -440,6 +469,8 @@ class Exports:
         routes[message.route] = source
         away = flow.away.pop(peer, None) if flow is not None else None
         route = self._route(message, source.topic, local, away)
+        known = self._catalogue.peer(peer)
+        route.name = known.name if known is not None else ""
         if flow is None:
             flow = self._flows[source] = _ExportedFlow(local.uri)
             flow.routes[peer, message.route] = route
@@ -448,6 +479,13 @@ class Exports:
         if flow.description is None:
             return []
         return self._start(source, flow, flow.description)
+
+    def _report_denied(self, peer: int, wire: str) -> None:
+        """Reports a topic that a peer asks for without permission; the answer is as if there were none."""
+        known = self._catalogue.peer(peer)
+        if known is not None and self._gate.on:
+            local = next(iter(self._names.of(known.name).locals_of(wire)), wire)
+            self._gate.admits(Access.SUBSCRIBE, known.name, local)
 
     def _route(self, message: OpenRoute, topic: str, local: LocalSource, away: _Route | None) -> _Route:
         """The route that a peer asks for; it continues a suspended one of the same epoch and contract."""

@@ -31,10 +31,12 @@ from rmpa.bridge.messages import (
     is_crossing_name,
 )
 from rmpa.bridge.naming import Names, PeerNames
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.relay import LinkedPeer, RelayPaths
 from rmpa.bridge.topics.import_routes import ImportRoutes
 from rmpa.bridge.topics.remote_topic import RemoteTopic, RouteState
 from rmpa.config.param_rules import CLOCK
+from rmpa.config.permission_rules import Access
 from rmpa.config.settings import LimitSettings
 from rmpa.core.backoff import Backoff
 from rmpa.core.contract import Contracts
@@ -85,6 +87,7 @@ class Imports:
         position: ``(peer, source)``: epoch and last message of a reliable route that outlived its link, or ``None``.
         names: Translates the peers' names to local ones.
         limit_settings: Bounds the topics and nodes that are taken from one peer.
+        gate: Decides which topics each module may publish here.
     """
 
     def __init__(
@@ -95,7 +98,9 @@ class Imports:
         position: Callable[[int, Source], tuple[int, int] | None] = _nothing,
         names: Names = _NO_NAMES,
         limit_settings: LimitSettings = _DEFAULT_LIMITS,
+        gate: PermissionGate = OPEN_GATE,
     ) -> None:
+        self._gate = gate
         self._policy = policy
         self._limit_settings = limit_settings
         self._names = names
@@ -103,7 +108,7 @@ class Imports:
         self._contracts = contracts if contracts is not None else Contracts()
         self._routes = ImportRoutes(self.get, self._contracts, position)
         self._peers: dict[int, _ImportPeer] = {}
-        self.ways = RelayPaths()
+        self.ways = RelayPaths(gate.may_relay)
         """Selects the path to each module that relays offer."""
         self._local_types: dict[str, str] = {}
 
@@ -194,8 +199,10 @@ class Imports:
         for known in self._peers.values():
             known.names = names.of(known.name)
             known.nodes.bound(limit_settings.nodes)
+        # Shown ones first: what another relay brings from now on has the same proxies.
+        sources = sorted(self, key=lambda one: not one[2].shown) if self._gate.on else self
         return chain(
-            (self._rejudge(peer, source, now) for peer, source, _ in self),
+            (self._rejudge(peer, source, now) for peer, source, _ in sources),
             (actions for peer in list(self._peers) for actions in self._admit(peer, now)),
         )
 
@@ -385,6 +392,8 @@ class Imports:
             if (entry.type, entry.origin) == (offer.type, offer.origin):
                 # It was offered over an earlier link: open the route again that ended with that link.
                 waits = entry.state is RouteState.WAITING and entry.timer is None
+                if waits or entry.state is RouteState.IDLE:
+                    entry.problem = ""  # the peer was away, and is back
                 return self._routes.open(peer, source, entry, now) if waits else []
             actions += self._forget(peer, source)
         elif len(known) >= self._limit_settings.topics:
@@ -410,6 +419,7 @@ class Imports:
     def _show_or_hide(self, peer: int, source: Source, entry: RemoteTopic) -> list[Action]:
         nodes = self._peers[peer].nodes
         entry.hidden, entry.conflict = self._why_hidden(peer, source, entry)
+        self._judge_permission(peer, entry)
         entry.crowded = not entry.hidden and not nodes.free(source.node)
         if entry.crowded:
             entry.hidden = f"{self._peers[peer].name} has more nodes than limits.nodes = {nodes.limit} of this module"
@@ -425,6 +435,20 @@ class Imports:
         self._peers[peer].places[entry.topic, source.node] = source
         topic = entry.topic if entry.topic != source.topic else ""
         return [Publish(peer, source, entry.type, topic, entry.origin)]
+
+    def _judge_permission(self, peer: int, entry: RemoteTopic) -> None:
+        """Hides a source that its module may not publish here, and reports it if it was not so before."""
+        known, origin = self._peers[peer], entry.origin
+        module, relay = (known.name, "") if origin is None else (origin.name, known.name)
+        before, entry.denied = entry.denied, False
+        if entry.hidden and not entry.conflict:
+            return  # by a rule that does not depend on permissions
+        decision = self._gate.judge(Access.PUBLISH, module, entry.topic, relay=relay)
+        if decision.allowed:
+            return
+        entry.denied, entry.conflict, entry.hidden = True, False, decision.rule
+        if not before:
+            self._gate.refused(Access.PUBLISH, module, entry.topic, decision, relay=relay)
 
     def _hide(self, peer: int, source: Source, entry: RemoteTopic) -> list[Action]:
         entry.shown = False

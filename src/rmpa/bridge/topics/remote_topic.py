@@ -64,6 +64,7 @@ class RemoteTopic:
         backoff: Delays between attempts to open its route.
         shown: Whether it is in the local graph.
         hidden: Why it is not, or empty.
+        denied: Whether it is hidden because no permission lets its module publish it here.
         conflict: Whether it is hidden because a local node publishes the topic with another type, or, for ``/clock``,
             because time already has another source.
         state: The state of its route.
@@ -85,6 +86,7 @@ class RemoteTopic:
     backoff: Backoff
     shown: bool = False
     hidden: str = ""
+    denied: bool = False
     conflict: bool = False
     state: RouteState = RouteState.IDLE
     route: int = 0

@@ -209,7 +209,22 @@ class Discovery:
             if beacon is not None:
                 _log.debug("< %s:%d (interface %d): %s", *source, index, beacon)
                 self._membership.receive(beacon, source, now, multicast=multicast)
+            elif self._filter.overrun:
+                self._pause(sock, multicast=multicast)
+                break
         self._flush()
+
+    def _pause(self, sock: socket.socket, *, multicast: bool) -> None:
+        """Leave what comes to the kernel's buffer for a while: a flood of forged packets must not take the core."""
+        self.counters.add("beacon.paused")
+        self._filter.overrun = False
+        loop = asyncio.get_running_loop()
+        loop.remove_reader(sock.fileno())
+        loop.call_later(limits.BEACONS_UNPROVED_PAUSE, partial(self._resume, sock, multicast=multicast))
+
+    def _resume(self, sock: socket.socket, *, multicast: bool) -> None:
+        if self._started:
+            asyncio.get_running_loop().add_reader(sock.fileno(), partial(self._readable, sock, multicast=multicast))
 
     # --- interfaces and seeds ---------------------------------------------------------------------------------
 

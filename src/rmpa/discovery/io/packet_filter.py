@@ -61,6 +61,9 @@ class PacketFilter:
         self._counters = counters
         self._is_linked = is_linked
         self._unlinked: dict[int, TokenBucket] = {}
+        self._unproved = TokenBucket(limits.BEACONS_UNPROVED_PER_SECOND, limits.BEACONS_UNPROVED_BURST)
+        self.overrun = False
+        """Whether packets without a valid proof come faster than they can be looked at: pause the reading."""
         self._refusals = RefusalLog(_log, counters)
         self._recent: OrderedDict[bytes, None] = OrderedDict()
         self._sources: OrderedDict[str, tuple[float, int]] = OrderedDict()
@@ -132,7 +135,9 @@ class PacketFilter:
             return False
         found = trust.verifier.verify(data, KeyPurpose.BEACON, RUN_AT, now, trust.wall())
         if found.verdict in _USABLE:
+            trust.heard(host, found)
             return True
+        self.overrun = not self._unproved.take(now)
         text = _refusal(found)
         if text:
             self._refusals.refuse(now, f"beacon.{found.verdict}", host, f"{host} {text}")

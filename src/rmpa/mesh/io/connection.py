@@ -6,6 +6,8 @@ import asyncio
 import errno
 import logging
 import math
+import ssl
+from functools import partial
 from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.core.errors import RemoteProtocolError
@@ -27,6 +29,7 @@ from rmpa.mesh.connection import (
 )
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Lane
+from rmpa.mesh.io.securing import tls_failure
 from rmpa.mesh.io.sockets import reset_at_close, unacknowledged
 from rmpa.mesh.path_mtu import StallWatch
 from rmpa.runtime.machine_timer import MachineTimer
@@ -41,6 +44,7 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
     from rmpa.mesh.connection import OnData, OnPart
     from rmpa.mesh.handshake import Hello, Refuse
+    from rmpa.mesh.io.securing import SecuredSocket
     from rmpa.mesh.remote_clock import RemoteClock
 
     OnMark = Callable[[FrameKind, int, int], None]
@@ -63,6 +67,10 @@ class ConnectionOwner(Protocol):
 
     def connection_judge(self, connection: Connection, hello: Hello) -> Refuse | None:
         """Decide on the hello of a dialler: ``None`` accepts the connection."""
+        ...
+
+    def connection_prove(self, connection: Connection, hello: Hello) -> Refuse | None:
+        """Compare the hello or welcome of a secured connection with its certificate; ``None`` accepts it."""
         ...
 
     def connection_opened(self, connection: Connection) -> None:
@@ -114,6 +122,7 @@ class Connection:
         expected: The GUID that was dialled; ``None`` on an accepted connection.
         lane: What this side dials for; on an accepted connection the remote side's hello says it.
         segment: Bytes that one packet may carry; ``None`` for as many as the kernel chooses.
+        secured: What encrypts ``sock``, and the remote side's certificate; ``None`` in a mesh without trust.
     """
 
     def __init__(
@@ -129,12 +138,15 @@ class Connection:
         expected: Guid | None = None,
         lane: Lane = Lane.EXPRESS,
         segment: int | None = None,
+        secured: SecuredSocket | None = None,
     ) -> None:
         self.id = connection_id
         self.sock = sock
         self.remote_endpoint = endpoint
         self.local_address: str = sock.getsockname()[0]
         """The address of this side."""
+        self.certificate: Final = None if secured is None else secured.certificate
+        """The remote side's certificate, as ``SSLObject.getpeercert`` returns it; ``None`` without trust."""
         self.crashed = False
         """Once ended: whether the remote kernel ended it without a bye, so that only the agent's process has died."""
         self.since: float | None = None
@@ -164,6 +176,7 @@ class Connection:
             # For control frames only: ``LaneSender.connect`` replaces it by the lane's outbox.
             outbox=Outbox(1, limits.CONNECTION_URGENT_BYTES),
             segment=segment,
+            secure=None if secured is None else secured.socket,
         )
         self._machine = ConnectionProtocol(
             role,
@@ -176,6 +189,7 @@ class Connection:
             lane=lane,
             lease=limits.BULK_LEASE if lane is Lane.BULK else limits.EXPRESS_LEASE,
             label=f"{endpoint[0]}:{endpoint[1]}",
+            prove=None if secured is None else partial(owner.connection_prove, self),
         )
         self._timer = MachineTimer(self._machine.next_timer, self._due, now=clock.now)
         self._send_output()
@@ -299,6 +313,11 @@ class Connection:
         self.stalls = StallWatch(size, self._clock.now(), self.stalls)
         self.stream.segment(size)
 
+    def expel(self, refuse: Refuse) -> None:
+        """Close a connection that is up because its peer was revoked, and say so; as ``close`` otherwise."""
+        self._machine.expel(refuse, self._clock.now())
+        self._send_output()
+
     def close(self, reason: str) -> None:
         """Send a bye, wait at most ``limits.DRAIN_TIMEOUT`` for the last bytes to be sent, and close."""
         self._machine.close(reason, self._clock.now())
@@ -387,6 +406,10 @@ class Connection:
         self.silent = isinstance(error, OSError) and error.errno in _SILENCE
         ended = error is None or (isinstance(error, OSError) and error.errno in _ENDED_THERE)
         self.crashed = self._machine.state is ConnectionState.UP and ended
+        if isinstance(error, ssl.SSLError) and self._machine.state is ConnectionState.HANDSHAKING:
+            # In TLS 1.3 the acceptor judges the dialler's certificate when the dialler is already done.
+            failure = tls_failure(error)
+            self._owner.connection_refused(self, failure.refuse, by_us=failure.by_us)
         reason = f"{self.name} closed the connection" if error is None else f"connection to {self.name} lost: {error}"
         self._machine.lost(reason)
 
@@ -404,6 +427,7 @@ class Connection:
         self.deliver_to(None, None, None)
         # The machine would keep this object, with its perhaps large buffers, in a reference cycle until a collection.
         self._machine.on_event = _ignore_event
+        self._machine.prove = None
         self._end.set_result(None)
         self._owner.connection_ended(self, reason)
 

@@ -20,6 +20,7 @@ from rmpa.mesh.io.connection import Connection
 from rmpa.mesh.io.dialler import Dialler
 from rmpa.mesh.io.link import LinkHandlers, PeerLink
 from rmpa.mesh.io.path_monitor import PathMonitor
+from rmpa.mesh.io.securing import Securing, SecuringError, prove, secure_dialled
 from rmpa.mesh.io.sockets import tune_bulk, tune_express, unacknowledged
 from rmpa.mesh.peering import (
     CloseLink,
@@ -37,6 +38,7 @@ from rmpa.runtime.acceptor import Acceptor
 from rmpa.runtime.descriptors import Use
 from rmpa.runtime.machine_timer import MachineTimer
 from rmpa.runtime.system_clock import SystemClock
+from rmpa.trust.reasons import TrustReason
 
 if TYPE_CHECKING:
     import socket
@@ -46,12 +48,15 @@ if TYPE_CHECKING:
     from rmpa.core.guid import Guid
     from rmpa.core.identity import Identity
     from rmpa.mesh.handshake import Hello, Refuse
+    from rmpa.mesh.io.securing import MeshSecurity, OnJoin, SecuredSocket
     from rmpa.mesh.peering import SocketAddress
 
 _log = logging.getLogger(__name__)
 
 _ORDINARY: Final = frozenset({Refusal.ALREADY_LINKED, Refusal.MYSELF, Refusal.NO_EXPRESS})
 """Refusals that are part of the normal course, and are not logged as warnings."""
+
+_TRUST: Final = frozenset(TrustReason)
 
 OnLinkUp = Callable[[PeerLink], None]
 OnLinkDown = Callable[[PeerLink, LinkDown], None]
@@ -76,6 +81,8 @@ class Mesh:
         counters: Where refusals and failures are counted.
         rng: Uniform numbers in [0, 1), for jitter.
         dialler: Opens the connections; by default real ones.
+        security: This module's membership of a secured mesh: all links use TLS then; ``None``: none does.
+        on_join: Takes accepted connections for a join or a renewal, with their prefaces.
     """
 
     def __init__(
@@ -92,6 +99,8 @@ class Mesh:
         counters: Counters | None = None,
         rng: Callable[[], float] = random.random,
         dialler: Dialler | None = None,
+        security: MeshSecurity | None = None,
+        on_join: OnJoin | None = None,
     ) -> None:
         self.identity = identity
         self.counters = counters if counters is not None else Counters()
@@ -119,6 +128,19 @@ class Mesh:
         self._bulk_dials: dict[int, asyncio.Task[None]] = {}
         self._bulk_backoffs: dict[int, Backoff] = {}
         self._redials: dict[int, asyncio.Task[None]] = {}
+        self._security = security
+        self._securing: Securing | None = None
+        if security is not None:
+            self._securing = Securing(
+                security,
+                clock=self._clock,
+                refusals=self._refusals,
+                on_secured=self._secured,
+                on_refused=self._peering.refused_from,
+                on_join=on_join,
+                pause=self._acceptor.pause,
+            )
+            security.on_denied.append(self._denied)
         self._rng = rng
         self._ids = count(1)
         self._acting = False
@@ -137,7 +159,15 @@ class Mesh:
             return
         self._running = False
         self._timer.close()
-        tasks: list[asyncio.Task[None]] = [*self._dials, *self._bulk_dials.values(), *self._redials.values()]
+        if self._security is not None:
+            self._security.on_denied.remove(self._denied)
+        securing = self._securing.close() if self._securing is not None else []
+        tasks: list[asyncio.Task[None]] = [
+            *securing,
+            *self._dials,
+            *self._bulk_dials.values(),
+            *self._redials.values(),
+        ]
         for task in tasks:
             task.cancel()
         await asyncio.gather(*self.paths.close(), *self.dialler.close(), *tasks, return_exceptions=True)
@@ -189,6 +219,13 @@ class Mesh:
         """Decide on a hello; the peering machine knows the links that are up."""
         return self._peering.judge(hello)
 
+    def connection_prove(self, connection: Connection, hello: Hello) -> Refuse | None:
+        """Compare a hello with the certificate, and with the names of the links that it would replace or join."""
+        if self._security is None or connection.certificate is None:
+            return None
+        linked = [(link.identity, self._alive(link.id)) for link in self.links()]
+        return prove(hello, connection.certificate, self._security, linked)
+
     def connection_opened(self, connection: Connection) -> None:
         """A handshake succeeded."""
         self._pending.discard(connection.id)
@@ -212,12 +249,28 @@ class Mesh:
         elif by_us:
             text = f"refused a link with {connection.name} at {address}: {refuse.text}"
             self._refusals.refuse(now, f"link.refused.{refuse.label}", address, text)
+        elif refuse.code in _TRUST:
+            self.counters.add(f"link.refused.{refuse.label}")
+        self._note_refusal(connection, refuse, by_us=by_us)
         if connection.lane == Lane.BULK:
             return  # connection_ended follows, and the lane is dialled again
         guid = self._dialled.pop(connection.id, None)
         if guid is not None:
             self._peering.dial_refused(guid, refuse, now, connection.remote_endpoint)
             self._act()
+
+    def _note_refusal(self, connection: Connection, refuse: Refuse, *, by_us: bool) -> None:
+        """Show a refusal for trust that concerns a connection which the peer dialled, or which was up."""
+        if refuse.code not in _TRUST or (connection.dialled and connection.since is None):
+            return
+        if not by_us:
+            _log.warning("! %s refuses a link: %s", connection.name, refuse.text)
+        if (link := self._used(connection)) is not None:
+            # Not when its socket is closed: a revoked peer need not answer the refusal.
+            self._peering.link_down(link.id, str(refuse), self._clock.now())
+            self._act()
+        if connection.remote is not None:
+            self._peering.link_refused(connection.remote.guid, refuse)
 
     def connection_control(self, connection: Connection, payload: bytes) -> None:
         """A control frame came."""
@@ -353,6 +406,7 @@ class Mesh:
         while link.used:
             try:
                 sock = await self.dialler.connect(link.remote_endpoint, Lane.BULK)
+                secured = await self._secure_dialled(sock)
             except OSError as error:
                 self.counters.add("link.bulk_failed")
                 _log.debug("! %s: no bulk lane: %s", link.name, error)
@@ -361,12 +415,11 @@ class Mesh:
             if _is_over(link):
                 sock.close()  # the link ended meanwhile
                 return
-            self._open(sock, ConnectionRole.DIALLER, link.remote_endpoint, link.guid, Lane.BULK)
+            self._open(sock, ConnectionRole.DIALLER, link.remote_endpoint, link.guid, Lane.BULK, secured=secured)
             return
 
     def _bulk_opened(self, bulk: Connection) -> None:
-        instance = bulk.identity.instance
-        link = next((link for link in self.links() if link.identity.instance == instance), None)
+        link = next((link for link in self.links() if link.identity.is_same_run(bulk.identity)), None)
         if link is None:
             bulk.close("its express lane is gone")
             return
@@ -403,8 +456,29 @@ class Mesh:
             problem = os.strerror(error.errno) if error.errno else f"no answer within {limits.DIAL_TIMEOUT:g} s"
             self._peering.dial_failed(dial.guid, f"{places}: {problem}", self._clock.now())
             self._act()
+            return
+        try:
+            secured = await self._secure_dialled(sock)
+        except SecuringError as error:
+            self.counters.add(f"link.refused.{error.refuse.label}")
+            self._peering.dial_refused(dial.guid, error.refuse, self._clock.now(), endpoint, proved=error.by_us)
+            self._act()
+        except OSError as error:
+            self.counters.add("link.dial_failed")
+            self._peering.dial_failed(dial.guid, f"{endpoint[0]}:{endpoint[1]}: {error}", self._clock.now(), endpoint)
+            self._act()
         else:
-            self._open(sock, ConnectionRole.DIALLER, endpoint, dial.guid)
+            self._open(sock, ConnectionRole.DIALLER, endpoint, dial.guid, secured=secured)
+
+    async def _secure_dialled(self, sock: socket.socket) -> SecuredSocket | None:
+        """Do the TLS handshake of a dialled connection in a secured mesh; closes the socket if it fails."""
+        if self._security is None:
+            return None
+        try:
+            return await secure_dialled(sock, self._security)
+        except BaseException:
+            sock.close()
+            raise
 
     async def _redial(self, link: PeerLink) -> None:
         """Replace a link without acknowledgements as soon as the peer can be reached again, on any path."""
@@ -423,8 +497,16 @@ class Mesh:
                 _log.debug("= %s: silent, but not for want of a way to it", link.name)
                 sock.close()
                 return
-            _log.debug("= %s: silent, but it can be reached at %s:%d: a new link", link.name, *endpoint)
-            self._open(sock, ConnectionRole.DIALLER, endpoint, link.guid)
+            try:
+                secured = await self._secure_dialled(sock)
+            except OSError as error:
+                _log.debug("! %s: silent, and no TLS handshake: %s", link.name, str(error) or "no answer")
+                await asyncio.sleep(limits.REDIAL_PAUSE)
+                continue
+            if _is_over(link):
+                sock.close()
+                return
+            self._open(sock, ConnectionRole.DIALLER, endpoint, link.guid, secured=secured)
             return
 
     async def _reachable(self, link: PeerLink) -> bool:
@@ -449,6 +531,8 @@ class Mesh:
         endpoint: SocketAddress,
         expected: Guid | None = None,
         lane: Lane = Lane.EXPRESS,
+        *,
+        secured: SecuredSocket | None = None,
     ) -> None:
         connection_id = next(self._ids)
         if expected is not None:
@@ -466,14 +550,28 @@ class Mesh:
             expected=expected,
             lane=lane,
             segment=self.paths.segment(endpoint[0]),
+            secured=secured,
         )
 
     def _accepted(self, sock: socket.socket, address: SocketAddress) -> None:
+        if self._securing is not None:
+            self._securing.accept(sock, address)
+        else:
+            self._secured(sock, address, None)
+
+    def _secured(self, sock: socket.socket, address: SocketAddress, secured: SecuredSocket | None) -> None:
         if not self._has_room(address[0]):
             sock.close()
             return
         tune_express(sock, self._lanes, self.counters)
-        self._open(sock, ConnectionRole.ACCEPTOR, address)
+        self._open(sock, ConnectionRole.ACCEPTOR, address, secured=secured)
+
+    def _denied(self) -> None:
+        """End the links whose peers are on the new deny list."""
+        for connection in self.connections():
+            remote = connection.remote
+            if connection.up and remote is not None and (refuse := self.connection_prove(connection, remote)):
+                connection.expel(refuse)
 
     def _has_room(self, address: str) -> bool:
         there = sum(self._connections[k].remote_endpoint[0] == address for k in self._pending)

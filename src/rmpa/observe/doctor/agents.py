@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rmpa.core.open_files import remedy
 from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
@@ -14,6 +14,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from rmpa.observe.snapshot import AgentInfo, FilesInfo, PeerInfo, Snapshot, UnreachableInfo
+    from rmpa.trust.status import TrustStatus
+
+
+_PERMISSION: Final = "permission."
+"""The counters of what ``[[permission]]`` refused begin so."""
 
 
 def judge_agents(agents: Mapping[str, Snapshot | str], version: str) -> list[Check]:
@@ -46,7 +51,14 @@ def _agent(snapshot: Snapshot, version: str) -> Iterator[Check]:
         text = f"it is RMPA {agent.version}, this command is {version}"
         yield Check("agent", WARN, text, "start it again with this version", where=here)
     shortage = agent.files.problem if agent.files is not None else ""
-    yield from (Check("agent", WARN, note, where=here) for note in snapshot.notes if note != shortage)
+    shown = {shortage, *(snapshot.trust.problems if snapshot.trust is not None else ())}  # by checks of their own
+    yield from (Check("agent", WARN, note, where=here) for note in snapshot.notes if note not in shown)
+    refused = [(n.removeprefix(_PERMISSION), c) for n, c in snapshot.counters.items() if n.startswith(_PERMISSION)]
+    if refused:
+        text = (
+            f"refused so far: {', '.join(f'{count} {access}' for access, count in refused)}; its log names the rules"
+        )
+        yield Check("permissions", OK, text, where=here)
     yield from map(_unreachable, snapshot.unreachable)
     if agent.files is not None:
         yield _files(agent, agent.files)
@@ -58,9 +70,27 @@ def _agent(snapshot: Snapshot, version: str) -> Iterator[Check]:
             f"is `rmpa up` running elsewhere with --domain {agent.domain}? `rmpa multicast` tries the way by hand"
         )
         yield Check("peer", WARN, text, advice, where=here)
+    if snapshot.trust is not None:
+        yield judge_membership(snapshot.trust, snapshot.taken)
     for peer in snapshot.peers:
         yield from _peer(here, peer)
     yield from _transport(snapshot)
+
+
+def judge_membership(trust: TrustStatus, wall: float) -> Check:
+    """How a module's part in its secured mesh is.
+
+    Args:
+        trust: Its state.
+        wall: Seconds since 1970.
+    """
+    if trust.problems:
+        text, _, what_to_do = trust.problems[0].partition("; ")
+        ended = trust.clock_set and wall >= trust.expires
+        return Check("trust", FAIL if ended else WARN, text, what_to_do or "rmpa trust status", where=trust.module)
+    left = (trust.expires - wall) / 3600
+    text = f"its certificate is valid for {left:.0f} h more; group key {trust.key}, deny list {trust.deny_number}"
+    return Check("trust", OK, text, where=trust.module)
 
 
 def _transport(snapshot: Snapshot) -> Iterator[Check]:

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import TracebackType
 
+    from rmpa.observe.snapshot_decoder import SnapshotDecoder
+
 _T = TypeVar("_T")
 _START_ONE = "start one with `rmpa up`"
 
@@ -96,18 +98,38 @@ class ControlClient:
             UnreachableError: It closed the connection, or did not reply in time.
             RemoteProtocolError: Its value has another type.
         """
+        line = self._exchange(op, args)
+        with contextlib.suppress(msgspec.DecodeError, RecursionError, UnicodeDecodeError):
+            # Straight to its type takes half the time.
+            typed = _decoder(type).decode(line)  # type: ignore[arg-type]  # types are hashable
+            if typed.ok and typed.value is not msgspec.UNSET:
+                return cast("_T", typed.value)
+        return self._parse(op, line, type)
+
+    def snapshot(self, decoder: SnapshotDecoder | None = None, **args: object) -> Snapshot:
+        """Everything that the agent shows; raises as ``call``.
+
+        Args:
+            decoder: For those that ask again and again.
+            args: Of the operation.
+        """
+        if decoder is None:
+            return self.call("snapshot", Snapshot, **args)
+        line = self._exchange("snapshot", args)
+        with contextlib.suppress(RemoteProtocolError):
+            return decoder.decode(line)
+        return self._parse("snapshot", line, Snapshot)
+
+    def _exchange(self, op: str, args: dict[str, object]) -> bytes:
         try:
             self._sock.sendall(ControlRequest(op, args).serialize())
-            line = self._line()
+            return self._line()
         except TimeoutError:
             raise UnreachableError("agent", f"{self.path} in time", "is it stopped? its log may tell") from None
         except OSError as error:
             raise UnreachableError("agent", f"{self.path} ({error.strerror})", _START_ONE) from None
-        with contextlib.suppress(msgspec.DecodeError, RecursionError, UnicodeDecodeError):
-            # Straight to its type takes half the time: the monitor asks for all of a large mesh six times a second.
-            typed = _decoder(type).decode(line)  # type: ignore[arg-type]  # types are hashable
-            if typed.ok and typed.value is not msgspec.UNSET:
-                return cast("_T", typed.value)
+
+    def _parse(self, op: str, line: bytes, type: type[_T]) -> _T:  # noqa: A002 - as msgspec calls it
         reply = ControlReply.parse(line)
         if not reply.ok:
             raise PeerRefused(f"agent {self.name}", reply.error, reply.remedy)
@@ -117,10 +139,6 @@ class ControlClient:
             raise RemoteProtocolError(
                 f"agent {self.name} answers {op} in another way: {error}; is it older?"
             ) from None
-
-    def snapshot(self) -> Snapshot:
-        """Everything that the agent shows."""
-        return self.call("snapshot", Snapshot)
 
     def _line(self) -> bytes:
         parts = [self._rest]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import msgspec
 
@@ -15,9 +15,14 @@ from rmpa.bridge.params.transfer import QUESTIONS as PARAM_REQUESTS
 from rmpa.bridge.policy import OWN_NODE
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
+from rmpa.core.names import is_global_name
 from rmpa.observe import limits
+from rmpa.observe.contract_term import ContractTerm
+from rmpa.observe.graph_changes import GraphRevision
+from rmpa.observe.io.agent_requests import INFO as AGENT_INFO
+from rmpa.observe.peer_agent import PeerAgent
 from rmpa.observe.reload_reply import ReloadReply
-from rmpa.observe.snapshot import FollowedInfo, GraphRevision, PingReply, Snapshot
+from rmpa.observe.snapshot import FollowedInfo, PingReply, Snapshot
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.node_info import NodeLine, PeerNodes
 
@@ -25,6 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Collection
 
     from rmpa.bridge.io.bridge import Bridge
+    from rmpa.bridge.io.node_requests import NodeRequests
     from rmpa.bridge.params.io.part import Params
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.observe.io.control_server import Handler
@@ -33,6 +39,14 @@ if TYPE_CHECKING:
     from rmpa.observe.why.io.why import WhyService
 
 Args = dict[str, object]
+
+
+class TrustCommands(Protocol):
+    """Answers the commands of ``rmpa trust``: ``agent.trust_operations`` has them."""
+
+    async def answer_command(self, args: Args, /) -> object:
+        """The reply to one command; an ``RmpaError`` is the client's error."""
+        ...
 
 
 class ControlOperations:
@@ -46,6 +60,8 @@ class ControlOperations:
         why: Answers ``why``.
         reload: Reads the settings again; with ``check`` it changes nothing.
         graph: Counts the changes of the local graph.
+        trust: Answers the commands of ``rmpa trust``.
+        nodes: Knows the nodes of this module.
     """
 
     def __init__(
@@ -57,6 +73,8 @@ class ControlOperations:
         why: WhyService,
         reload: Callable[..., Awaitable[ReloadReply]],
         graph: GraphRevisions,
+        trust: TrustCommands,
+        nodes: NodeRequests,
     ) -> None:
         self._name = name
         self._bridge = bridge
@@ -65,6 +83,8 @@ class ControlOperations:
         self._why = why
         self._reload = reload
         self._graph = graph
+        self._trust = trust
+        self._nodes = nodes
 
     def handlers(self) -> dict[str, Handler]:
         """The handler of each operation, for ``ControlServer``."""
@@ -129,8 +149,13 @@ class ControlOperations:
         )
 
     async def node(self, args: Args) -> Any:
-        """Pass a request about a node on to a peer: ``peer``, ``what``, ``node``; without a peer, list all nodes."""
+        """Pass a request about a node on to a peer: ``peer``, ``what``, ``node``.
+
+        Without a peer: the facts about a node of this module, or a list of the nodes of all peers.
+        """
         what, peer = _request(args, node_requests.REPLIES), args.get("peer")
+        if peer is None and what == node_requests.INFO:
+            return await self._nodes.info(args)
         if peer is None:
             return await asyncio.gather(
                 *(self._nodes_of(session) for session in list(self._bridge.sessions.linked()))
@@ -151,9 +176,24 @@ class ControlOperations:
             nodes = tuple(NodeLine(name=node) for node, _ in session.proxies)
             return PeerNodes(peer=peer, nodes=nodes, problem=str(error))
 
+    async def agent(self, args: Args) -> Any:
+        """What the agent of a peer tells of itself: ``peer``, its name or GUID."""
+        return await self._bridge.rpc.request(self._session(args.get("peer", "")), AGENT_INFO, {})
+
+    def contract(self, args: Args) -> dict[str, ContractTerm]:
+        """The terms that this module's settings give a ``topic`` of a ``type_name``, by key; it need not exist."""
+        topic, type_name = str(args.get("topic", "")), str(args.get("type_name", ""))
+        if not is_global_name(topic):
+            raise ConfigError("topic", f"{topic!r} is not a topic", "write /name")
+        return self._snapshots.contract(topic, type_name)
+
     async def graph(self, args: Args) -> GraphRevision:
         """The arguments of ``GraphRevisions.after``."""
         return await self._graph.after(args)
+
+    async def trust(self, args: Args) -> object:
+        """``what``: the command, with its own arguments."""
+        return await self._trust.answer_command(args)
 
     def _session(self, name: object) -> PeerSession:
         """The linked peer of a name or GUID.
@@ -222,6 +262,9 @@ OPERATIONS: Final = (
     Operation("param", ControlOperations.param, object),  # the value that the peer replies
     Operation("graph", ControlOperations.graph, GraphRevision),
     Operation("followed", ControlOperations.followed, tuple[FollowedInfo, ...]),
+    Operation("trust", ControlOperations.trust, object),  # TrustStatus, or as the command says (trust.status)
+    Operation("agent", ControlOperations.agent, PeerAgent),
+    Operation("contract", ControlOperations.contract, dict[str, ContractTerm]),
     Operation("node", ControlOperations.node, object),  # tuple[PeerNodes, ...] for lists, else as REPLIES says
 )
 """All operations of the control socket."""

@@ -17,6 +17,7 @@ from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import RemoteProtocolError, RmpaError, StartError
 from rmpa.observe import limits
 from rmpa.observe.control import ControlReply, ControlRequest
+from rmpa.observe.io.peer_credentials import ControlAccess, peer_credentials
 from rmpa.observe.io.runtime_dir import NameLock
 from rmpa.runtime.acceptor import Acceptor
 from rmpa.runtime.descriptors import Use
@@ -32,27 +33,39 @@ Handler = Callable[[dict[str, object]], Awaitable[object] | object]
 
 
 class ControlServer:
-    """A UNIX stream socket ``<name>.sock`` that only this user can open, and the lock on its name.
+    """A UNIX stream socket ``<name>.sock`` for this user, root and one group, and the lock on its name.
+
+    The modes of the directory and the socket keep others out; besides them the kernel is asked for the user of each
+    client, since a socket may be passed on, bind-mounted into a container, or have had its mode changed.
 
     Args:
         place: The runtime directory; made if needed.
         name: The agent's name.
         handlers: By operation; each gets the request's ``args`` and returns a value for JSON (``msgspec`` structs
             too) or an awaitable of one. An ``RmpaError`` becomes the error that the client shows.
-        counters: Where refusals are counted: ``control.refused``, ``control.busy``, ``control.failed``.
+        counters: Where refusals are counted: ``control.user``, ``control.refused``, ``control.busy``,
+            ``control.failed``.
+        access: The users that are served; the agent's own and root, unless it is said.
 
     Raises:
         StartError: By ``lock()`` and ``start()``, if an agent of this name runs or the socket cannot be made.
     """
 
     def __init__(
-        self, place: Path, name: str, handlers: Mapping[str, Handler], *, counters: Counters | None = None
+        self,
+        place: Path,
+        name: str,
+        handlers: Mapping[str, Handler],
+        *,
+        counters: Counters | None = None,
+        access: ControlAccess | None = None,
     ) -> None:
         self._place = place
         self._name = name
         self._handlers = handlers
         self.counters = counters if counters is not None else Counters()
         self._refusals = RefusalLog(_log, self.counters)
+        self._access = access if access is not None else ControlAccess(os.geteuid())
         self._lock: NameLock | None = None
         self._acceptor: Acceptor | None = None
         self._clients: set[asyncio.Task[None]] = set()
@@ -61,7 +74,7 @@ class ControlServer:
     def lock(self) -> None:
         """Lock the name, before anything else of the agent starts; else ``start()`` does it."""
         if self._lock is None:
-            self._lock = NameLock(self._place, self._name)
+            self._lock = NameLock(self._place, self._name, self._access.group)
 
     async def start(self) -> None:
         """Bind and serve. The socket of an agent that was killed is replaced, since its name's lock is ours."""
@@ -79,9 +92,12 @@ class ControlServer:
             self.path.unlink()
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
-            # The directory's mode is 0700, so no other user can connect between bind and chmod.
+            # The directory's mode is 0700 (0750 with a group), so no other user can connect between bind and chmod.
             sock.bind(str(self.path))
             self.path.chmod(0o600)
+            if self._access.group is not None:
+                os.chown(self.path, -1, self._access.group)
+                self.path.chmod(0o660)
             sock.listen(limits.CONTROL_BACKLOG)
         except OSError as error:
             sock.close()
@@ -124,12 +140,15 @@ class ControlServer:
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
+            if refused := self._wrong_user(writer.get_extra_info("socket")):
+                await self._turn_away(reader, writer, refused)
+                return
             if len(self._clients) > limits.CONTROL_CLIENTS_MAX:
                 self._refuse("control.busy", f"more than {limits.CONTROL_CLIENTS_MAX} clients of the control socket")
                 busy = ControlReply(
                     ok=False, error="the agent has too many clients", remedy="close some, or try again"
                 )
-                await self._send(writer, busy)
+                await self._turn_away(reader, writer, busy)
                 return
             while await self._one(reader, writer):
                 pass
@@ -141,6 +160,25 @@ class ControlServer:
             writer.close()
             with contextlib.suppress(OSError):
                 await writer.wait_closed()
+
+    def _wrong_user(self, sock: socket.socket) -> ControlReply | None:
+        """The reply to a client of a user who is not served; ``None``: it is served."""
+        user = peer_credentials(sock)
+        if self._access.allows(user):
+            return None
+        self._refuse("control.user", f"user {user.uid} (pid {user.pid}) at the control socket")
+        error = f"user {user.uid} may not use the control socket of user {self._access.uid}"
+        remedy = "use sudo, or name a group of yours as group of [control] in rmpa.toml"
+        return ControlReply(ok=False, error=error, remedy=remedy)
+
+    async def _turn_away(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, reply: ControlReply
+    ) -> None:
+        """Send a reply, and wait for what the client sends: a socket closed before that would break its ``send``."""
+        await self._send(writer, reply)
+        writer.write_eof()
+        async with asyncio.timeout(limits.CONTROL_REFUSED_TIMEOUT):
+            await reader.read(limits.CONTROL_REQUEST_MAX)
 
     async def _one(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
         """Serve one request; returns whether the connection stays open."""

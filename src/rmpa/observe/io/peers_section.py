@@ -8,7 +8,7 @@ import msgspec
 
 from rmpa.observe.io.direct_section import direct_counts
 from rmpa.observe.shared_address import mark_shared_addresses
-from rmpa.observe.snapshot import BoundInfo, LinkInfo, PeerInfo
+from rmpa.observe.snapshot import BoundInfo, LaneInfo, LinkInfo, PeerInfo
 from rmpa.runtime.event_loop import yield_to_data
 from rmpa.runtime.system_clock import SystemClock
 
@@ -22,10 +22,12 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
     from rmpa.discovery.events import PeerView
     from rmpa.discovery.io.discovery import Discovery
+    from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.io.mesh import Mesh
     from rmpa.mesh.io.path_monitor import PathMonitor
     from rmpa.mesh.peering import PeerStatus
+    from rmpa.runtime.stream import Stream
 
 _DENY: Final = {"services": "services.deny"}
 """The setting that denies things of a kind, where it is not ``bridge.deny``."""
@@ -145,7 +147,23 @@ class PeersSection:
             packet=paths.packet_bytes(link),
             path_problem=problem.text if problem is not None else "",
             path_remedy=problem.remedy if problem is not None else "",
+            lanes=(
+                _lane(link.express, link.connection.stream),
+                _lane(link.bulk, link.bulk_connection.stream if link.bulk_connection is not None else None),
+            ),
         )
+
+
+def _lane(lane: LaneSender, stream: Stream | None) -> LaneInfo:
+    """A lane of a link; ``stream`` is that of its connection, while it has one."""
+    return LaneInfo(
+        name=lane.name,
+        connected=stream is not None,
+        bytes_in=stream.bytes_in if stream is not None else 0,
+        bytes_out=stream.bytes_out if stream is not None else 0,
+        queued=stream.pending_bytes if stream is not None else lane.outbox.pending_bytes,
+        dropped=lane.outbox.dropped.total(),
+    )
 
 
 def _bound_here(peer: str, beyond: Beyond) -> BoundInfo:

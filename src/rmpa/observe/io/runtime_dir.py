@@ -58,11 +58,15 @@ def _usable(place: Path) -> bool:
     return stat.S_ISDIR(info.st_mode) and trusted and os.access(place, os.R_OK | os.X_OK)
 
 
-def make_runtime_dir(place: Path) -> None:
-    """Make the directory, for this user alone.
+def make_runtime_dir(place: Path, group: int | None = None) -> None:
+    """Make the directory, for this user alone, or for one group too.
+
+    Args:
+        place: The directory.
+        group: The number of the group that may look into it.
 
     Raises:
-        StartError: It cannot be made, or another user owns it.
+        StartError: It cannot be made or given to the group, or another user owns it.
     """
     try:
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -71,7 +75,10 @@ def make_runtime_dir(place: Path) -> None:
             raise StartError(str(place), "is not a directory", _REMEDY)
         if info.st_uid != os.geteuid():
             raise StartError(str(place), f"belongs to user {info.st_uid}, not to us", _REMEDY)
-        if info.st_mode & 0o077:
+        if group is not None:
+            os.chown(place, -1, group)
+            place.chmod(0o750)
+        elif info.st_mode & 0o077:
             place.chmod(0o700)
     except OSError as error:
         raise StartError(str(place), f"cannot be made: {error.strerror}", _REMEDY) from None
@@ -83,13 +90,14 @@ class NameLock:
     Args:
         place: The runtime directory; made if needed.
         name: The agent's name.
+        group: As for ``make_runtime_dir``.
 
     Raises:
         StartError: Another agent holds it (the text has its process id), or the directory cannot be used.
     """
 
-    def __init__(self, place: Path, name: str) -> None:
-        make_runtime_dir(place)
+    def __init__(self, place: Path, name: str, group: int | None = None) -> None:
+        make_runtime_dir(place, group)
         self.path = place / f"{name}.lock"
         while True:
             try:

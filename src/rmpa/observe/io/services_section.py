@@ -11,9 +11,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rmpa.bridge.services.exports import LocalService
-    from rmpa.bridge.services.imports import RemoteService
     from rmpa.bridge.services.io.calls import CallStats
     from rmpa.bridge.services.io.part import Services
+    from rmpa.bridge.services.remote_service import RemoteService
 
 
 class ServicesSection:

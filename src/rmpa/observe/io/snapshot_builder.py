@@ -17,6 +17,7 @@ from rmpa.observe.io.direct_section import DirectSection
 from rmpa.observe.io.peers_section import PeersSection, own_text
 from rmpa.observe.io.services_section import ServicesSection
 from rmpa.observe.io.topics_section import TopicsSection, unreachable_infos
+from rmpa.observe.peer_agent import PeerAgent
 from rmpa.observe.snapshot import AgentInfo, FilesInfo, Snapshot
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.descriptors import DESCRIPTORS
@@ -32,10 +33,12 @@ if TYPE_CHECKING:
     from rmpa.bridge.services.io.part import Services
     from rmpa.config.settings import Settings
     from rmpa.core.counters import Counters
+    from rmpa.observe.contract_term import ContractTerm
     from rmpa.observe.io.peer_clocks import PeerClocks
     from rmpa.observe.io.peers_section import EndpointView
     from rmpa.ros.core.api import Core
     from rmpa.runtime.realtime import SchedulingRequest
+    from rmpa.trust.status import TrustStatus
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +56,7 @@ class SnapshotSources:
         notes: What else the user should know, each ready to read.
         started: When the agent started, seconds since the epoch.
         requests: The outcome of each request of ``--realtime``.
+        trust: The state of trust; ``None``: it is off.
     """
 
     core: Core
@@ -65,6 +69,7 @@ class SnapshotSources:
     notes: Callable[[], Iterable[str]]
     started: float
     requests: tuple[SchedulingRequest, ...] = ()
+    trust: Callable[[], TrustStatus | None] = lambda: None
 
 
 class SnapshotBuilder:
@@ -100,6 +105,24 @@ class SnapshotBuilder:
         self._settings = settings
         self._topics.reload(settings)
 
+    def contract(self, topic: str, type_name: str) -> dict[str, ContractTerm]:
+        """The terms of a topic's contract by the settings, by key; ``type_name`` may be empty."""
+        return self._topics.contract(topic, type_name)
+
+    def peer_agent(self) -> PeerAgent:
+        """What this agent tells its peers of itself."""
+        agent = self._agent(self.endpoint)
+        return PeerAgent(
+            version=agent.version,
+            uptime=agent.uptime,
+            core_uri=agent.core_uri,
+            cpu=agent.cpu,
+            rss=agent.rss,
+            files_open=agent.files.open if agent.files is not None else None,
+            files_limit=agent.files.limit if agent.files is not None else None,
+            proxies=agent.proxies,
+        )
+
     def build(self, topics: Collection[str] | None = None) -> Snapshot:
         """A snapshot of this moment. It yields to data between its parts.
 
@@ -120,6 +143,7 @@ class SnapshotBuilder:
             counters=dict(sorted(counters.items())),
             notes=self._notes(endpoint),
             unreachable=unreachable_infos(self._sources.core, time.monotonic()),
+            trust=self._sources.trust(),
         )
 
     def _counters(self, endpoint: EndpointView | None) -> Iterator[Counters]:

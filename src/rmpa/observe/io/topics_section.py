@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
@@ -16,7 +16,15 @@ from rmpa.bridge.topics.remote_topic import RouteState
 from rmpa.config.param_rules import CLOCK
 from rmpa.core import limits
 from rmpa.core.contract import KEYS, Contract
-from rmpa.observe.snapshot import EventInfo, LatencyInfo, RouteInfo, SampleSpread, TopicInfo, UnreachableInfo
+from rmpa.observe.contract_term import ContractTerm
+from rmpa.observe.snapshot import (
+    EventInfo,
+    LatencyInfo,
+    RouteInfo,
+    SampleSpread,
+    TopicInfo,
+    UnreachableInfo,
+)
 from rmpa.ros.wire.tcpros import LENGTH
 from rmpa.runtime.event_loop import sorted_yielding, yield_to_data, yielding_to_data
 from rmpa.runtime.system_clock import SystemClock
@@ -83,6 +91,13 @@ class TopicsSection:
         self._policy = Policy(settings.policy, settings.peers, settings.time)
         self._contracts = settings.make_contracts()
         self._follow = settings.time.follow
+
+    def contract(self, topic: str, type_name: str) -> dict[str, ContractTerm]:
+        """The terms of a topic's contract by the settings, by key."""
+        return {
+            key: ContractTerm(value=cast("str | float | None", value), rule=rule)
+            for key, (value, rule) in self._contracts.explain(topic, type_name).items()
+        }
 
     def infos(self, wanted: Collection[str] | None = None) -> tuple[TopicInfo, ...]:
         """All topics of the local graph and of the peers, by name; or those that are wanted."""

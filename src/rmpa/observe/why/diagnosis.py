@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Final, Self
 
 import msgspec
 
-from rmpa.observe.check import FAIL, Check
+from rmpa.config.permission_rules import Access
+from rmpa.observe.check import FAIL, OK, Check
 from rmpa.observe.snapshot import SubscriberTransport  # noqa: TC001 - msgspec reads the annotation
+from rmpa.trust.permissions import prohibition, refusal
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -16,11 +18,17 @@ if TYPE_CHECKING:
     from rmpa.observe.snapshot import Snapshot
 
 
+PERMISSION_THERE: Final = "permission there"
+"""The stage of what the publisher's (server's) module lets this one do."""
+PERMISSION_HERE: Final = "permission here"
+"""The stage of what this module lets that of the publisher (server) do."""
+
+
 class Diagnosis(msgspec.Struct, frozen=True, kw_only=True):
     """The path of a topic (service) from its publisher (server) in one module to its users in another.
 
     Attributes:
-        kind: ``topic`` or ``service``.
+        kind: ``topic``, ``service`` or ``module``.
         name: Its name in the graph of the module that diagnoses.
         peer: The module of the publisher (server).
         to: The module of the users.
@@ -49,6 +57,47 @@ class Diagnosis(msgspec.Struct, frozen=True, kw_only=True):
     def failed(self) -> Check | None:
         """The first stage that fails."""
         return next((stage for stage in self.stages if stage.level is FAIL), None)
+
+
+def permission_there(peer: str, to: str, access: Access, name: str) -> Check:
+    """The stage that fails because a peer does not let this module do something: it does not say by which rule.
+
+    Args:
+        peer: The peer.
+        to: This module.
+        access: What it may not do.
+        name: The topic or service, by its name at the peer.
+    """
+    text = refusal(access, to, name, f"of {peer}")
+    remedy = f"allow it by a [[permission]] in the rmpa.toml of {peer}; `rmpa trust check {to} {access} {name}` there"
+    return Check(PERMISSION_THERE, FAIL, text, f"{remedy} names the rule")
+
+
+def permission_here(peer: str, access: Access, name: str, rule: str) -> Check:
+    """The stage that fails because this module does not let a peer do something.
+
+    Args:
+        peer: The peer, or the relay by which it comes.
+        access: What the module may not do.
+        name: The topic or service, by its name here.
+        rule: The rule that forbids it.
+    """
+    remedy = "change [[permission]] in this module's rmpa.toml, and `rmpa reload`"
+    return Check(PERMISSION_HERE, FAIL, f"{prohibition(access, peer, name)} here: {rule}", remedy)
+
+
+def without_rules(found: Diagnosis) -> Diagnosis:
+    """A diagnosis for the peer whose topic it is: whether it may publish, but not by which rule."""
+    return msgspec.structs.replace(
+        found,
+        stages=tuple(_outcome(found, stage) if stage.name == PERMISSION_HERE else stage for stage in found.stages),
+    )
+
+
+def _outcome(found: Diagnosis, stage: Check) -> Check:
+    if stage.level is FAIL:
+        return permission_there(found.to, found.peer, Access.PUBLISH, found.name)
+    return Check(stage.name, OK, f"{found.to} lets {found.peer} publish it")
 
 
 def until_failure(stages: Iterable[Check]) -> tuple[Check, ...]:
@@ -112,6 +161,8 @@ class TopicAtPublisher(msgspec.Struct, frozen=True, kw_only=True):
         path_problem: What is wrong with the network path to the agent that asks, ready to read; empty if nothing is
             known.
         path_remedy: What to do about that.
+        permitted: Whether the permissions of its module let the module that asks subscribe; ``None``: trust is off
+            there. If not, nothing else is told, also not whether there is such a topic.
     """
 
     sources: tuple[PublisherReport, ...] = ()
@@ -120,6 +171,7 @@ class TopicAtPublisher(msgspec.Struct, frozen=True, kw_only=True):
     awaited: tuple[str, ...] = ()
     path_problem: str = ""
     path_remedy: str = ""
+    permitted: bool | None = None
 
 
 class SubscriberConnection(msgspec.Struct, frozen=True, kw_only=True):
@@ -149,6 +201,8 @@ class ProxyState:
     Args:
         name: The proxy's name.
         registered: Whether it is a publisher of the topic in the local graph.
+        permission: The rule by which the module may publish it here, or may not; empty: trust is off.
+        denied: Whether it may not.
         conflict: Whether the publisher's type differs from that of the local publishers.
         connections: Those of local subscribers.
         mismatches: The subscribers that were refused here or at the peer, ready to read.
@@ -156,6 +210,8 @@ class ProxyState:
 
     name: str = ""
     registered: bool = False
+    permission: str = ""
+    denied: bool = False
     conflict: bool = False
     connections: tuple[SubscriberConnection, ...] = ()
     mismatches: tuple[str, ...] = ()

@@ -2,7 +2,8 @@
 
 The stages::
 
-    peer ─ link ─ server ─ policy there ─ offer ─ shown ─ graph ─ transport ─ answer ─ calls
+    peer ─ link ─ server ─ policy there ─ permission there ─ offer ─ shown (permission here) ─ graph ─ transport
+         ─ answer ─ calls
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from rmpa.bridge import limits
+from rmpa.config.permission_rules import Access
 from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check
-from rmpa.observe.why.diagnosis import Diagnosis, until_failure
+from rmpa.observe.why.diagnosis import PERMISSION_THERE, Diagnosis, permission_here, permission_there, until_failure
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -31,6 +33,8 @@ class ServiceAtServer(msgspec.Struct, frozen=True, kw_only=True):
         rule: The rule that says so.
         refusal: Why the server did not answer its own agent's probe, or empty.
         similar: A service of that module with nearly this name, or empty; ``near`` on the wire.
+        permitted: Whether the permissions of its module let the module that asks call it; ``None``: trust is off
+            there. If not, nothing else is told, also not whether there is such a service.
     """
 
     node: str = ""
@@ -39,6 +43,7 @@ class ServiceAtServer(msgspec.Struct, frozen=True, kw_only=True):
     rule: str = ""
     refusal: str = ""
     similar: str = msgspec.field(default="", name="near")
+    permitted: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +72,7 @@ class ServiceAtClient:
         offered: Whether the peer has offered it.
         node: Its node at the peer.
         hidden: Why it is not shown here, or empty.
+        denied: Whether that is a permission.
         registered: Whether the local core sends clients to it.
         transport: How the nodes of this module call it.
         answer: The type and md5 sum that a probe brought; empty if it was refused.
@@ -81,6 +87,7 @@ class ServiceAtClient:
     offered: bool = False
     node: str = ""
     hidden: str = ""
+    denied: bool = False
     registered: bool = False
     transport: ServiceTransport = ServiceTransport()
     answer: str = ""
@@ -114,21 +121,23 @@ def diagnose_service(
         there: What the peer's agent answered; ``None`` if it did not.
         refusal: Why the peer's agent did not answer.
     """
-    stages = until_failure(chain(begin, _stages(peer, service, here, there, refusal)))
+    stages = until_failure(chain(begin, _stages(peer, service, to, here, there, refusal)))
     node = (there.node if there is not None else "") or here.node
     return Diagnosis.of(stages, kind="service", name=service, peer=peer, to=to, node=node)
 
 
 def _stages(
-    peer: str, service: str, here: ServiceAtClient, there: ServiceAtServer | None, refusal: str
+    peer: str, service: str, to: str, here: ServiceAtClient, there: ServiceAtServer | None, refusal: str
 ) -> Iterator[Check]:
-    yield from _at_server(peer, here.wire or service, here, there, refusal)
+    yield from _at_server(peer, here.wire or service, to, here, there, refusal)
     if not here.offered:
         remedy = (
             f"if it stays so for more than {limits.RECONCILE_INTERVAL:g} s, it is a bug of ours: both logs, please"
         )
         yield Check("offer", FAIL, f"the offer of {peer} has not come here", remedy)
     yield Check("offer", OK, f"{peer} offers it")
+    if here.denied:
+        yield permission_here(peer, Access.SERVE, service, here.hidden)
     if here.hidden:
         yield Check("shown", FAIL, f"it is not shown here: {here.hidden}", _unhide(here.hidden))
     was = f" (its {here.wire})" if here.wire not in ("", service) else ""
@@ -143,12 +152,14 @@ def _stages(
 
 
 def _at_server(
-    peer: str, wire: str, here: ServiceAtClient, there: ServiceAtServer | None, refusal: str
+    peer: str, wire: str, to: str, here: ServiceAtClient, there: ServiceAtServer | None, refusal: str
 ) -> Iterator[Check]:
     if there is None:
         level = UNKNOWN if here.offered else FAIL
         yield Check("server", level, f"{peer} does not tell ({refusal})", f"ask on {peer}: rosservice info {wire}")
         return
+    if there.permitted is False:
+        yield permission_there(peer, to, Access.CALL, wire)
     if not there.node:
         remedy = (
             f"did you mean {there.similar}?"
@@ -165,6 +176,8 @@ def _at_server(
         remedy = f"change [services] or [[peer]] in the rmpa.toml of {peer}, and `rmpa reload` there"
         yield Check("policy there", FAIL, f"{peer} keeps it at home: {there.rule}", remedy)
     yield Check("policy there", OK, f"{peer} lets it cross: {there.rule}")
+    if there.permitted:
+        yield Check(PERMISSION_THERE, OK, f"{peer} lets {to} call it")
 
 
 def _unhide(hidden: str) -> str:

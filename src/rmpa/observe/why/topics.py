@@ -2,8 +2,8 @@
 
 Pure: what both ends know goes in, stages come out, and the first that fails says what to do. The stages::
 
-    peer ─ link ─ publisher ─ policy there ─ offer ─ limit ─ policy here ─ type ─ graph ─ subscriber ─ md5 ─ transport
-         ─ route ─ sent ─ arrived ─ contract ─ reader
+    peer ─ link ─ publisher ─ policy there ─ permission there ─ offer ─ limit ─ policy here ─ permission here ─ type
+         ─ graph ─ subscriber ─ md5 ─ transport ─ route ─ sent ─ arrived ─ contract ─ reader
 
 Of subscribers that are connected directly ``direct_stages`` judges what follows the transport.
 """
@@ -15,11 +15,19 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.config import limits as config_limits
+from rmpa.config.permission_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.mesh import limits as mesh_limits
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check
-from rmpa.observe.why.diagnosis import Diagnosis, until_failure
+from rmpa.observe.why.diagnosis import (
+    PERMISSION_HERE,
+    PERMISSION_THERE,
+    Diagnosis,
+    permission_here,
+    permission_there,
+    until_failure,
+)
 from rmpa.observe.why.direct_stages import adrift_stages, connected_directly, direct_stages, transport
 from rmpa.ros import limits as ros_limits
 
@@ -172,6 +180,9 @@ def _published(ends: BothEnds, peer: str, wire: str) -> Check:
             return Check("publisher", UNKNOWN, text)
         text = f"{peer} offers no {wire}, and its agent does not tell why ({ends.refusal})"
         return Check("publisher", FAIL, text, f"ask on {peer} itself: rostopic info {wire}")
+    if there.permitted is False:
+        to = ends.here.snapshot.agent.name
+        return permission_there(peer, to, Access.SUBSCRIBE, wire)
     if there.sources:
         nodes = ", ".join(source.node for source in there.sources)
         text = f"{nodes} on {peer} publish{'' if len(there.sources) > 1 else 'es'} {wire}"
@@ -195,6 +206,8 @@ def _source_stages(ends: BothEnds, later: BothEnds | None, peer: str, node: str,
     """Generate the stages of one publisher lazily: stages after the first that fails need not be built."""
     report = _report(ends, node)
     yield _policy_there(report, peer)
+    if ends.there is not None and ends.there.permitted:
+        yield Check(PERMISSION_THERE, OK, f"{peer} lets {ends.here.snapshot.agent.name} subscribe to it")
     if report is not None and report.unreachable:
         yield _unreachable(report, peer)
     route = _route(ends, peer, node)
@@ -206,6 +219,8 @@ def _source_stages(ends: BothEnds, later: BothEnds | None, peer: str, node: str,
         yield _limit(ends.here, route)
         return
     yield _policy_here(ends.here, route)
+    if (permission := ends.here.proxy(node).permission) and route.state != "hidden":
+        yield Check(PERMISSION_HERE, OK, permission)
     yield _type(ends.here, route)
     yield _in_graph(ends.here, route)
     yield from _subscriber(ends.here, route)
@@ -278,6 +293,8 @@ def _limit(here: TopicAtSubscriber, route: RouteInfo) -> Check:
 
 
 def _policy_here(here: TopicAtSubscriber, route: RouteInfo) -> Check:
+    if here.proxy(route.node).denied:
+        return permission_here(route.peer, Access.PUBLISH, here.topic, here.proxy(route.node).permission)
     if route.state == "hidden" and not here.proxy(route.node).conflict:
         remedy = "change [bridge] in this module's rmpa.toml, and `rmpa reload`"
         return Check("policy here", FAIL, f"this module does not take it: {route.problem}", remedy)

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+from itertools import islice
+from typing import TYPE_CHECKING
 
-from rmpa.core.errors import PeerRefused, RemoteProtocolError, UnreachableError
+from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.core.liveness import refuses
-from rmpa.ros.http.client import call_api
-from rmpa.ros.node_info import NodePing
+from rmpa.ros.http.client import call, call_api
+from rmpa.ros.node_info import NodeConnection, NodePing
+from rmpa.ros.wire.bus import read_bus_info
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 
 async def ping_node(node: str, uri: str, caller_id: str) -> NodePing:
@@ -31,6 +37,27 @@ async def ping_node(node: str, uri: str, caller_id: str) -> NodePing:
     if reply.code != 1 or not isinstance(reply.value, int):
         raise PeerRefused(node, reply.status or "it does not tell its process")
     return NodePing(uri=uri, time=loop.time() - begin, pid=reply.value)
+
+
+async def node_connections(uri: str, caller_id: str, names: Mapping[str, str]) -> tuple[NodeConnection, ...] | None:
+    """Ask a node for its connections; ``None`` if it does not answer.
+
+    Args:
+        uri: Its slave API.
+        caller_id: The asking node's name.
+        names: Nodes by their slave APIs: of a publisher a subscriber knows that address alone.
+    """
+    try:
+        links = read_bus_info(await call(uri, "getBusInfo", caller_id))
+    except (RmpaError, RosFault):
+        return None
+    found = (
+        NodeConnection(
+            topic=link.topic, inbound=link.inbound, other=names.get(link.other, link.other), connected=link.connected
+        )
+        for link in links
+    )
+    return tuple(islice(found, limits.NODE_CONNECTIONS_SHOWN))
 
 
 async def end_node(node: str, uri: str, caller_id: str, reason: str) -> bool:

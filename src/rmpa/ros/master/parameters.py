@@ -166,9 +166,14 @@ def _names(namespace: str, tree: Tree) -> Iterator[str]:
 
 
 def _below(key: str, value: XmlRpcValue) -> Iterator[tuple[str, XmlRpcValue]]:
-    """Yield every key below ``key`` with its value, each namespace before its content."""
+    """Yield every key below ``key`` with its value, each namespace before its content.
+
+    A member whose name holds a slash is left out: no key leads to it, and joined it may be another parameter's key.
+    """
     if isinstance(value, dict):
         for name, part in value.items():
+            if "/" in name:
+                continue
             full = join(key, name) + "/"
             yield full, part
             yield from _below(full, part)

@@ -37,7 +37,7 @@ from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import ANY, TopicDescription
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
     from types import TracebackType
 
     from rmpa.ros.types.service_types import ServiceType
@@ -196,6 +196,7 @@ class Node:
         kind: str | MessageType | None = None,
         callback: Callable[[Received], None] | None = None,
         *,
+        on_bytes: Callable[[memoryview, Mapping[str, str]], None] | None = None,
         nodelay: bool = True,
         queue_messages: int = limits.RECEIVED_QUEUE,
     ) -> Subscriber:
@@ -206,6 +207,8 @@ class Node:
             kind: The type; ``None`` accepts any. Without a definition on this machine the publisher's is used.
             callback: Called in the event loop with each message; its exceptions are logged. Without one, use
                 ``async for`` on the result.
+            on_bytes: ``(data, header)``: called in place of ``callback`` with a message's bytes, a view that is valid
+                during the call only, and the publisher's connection header.
             nodelay: Whether to ask publishers for TCP_NODELAY.
             queue_messages: Messages queued for the ``async for``; above it the oldest is dropped.
 
@@ -226,6 +229,7 @@ class Node:
             self.name,
             kind,
             callback,
+            on_bytes=on_bytes,
             type_name=type_name,
             own_uri=self.uri,
             nodelay=nodelay,

@@ -162,6 +162,7 @@ class Subscriber:
         kind: MessageType | None,
         callback: Callable[[Received], None] | None,
         *,
+        on_bytes: Callable[[memoryview, Mapping[str, str]], None] | None = None,
         type_name: str = ANY,
         own_uri: str,
         nodelay: bool,
@@ -177,6 +178,7 @@ class Subscriber:
         self.refusals: dict[str, str] = {}
         """Why publishers (by slave API URI) refused or do not match."""
         self._callback = callback
+        self._on_bytes = on_bytes
         self._refusals = RefusalLog(_log, Counters())
         self._queue: deque[Received] = deque()
         self._queue_messages = queue_messages
@@ -227,12 +229,17 @@ class Subscriber:
         self._wake.set()
 
     def _message(self, connection: PublisherConnection, framed: memoryview) -> None:
-        received = Received(bytes(framed[LENGTH.size :]), connection.fields, time.time_ns(), self.kind)
-        if self._callback is not None:
-            try:
+        try:
+            if self._on_bytes is not None:
+                self._on_bytes(framed[LENGTH.size :], connection.fields)
+                return
+            received = Received(bytes(framed[LENGTH.size :]), connection.fields, time.time_ns(), self.kind)
+            if self._callback is not None:
                 self._callback(received)
-            except Exception:  # noqa: BLE001 - a callback's mistake must not end the connection
-                _log.exception("! %s: the callback failed on a message from %s", self.topic, received.caller_id)
+                return
+        except Exception:  # noqa: BLE001 - a callback's mistake must not end the connection
+            caller = connection.fields.get("callerid", "?")
+            _log.exception("! %s: the callback failed on a message from %s", self.topic, caller)
             return
         if len(self._queue) >= self._queue_messages:
             self._queue.popleft()

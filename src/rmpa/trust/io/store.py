@@ -22,7 +22,7 @@ from rmpa.trust import limits
 from rmpa.trust.tokens import Invitation, TokenBook
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
     from pathlib import Path
 
 FOLDER: Final = "trust"
@@ -33,11 +33,18 @@ KEYS: Final = "keys.json"
 DENY: Final = "deny.json"
 CA_KEY: Final = "ca.key"
 TOKENS: Final = "tokens.json"
+ISSUED: Final = "issued.json"
+AUTHORITY: Final = "authority.json"
+REQUEST_KEY: Final = "request.key"
+"""The key of a join by files, until its answer comes."""
 _MEMBER: Final = (KEY, CERTIFICATE, CA, KEYS)
 """Files that each member must have."""
-_ALL: Final = (*_MEMBER, DENY, CA_KEY, TOKENS)
+_SIGNS: Final = (*_MEMBER, DENY, CA_KEY, TOKENS, ISSUED)
+"""Any of these is the sign of a module that has joined."""
+_ALL: Final = (*_SIGNS, AUTHORITY, REQUEST_KEY)
 _FILE_MAX: Final = limits.DOCUMENT_MAX
 _JOIN: Final = "join again: rmpa trust invite at the authority, rmpa trust join TOKEN here; or rmpa trust leave"
+_USER: Final = "run it as the user of the agent, or give the files and their folder back to that user"
 _OPEN: Final = os.O_CLOEXEC | os.O_NOFOLLOW
 
 
@@ -60,6 +67,34 @@ class MemberFiles:
     deny: bytes = b""
 
 
+class Issued(msgspec.Struct, frozen=True):
+    """One certificate that the authority has issued, the last of its module.
+
+    Args:
+        name: The module's.
+        issued: When, seconds since 1970.
+        expires: When it ends.
+    """
+
+    name: str
+    issued: int
+    expires: int
+
+
+class AuthorityPlace(msgspec.Struct, frozen=True):
+    """Where a member last reached the authority.
+
+    Args:
+        name: The authority's; empty if it is not known yet.
+        address: IPv4.
+        port: Its mesh port.
+    """
+
+    name: str
+    address: str
+    port: int
+
+
 class TrustStore:
     """Reads and writes the files of one module.
 
@@ -78,12 +113,12 @@ class TrustStore:
     @property
     def exists(self) -> bool:
         """Whether trust is on here: there is any of the files, whole or not."""
-        return any(os.path.lexists(self.path(name)) for name in _ALL)
+        return any(_is_there(self.path(name)) for name in _SIGNS)
 
     @property
     def is_authority(self) -> bool:
         """Whether this module has the CA's key."""
-        return os.path.lexists(self.path(CA_KEY))
+        return _is_there(self.path(CA_KEY))
 
     def load(self) -> MemberFiles:
         """The files of a member.
@@ -92,7 +127,7 @@ class TrustStore:
             StartError: One is missing, cannot be read, belongs to another user, or others may read it.
         """
         found = {name: self._read(name) for name in _MEMBER}
-        deny = self._read(DENY) if os.path.lexists(self.path(DENY)) else b""
+        deny = self._read(DENY) if _is_there(self.path(DENY)) else b""
         return MemberFiles(found[KEY], self._der(CERTIFICATE, found), self._der(CA, found), found[KEYS], deny)
 
     def save(self, files: MemberFiles) -> None:
@@ -117,18 +152,52 @@ class TrustStore:
         Raises:
             StartError: The file cannot be read or is broken.
         """
-        if not os.path.lexists(self.path(TOKENS)):
+        if not _is_there(self.path(TOKENS)):
             return TokenBook()
         remedy = "remove it: open tokens are then void"
         try:
             invitations = msgspec.json.decode(self._read(TOKENS, remedy), type=list[Invitation])
-        except (msgspec.MsgspecError, UnicodeError) as error:
+        except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
             raise StartError(str(self.path(TOKENS)), f"is broken: {error!s:.200}", remedy) from None
         return TokenBook(invitations)
 
     def save_tokens(self, book: TokenBook) -> None:
         """Write the tokens of the authority; raises as ``save``."""
         self.write(TOKENS, msgspec.json.encode(book.invitations))
+
+    def load_issued(self) -> dict[str, Issued]:
+        """The certificates of the authority, by name; none if the file is missing or broken: renewals fill it."""
+        with contextlib.suppress(StartError, msgspec.MsgspecError, UnicodeError):
+            return {each.name: each for each in msgspec.json.decode(self._read(ISSUED), type=list[Issued])}
+        return {}
+
+    def save_issued(self, issued: Iterable[Issued]) -> None:
+        """Write the certificates of the authority; raises as ``save``."""
+        self.write(ISSUED, msgspec.json.encode(list(issued)))
+
+    def load_authority(self) -> AuthorityPlace | None:
+        """Where the authority was last; ``None``: not known, or the file is broken."""
+        with contextlib.suppress(StartError, msgspec.MsgspecError, UnicodeError):
+            return msgspec.json.decode(self._read(AUTHORITY), type=AuthorityPlace)
+        return None
+
+    def save_authority(self, place: AuthorityPlace) -> None:
+        """Write where the authority is; raises as ``save``."""
+        self.write(AUTHORITY, msgspec.json.encode(place))
+
+    def load_request_key(self) -> bytes:
+        """The key (PEM) of a join by files; raises as ``load``."""
+        return self._read(REQUEST_KEY, "begin again: rmpa trust join --request FILE")
+
+    def check_writable(self) -> None:
+        """Raise ``StartError`` if files cannot be written here."""
+        self.write(REQUEST_KEY, b"-")
+        self.forget(REQUEST_KEY)
+
+    def forget(self, name: str) -> None:
+        """Remove a file that is not needed any more, if it is there."""
+        with contextlib.suppress(OSError):
+            self.path(name).unlink()
 
     def write(self, name: str, data: bytes) -> None:
         """Write one file atomically, for this user alone.
@@ -160,7 +229,7 @@ class TrustStore:
         Raises:
             StartError: One cannot be removed.
         """
-        removed = [name for name in _ALL if os.path.lexists(self.path(name))]
+        removed = [name for name in _ALL if _is_there(self.path(name))]
         for name in removed:
             try:
                 self.path(name).unlink()
@@ -178,6 +247,8 @@ class TrustStore:
                 data = b"" if problem else file.read(_FILE_MAX + 1)
         except FileNotFoundError:
             raise StartError(str(path), "is missing", remedy) from None
+        except PermissionError as error:
+            raise StartError(str(path), f"cannot be read: {error.strerror}", _USER) from None
         except OSError as error:
             raise StartError(str(path), f"cannot be read: {error.strerror}", remedy) from None
         if problem:
@@ -191,6 +262,17 @@ class TrustStore:
             return ssl.PEM_cert_to_DER_cert(found[name].decode("ascii"))
         except ValueError:
             raise StartError(str(self.path(name)), "is broken: not a certificate in PEM", _JOIN) from None
+
+
+def _is_there(path: Path) -> bool:
+    """Whether there is a file; ``True`` also if that cannot be known, so that an error never turns trust off."""
+    try:
+        os.lstat(path)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError:
+        return True
+    return True
 
 
 def _pem(certificate: bytes) -> bytes:

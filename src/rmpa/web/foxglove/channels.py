@@ -1,7 +1,8 @@
 """The channels and services that a Foxglove client is offered, from the graph and the definitions of its types.
 
-A topic has one channel for each of its types: where publishers disagree there are several, which differ in their
-schema. A channel or a service is offered once its definition is known, and has an id that is never used again.
+A topic has one channel for each of its types, and for each version of a type that its messages have (by the md5 sum):
+where publishers disagree there are several, which differ in their schema. A channel or a service is offered once its
+definition is known, and has an id that is never used again.
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ class _Type:
     handle: int
     name: str
     service: bool
+    md5sum: str = ""
     described: requests.Described | None = None
     warned: bool = False
 
@@ -62,18 +64,22 @@ class ChannelTable:
         self._with_services = services
         self._channel_ids = itertools.count(1)
         self._service_ids = itertools.count(1)
-        self._types: dict[tuple[str, bool], _Type] = {}
+        self._types: dict[tuple[str, bool, str], _Type] = {}
         self._asked: dict[int, _Type] = {}
         self._searched: dict[int, str] = {}
         self._found: dict[str, str | None] = {}
-        self._wanted: dict[tuple[str, str], None] = {}
+        self._pairs: dict[tuple[str, str], None] = {}
+        self._versions: dict[tuple[str, str], dict[str, None]] = {}
+        self._wanted: dict[tuple[str, str, str], None] = {}
         self._wanted_services: dict[tuple[str, str], None] = {}
-        self._by_key: dict[tuple[str, str], Channel] = {}
+        self._by_key: dict[tuple[str, str, str], Channel] = {}
         self._services_by_key: dict[tuple[str, str], FoxgloveService] = {}
         self.channels: dict[int, Channel] = {}
         """What is offered, by id."""
         self.services: dict[int, FoxgloveService] = {}
         """Likewise."""
+        self.md5sums: dict[int, str] = {}
+        """The md5 sum of each channel's schema, by the channel's id; "" where the hub does not tell it."""
 
     def owns(self, handle: int) -> bool:
         """Whether the hub's answers with this handle belong here."""
@@ -81,7 +87,7 @@ class ChannelTable:
 
     def update(self, graph: GraphChanged) -> Iterator[ServerMessage | requests.Request]:
         """Offer what is new in the graph, withdraw what is gone, and ask for the types that are not known yet."""
-        self._wanted = {
+        self._pairs = {
             (topic.name, type_): None
             for topic in graph.topics
             if topic.publishers
@@ -90,9 +96,10 @@ class ChannelTable:
         }
         if self._with_services:
             yield from self._want_services(graph)
-        yield from self._forget_types()
-        for _, type_ in self._wanted:
-            yield from self._describe(type_, service=False)
+        for pair in self._versions.keys() - self._pairs.keys():
+            if len(self._versions.pop(pair)) > 1:
+                yield RemoveStatus(status_ids=(_versions_id(*pair),))
+        yield from self._want_channels()
         for _, type_ in self._wanted_services:
             yield from self._describe(type_, service=True)
         yield from self._offer()
@@ -119,7 +126,42 @@ class ChannelTable:
                 yield RemoveStatus(status_ids=(_status_id(asked),))
             yield from self._offer()
 
+    def other_version(
+        self, channel: Channel, md5sum: str, *, keep: bool
+    ) -> Iterator[ServerMessage | requests.Request]:
+        """A message for a channel has another version of the type than its schema; it must not be sent there.
+
+        Args:
+            channel: The channel.
+            md5sum: Of the message's version, which gets a channel of its own.
+            keep: Whether messages of the channel's own version have come, too; else it is withdrawn.
+        """
+        pair = channel.topic, channel.schema_name
+        versions = self._versions.setdefault(pair, {})
+        if md5sum in versions or len(versions) >= limits.SEEN_TYPES_MAX:
+            return
+        if not versions and keep:
+            own = self.md5sums[channel.id]
+            versions[own] = None
+            self._by_key[*pair, own] = self._by_key.pop((*pair, ""))
+        versions[md5sum] = None
+        if len(versions) > 1:
+            text = (
+                f"publishers of {channel.topic} have {len(versions)} versions of {channel.schema_name} (md5 sums "
+                f"{', '.join(versions)}): each has a channel of its own; build all modules with one version"
+            )
+            yield FoxgloveStatus(level=StatusLevel.WARNING, message=text, id=_versions_id(*pair))
+        yield from self._want_channels()
+        yield from self._offer()
+
     # --- inside -----------------------------------------------------------------------------------------------
+
+    def _want_channels(self) -> Iterator[ServerMessage | requests.Request]:
+        """A channel for each version that was seen of a topic's type; before that one, of the version known here."""
+        self._wanted = {(*pair, md5sum): None for pair in self._pairs for md5sum in self._versions.get(pair) or ("",)}
+        yield from self._forget_types()
+        for _, type_, md5sum in self._wanted:
+            yield from self._describe(type_, service=False, md5sum=md5sum)
 
     def _want_services(self, graph: GraphChanged) -> Iterator[requests.Request]:
         present = {service.name for service in graph.services}
@@ -145,29 +187,32 @@ class ChannelTable:
             yield from self._offer()
 
     def _forget_types(self) -> Iterator[ServerMessage]:
-        wanted = {(type_, False) for _, type_ in self._wanted} | {(type_, True) for _, type_ in self._wanted_services}
+        wanted = {(type_, False, md5sum) for _, type_, md5sum in self._wanted}
+        wanted |= {(type_, True, "") for _, type_ in self._wanted_services}
         for key in self._types.keys() - wanted:
             asked = self._types.pop(key)
             del self._asked[asked.handle]
             if asked.warned:
                 yield RemoveStatus(status_ids=(_status_id(asked),))
 
-    def _describe(self, name: str, *, service: bool) -> Iterator[requests.Request]:
-        if (name, service) not in self._types:
+    def _describe(self, name: str, *, service: bool, md5sum: str = "") -> Iterator[requests.Request]:
+        if (name, service, md5sum) not in self._types:
             handle = self._next_handle()
-            self._types[name, service] = self._asked[handle] = _Type(handle, name, service)
-            yield requests.DescribeType(handle, name, service)
+            self._types[name, service, md5sum] = self._asked[handle] = _Type(handle, name, service, md5sum)
+            yield requests.DescribeType(handle, name, service, md5sum)
 
     def _offer(self) -> Iterator[ServerMessage]:
         gone = [key for key in self._by_key if key not in self._wanted]
         if gone:
             ids = tuple(self._by_key.pop(key).id for key in gone)
             for each in ids:
-                del self.channels[each]
+                del self.channels[each], self.md5sums[each]
             yield FoxgloveUnadvertise(channel_ids=ids)
-        new = [channel for key in self._wanted if key not in self._by_key and (channel := self._channel(*key))]
-        for channel in new:
-            self._by_key[channel.topic, channel.schema_name] = self.channels[channel.id] = channel
+        new: list[Channel] = []
+        for key in self._wanted:
+            if key not in self._by_key and (channel := self._channel(*key)):
+                self._by_key[key] = self.channels[channel.id] = channel
+                new.append(channel)
         yield from (FoxgloveAdvertise(channels=part) for part in _parts(new, lambda channel: len(channel.schema)))
         yield from self._offer_services()
 
@@ -185,12 +230,14 @@ class ChannelTable:
         sized = _parts(new, lambda service: len(service.request.schema) + len(service.response.schema))
         yield from (FoxgloveAdvertiseServices(services=part) for part in sized)
 
-    def _channel(self, topic: str, type_: str) -> Channel | None:
-        described = self._types[type_, False].described
+    def _channel(self, topic: str, type_: str, md5sum: str) -> Channel | None:
+        described = self._types[type_, False, md5sum].described
         if described is None:
             return None
+        number = next(self._channel_ids)
+        self.md5sums[number] = md5sum or described.md5sum
         return Channel(
-            id=next(self._channel_ids),
+            id=number,
             topic=topic,
             encoding=ENCODING,
             schema_name=type_,
@@ -199,7 +246,7 @@ class ChannelTable:
         )
 
     def _service(self, name: str, type_: str) -> FoxgloveService | None:
-        described = self._types[type_, True].described
+        described = self._types[type_, True, ""].described
         if described is None:
             return None
         request, response = (
@@ -220,7 +267,12 @@ def schema_text(definition: str) -> str:
 
 
 def _status_id(asked: _Type) -> str:
-    return f"{'service' if asked.service else 'message'} type {asked.name}"
+    version = f" {asked.md5sum}" if asked.md5sum else ""
+    return f"{'service' if asked.service else 'message'} type {asked.name}{version}"
+
+
+def _versions_id(topic: str, type_: str) -> str:
+    return f"versions of {type_} on {topic}"
 
 
 def _parts(items: Iterable[_T], size: Callable[[_T], int]) -> Iterator[tuple[_T, ...]]:

@@ -47,11 +47,12 @@ class FoxgloveClose:
 Output: TypeAlias = FoxgloveFrame | requests.Request | FoxgloveClose
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Subscription:
     id: int
     channel_id: int
     handle: int
+    delivered: bool = False  # whether a message of it was sent
 
 
 @dataclass(frozen=True, slots=True)
@@ -357,6 +358,12 @@ class FoxgloveSession:
         subscription = self._by_handle.get(message.handle)
         if subscription is None:
             return []
+        known = self._channels.md5sums.get(subscription.channel_id)
+        if known != message.md5sum and known and message.md5sum:
+            channel = self._channels.channels[subscription.channel_id]
+            found = self._channels.other_version(channel, message.md5sum, keep=subscription.delivered)
+            return _framed(self._offered(found))
+        subscription.delivered = True
         stamp = message.stamp_ns if self._time_ns is None else self._time_ns
         return [protocol.message_data(subscription.id, stamp, message.payload)]
 

@@ -12,19 +12,22 @@ import socket
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from aiohttp import WebSocketError, WSCloseCode, WSMsgType, web
+from aiohttp import WebSocketError, WSCloseCode, WSMsgType
 
 from rmpa.core.errors import RmpaError
 from rmpa.web import limits
-from rmpa.web.gateways.websocket_frames import Opcode, frame_header
+from rmpa.web.gateways.frame_writer import FrameWriter
+from rmpa.web.gateways.message_arrival import MessageArrival
+from rmpa.web.gateways.websocket_frames import Opcode
 from rmpa.web.hub.fair_queue import FairQueue
 from rmpa.web.hub.requests import ReceivedMessage, Unsubscribe
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from aiohttp.abc import AbstractStreamWriter
+    from aiohttp import web
 
+    from rmpa.web.gateways.frame_writer import FrameSocket
     from rmpa.web.hub.clients import HubClient
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.requests import Answer, Payload, Request
@@ -75,12 +78,15 @@ class ClientConnection(ABC):
         self.sent = 0
         """Messages and answers that were written."""
         self._heard = 0
+        self._received: Callable[[], int] = int
+        self._arrival = MessageArrival()
         self._priority = priority
         self._unadvertise_delay = unadvertise_delay
         self._wake = asyncio.Event()
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._transport: asyncio.Transport | None = None
+        self._out: FrameWriter | None = None
         self._close: tuple[int, str] | None = None
         self._close_timer: asyncio.TimerHandle | None = None
         self._refused: Callable[[str, str], None] | None = None
@@ -176,17 +182,16 @@ class ClientConnection(ABC):
 
     @property
     def unsent(self) -> int:
-        """Bytes that wait, here and in the connection's own buffer."""
-        waiting = self._transport.get_write_buffer_size() if self._transport is not None else 0
-        return self.queue.bytes + waiting
+        """Bytes that wait, here and behind the queue."""
+        return self.queue.bytes + self._waiting
 
     # --- the WebSocket ----------------------------------------------------------------------------------------
 
     async def run(
         self,
         request: web.Request,
-        socket_: web.WebSocketResponse,
-        upgraded: Callable[[web.Request], None],
+        socket_: FrameSocket,
+        upgraded: Callable[[web.Request], Callable[[], int]],
         refused: Callable[[str, str], None],
     ) -> None:
         """Serve the client until it has gone.
@@ -194,7 +199,7 @@ class ClientConnection(ABC):
         Args:
             request: Asks for the WebSocket.
             socket_: Not prepared yet.
-            upgraded: Called when the handshake is done.
+            upgraded: Called when the handshake is done; what it returns counts the bytes that the client has sent.
             refused: ``(reason, text)``: called if the client is disconnected for one of ``figures.REASONS``.
 
         Raises:
@@ -207,13 +212,16 @@ class ClientConnection(ABC):
         tasks: list[asyncio.Task[None]] = []
         try:
             writer = await socket_.prepare(request)
-            upgraded(request)
+            self._received = upgraded(request)
+            self._arrival.message_ended(self._received())
             self._transport = request.transport
             if self._transport is None:
                 return  # it went during the handshake
             _tune(self._transport)
+            self._out = FrameWriter(self._transport, writer.drain)
+            socket_.before_close = self._out.hand_over
             self.opened()
-            for name, work in (("write to", self._write(socket_, writer)), ("watch", self._watch())):
+            for name, work in (("write to", self._write(socket_, self._out)), ("watch", self._watch())):
                 tasks.append(self._loop.create_task(work, name=f"{name} {self.client.name}"))
             await self._read(socket_)
         finally:
@@ -227,14 +235,20 @@ class ClientConnection(ABC):
                     task.cancel()
                 self.hub.disconnect(self._client)
                 self.queue.clear()
+                if self._out is not None:
+                    self._out.close()
                 if tasks:
                     await asyncio.wait(tasks)
 
-    async def _read(self, socket_: web.WebSocketResponse) -> None:
+    async def _read(self, socket_: FrameSocket) -> None:
         async for message in socket_:
             self._heard += 1
             if self._heard % _TURN == 0:
                 await asyncio.sleep(0)  # frames that have arrived already do not suspend this task
+            if message.type in (WSMsgType.PING, WSMsgType.PONG):
+                self._arrival.control_frame(len(message.data))
+            else:
+                self._arrival.message_ended(self._received())
             if message.type == WSMsgType.ERROR:
                 self._failed(message.data)
             if self._gone:
@@ -266,21 +280,25 @@ class ClientConnection(ABC):
     async def _watch(self) -> None:
         """Disconnect a client without a sign of life: it sends nothing, answers no ping, and takes nothing.
 
-        A large message on a slow link holds up the ping behind it; that it goes on is a sign of life, too.
+        A large message on a slow link holds up the ping behind it; that it goes on is a sign of life, too. A client
+        whose message never ends is disconnected as well, alive or not.
         """
-        silent, heard, waiting = 0, -1, 0
+        silent, heard, waiting = 0, (-1, 0), 0
         while silent < _SILENT_LOOKS:
             await asyncio.sleep(limits.PING_INTERVAL / 2)
-            now = self._transport.get_write_buffer_size() if self._transport is not None else 0
-            alive = self._heard != heard or (waiting and now != waiting)
+            now, received = self._waiting, self._received()
+            if self._arrival.takes_too_long(received, self._loop.time()):
+                self.end(WSCloseCode.POLICY_VIOLATION, "a message did not end in time", "message")
+                return
+            alive = (self._heard, received) != heard or (waiting and now != waiting)
             silent = 0 if alive else silent + 1
-            heard, waiting = self._heard, now
+            heard, waiting = (self._heard, received), now
             if not waiting:
                 self._send(Opcode.PING, ())
         _log.info("= %s gave no sign of life, and is disconnected", self.client.name)
         self._abort()
 
-    async def _write(self, socket_: web.WebSocketResponse, writer: AbstractStreamWriter) -> None:
+    async def _write(self, socket_: FrameSocket, out: FrameWriter) -> None:
         try:
             turn = 0
             while not socket_.closed and not self._gone:
@@ -295,7 +313,7 @@ class ClientConnection(ABC):
                 for frame in self.encode(entry) if isinstance(entry, ReceivedMessage) else (entry,):
                     self._send(*frame)
                 self._tell_drops()
-                await writer.drain()
+                await out.drain()
                 turn += 1
                 if turn % _TURN == 0:
                     await asyncio.sleep(0)
@@ -309,22 +327,15 @@ class ClientConnection(ABC):
     def _gone(self) -> bool:
         return self._transport is None or self._transport.is_closing()
 
+    @property
+    def _waiting(self) -> int:
+        return self._out.unsent if self._out is not None else 0
+
     def _send(self, opcode: Opcode, parts: Sequence[Payload]) -> None:
-        transport = self._transport
-        if transport is None or transport.is_closing():
+        if self._out is None or self._out.is_closing:
             return
         self.sent += opcode in (Opcode.TEXT, Opcode.BINARY)
-        header = frame_header(opcode, sum(map(len, parts)))
-        small: list[Payload] = [header]
-        for part in parts:
-            if len(part) <= limits.JOINED_BYTES:
-                small.append(part)
-                continue
-            transport.write(b"".join(small))
-            transport.write(part)
-            small.clear()
-        if small:
-            transport.write(b"".join(small))
+        self._out.write(opcode, parts)
 
     def _queue(self, handle: int, entry: ReceivedMessage | OutFrame, size: int, topic: str) -> None:
         if self._gone:
@@ -346,8 +357,7 @@ class ClientConnection(ABC):
 
     def _due(self) -> None:
         self._timer = None
-        waiting = self._transport.get_write_buffer_size() if self._transport is not None else 0
-        if self.timer_waits and waiting > limits.WRITE_BUFFER:
+        if self.timer_waits and self._waiting > limits.WRITE_BUFFER:
             # The client cannot take what the session holds back: it stays there, within its bounds.
             self._timer = self._loop.call_later(limits.TIMER_RETRY, self._due)
             return

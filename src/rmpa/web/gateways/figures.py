@@ -9,7 +9,8 @@ PROTOCOLS: Final = ("foxglove", "monitor", "rosbridge")
 """The gateways, as ``ClientConnection.kind`` names them."""
 REASONS: Final = ("handshake", "clients", "message", "message_size", "message_rate")
 """Why WebSocket clients are refused or disconnected, as counted: a handshake that is malformed or asks for another
-protocol; too many clients; a malformed frame or message; one that is too long; too many in a second."""
+protocol; too many clients; a malformed frame or message, or one that does not end; one that is too long; too many in
+a second."""
 
 
 @dataclass(frozen=True, slots=True)

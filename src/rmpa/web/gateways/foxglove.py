@@ -56,8 +56,17 @@ class FoxgloveConnection(ClientConnection):
         self._do(self._session.answer(answer))
 
     def encode(self, message: ReceivedMessage) -> Iterable[OutFrame]:
-        """The frame of a message; none where its subscription has ended."""
-        return [_out(each) for each in self._session.answer(message) if isinstance(each, TextFrame | BinaryFrame)]
+        """The frame of a message; none where its subscription has ended.
+
+        The first message of another version of its type has other ones: of channels, and requests about that version.
+        """
+        frames = []
+        for each in self._session.answer(message):
+            if isinstance(each, TextFrame | BinaryFrame):
+                frames.append(_out(each))
+            elif not isinstance(each, FoxgloveClose):
+                self.ask(each)
+        return frames
 
     def show_drops(self, dropped: dict[str, int]) -> None:
         """A warning for each topic, which a later one replaces."""

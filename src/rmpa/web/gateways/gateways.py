@@ -8,6 +8,7 @@ import logging
 import secrets
 import time
 from collections import Counter
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from aiohttp import web
@@ -18,6 +19,7 @@ from rmpa.web import limits
 from rmpa.web.foxglove.protocol import SUBPROTOCOLS, choose_subprotocol
 from rmpa.web.gateways.figures import PROTOCOLS, GatewayFigures
 from rmpa.web.gateways.foxglove import FoxgloveConnection
+from rmpa.web.gateways.frame_writer import FrameSocket
 from rmpa.web.gateways.monitor import MonitorConnection
 from rmpa.web.gateways.rosbridge import RosbridgeConnection
 from rmpa.web.monitor import limits as monitor_limits
@@ -26,7 +28,7 @@ from rmpa.web.rosbridge import limits as rosbridge_limits
 from rmpa.web.rosbridge.encodings import PublishFrames
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from rmpa.web.gateways.connection import ClientConnection
     from rmpa.web.hub.hub import Hub
@@ -40,6 +42,20 @@ _log = logging.getLogger(__name__)
 def is_upgrade(request: web.BaseRequest) -> bool:
     """Whether a request asks for a WebSocket."""
     return request.headers.get("Upgrade", "").lower() == "websocket"
+
+
+_GOING_AWAY: Final = 1001
+"""A WebSocket's close code, RFC 6455, section 7.4.1."""
+_SERVICE_RESTART: Final = 1012
+"""Likewise, of IANA's registry: the client may connect again."""
+_RIGHTS_CHANGED: Final = "the rights of this client have changed; connect again"
+
+
+@dataclass(frozen=True, slots=True)
+class _OpenClient:
+    response: FrameSocket
+    request: web.Request
+    rights: Rights
 
 
 class Gateways:
@@ -64,8 +80,9 @@ class Gateways:
         self.counters = Counters()
         """Clients that were refused or disconnected, by the words of ``figures.REASONS``."""
         self._refusals = RefusalLog(_log, self.counters)
-        self.upgraded: Callable[[web.Request], None] = lambda _: None
-        """Called when the handshake of a WebSocket is done."""
+        self.upgraded: Callable[[web.Request], Callable[[], int]] = lambda _: int
+        """Called when the handshake of a WebSocket is done; returns a counter of the bytes that its client has sent,
+        which is 0 where they are not counted."""
         self._monitor = monitor
         self._hub = hub
         self._name = name
@@ -73,7 +90,7 @@ class Gateways:
         self._priority = priority
         self._session_id = secrets.token_hex(8)
         self._frames = PublishFrames()
-        self._open: dict[ClientConnection, web.WebSocketResponse] = {}
+        self._open: dict[ClientConnection, _OpenClient] = {}
         self._sent: Counter[str] = Counter()
         self._dropped: Counter[str] = Counter()
 
@@ -100,7 +117,6 @@ class Gateways:
         offered = [name.strip() for name in request.headers.get("Sec-WebSocket-Protocol", "").split(",")]
         protocol = choose_subprotocol(offered)
         address = request.remote or "?"
-        rights = self._rights_of(request)
         connection: ClientConnection
         if request.path == MONITOR_PATH:
             if self._monitor is None or SUBPROTOCOL not in offered:
@@ -108,9 +124,11 @@ class Gateways:
                 self.refuse(address, "handshake", text)
                 return web.Response(status=400, text=f"{text}\n")
             await self._monitor.ready()
+            rights = self._rights_of(request)
             connection = MonitorConnection(self._hub, rights, self._priority, address, monitor=self._monitor)
-            return await self._serve(request, connection, monitor_limits.REQUEST_MAX + 1)
+            return await self._serve(request, connection, monitor_limits.REQUEST_MAX + 1, rights)
         await self._hub.settled(limits.SETTLE)
+        rights = self._rights_of(request)  # after the last wait: a reload before this is not noticed by end_changed
         if protocol is not None:
             connection = FoxgloveConnection(
                 self._hub, rights, self._priority, address, name=self._name, session_id=self._session_id
@@ -119,20 +137,29 @@ class Gateways:
         else:
             connection = RosbridgeConnection(self._hub, rights, self._priority, address, frames=self._frames)
             most = rosbridge_limits.FRAME_MAX if _sends_data(rights) else limits.FOXGLOVE_TEXT_MAX
-        return await self._serve(request, connection, most)
+        return await self._serve(request, connection, most, rights)
 
-    async def _serve(self, request: web.Request, connection: ClientConnection, most: int) -> web.StreamResponse:
-        response = web.WebSocketResponse(
+    async def _serve(
+        self, request: web.Request, connection: ClientConnection, most: int, rights: Rights
+    ) -> web.StreamResponse:
+        response = FrameSocket(
             protocols=(*SUBPROTOCOLS, SUBPROTOCOL),
             autoping=False,
             compress=False,
             max_msg_size=most,
             timeout=limits.CLOSE_TIMEOUT,
         )
-        self._open[connection] = response
+
+        def upgraded(request: web.Request) -> Callable[[], int]:
+            # A WebSocket cannot be closed before this: end_changed leaves it open.
+            if self._rights_of(request) != rights:
+                connection.end(_SERVICE_RESTART, _RIGHTS_CHANGED)
+            return self.upgraded(request)
+
+        self._open[connection] = _OpenClient(response, request, rights)
         try:
             refused = functools.partial(self._refuse_client, connection)
-            await connection.run(request, response, self.upgraded, refused)
+            await connection.run(request, response, upgraded, refused)
         except PeerRefused as error:
             self.refuse(connection.address, "clients", str(error))
             return web.Response(status=503, text=f"{error}\n")
@@ -159,14 +186,24 @@ class Gateways:
     def _refuse_client(self, connection: ClientConnection, reason: str, text: str) -> None:
         self.refuse(connection.address, reason, f"a client of {connection.kind} is disconnected: {text}")
 
+    async def end_changed(self) -> int:
+        """Disconnect the clients whose rights are others now, so that nothing stays open that they no longer may.
+
+        Returns:
+            How many they were.
+        """
+        changed = [each for each in self._open.values() if self._rights_of(each.request) != each.rights]
+        await _close(changed, _SERVICE_RESTART, _RIGHTS_CHANGED.encode())
+        return len(changed)
+
     async def close(self) -> None:
         """Tell all clients that the server ends."""
-        closing = [
-            response.close(code=1001, message=b"the server ends")
-            for response in self._open.values()
-            if response.prepared
-        ]
-        await asyncio.gather(*closing, return_exceptions=True)
+        await _close(self._open.values(), _GOING_AWAY, b"the server ends")
+
+
+async def _close(clients: Iterable[_OpenClient], code: int, message: bytes) -> None:
+    closing = [each.response.close(code=code, message=message) for each in clients if each.response.prepared]
+    await asyncio.gather(*closing, return_exceptions=True)
 
 
 def _sends_data(rights: Rights) -> bool:

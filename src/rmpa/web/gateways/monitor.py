@@ -153,7 +153,7 @@ class MonitorConnection(ClientConnection):
     def _ask(self, question: Question) -> None:
         async def answer() -> None:
             try:
-                value = await self._monitor.answers.answer(question)
+                value = await self._monitor.answers.answer(question, self.rights)
             except RmpaError as error:
                 failed = Failed.of(0, error)
                 self._act(self._session.refuse(question.id, failed.error, failed.remedy))

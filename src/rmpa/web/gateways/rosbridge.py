@@ -24,7 +24,7 @@ class HubGraph:
     """The graph as one client may see it: without parameters where it may not read them."""
 
     hub: Hub
-    with_params: bool
+    rights: Rights
 
     @property
     def topics(self) -> Mapping[str, GraphTopic]:
@@ -44,7 +44,7 @@ class HubGraph:
     @property
     def params(self) -> Mapping[str, ParamValue]:
         """The tree of parameters."""
-        return self.hub.params.tree if self.with_params else {}
+        return self.rights.visible_tree(self.hub.params.tree) if self.rights.read_parameters else {}
 
 
 class RosbridgeConnection(ClientConnection):
@@ -67,7 +67,7 @@ class RosbridgeConnection(ClientConnection):
     ) -> None:
         # The session itself delays the end of a publisher.
         super().__init__(hub, rights, priority, address, unadvertise_delay=0.0)
-        graph = HubGraph(hub, rights.read_parameters)
+        graph = HubGraph(hub, rights)
         self._session = RosbridgeSession(
             hub.types, graph, hub.time.now_ns, frames=frames, client=f"rosbridge_{id(self):x}"
         )

@@ -36,13 +36,20 @@ def read_asset(uri: str, most: int, environ: Mapping[str, str]) -> bytes:
     package, _, path = uri.removeprefix(_SCHEME).partition("/")
     if not uri.startswith(_SCHEME) or not package or not path or "\0" in path:
         raise AssetError(f"{uri[:200]!r} is not the file of a package; write package://NAME/PATH")
+    try:
+        return _find(package, path, most, environ)
+    except OSError as error:  # such as a name that is too long
+        raise AssetError(f"{uri[:200]} cannot be read: {error.strerror}") from error
+
+
+def _find(package: str, path: str, most: int, environ: Mapping[str, str]) -> bytes:
     found = False
     for folder in _folders(package, environ):
         found = True
         root = folder.resolve()
         file = (root / path).resolve()
         if not file.is_relative_to(root):
-            raise AssetError(f"{uri[:200]} is outside of its package")
+            raise AssetError(f"{path[:200]} is outside of its package {package[:200]}")
         if file.is_file():
             return _read(file, most)
     if found:

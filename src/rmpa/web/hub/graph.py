@@ -1,37 +1,34 @@
-"""The graph as the local core shows it: read again and again, compared as bytes, and parsed where it has changed."""
+"""The graph of the local core: as the agent tells it, else read from the master again and again."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import logging
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from rmpa.core.errors import RmpaError
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.http.client import exchange, read_response
-from rmpa.ros.wire.tcpros import ANY
 from rmpa.ros.wire.xmlrpc import RosReply, call_pieces
 from rmpa.web import limits
-from rmpa.web.hub.requests import GraphService, GraphTopic
+from rmpa.web.hub.graph_table import GraphTable, rows_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
+    from rmpa.observe.graph_changes import GraphRows
     from rmpa.ros.node.node import Node
-    from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.web.hub.clients import Key
     from rmpa.web.hub.node_link import NodeLink
+    from rmpa.web.hub.requests import GraphService, GraphTopic
     from rmpa.web.hub.services import FoundService
 
 _log = logging.getLogger(__name__)
-Rows = dict[str, tuple[str, ...]]
-_KNOWN_TYPES: Final = {"/rosout": "rosgraph_msgs/Log", "/rosout_agg": "rosgraph_msgs/Log"}
-"""Types where the master has none: clients tell ROS 1 by that of ``/rosout``."""
 
 
 class GraphWatch:
-    """The graph, always the last one that was read, and the clients that follow it.
+    """The graph, always the last one that was told or read, and the clients that follow it.
 
     Args:
         link: Has the node.
@@ -51,12 +48,9 @@ class GraphWatch:
         self._link = link
         link.on_registration.append(self.look)
         self._found = found
-        self._services_changed = services_changed
+        self._table = GraphTable(self._service, services_changed)
         self._master_back = master_back
         self._followers: dict[Key, Callable[[], None]] = {}
-        self._seen: dict[str, dict[str, None]] = {}
-        self._state: tuple[Rows, Rows, Rows] = ({}, {}, {})
-        self._types: dict[str, str] = {}
         self._task: asyncio.Task[None] | None = None
         self._look = asyncio.Event()
         self._documents: tuple[bytes, bytes] = (b"", b"")
@@ -65,17 +59,28 @@ class GraphWatch:
         self.active = False
         """Whether there are clients, for which it is read more often."""
         self.told = False
-        """Whether each change is told by ``look``, so that it need not be searched for."""
-        self.topics: Mapping[str, GraphTopic] = {}
-        """By name, in order of names."""
-        self.services: Mapping[str, GraphService] = {}
-        """Likewise."""
-        self.nodes: Sequence[str] = ()
-        """In order of names."""
+        """Whether each change is told by ``look`` or ``take``, so that it need not be searched for."""
+        self.taken = False
+        """Whether ``take`` has given the graph, and tells its changes: then the master is not asked for it."""
         self.changes = 0
         """How often it has changed."""
         self.reads = 0
-        """How often it was read."""
+        """How often it was read from the master."""
+
+    @property
+    def topics(self) -> Mapping[str, GraphTopic]:
+        """By name, in order of names."""
+        return self._table.topics
+
+    @property
+    def services(self) -> Mapping[str, GraphService]:
+        """By name, in order of names."""
+        return self._table.services
+
+    @property
+    def nodes(self) -> Sequence[str]:
+        """In order of names."""
+        return self._table.nodes
 
     def start(self) -> None:
         """Begin, in a task."""
@@ -88,8 +93,26 @@ class GraphWatch:
             await asyncio.wait([self._task])
 
     def look(self) -> None:
-        """Read it soon: something has changed, or a client has come."""
-        self._look.set()
+        """Read it soon: something has changed, or a client has come. Where ``take`` tells all that is not needed."""
+        if not self.taken:
+            self._look.set()
+
+    async def master(self) -> str:
+        """The URI of the master; waits until there is one."""
+        return (await self._link.current()).master_uri
+
+    def take(self, rows: GraphRows) -> None:
+        """Take all rows of the agent, or those that have changed since."""
+        self.taken = self.told = True
+        if self._table.update(rows) or not self.loaded.is_set():
+            self._tell()
+
+    def lose(self) -> None:
+        """The agent tells no more: the master is asked instead."""
+        if self.taken:
+            self._documents = (b"", b"")  # they are older than what was taken
+        self.taken = self.told = False
+        self.look()
 
     def follow(self, key: Key, changed: Callable[[], None]) -> None:
         """Call ``changed`` at each change; now, too, where the graph is known."""
@@ -108,16 +131,13 @@ class GraphWatch:
 
     def saw_type(self, topic: str, type_: str) -> None:
         """A publisher of a topic has this type; the master knows one only."""
-        seen = self._seen.setdefault(topic, {})
-        if type_ not in seen and len(seen) < limits.SEEN_TYPES_MAX:
-            seen[type_] = None
-            known = self.topics.get(topic)
-            if known is not None and type_ not in known.types:
-                self._rebuild()
+        if self._table.saw_type(topic, type_):
+            self._tell()
 
     def found_service(self) -> None:
         """The type of a service became known."""
-        self._rebuild()
+        self._table.found_services()
+        self._tell()
 
     # --- inside -----------------------------------------------------------------------------------------------
 
@@ -139,8 +159,8 @@ class GraphWatch:
             if away:
                 away = False
                 self._master_back()
-            if changed or not self.loaded.is_set():
-                self._rebuild()
+            if changed or not (self.loaded.is_set() or self.taken):
+                self._tell()
             ended = loop.time()
             took = ended - began
             period = self._period()
@@ -160,33 +180,24 @@ class GraphWatch:
 
     async def _read(self, node: Node) -> bool:
         """Read the graph; returns whether it differs from the last one."""
+        if self.taken:
+            await _exchange(node, "getPid")  # whether the master is there: its graph is told
+            return False
         self.reads += 1
         state = await _exchange(node, "getSystemState")
         if state == self._documents[0]:
             return False
         types = await _exchange(node, "getTopicTypes")
-        parsed = RosReply.of(await read_response(state)).value
-        self._types = _pairs(RosReply.of(await read_response(types)).value)
-        rows = parsed if isinstance(parsed, list) and len(parsed) == 3 else [[], [], []]
-        before = self._state[2]
-        self._state = (_rows(rows[0]), _rows(rows[1]), _rows(rows[2]))
-        self._documents = (state, types)
-        other = [name for name, nodes in before.items() if self._state[2].get(name) != nodes]
-        if other:
-            self._services_changed(other)
-        return True
+        rows = rows_of(RosReply.of(await read_response(state)).value, RosReply.of(await read_response(types)).value)
+        return self._take_read(rows, (state, types))
 
-    def _rebuild(self) -> None:
-        publishers, subscribers, services = self._state
-        names = sorted(publishers.keys() | subscribers.keys())
-        for name in self.topics.keys() - publishers.keys():
-            self._seen.pop(name, None)
-        self.topics = {
-            name: GraphTopic(name, self._types_of(name), publishers.get(name, ()), subscribers.get(name, ()))
-            for name in names
-        }
-        self.services = {name: self._service(name, services[name]) for name in sorted(services)}
-        self.nodes = tuple(sorted({node for rows in self._state for nodes in rows.values() for node in nodes}))
+    def _take_read(self, rows: GraphRows, documents: tuple[bytes, bytes]) -> bool:
+        if self.taken:
+            return False  # what was told meanwhile is newer
+        self._documents = documents
+        return self._table.update(rows)
+
+    def _tell(self) -> None:
         self.changes += 1
         self.loaded.set()
         for changed in [*self._followers.values()]:
@@ -195,35 +206,11 @@ class GraphWatch:
             except Exception:  # noqa: BLE001 - a fault of one client must not end the watch for all
                 _log.exception("! a client could not be told of the graph")
 
-    def _types_of(self, topic: str) -> tuple[str, ...]:
-        first = self._types.get(topic, ANY)
-        known = dict.fromkeys(() if first in (ANY, "") else (first,))
-        known |= self._seen.get(topic, {})
-        return tuple(known) or ((_KNOWN_TYPES[topic],) if topic in _KNOWN_TYPES else ())
-
-    def _service(self, name: str, providers: tuple[str, ...]) -> GraphService:
+    def _service(self, name: str) -> tuple[str, str]:
         found = self._found.get(name)
-        return GraphService(name, found.type if found else "", providers, found.uri if found else "")
+        return (found.type, found.uri) if found else ("", "")
 
 
 async def _exchange(node: Node, method: str) -> bytes:
     document = b"".join(call_pieces(method, (node.name,)))
     return await exchange(node.master_uri, method, document, timeout=ros_limits.SLAVE_CALL_TIMEOUT)
-
-
-def _rows(value: XmlRpcValue) -> Rows:
-    found: Rows = {}
-    for row in value if isinstance(value, list) else ():
-        match row:
-            case [str(name), list(nodes)]:
-                found[name] = tuple(sorted(str(node) for node in nodes))
-    return found
-
-
-def _pairs(value: XmlRpcValue) -> dict[str, str]:
-    found: dict[str, str] = {}
-    for row in value if isinstance(value, list) else ():
-        match row:
-            case [str(name), str(type_)]:
-                found[name] = type_
-    return found

@@ -11,6 +11,7 @@ import os
 import time
 from typing import TYPE_CHECKING, Any, Self
 
+from rmpa.config.permission_rules import Access
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.web import limits
 from rmpa.web.hub import requests
@@ -215,6 +216,13 @@ class Hub:
     # --- topics -----------------------------------------------------------------------------------------------
 
     def _subscribe(self, client: HubClient, request: requests.Subscribe) -> None:
+        client.rights.check_look(Access.SUBSCRIBE, request.topic)
+        subscribed = self.topics.names
+        if len(subscribed) >= limits.SUBSCRIBED_TOPICS_MAX and request.topic not in subscribed:
+            known = self.graph.topics.get(request.topic)
+            if known is None or not known.publishers:
+                problem = f"its clients subscribe to {len(subscribed)} topics, and {request.topic} has no publisher"
+                raise PeerRefused("the web server", problem, "subscribe when it has one, or to fewer topics")
         client.subscriptions[request.handle] = request.topic
         self.topics.subscribe(
             (client.number, request.handle),
@@ -231,6 +239,7 @@ class Hub:
 
     def _advertise(self, client: HubClient, request: requests.AdvertiseTopic) -> None:
         _check(client.rights.publish, "publish")
+        client.rights.check_change(Access.PUBLISH, request.topic)
 
         def failed(error: RmpaError) -> None:
             client.publishers.pop(request.handle, None)
@@ -266,6 +275,7 @@ class Hub:
 
     def _call(self, client: HubClient, request: requests.CallService) -> None:
         _check(client.rights.call_services, "call services")
+        client.rights.check_change(Access.CALL, request.service)
         md5sum = self.types.service(request.type).md5sum if request.type else ""
 
         async def call() -> None:
@@ -313,6 +323,7 @@ class Hub:
 
     def _serve(self, client: HubClient, request: requests.ServeService) -> None:
         _check(client.rights.serve_services, "offer services")
+        client.rights.check_change(Access.SERVE, request.service)
 
         def failed(error: RmpaError) -> None:
             client.services.pop(request.handle, None)
@@ -346,7 +357,7 @@ class Hub:
 
         async def get() -> None:
             await self.params.loaded.wait()
-            values = self.params.values(request.names, request.prefix)
+            values = client.rights.visible(self.params.values(request.names, request.prefix))
             client.receive(requests.ParamsChanged(request.handle, values))
 
         self._run(client, request.handle, get())
@@ -355,6 +366,7 @@ class Hub:
         _check(client.rights.set_parameters, "set parameters")
 
         async def set_() -> None:
+            await self.check_param_change(client.rights, request.name, request.value)
             await self.params.set(request.name, request.value)
             client.receive(requests.ParamsChanged(request.handle, {request.name: request.value}))
 
@@ -364,16 +376,30 @@ class Hub:
         _check(client.rights.set_parameters, "delete parameters")
 
         async def delete() -> None:
+            await self.check_param_change(client.rights, request.name)
             await self.params.delete(request.name)
             client.receive(requests.ParamsChanged(request.handle, {request.name: None}))
 
         self._run(client, request.handle, delete())
 
+    async def check_param_change(self, rights: Rights, name: str, after: requests.ParamValue = None) -> None:
+        """Check a change as ``Rights.check_param_change`` does, against the core's parameters, once they are known.
+
+        Raises:
+            RmpaError: The client may not, or there is no core.
+        """
+        if rights.change is not None:
+            self.link.need()
+            await self.params.known()
+            rights.check_param_change(name, self.params.value, after)
+
     def _follow_params(self, client: HubClient, request: requests.FollowParams) -> None:
         _check(client.rights.read_parameters, "read parameters", READ_REMEDY)
 
         def changed(values: Mapping[str, requests.ParamValue]) -> None:
-            client.receive(requests.ParamsChanged(request.handle, values))
+            visible = client.rights.visible(values)
+            if visible:
+                client.receive(requests.ParamsChanged(request.handle, visible))
 
         self.params.follow((client.number, request.handle), request.names, changed)
 
@@ -397,8 +423,15 @@ class Hub:
                 return
 
             def known(kind: Any) -> None:
-                client.receive(requests.Described(request.handle, request.type, kind.definition))
+                answer = requests.Described(request.handle, request.type, kind.definition, md5sum=kind.md5sum)
+                client.receive(answer)
 
+            if request.md5sum:
+                version = self.types.seen_version(request.type, request.md5sum)
+                if version is None:
+                    raise RmpaError(f"no publisher has told the version {request.md5sum} of {request.type}")
+                known(version)
+                return
             try:
                 known(await self.types.find_message(request.type))
             except RmpaError:
@@ -434,6 +467,7 @@ class Hub:
         task = self._tasks[key] = asyncio.get_running_loop().create_task(run(), name=f"request of {client.name}")
 
         def ended(task: asyncio.Task[None]) -> None:
+            work.close()  # of a client that has gone before it began
             if self._tasks.get(key) is task:
                 del self._tasks[key]
 

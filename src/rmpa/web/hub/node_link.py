@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import logging
 from typing import TYPE_CHECKING, Generic, TypeAlias, TypeVar
 
@@ -155,11 +156,6 @@ class Registration(Generic[_T]):
             self._run(after), name=f"register {name}"
         )
 
-    @property
-    def ended(self) -> bool:
-        """Whether all is done."""
-        return self._task.done()
-
     def end(self) -> None:
         """Withdraw it, in its task."""
         self._unwanted.set()
@@ -167,6 +163,10 @@ class Registration(Generic[_T]):
     async def closed(self) -> None:
         """Wait, after ``end``, until it is withdrawn."""
         await asyncio.wait([self._task])
+
+    def when_closed(self, call: Callable[[], None]) -> None:
+        """Have a function called when all is done."""
+        self._task.add_done_callback(lambda _: call())
 
     async def _run(self, after: Registration[_T] | None) -> None:
         if after is not None:
@@ -203,3 +203,29 @@ class Registration(Generic[_T]):
             for each in (unwanted, task):
                 each.cancel()
             await asyncio.wait([unwanted, task])
+
+
+class EndingRegistrations(Generic[_T]):
+    """Registrations that are being withdrawn, by name: a new one of the same name waits for the old one."""
+
+    def __init__(self) -> None:
+        self._registrations: dict[str, Registration[_T]] = {}
+
+    def end(self, name: str, registration: Registration[_T]) -> None:
+        """Withdraw a registration; it is kept until that is done."""
+        registration.end()
+        self._registrations[name] = registration
+        registration.when_closed(functools.partial(self._closed, name, registration))
+
+    def take(self, name: str) -> Registration[_T] | None:
+        """The registration of this name that is still being withdrawn, which is no longer kept here."""
+        return self._registrations.pop(name, None)
+
+    async def closed(self) -> None:
+        """Wait until all are withdrawn."""
+        for registration in [*self._registrations.values()]:
+            await registration.closed()
+
+    def _closed(self, name: str, registration: Registration[_T]) -> None:
+        if self._registrations.get(name) is registration:
+            del self._registrations[name]

@@ -46,6 +46,8 @@ class ParamMirror:
         self._told = 0
         self.loaded = asyncio.Event()
         """Set once the parameters are known."""
+        self.changes = 0
+        """How often they have changed."""
         link.on_node.append(self._load_from)
 
     @property
@@ -59,6 +61,12 @@ class ParamMirror:
             return cast("ParamValue", self._parameters.get(name))
         except KeyError:
             return None
+
+    async def known(self) -> None:
+        """Wait until the parameters are known, and no reading of them is under way."""
+        await self.loaded.wait()
+        while self._loading is not None and not self._loading.done():
+            await asyncio.wait([self._loading])
 
     def values(self, names: tuple[str, ...], prefix: str) -> dict[str, ParamValue]:
         """The values of ``names`` that exist; without names those of all parameters below ``prefix``."""
@@ -171,7 +179,10 @@ class ParamMirror:
         before = self._parameters.tree
         apply()
         after = self._parameters.tree
-        if before is after or not self._followers:
+        if before is after:
+            return
+        self.changes += 1
+        if not self._followers:
             return
         leaves: dict[str, ParamValue] | None = None
         for follower in [*self._followers.values()]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.core.errors import PeerRefused
 from rmpa.web import limits
-from rmpa.web.hub.node_link import Registration
+from rmpa.web.hub.node_link import EndingRegistrations, Registration
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -67,7 +67,7 @@ class Publishers:
         self._ended = ended
         self._now_ns = now_ns
         self._shared: dict[str, _Shared] = {}
-        self._ending: dict[str, Registration[Publisher]] = {}
+        self._ending: EndingRegistrations[Publisher] = EndingRegistrations()
 
     @property
     def topics(self) -> dict[str, str]:
@@ -140,14 +140,9 @@ class Publishers:
 
     async def close(self) -> None:
         """End all, after the node was closed."""
-        ending = [*self._ending.values()]
         for shared in [*self._shared.values()]:
-            if shared.registration is not None:
-                ending.append(shared.registration)
             self._end(shared)
-        for registration in ending:
-            await registration.closed()
-        self._ending.clear()
+        await self._ending.closed()
 
     # --- inside -----------------------------------------------------------------------------------------------
 
@@ -165,7 +160,7 @@ class Publishers:
             functools.partial(self._register, shared),
             _withdraw,
             functools.partial(self._refused, shared),
-            after=self._ending.pop(topic, None),
+            after=self._ending.take(topic),
         )
         return shared
 
@@ -198,9 +193,7 @@ class Publishers:
         del self._shared[shared.topic]
         self._ended(shared.topic)
         if shared.registration is not None:
-            shared.registration.end()
-            self._ending = {name: each for name, each in self._ending.items() if not each.ended}
-            self._ending[shared.topic] = shared.registration
+            self._ending.end(shared.topic, shared.registration)
 
 
 async def _withdraw(publisher: Publisher) -> None:

@@ -187,12 +187,14 @@ class UnfollowGraph:
 class DescribeType:
     """Asks for the definition of a message type, or of a service type where `service`.
 
+    `md5sum` asks for the version that a publisher has whose messages came; "" for the one that is known best.
     Answered by `Described`, or by `Failed` where it is not known; then by `Described` if it becomes known later.
     """
 
     handle: int
     type: str
     service: bool = False
+    md5sum: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -326,13 +328,15 @@ class GraphChanged:
 class Described:
     """The definition of a type with all that it embeds, as in a TCPROS header; of a service, of both its halves.
 
-    `text` is the message type's, or that of a service's request; `response` that of a service's response.
+    `text` is the message type's, or that of a service's request; `response` that of a service's response. `md5sum` is
+    that of the message type; "" for services.
     """
 
     handle: int
     type: str
     text: str
     response: str = ""
+    md5sum: str = ""
 
 
 @dataclass(frozen=True, slots=True)

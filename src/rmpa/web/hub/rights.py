@@ -1,8 +1,48 @@
-"""What a client may do."""
+"""What a client may do: kinds of acts, and names by the rules of ``[[permission]]``."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from rmpa.config.permission_rules import Access
+from rmpa.core.errors import PeerRefused
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rmpa.trust.permissions import Permissions
+    from rmpa.web.hub.requests import ParamValue
+
+_WHO: Final = "the web server"
+
+
+@dataclass(frozen=True, slots=True)
+class ClientRules:
+    """The rules about one client, by names.
+
+    Args:
+        client: Its name, for which ``[[permission]]`` is judged as for a module's.
+        permissions: Judges.
+    """
+
+    client: str
+    permissions: Permissions
+
+    def check(self, access: Access, name: str) -> None:
+        """Check one name.
+
+        Raises:
+            PeerRefused: The client may not; the text has the rule.
+        """
+        decision = self.permissions.judge(access, self.client, _resolved(name))
+        if not decision.allowed:
+            raise PeerRefused(_WHO, f"the client {self.client} may not {access} {name}", decision.rule)
+
+    def allows(self, access: Access, name: str) -> bool:
+        """Whether the client may."""
+        return self.permissions.judge(access, self.client, _resolved(name)).allowed
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,6 +58,8 @@ class Rights:
         serve_services: Offer services.
         configure_resources: Choose the profile and the context of a Smart Resource.
         drive: Command a robot by the monitor's joystick.
+        look: Which topics and parameters it may read; ``None``: all.
+        change: What it may publish, call, serve and set, by names; ``None``: all.
     """
 
     publish: bool = False
@@ -28,6 +70,102 @@ class Rights:
     serve_services: bool = False
     configure_resources: bool = False
     drive: bool = False
+    look: ClientRules | None = None
+    change: ClientRules | None = None
+
+    def check_look(self, access: Access, name: str) -> None:
+        """Check that the client may read something of this name.
+
+        Raises:
+            PeerRefused: It may not.
+        """
+        if self.look is not None:
+            self.look.check(access, name)
+
+    def check_change(self, access: Access, name: str) -> None:
+        """Check that the client may change, or bring, something of this name; raises as ``check_look``."""
+        if self.change is not None:
+            self.change.check(access, name)
+
+    def check_param_change(self, name: str, value_of: Callable[[str], ParamValue], after: ParamValue = None) -> None:
+        """Check each parameter that a change of a name replaces, makes or removes; raises as ``check_look``.
+
+        Args:
+            name: A parameter, or a namespace, which is changed as a whole.
+            value_of: Returns the present value of a name; ``None`` if there is none.
+            after: Its next value; ``None``: it is deleted.
+        """
+        if self.change is None:
+            return
+        if (key := _bad_key(after)) is not None:
+            # A core tells /motors/limit of the change where a key below /speed is that name.
+            text = (
+                f"the client {self.change.client} may not set {name}: the key {key[:80]!r} is not one part of a name"
+            )
+            raise PeerRefused(_WHO, text, "write a namespace as a value of values")
+        name = _resolved(name)
+        changed = {*_leaves(name, value_of(name)), *_leaves(name, after)}
+        # A parameter that stands where a namespace is needed is replaced by one.
+        above = [name[:at] for at in range(1, len(name)) if name[at] == "/"]
+        changed |= {each for each in above if not isinstance(value_of(each), Mapping | None)}
+        for each in sorted(changed) or [name]:
+            self.change.check(Access.PARAM, each)
+
+    def visible(self, values: Mapping[str, ParamValue]) -> Mapping[str, ParamValue]:
+        """Those of some parameters that the client may read.
+
+        Args:
+            values: Values by global names; a namespace is a mapping.
+        """
+        if self.look is None:
+            return values
+        shown = {name: _pruned(name, value, self.look) for name, value in values.items()}
+        return {name: value for name, value in shown.items() if value is not _HIDDEN}
+
+    def visible_tree(self, tree: Mapping[str, ParamValue]) -> Mapping[str, ParamValue]:
+        """The same of a tree of parameters, whose keys are names below the root."""
+        if self.look is None:
+            return tree
+        return {name[1:]: value for name, value in self.visible({f"/{key}": tree[key] for key in tree}).items()}
+
+
+_HIDDEN: Final[ParamValue] = object()  # type: ignore[assignment] # it is compared by identity, and never shown
+
+
+def _resolved(name: str) -> str:
+    """A name as the core resolves it: ``//a/`` is ``/a``, and so is ``a``."""
+    return "/" + "/".join(part for part in name.split("/") if part)
+
+
+def _leaves(name: str, value: ParamValue) -> Iterator[str]:
+    """The names of the parameters below a name, which is one itself if it is no namespace."""
+    if isinstance(value, Mapping):
+        for key, each in value.items():
+            yield from _leaves(f"{name.rstrip('/')}/{key}", each)
+    elif value is not None:
+        yield name
+
+
+def _bad_key(value: ParamValue) -> str | None:
+    """A key in a namespace, at any depth, that a core takes for another name than that of a parameter in it."""
+    if not isinstance(value, Mapping):
+        return None
+    for key, each in value.items():
+        if not key or "/" in key:
+            return key
+        if (inner := _bad_key(each)) is not None:
+            return inner
+    return None
+
+
+def _pruned(name: str, value: ParamValue, rules: ClientRules) -> ParamValue:
+    """A parameter without what a client may not read; ``_HIDDEN``: nothing is left."""
+    if not isinstance(value, Mapping):
+        return value if rules.allows(Access.PARAM, name) else _HIDDEN
+    kept = {
+        key: shown for key, each in value.items() if (shown := _pruned(f"{name}/{key}", each, rules)) is not _HIDDEN
+    }
+    return kept if kept or not value else _HIDDEN
 
 
 READ_ONLY = Rights()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.web import limits
-from rmpa.web.hub.node_link import Registration
+from rmpa.web.hub.node_link import EndingRegistrations, Registration
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -43,7 +43,7 @@ class ServedServices:
     def __init__(self, link: NodeLink) -> None:
         self._link = link
         self._served: dict[str, _Served] = {}
-        self._ending: dict[str, Registration[Service]] = {}
+        self._ending: EndingRegistrations[Service] = EndingRegistrations()
         self._numbers = itertools.count(1)
 
     def serve(
@@ -76,7 +76,7 @@ class ServedServices:
             functools.partial(self._register, served),
             _withdraw,
             functools.partial(self._refused, served),
-            after=self._ending.pop(name, None),
+            after=self._ending.take(name),
         )
 
     def respond(self, key: Key, name: str, call: int, *, ok: bool, response: Payload | str) -> None:
@@ -98,14 +98,9 @@ class ServedServices:
 
     async def close(self) -> None:
         """End all, after the node was closed."""
-        ending = [*self._ending.values()]
         for served in [*self._served.values()]:
-            if served.registration is not None:
-                ending.append(served.registration)
             self._end(served)
-        for registration in ending:
-            await registration.closed()
-        self._ending.clear()
+        await self._ending.closed()
 
     # --- inside -----------------------------------------------------------------------------------------------
 
@@ -138,9 +133,7 @@ class ServedServices:
             if not future.done():
                 future.set_exception(RmpaError(f"the client that offers {served.name} has ended it"))
         if served.registration is not None:
-            served.registration.end()
-            self._ending = {name: each for name, each in self._ending.items() if not each.ended}
-            self._ending[served.name] = served.registration
+            self._ending.end(served.name, served.registration)
 
 
 async def _withdraw(service: Service) -> None:

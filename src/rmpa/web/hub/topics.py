@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.ros.wire.tcpros import ANY
 from rmpa.web import limits
-from rmpa.web.hub.node_link import Registration
+from rmpa.web.hub.node_link import EndingRegistrations, Registration
+from rmpa.web.hub.payload_buffers import PayloadBuffers
 from rmpa.web.hub.requests import ReceivedMessage
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, KeysView, Mapping
 
     from rmpa.core.errors import RmpaError
     from rmpa.ros.node.node import Node, Subscriber
-    from rmpa.ros.node.topics import Received as RosReceived
     from rmpa.web.hub.clients import Key
     from rmpa.web.hub.node_link import NodeLink
 
@@ -85,14 +85,15 @@ class HubTopics:
         self._own_latched = own_latched
         self._now_ns = now_ns
         self._topics: dict[str, _Topic] = {}
-        self._ending: dict[str, Registration[Subscriber]] = {}
+        self._ending: EndingRegistrations[Subscriber] = EndingRegistrations()
         self._latched_bytes = 0
         self._latched_order: OrderedDict[tuple[str, str], None] = OrderedDict()
+        self._buffers = PayloadBuffers()
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> KeysView[str]:
         """The topics that are subscribed to, those included that linger."""
-        return tuple(self._topics)
+        return self._topics.keys()
 
     def subscribe(
         self,
@@ -121,7 +122,7 @@ class HubTopics:
                 functools.partial(self._register, there),
                 _withdraw,
                 functools.partial(self._refused, there),
-                after=self._ending.pop(topic, None),
+                after=self._ending.take(topic),
             )
             own = self._own_latched(topic)
             if own is not None:
@@ -156,19 +157,14 @@ class HubTopics:
 
     async def close(self) -> None:
         """End all, after the node was closed."""
-        ending = [*self._ending.values()]
         for there in [*self._topics.values()]:
-            if there.registration is not None:
-                ending.append(there.registration)
             self._end(there)
-        for registration in ending:
-            await registration.closed()
-        self._ending.clear()
+        await self._ending.closed()
 
     # --- inside -----------------------------------------------------------------------------------------------
 
     async def _register(self, there: _Topic, node: Node) -> Subscriber:
-        return await node.subscribe(there.name, None, functools.partial(self._take, there))
+        return await node.subscribe(there.name, None, on_bytes=functools.partial(self._take, there))
 
     def _refused(self, there: _Topic, error: RmpaError) -> None:
         if self._topics.get(there.name) is there:
@@ -185,14 +181,14 @@ class HubTopics:
         for source in [*there.latched]:
             self._forget_latched(there.name, source, there)
         if there.registration is not None:
-            there.registration.end()
-            self._ending = {name: each for name, each in self._ending.items() if not each.ended}
-            self._ending[there.name] = there.registration
+            self._ending.end(there.name, there.registration)
+        if not self._topics:
+            self._buffers.clear()
 
-    def _take(self, there: _Topic, message: RosReceived) -> None:
+    def _take(self, there: _Topic, data: memoryview, header: Mapping[str, str]) -> None:
         if self._topics.get(there.name) is not there:
             return  # it has ended, and is being withdrawn
-        header = message.header
+        stamp_ns = self._now_ns()
         source = header.get("callerid", "?")
         if there.headers.get(source) is not header:
             there.headers[source] = header
@@ -200,8 +196,8 @@ class HubTopics:
                 del there.headers[next(iter(there.headers))]
             self._learn(there.name, header)
         latch = header.get("latching") == "1"
-        payload = memoryview(message.raw)
-        self._deliver(there, source, header, header.get("type", ""), payload, message.stamp_ns, latch=latch)
+        payload = self._buffers.copy(data)
+        self._deliver(there, source, header, header.get("type", ""), payload, stamp_ns, latch=latch)
 
     def _deliver(
         self,

@@ -79,6 +79,10 @@ class TypeLibrary:
         """
         return self._versions.get((name, md5sum)) or self.message(name)
 
+    def seen_version(self, name: str, md5sum: str) -> MessageType | None:
+        """The version of a message type with that md5 sum, if it is known."""
+        return self._versions.get((name, md5sum))
+
     def service(self, name: str) -> ServiceType:
         """A service type; as ``message``."""
         kind = self._services.get(name)

@@ -51,6 +51,10 @@ TOPICS_SHOWN: Final = 2000
 """Topics in a state; further ones are counted."""
 SERVICES_SHOWN: Final = 2000
 """Services in a state; further ones are counted."""
+NODES_SHOWN: Final = 2000
+"""Nodes in a state; further ones are counted."""
+PARAMETER_NAMES_SHOWN: Final = 5000
+"""Names of parameters that a search is given."""
 MODULES_SHOWN: Final = 256
 """Modules in a state; further ones are counted. A ring of more could not be read."""
 FLOW_TOPICS: Final = 8

@@ -12,9 +12,11 @@ from rmpa.web.monitor import limits
 VERSION: Final = 1
 SUBPROTOCOL: Final = "rmpa.monitor.v1"
 """The WebSocket subprotocol; a version that older pages cannot read has another one."""
+LOG_TOPIC: Final = "/rosout_agg"
+"""The messages of all nodes, from one publisher: ``/rosout`` would be a connection to each node."""
 
 Id: TypeAlias = int
-Kind: TypeAlias = Literal["module", "topic", "service", "resource", "counters"]
+Kind: TypeAlias = Literal["module", "topic", "service", "node", "resource", "counters"]
 How: TypeAlias = Literal["value", "plot", "image", "scan"]
 
 

@@ -14,6 +14,26 @@ def rounded(value: float, digits: int = 3) -> float:
     return float(f"{value:.{digits}g}")
 
 
+def steady_figure(
+    before: float | None, value: float | None, share: float = limits.STEADY, least: float = 0.0
+) -> float | None:
+    """The figure to show in place of ``before``, which is shown now.
+
+    Args:
+        before: What is shown; ``None`` for nothing.
+        value: The new value; ``None`` where it is not known.
+        share: Of the figure that is shown; a smaller change is not shown.
+        least: A smaller change than this is not shown either.
+    """
+    if value is None or not math.isfinite(value):
+        return None
+    if before is not None and before != 0:
+        change = abs(value - before)
+        if change <= abs(before) * share or change <= least:
+            return before
+    return rounded(value)
+
+
 class Steady:
     """Keeps the figures that are shown, by key, and gives a new one only for a change that can be seen."""
 
@@ -22,22 +42,13 @@ class Steady:
         self._used: set[str] = set()
 
     def figure(self, key: str, value: float | None, share: float = limits.STEADY, least: float = 0.0) -> float | None:
-        """The figure to show.
-
-        Args:
-            key: Which one it is.
-            value: The new value; ``None`` where it is not known.
-            share: Of the figure that is shown; a smaller change is not shown.
-            least: A smaller change than this is not shown either.
-        """
-        if value is None or not math.isfinite(value):
+        """The figure to show under this key; the other arguments are those of ``steady_figure``."""
+        shown = steady_figure(self._shown.get(key), value, share, least)
+        if shown is None:
             self._shown.pop(key, None)
-            return None
-        self._used.add(key)
-        before = self._shown.get(key)
-        if before is not None and before != 0 and abs(value - before) <= max(abs(before) * share, least):
-            return before
-        self._shown[key] = shown = rounded(value)
+        else:
+            self._used.add(key)
+            self._shown[key] = shown
         return shown
 
     def moment(self, key: str, value: float | None) -> float | None:

@@ -8,15 +8,17 @@ costs little.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, cast
+from itertools import islice
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias, cast
 
 import msgspec
 
 from rmpa.web.monitor import limits
+from rmpa.web.monitor.nodes import NodeEntries, node_detail
 from rmpa.web.monitor.patch import Tree, Value, without_nulls
 from rmpa.web.monitor.places import Places
 from rmpa.web.monitor.resources import resource_detail, resource_entry, resource_flows
-from rmpa.web.monitor.steady import Steady
+from rmpa.web.monitor.steady import Steady, steady_figure
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -81,6 +83,33 @@ class _ByteRates:
                 self._rates.pop(name, None)
 
 
+_Facts: TypeAlias = tuple[str, tuple[bool, bool], list[tuple[str, bool]], int, int, str, bool]
+"""Of a topic: its type, whether this module publishes and subscribes, peers and whether they send it, messages lost,
+messages dropped, the problem, whether it crosses."""
+_Figures: TypeAlias = tuple[float | None, float | None, float | None]
+
+
+class _KnownTopic(NamedTuple):
+    """A topic of the last snapshot.
+
+    Args:
+        topic: The topic.
+        entry: What the state says of it.
+        figures: Its rate, bandwidth and latency as shown.
+        facts: All else of which the entry is made.
+        flows: What it adds to flows: each a peer and whether that sends it, messages and bytes a second.
+    """
+
+    topic: TopicInfo
+    entry: Tree
+    figures: _Figures
+    facts: _Facts
+    flows: list[tuple[tuple[str, bool], float, float]]
+
+
+_UNKNOWN_FIGURES: _Figures = (None, None, None)
+
+
 class StateBuilder:
     """Makes the state of each snapshot.
 
@@ -94,7 +123,8 @@ class StateBuilder:
         self._places = Places(own)
         self._steady = Steady()
         self._bytes = _ByteRates()
-        self._idle: dict[str, tuple[TopicInfo, Tree]] = {}
+        self._known: dict[str, _KnownTopic] = {}
+        self._nodes = NodeEntries()
         self._served: dict[str, tuple[ServiceInfo, Tree]] = {}
         self._sections: Tree = {}
 
@@ -104,6 +134,7 @@ class StateBuilder:
         resources: Sequence[ResourceFacts] = (),
         alarms: Sequence[Tree] = (),
         recorded: int = 0,
+        parameters: int = 0,
     ) -> Tree:
         """The state of ``snapshot``.
 
@@ -113,25 +144,30 @@ class StateBuilder:
             alarms: The alarms that stand, each with ``id``, ``module`` (empty: this one), ``resource``, ``level``,
                 ``text`` and ``at``.
             recorded: How many entries the history has had.
+            parameters: How often the parameters of this module's core have changed.
         """
         taken = snapshot.taken
         peers = snapshot.peers[: limits.MODULES_SHOWN]
         self._bytes.keep(peer.name for peer in peers)
         self._places.update((peer.name for peer in peers), taken)
+        topics, flows = self._topics_and_flows(snapshot.topics)
+        nodes = self._nodes.build(snapshot)
         state: Tree = {
             "reach": {"ok": True},
             "agent": self._agent(snapshot),
             "ring": {"slots": self._places.slots, "places": dict(self._places.places)},
             "modules": dict(self._modules(snapshot, peers)),
-            "flows": {**self._flows(snapshot.topics), **resource_flows(resources, self.own, self._steady)},
-            "topics": self._topics(snapshot.topics[: limits.TOPICS_SHOWN]),
+            "flows": {**flows, **resource_flows(resources, self.own, self._steady)},
+            "topics": topics,
             "services": self._services(snapshot.services[: limits.SERVICES_SHOWN]),
+            "nodes": dict(islice(nodes.items(), limits.NODES_SHOWN)),
             "resources": {one.key: resource_entry(one, self.own) for one in resources},
             "alarms": {
                 str(alarm.get("id", index)): {**alarm, "module": alarm.get("module") or self.own}
                 for index, alarm in enumerate(alarms)
             },
             "recorded": recorded,
+            "parameters": parameters,
             "notes": list(snapshot.notes[:100]),
             "unreachable": [str(each) for each in snapshot.unreachable[:100]],
         }
@@ -139,6 +175,7 @@ class StateBuilder:
             "topics": len(snapshot.topics) - limits.TOPICS_SHOWN,
             "services": len(snapshot.services) - limits.SERVICES_SHOWN,
             "modules": len(snapshot.peers) - limits.MODULES_SHOWN,
+            "nodes": len(nodes) - limits.NODES_SHOWN,
         }
         state["hidden"] = {kind: count for kind, count in hidden.items() if count > 0}
         self._steady.sweep()
@@ -222,41 +259,41 @@ class StateBuilder:
                 "bytes_in": steady.figure(f"{name} in", rates[0] if rates else None, share=0.1, least=20.0),
                 "bytes_out": steady.figure(f"{name} out", rates[1] if rates else None, share=0.1, least=20.0),
             }
-        return _tree({key: value for key, value in entry.items() if value not in ("", [], ())})
+        return _given(entry)
 
-    def _flows(self, topics: Iterable[TopicInfo]) -> dict[str, Tree]:
-        """What flows on the own links, ``from>to``: messages and bytes a second, and the busiest topics."""
-        sums: dict[str, list[tuple[float, float, str]]] = {}
-        for topic in topics:
-            for route in topic.routes:
-                rate, bandwidth = _figures(route)
-                if rate:
-                    ends = (route.peer, self.own) if route.direction == "in" else (self.own, route.peer)
-                    sums.setdefault(">".join(ends), []).append((rate, bandwidth, topic.name))
-        found: dict[str, Tree] = {}
-        for key, parts in sums.items():
-            parts.sort(key=lambda part: (-part[0], part[2]))
-            names: list[Value] = list(dict.fromkeys(part[2] for part in parts))[: limits.FLOW_TOPICS]  # type: ignore[assignment]
-            names.sort(key=str)
-            found[key] = _tree({
-                "rate": self._steady.figure(f"{key} rate", sum(part[0] for part in parts)),
-                "bandwidth": self._steady.figure(f"{key} bandwidth", sum(part[1] for part in parts), share=0.1),
-                "topics": names,
-            })  # fmt: skip
-        return found
+    def _topics_and_flows(self, topics: Sequence[TopicInfo]) -> tuple[Tree, dict[str, Tree]]:
+        """The topics by name, and what flows on the own links, ``from>to``.
 
-    def _topics(self, topics: Sequence[TopicInfo]) -> Tree:
-        """By name. Most topics of a large mesh are idle: their entries are kept until they change."""
-        found: Tree = {}
-        idle: dict[str, tuple[TopicInfo, Tree]] = {}
-        for topic in topics:
-            before = self._idle.get(topic.name)
-            entry = before[1] if before is not None and before[0] == topic else self._topic(topic)
-            found[topic.name] = entry
-            if "rate" not in entry:
-                idle[topic.name] = (topic, entry)
-        self._idle = idle
-        return found
+        Most topics of a large mesh are idle, and their entries are kept until they change.
+        """
+        known, shown = self._known, limits.TOPICS_SHOWN
+        entries: Tree = {}
+        kept: dict[str, _KnownTopic] = {}
+        flows: dict[tuple[str, bool], list[tuple[float, float, str]]] = {}
+        for index, topic in enumerate(topics):
+            name = topic.name
+            before = known.get(name)
+            if before is None or before.flows or (before.topic is not topic and before.topic != topic):
+                before = self._topic(topic, before)
+            kept[name] = before
+            if index < shown:
+                entries[name] = before.entry
+            for end, rate, bandwidth in before.flows:
+                flows.setdefault(end, []).append((rate, bandwidth, name))
+        self._known = kept
+        return entries, dict(self._flow(*end, parts) for end, parts in flows.items())
+
+    def _flow(self, peer: str, incoming: bool, parts: list[tuple[float, float, str]]) -> tuple[str, Tree]:
+        """Its key ``from>to``; messages and bytes a second, and the busiest topics."""
+        key = f"{peer}>{self.own}" if incoming else f"{self.own}>{peer}"
+        parts.sort(key=lambda part: (-part[0], part[2]))
+        names = list(dict.fromkeys(part[2] for part in parts))[: limits.FLOW_TOPICS]
+        names.sort()
+        return key, _given({
+            "rate": self._steady.figure(f"{key} rate", sum(part[0] for part in parts)),
+            "bandwidth": self._steady.figure(f"{key} bandwidth", sum(part[1] for part in parts), share=0.1),
+            "topics": names,
+        })  # fmt: skip
 
     def _services(self, services: Sequence[ServiceInfo]) -> Tree:
         """By ``service_key``; entries are kept until they change."""
@@ -264,38 +301,65 @@ class StateBuilder:
         for service in services:
             key = service_key(service)
             before = self._served.get(key)
-            served[key] = before if before is not None and before[0] == service else (service, _service(service))
+            same = before is not None and (before[0] is service or before[0] == service)
+            served[key] = before if before is not None and same else (service, _service(service))
         self._served = served
         return {key: entry for key, (_, entry) in served.items()}
 
-    def _topic(self, topic: TopicInfo) -> Tree:
-        incoming = [route for route in topic.routes if route.direction == "in"]
-        figures = [_figures(route) for route in topic.routes]
-        bandwidth = sum(one[1] for one in figures)
-        sources = {route.peer for route in incoming}
-        targets = {
-            route.peer
-            for route in topic.routes
-            if route.direction == "out" and (route.state == "open" or any(map(_is_direct, route.subscribers)))
-        }
-        entry = {
-            "type": topic.type,
-            "from": sorted(sources | {self.own} if topic.publishers else sources),
-            "to": sorted(targets | {self.own} if topic.subscribers else targets),
-            "rate": self._steady.figure(f"{topic.name} rate", max((one[0] for one in figures), default=0.0) or None),
-            "bandwidth": self._steady.figure(f"{topic.name} bandwidth", bandwidth or None, share=0.1),
-            "latency": self._steady.figure(
-                f"{topic.name} latency",
-                max((r.latency.p50 for r in incoming if r.latency), default=None),
-                share=0.25,
-                least=1e-4,
-            ),
-            "lost": sum(r.lost + r.expired for r in topic.routes),
-            "dropped": sum(r.dropped + r.oversized for r in topic.routes),
-            "problem": _problem(topic),
-            "crosses": topic.crosses,
-        }
-        return _said(entry)
+    def _topic(self, topic: TopicInfo, before: _KnownTopic | None) -> _KnownTopic:
+        most = bandwidth = 0.0
+        latency: float | None = None
+        lost = dropped = 0
+        problem = _problem(topic)
+        ends: list[tuple[str, bool]] = []
+        flows: list[tuple[tuple[str, bool], float, float]] = []
+        for route in topic.routes:
+            rate, bytes_ = _figures(route) if route.subscribers else (route.rate or 0.0, route.bandwidth or 0.0)
+            bandwidth += bytes_
+            lost += route.lost + route.expired
+            dropped += route.dropped + route.oversized
+            incoming = route.direction == "in"
+            end = route.peer, incoming
+            if rate:
+                flows.append((end, rate, bytes_))
+                most = max(most, rate)
+            if incoming:
+                ends.append(end)
+                if route.latency is not None and (latency is None or route.latency.p50 > latency):
+                    latency = route.latency.p50
+            elif route.state == "open" or any(map(_is_direct, route.subscribers)):
+                ends.append(end)
+            if route.problem and not problem:
+                problem = route.problem
+        old = before.figures if before is not None else _UNKNOWN_FIGURES
+        figures = (
+            steady_figure(old[0], most or None),
+            steady_figure(old[1], bandwidth or None, 0.1),
+            steady_figure(old[2], latency, 0.25, 1e-4),
+        )
+        here = bool(topic.publishers), bool(topic.subscribers)
+        facts: _Facts = (topic.type, here, ends, lost, dropped, problem, topic.crosses)
+        if before is not None and before.figures == figures and before.facts == facts:
+            return _KnownTopic(topic, before.entry, figures, facts, flows)
+        return _KnownTopic(topic, _topic_entry(self.own, figures, facts), figures, facts, flows)
+
+
+def _topic_entry(own: str, figures: _Figures, facts: _Facts) -> Tree:
+    type_, (published, subscribed), ends, lost, dropped, problem, crosses = facts
+    sources = {peer for peer, incoming in ends if incoming} | ({own} if published else set())
+    targets = {peer for peer, incoming in ends if not incoming} | ({own} if subscribed else set())
+    return _said({
+        "type": type_,
+        "from": sorted(sources),
+        "to": sorted(targets),
+        "rate": figures[0],
+        "bandwidth": figures[1],
+        "latency": figures[2],
+        "lost": lost,
+        "dropped": dropped,
+        "problem": problem,
+        "crosses": crosses,
+    })  # fmt: skip
 
 
 def _is_direct(subscriber: SubscriberTransport) -> bool:
@@ -317,12 +381,19 @@ def _figures(route: RouteInfo) -> tuple[float, float]:
 
 def _said(entry: Mapping[str, object]) -> Tree:
     """Without what says nothing: no, none, nothing, not known. A page takes a missing member as that."""
-    return cast("Tree", {key: value for key, value in entry.items() if value not in ("", 0, [], None)})
+    return cast("Tree", {key: value for key, value in entry.items() if value})
+
+
+def _given(entry: Mapping[str, object]) -> Tree:
+    """Without empty texts and lists, and without what is not known; zeros stay."""
+    return cast("Tree", {key: value for key, value in entry.items() if value or value == 0})
 
 
 def _problem(topic: TopicInfo) -> str:
-    said = (*topic.mismatches, *topic.unreachable, *(route.problem for route in topic.routes if route.problem))
-    return next(iter(said), "")
+    """What is wrong with the topic itself, or empty; its routes have problems of their own."""
+    if topic.mismatches:
+        return topic.mismatches[0]
+    return topic.unreachable[0] if topic.unreachable else ""
 
 
 def service_key(service: ServiceInfo) -> str:
@@ -342,7 +413,7 @@ def _service(service: ServiceInfo) -> Tree:
         "transport": service.transport,
         "problem": service.problem or service.hidden,
     }
-    return _tree({key: value for key, value in entry.items() if value not in ("", 0)})
+    return _said(entry)
 
 
 def details(snapshot: Snapshot, resources: Mapping[str, ResourceFacts], kind: str, name: str) -> Tree | None:
@@ -351,14 +422,16 @@ def details(snapshot: Snapshot, resources: Mapping[str, ResourceFacts], kind: st
     Args:
         snapshot: The newest.
         resources: By ``ResourceFacts.key``.
-        kind: ``module``, ``topic``, ``service`` or ``resource``; or ``counters``, without a name.
-        name: A module's or topic's name; ``service_key`` of a service; ``key`` of a resource.
+        kind: ``module``, ``topic``, ``service``, ``node`` or ``resource``; or ``counters``, without a name.
+        name: A module's or topic's name; ``service_key`` of a service; ``node_key``; ``key`` of a resource.
     """
     own = snapshot.agent.name
     if kind == "counters":
         return dict(sorted(snapshot.counters.items()))
     if kind == "resource":
         return resource_detail(resources[name], own) if name in resources else None
+    if kind == "node":
+        return node_detail(snapshot, name)
     if kind == "module" and name == own:
         return _tree(msgspec.to_builtins(snapshot.agent))
     found: object = None

@@ -9,6 +9,7 @@ import math
 import struct
 import zlib
 from collections import OrderedDict
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
 import cbor2
@@ -103,10 +104,16 @@ def encode_cbor(values: Mapping[str, Any]) -> RosbridgeFrame:
 def encode_cbor_raw(topic: str, payload: memoryview, stamp_ns: int) -> RosbridgeFrame:
     """A ``publish`` of ROS 1 bytes, which are not copied: ``msg`` is ``{secs, nsecs, bytes}``."""
     secs, nsecs = divmod(max(0, stamp_ns), 1_000_000_000)
-    head = cbor2.dumps({"op": "publish", "topic": topic})
-    # A map of three: the two keys above, and msg.
-    inner = b"\x63msg\xa3\x64secs" + cbor2.dumps(secs) + b"\x65nsecs" + cbor2.dumps(nsecs) + b"\x65bytes"
-    return RosbridgeFrame((b"\xa3" + head[1:] + inner + _cbor_length(0x40, len(payload)), payload), binary=True)
+    stamp = b"".join((b"\x64secs", _cbor_length(0, secs), b"\x65nsecs", _cbor_length(0, nsecs)))
+    head = b"".join((_cbor_raw_head(topic), stamp, b"\x65bytes", _cbor_length(0x40, len(payload))))
+    return RosbridgeFrame((head, payload), binary=True)
+
+
+@lru_cache(limits.SUBSCRIPTIONS_MAX)
+def _cbor_raw_head(topic: str) -> bytes:
+    """All before the time: it is the same for each message of a topic."""
+    # A map of three: the two keys here, and msg.
+    return b"\xa3" + cbor2.dumps({"op": "publish", "topic": topic})[1:] + b"\x63msg\xa3"
 
 
 def _cbor_length(major: int, length: int) -> bytes:

@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING
 from rmpa.core.errors import RmpaError, UnreachableError
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.io.control_client import ControlClient, choose_agent
-from rmpa.observe.snapshot import Snapshot
+from rmpa.observe.snapshot_decoder import SnapshotDecoder
 from rmpa.web import limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+
+    from rmpa.observe.snapshot import Snapshot
 
 _log = logging.getLogger(__name__)
 
@@ -111,6 +113,7 @@ class ControlReader:
         self._environ = environ
         self._name = name
         self._client: ControlClient | None = None
+        self._decoder = SnapshotDecoder()
         self._used = 0.0
         self.figures = False
         """Whether the agent is to ask nodes for the figures of their direct connections."""
@@ -137,7 +140,7 @@ class ControlReader:
 
     def _ask(self, client: ControlClient) -> Snapshot:
         try:
-            snapshot = client.call("snapshot", Snapshot, figures="newest") if self.figures else client.snapshot()
+            snapshot = client.snapshot(self._decoder, **({"figures": "newest"} if self.figures else {}))
         except RmpaError:
             self.close()
             raise

@@ -48,6 +48,8 @@ WEBSOCKET_PATHS: Final = ("/", "/rosbridge", "/foxglove", MONITOR_PATH)
 _METHODS: Final = ("GET", "HEAD")
 _SHOWN: Final = 120
 """Characters of a faulty header that are told."""
+CLIENT: Final = web.RequestKey("rmpa.client", str)
+"""The client that a request is of, by its token (``AccessGranted.client``)."""
 _JUDGED: Final = web.RequestKey("rmpa.judged", bool)
 """Marks requests that reached the middleware; aiohttp answers malformed ones before."""
 HEADERS: Final = {
@@ -96,7 +98,8 @@ class Routes:
     ) -> None:
         self._watch = watch
         self._gateways = gateways
-        self._policy = policy
+        self.policy = policy
+        """May be replaced at any time."""
         self._pages = pages
         self._connections = connections
         self._counters = counters
@@ -143,7 +146,7 @@ class Routes:
         return middleware
 
     async def _respond(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        verdict = self._policy.judge(self._facts(request))
+        verdict = self.policy.judge(self._facts(request))
         if isinstance(verdict, AccessRefused):
             return self._refused(request, verdict.reason, rest.problem(verdict.status, verdict.detail))
         if request.method not in _METHODS and not isinstance(verdict, Preflight):
@@ -155,6 +158,7 @@ class Routes:
             return web.Response(status=204, headers=PREFLIGHT)
         if isinstance(verdict, MoveToken):
             return self._move_token(request)
+        request[CLIENT] = verdict.client
         if self._gateways is not None and is_upgrade(request) and request.path in WEBSOCKET_PATHS:
             return await self._upgrade(request, self._gateways)
         try:
@@ -186,21 +190,22 @@ class Routes:
             fetch_site=headers.get("Sec-Fetch-Site"),
             fetch_mode=headers.get("Sec-Fetch-Mode"),
             authorization=headers.get("Authorization"),
-            cookie=request.cookies.get(self._policy.cookie),
+            cookie=request.cookies.get(self.policy.cookie),
             token=request.query.get(TOKEN_PARAMETER),
             is_page=page is not None and page.is_html,
             is_open=request.path in _OPEN,
             is_preflight=request.method == "OPTIONS"
             and "Access-Control-Request-Method" in headers
             and request.path not in self._pages,
+            secure=request.secure,
         )
 
     def _sharing(self, request: web.Request) -> dict[str, str]:
         """Headers that let pages of listed sites read a response; those of the pages' own files are not shared."""
-        if not self._policy.origins or request.path in self._pages:
+        if not self.policy.origins or request.path in self._pages:
             return {}
         origin = request.headers.get("Origin")
-        allowed = {"Access-Control-Allow-Origin": origin} if origin is not None and self._policy.lists(origin) else {}
+        allowed = {"Access-Control-Allow-Origin": origin} if origin is not None and self.policy.lists(origin) else {}
         return {"Vary": "Origin", **allowed}
 
     def _refused(self, request: web.Request, reason: str, problem: rest.RestResponse) -> web.Response:
@@ -218,7 +223,7 @@ class Routes:
         response = web.Response(status=303, headers={"Location": str(request.rel_url.with_query(query))})
         token = request.query[TOKEN_PARAMETER]
         response.set_cookie(
-            self._policy.cookie, token, httponly=True, secure=request.secure, samesite="Strict", path="/"
+            self.policy.cookie, token, httponly=True, secure=request.secure, samesite="Strict", path="/"
         )
         return response
 
@@ -298,11 +303,13 @@ def _connection(request: web.Request) -> GuardedConnection | None:
     return protocol if isinstance(protocol, GuardedConnection) else None
 
 
-def _upgraded(request: web.Request) -> None:
-    """The limits of requests do not hold for the connection any more."""
+def _upgraded(request: web.Request) -> Callable[[], int]:
+    """The limits of requests do not hold for the connection any more; returns what counts its bytes."""
     connection = _connection(request)
-    if connection is not None:
-        connection.upgrade()
+    if connection is None:
+        return int
+    connection.upgrade()
+    return lambda: connection.received
 
 
 def _response(made: rest.RestResponse) -> web.Response:

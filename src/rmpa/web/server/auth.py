@@ -6,9 +6,10 @@ Three checks, in this order:
   machine (DNS rebinding) sends its own name here.
 * ``Origin``, where the browser sends one, is this server or a listed site; ``Sec-Fetch-Site`` says the same of
   requests without one. A browser asks before it sends a listed site's token (CORS preflight): that has no token yet.
-* The token, where there is one: ``Authorization: Bearer`` (programs), a cookie (browsers), or ``?token=`` (clients
-  that know only a URL). A page's ``?token=`` is moved into the cookie by a redirect, so that it leaves the address
-  bar and the history. The cookie's name has the port, since browsers share cookies between the ports of a host.
+* The token, where there is one; it tells which client it is: ``Authorization: Bearer`` (programs), a cookie
+  (browsers), or ``?token=`` (clients that know only a URL). A page's ``?token=`` is moved into the cookie by a
+  redirect, so that it leaves the address bar and the history. The cookie's name has the port, since browsers share
+  cookies between the ports of a host.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from __future__ import annotations
 import hmac
 import ipaddress
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ class RequestFacts:
         is_page: Whether the path is a page for people, for which a cookie is set.
         is_open: Whether the path needs no token.
         is_preflight: Whether a browser asks what a page of another site may send (Fetch standard, "CORS-preflight").
+        secure: Whether it came by HTTPS.
     """
 
     host: tuple[str, ...]
@@ -56,11 +58,19 @@ class RequestFacts:
     is_page: bool = False
     is_open: bool = False
     is_preflight: bool = False
+    secure: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class AccessGranted:
-    """The request is served."""
+    """The request is served.
+
+    Attributes:
+        client: The name of the client whose token it has (``[[web_token]]``); empty: the server's own token, or none
+            where none is needed.
+    """
+
+    client: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,12 +107,14 @@ class AccessPolicy:
         hosts: The names under which it may be asked, in lower case; addresses are always accepted.
         token: Empty: none is needed.
         origins: Other sites whose pages may connect, as ``Origin`` headers name them, in lower case.
+        clients: The tokens of clients that have their own, with their names; only where ``token`` is not empty.
     """
 
     port: int
     hosts: frozenset[str]
-    token: str = ""
+    token: str = field(default="", repr=False)
     origins: frozenset[str] = frozenset()
+    clients: tuple[tuple[str, str], ...] = field(default=(), repr=False)
 
     @property
     def cookie(self) -> str:
@@ -135,7 +147,10 @@ class AccessPolicy:
     def _wrong_origin(self, request: RequestFacts) -> AccessRefused | None:
         if request.origin is not None:
             scheme, _, rest = request.origin.partition("://")
-            if scheme in ("http", "https") and rest.lower() == request.host[0].lower():
+            # A page of plain HTTP may be forged on its way, so it is no page of a server of HTTPS. A server of plain
+            # HTTP may be behind a proxy that ends TLS: its own pages are then of HTTPS.
+            schemes = ("https",) if request.secure else ("http", "https")
+            if scheme in schemes and rest.lower() == request.host[0].lower():
                 return None
             if self.lists(request.origin):
                 return None
@@ -149,11 +164,12 @@ class AccessPolicy:
     def _by_token(self, request: RequestFacts) -> AccessGranted | MoveToken | AccessRefused:
         if not self.token or request.is_open:
             return AccessGranted()
-        if request.token is not None and self._fits(request.token):
-            return MoveToken() if request.is_page else AccessGranted()
+        if request.token is not None and (client := self._client(request.token)) is not None:
+            return MoveToken() if request.is_page else AccessGranted(client)
         given = [bearer(request.authorization), request.cookie]
-        if any(self._fits(each) for each in given if each is not None):
-            return AccessGranted()
+        for each in given:
+            if each is not None and (client := self._client(each)) is not None:
+                return AccessGranted(client)
         remedy = (
             "send it as Authorization: Bearer TOKEN or as ?token=TOKEN; rmpa web says at its start where the token is"
         )
@@ -161,8 +177,13 @@ class AccessPolicy:
             return AccessRefused("token", 401, f"this server needs a token; {remedy}")
         return AccessRefused("token", 401, f"the token is wrong; {remedy}")
 
-    def _fits(self, token: str) -> bool:
-        return hmac.compare_digest(token.encode("utf-8", "replace"), self.token.encode())
+    def _client(self, token: str) -> str | None:
+        """The client whose token it is; ``None``: it is of none. Each is compared, so that the time tells nothing."""
+        given, found = token.encode("utf-8", "replace"), None
+        for name, each in (("", self.token), *self.clients):
+            if hmac.compare_digest(given, each.encode()):
+                found = name
+        return found
 
 
 def _foreign(whose: str) -> AccessRefused:

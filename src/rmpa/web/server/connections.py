@@ -95,6 +95,8 @@ class GuardedConnection(asyncio.Protocol):
         self._arriving = False
         self._unread = False
         self._upgraded = False
+        self.received = 0
+        """Bytes of the client so far."""
         self.is_answering = False
         """Whether a response is being made."""
 
@@ -128,6 +130,7 @@ class GuardedConnection(asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         """Pass bytes on, as many as one request may have."""
+        self.received += len(data)
         if not self._upgraded:
             self._received += len(data)
             if self._received > limits.WEB_REQUEST_MAX:

@@ -1,4 +1,4 @@
-"""The agent's word that the graph has changed, so that the hub reads it at once and not twelve times a second."""
+"""Changes of the graph as the agent tells them, so that the hub has them at once and need not read all of it."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from rmpa.core.errors import RemoteProtocolError, RmpaError
-from rmpa.core.sizes import KIB
+from rmpa.observe import limits as observe_limits
 from rmpa.observe.control import ControlReply, ControlRequest
-from rmpa.observe.io.control_client import choose_agent
-from rmpa.observe.snapshot import GraphRevision
+from rmpa.observe.graph_changes import GraphRevision
+from rmpa.observe.io.control_client import choose_agent, same_core
 from rmpa.web import limits
 
 if TYPE_CHECKING:
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
     from rmpa.web.hub.graph import GraphWatch
 
 _log = logging.getLogger(__name__)
-_REPLY_MAX = 4 * KIB
 
 
 class GraphSignal:
-    """Waits for changes at the control socket, one question after the other, and has the graph read.
+    """Waits for changes at the control socket, one question after the other, and gives them to the graph.
 
-    Without it (no agent answers, or an older one) the graph is read again and again.
+    An older agent, and one whose core is another program, tells only that there is a change: then the master is asked
+    for the graph. While no agent answers, the master is asked again and again.
 
     Args:
         environ: Says where the sockets are.
         agent: Returns the agent's name; ``None``: the one that ``choose_agent`` finds.
-        graph: Reads the graph.
+        graph: Takes the changes.
     """
 
     def __init__(self, environ: Mapping[str, str], agent: Callable[[], str | None], graph: GraphWatch) -> None:
@@ -59,36 +59,48 @@ class GraphSignal:
             except (RmpaError, OSError, EOFError, asyncio.LimitOverrunError) as error:
                 _log.debug("! changes of the graph are not told: %s", error)
             finally:
-                self._graph.told = False
-                self._graph.look()
+                self._graph.lose()
             await asyncio.sleep(limits.NODE_RETRY)
 
     async def _follow(self) -> None:
+        master = await self._graph.master()
         agent = await asyncio.to_thread(choose_agent, self._environ, self._agent())
-        reader, writer = await asyncio.open_unix_connection(agent.path, limit=_REPLY_MAX)
+        # Only the first answer, and one after more changes than the agent keeps, has the whole graph.
+        reader, writer = await asyncio.open_unix_connection(agent.path, limit=observe_limits.CONTROL_REPLY_MAX)
         try:
             known: int | None = None
             while True:
-                request = ControlRequest("graph", {"after": known, "wait": limits.GRAPH_WAIT})
-                writer.write(request.serialize())
+                args: dict[str, object] = {"after": known, "wait": limits.GRAPH_WAIT, "rows": True}
+                writer.write(ControlRequest("graph", args).serialize())
                 async with asyncio.timeout(limits.GRAPH_WAIT + limits.WEB_AGENT_TIMEOUT):
                     line = await reader.readuntil(b"\n")
-                revision = _revision(line)
-                if revision != known:
-                    known = revision
-                    self._graph.look()
-                self._graph.told = True
+                known = await self._take(_revision(line), known, master)
         finally:
             writer.close()
             with contextlib.suppress(OSError):
                 await writer.wait_closed()
 
+    async def _take(self, told: GraphRevision, known: int | None, master: str) -> int:
+        if told.rows is None:
+            if told.revision != known:
+                self._graph.look()
+            self._graph.told = True
+        elif not same_core(told.core_uri, master):
+            raise RemoteProtocolError(f"the agent's core is {told.core_uri}, and this node's {master}")
+        elif told.revision != known:
+            loop = asyncio.get_running_loop()
+            began = loop.time()
+            self._graph.take(told.rows)
+            # Changes of the next moment come together: in a storm of them, half of the time is spent here.
+            await asyncio.sleep(max(limits.GRAPH_GATHER, loop.time() - began))
+        return told.revision
 
-def _revision(line: bytes) -> int:
+
+def _revision(line: bytes) -> GraphRevision:
     reply = ControlReply.parse(line)
     if not reply.ok:
         raise RemoteProtocolError(reply.error)
     try:
-        return msgspec.convert(reply.value, GraphRevision).revision
+        return msgspec.convert(reply.value, GraphRevision)
     except msgspec.ValidationError as error:
         raise RemoteProtocolError(f"the agent answers graph in another way: {error}") from None

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.contract import Priority
 from rmpa.core.errors import UnreachableError
 from rmpa.ros.node.node import Node
 from rmpa.web.hub.hub import Hub
-from rmpa.web.hub.rights import FULL, READ_ONLY, Rights
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -41,19 +39,6 @@ def make_hub(watch: AgentWatch, port: int) -> Hub:
         return Node(name, master_uri=uri, on_param_update=updated)
 
     return Hub(where, make_node)
-
-
-def rights_of(*, has_token: bool, control: bool, drive: bool = False) -> Rights:
-    """What clients may do.
-
-    Args:
-        has_token: Whether all clients have shown a token: without one parameters and files are not read either.
-        control: Whether they may change anything.
-        drive: Whether the monitor's joystick may command a robot.
-    """
-    if not has_token:
-        return READ_ONLY
-    return replace(FULL if control else Rights(read_parameters=True, fetch_assets=True), drive=drive)
 
 
 def priority_of(hub: Hub, contracts: Contracts) -> Callable[[str], int]:

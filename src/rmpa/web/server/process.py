@@ -8,27 +8,29 @@ import os
 import signal
 import socket
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rmpa.core.contract import Contracts
-from rmpa.core.errors import StartError
+from rmpa.core.errors import RmpaError, StartError
 from rmpa.runtime.state_dir import module_dir, state_dir
 from rmpa.web.gateways.gateways import Gateways
 from rmpa.web.monitor.io.monitor import Monitor
 from rmpa.web.server import auth
 from rmpa.web.server.agent_watch import AgentWatch, ControlReader
+from rmpa.web.server.app import CLIENT
 from rmpa.web.server.graph_signal import GraphSignal
-from rmpa.web.server.hub_setup import make_hub, priority_of, rights_of
+from rmpa.web.server.hub_setup import make_hub, priority_of
+from rmpa.web.server.roles import WebRoles
 from rmpa.web.server.server import WebServer
-from rmpa.web.server.tls import tls_context
+from rmpa.web.server.tls import CertificateFiles, ServerCertificate
 from rmpa.web.server.token_file import token_from
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
-    from rmpa.config.settings import WebSettings
+    from rmpa.config.settings import Settings, WebSettings
+    from rmpa.config.web_tokens import WebToken
 
 _log = logging.getLogger(__name__)
 
@@ -41,118 +43,241 @@ class Address:
         url: Of its first page; with the token if that was made now.
         token_file: Where the token is; empty where none is needed.
         is_new: Whether the token was made now.
+        clients: The names of clients with tokens of their own, and where those are.
     """
 
     url: str
     token_file: str
     is_new: bool
+    clients: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class Access:
-    """The token of a server, and where it is."""
+class ClientToken:
+    """The token of one ``[[web_token]]``, and where it is."""
 
-    token: str = ""
+    name: str
+    token: str = field(repr=False)
+    file: Path
+
+
+@dataclass(frozen=True, slots=True)
+class TokenAccess:
+    """The tokens of a server, and where they are."""
+
+    token: str = field(default="", repr=False)
     file: Path | None = None
     is_new: bool = False
+    clients: tuple[ClientToken, ...] = ()
 
 
-def access_of(web: WebSettings, module: str, environ: Mapping[str, str], state: str = "") -> Access:
-    """The token that the settings ask for: one beyond loopback, for control or driving, or where a file is given.
+@dataclass(frozen=True, slots=True)
+class WebSetup:
+    """What a server is made of.
+
+    Args:
+        settings: All settings, with those of the command line.
+        access: The tokens.
+        files: The certificate of HTTPS.
+        trusted: Whether this module is in a secured mesh.
+    """
+
+    settings: Settings
+    access: TokenAccess
+    files: CertificateFiles
+    trusted: bool = False
+
+    @property
+    def policy(self) -> auth.AccessPolicy:
+        """Which requests are served."""
+        web = self.settings.web
+        hosts = auth.own_names((socket.gethostname(), *web.hosts)) | {web.listen.lower()}
+        origins = frozenset(origin.lower().rstrip("/") for origin in web.origins)
+        clients = tuple((each.name, each.token) for each in self.access.clients)
+        return auth.AccessPolicy(web.port, hosts, self.access.token, origins, clients)
+
+    @property
+    def roles(self) -> WebRoles:
+        """What clients may do."""
+        return WebRoles(self.settings, has_token=bool(self.access.token), trusted=self.trusted)
+
+
+def access_of(
+    web: WebSettings, module: str, environ: Mapping[str, str], state: str = "", tokens: Sequence[WebToken] = ()
+) -> TokenAccess:
+    """The tokens that the settings ask for.
+
+    The server's own is there beyond loopback, for control or driving, or where a file or another token is given.
 
     Args:
         web: The settings.
-        module: The module's name; its token is in its folder of the state directory.
+        module: The module's name; its tokens are in its folder of the state directory.
         environ: As for ``state_dir``.
         state: ``Settings.state_dir``.
+        tokens: Those of ``[[web_token]]``.
 
     Raises:
-        StartError: The file cannot be used, or there is no place for one.
+        StartError: A file cannot be used, two have the same token, or there is no place for one.
     """
-    if auth.is_loopback(web.listen) and not (web.token_file or web.control or web.drive):
-        return Access()
-    if web.token_file:
-        file = Path(web.token_file)
-    else:
-        place = state_dir(environ, state or None)
-        if place is None:
+    if auth.is_loopback(web.listen) and not (web.token_file or web.control or web.drive or tokens):
+        return TokenAccess()
+    place = state_dir(environ, state or None)
+    folder = module_dir(place, module) if place is not None else None
+
+    def read(given: str, name: str) -> tuple[Path, str, bool]:
+        if not given and folder is None:
             raise StartError("rmpa web", "there is no state directory for the token", "choose a --token-file")
-        file = module_dir(place, module) / "web-token"
-    token, is_new = token_from(file)
-    return Access(token, file, is_new)
+        file = Path(given) if given or folder is None else folder / name
+        return file, *token_from(file)
+
+    file, token, is_new = read(web.token_file, "web-token")
+    known, clients = {token: file}, []
+    for each in tokens:
+        path, its, _ = read(each.file, f"web-tokens/{each.name}")
+        if its in known:
+            raise StartError(str(path), f"has the same token as {known[its]}", "remove it, and rmpa web makes one")
+        known[its] = path
+        clients.append(ClientToken(each.name, its, path))
+    return TokenAccess(token, file, is_new, tuple(clients))
 
 
-def address_of(web: WebSettings, access: Access, port: int) -> Address:
+def address_of(web: WebSettings, access: TokenAccess, port: int, *, is_https: bool = False) -> Address:
     """Where a server is, for the user."""
     host = socket.gethostname() if web.listen == "0.0.0.0" else web.listen  # noqa: S104 - compared
     query = f"?{auth.TOKEN_PARAMETER}={access.token}" if access.is_new else ""
-    scheme = "https" if web.cert else "http"
-    return Address(f"{scheme}://{host}:{port}/{query}", str(access.file or ""), access.is_new)
+    scheme = "https" if is_https else "http"
+    clients = tuple((each.name, str(each.file)) for each in access.clients)
+    return Address(f"{scheme}://{host}:{port}/{query}", str(access.file or ""), access.is_new, clients)
 
 
 async def serve(
-    web: WebSettings,
-    access: Access,
+    setup: WebSetup,
     agent: str | None,
     announce: Callable[[Address], None],
     *,
     with_agent: bool,
-    contracts: Contracts | None = None,
+    load: Callable[[], WebSetup] | None = None,
 ) -> None:
-    """Serve until SIGINT or SIGTERM.
+    """Serve until SIGINT or SIGTERM; at SIGHUP tokens, roles and rules are read again.
 
     Args:
-        web: The settings.
-        access: The token.
+        setup: The settings, tokens and certificate.
         agent: The agent's name; ``None``: the one that runs.
         announce: Called when the server listens.
         with_agent: Whether to end when standard input ends: it is a pipe that the agent holds open.
-        contracts: Their priorities say whose messages go first to a slow client.
+        load: Reads all of ``setup`` again; it may block, and raise ``RmpaError``.
 
     Raises:
-        StartError: The address cannot be used.
+        StartError: The address or the certificate cannot be used.
     """
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stop.set)
+    web = setup.settings.web
     reader = ControlReader(os.environ, agent)
-    hosts = auth.own_names((socket.gethostname(), *web.hosts)) | {web.listen.lower()}
-    origins = frozenset(origin.lower().rstrip("/") for origin in web.origins)
-    policy = auth.AccessPolicy(web.port, hosts, access.token, origins)
     watch = AgentWatch(reader)
     hub = make_hub(watch, web.port)
-    rights = rights_of(has_token=bool(access.token), control=web.control, drive=web.drive)
 
     def watched(is_open: bool) -> None:
         reader.figures = is_open
 
     monitor = Monitor(hub, watch, agent=agent, watched=watched)
     changes = GraphSignal(os.environ, lambda: agent or monitor.mesh.agent or None, hub.graph)
+    reload = WebReload(setup, load)
     gateways = Gateways(
         hub,
         f"RMPA {agent or socket.gethostname()}",
-        lambda _: rights,
-        priority_of(hub, contracts or Contracts()),
+        lambda request: reload.roles.of(request[CLIENT]),
+        priority_of(hub, setup.settings.make_contracts()),
         monitor,
     )
-    server = WebServer(watch, policy, web.listen, gateways, web.ports, tls_context(web.cert, web.key))
+    certificate = ServerCertificate(setup.files)
+    server = WebServer(watch, setup.policy, web.listen, gateways, web.ports, certificate.context)
+    loop.add_signal_handler(signal.SIGHUP, reload.request)
     try:
         async with hub:
             await server.start()
+            certificate.start()
             monitor.start()
             changes.start()
+            reload.start(server, gateways)
             if with_agent:
                 _stop_at_end_of_input(loop, stop)
-            announce(address_of(web, access, server.port))
+            announce(address_of(web, setup.access, server.port, is_https=certificate.context is not None))
             await stop.wait()
             _log.info("= ending")
             await gateways.close()
             await changes.close()
             await monitor.close()
     finally:
+        await reload.close()
+        await certificate.close()
         await server.close()
         reader.close()
+
+
+class WebReload:
+    """Takes tokens, roles and rules that were changed while the server runs, and ends clients whose rights changed.
+
+    Args:
+        setup: What the server runs with.
+        load: Reads it again; ``None``: nothing is read again.
+    """
+
+    def __init__(self, setup: WebSetup, load: Callable[[], WebSetup] | None) -> None:
+        self._load = load
+        self._asked = asyncio.Event()
+        self._task: asyncio.Task[None] | None = None
+        self._known = _rights_in(setup)
+        self.roles = setup.roles
+        """What clients may do now."""
+
+    def request(self) -> None:
+        """Read the settings again soon."""
+        self._asked.set()
+
+    def start(self, server: WebServer, gateways: Gateways) -> None:
+        """Begin to wait for requests, in a task."""
+        self._task = asyncio.get_running_loop().create_task(self._run(server, gateways), name="reload rmpa web")
+
+    async def close(self) -> None:
+        """End."""
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.wait([self._task])
+
+    async def _run(self, server: WebServer, gateways: Gateways) -> None:
+        while True:
+            await self._asked.wait()
+            self._asked.clear()
+            if self._load is None:
+                continue
+            try:
+                setup = await asyncio.to_thread(self._load)
+            except RmpaError as error:
+                _log.error("! rmpa web keeps its tokens and rules: %s", error)
+                continue
+            if _rights_in(setup) == self._known:
+                continue
+            self._known = _rights_in(setup)
+            self.roles = setup.roles
+            server.take(setup.policy)
+            ended = await gateways.end_changed()
+            _log.info("= tokens and rules are read again; %d clients with other rights connect again", ended)
+
+
+def _rights_in(setup: WebSetup) -> object:
+    """All of a setup that rights and tokens depend on."""
+    web = setup.settings.web
+    return (
+        setup.settings.trust,
+        setup.settings.web_tokens,
+        setup.access.clients,
+        web.control,
+        web.drive,
+        setup.trusted,
+    )
 
 
 def _stop_at_end_of_input(loop: asyncio.AbstractEventLoop, stop: asyncio.Event) -> None:

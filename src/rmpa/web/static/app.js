@@ -8,12 +8,13 @@ import { Mandala } from "./mandala.js";
 import { Search, Shortcuts } from "./search.js";
 import { applyTheme, nextTheme, theme } from "./theme.js";
 
-const PAGES = [["", "Mesh", "m"], ["topics", "Topics", "t"], ["services", "Services", "s"], ["params", "Parameters", "p"], ["resources", "Resources", "r"], ["alarms", "Alarms", "a"], ["log", "Log", "l"], ["drive", "Drive", "d"]];
-const DETAILED = ["module", "topic", "service", "resource"];
+const PAGES = [["", "Mesh", "m"], ["topics", "Topics", "t"], ["services", "Services", "s"], ["nodes", "Nodes", "n"], ["params", "Parameters", "p"], ["resources", "Resources", "r"], ["alarms", "Alarms", "a"], ["log", "Log", "l"], ["drive", "Drive", "d"]];
+const DETAILED = ["module", "topic", "service", "node", "resource"];
 // All pages but the first one are loaded when they are first opened.
 const LAZY = {
   module: ["module.js", "ModulePage"], topics: ["topics.js", "Topics"], topic: ["topics.js", "TopicPage"],
   services: ["services.js", "Services"], service: ["services.js", "ServicePage"], params: ["params.js", "Params"],
+  nodes: ["nodes.js", "Nodes"], node: ["nodes.js", "NodePage"],
   resources: ["resources.js", "Resources"], resource: ["resources.js", "ResourcePage"], alarms: ["alarms.js", "Alarms"],
   log: ["log.js", "Log"], drive: ["drive.js", "DrivePage"],
 };
@@ -114,7 +115,7 @@ class App extends Component {
     const agent = section(state, "agent").name || connection.hello.agent;
     const alarms = Object.keys(section(state, "alarms")).length;
     const gone = connection.phase === "lost" || section(state, "reach").ok === false;
-    const current = { topic: "topics", service: "services", resource: "resources", module: "" }[page] ?? page;
+    const current = { topic: "topics", service: "services", node: "nodes", resource: "resources", module: "" }[page] ?? page;
     const dark = theme() === "dark";
     return html`
       <a class="skip" href="#main" onClick=${(event) => { event.preventDefault(); document.querySelector("h1")?.focus(); }}>To the content</a>
@@ -129,7 +130,7 @@ class App extends Component {
       </header>
       ${this.banner()}
       <main id="main" class=${gone ? "gone" : ""}>${state ? this.page() : html`<p class="loading">${connection.phase === "lost" ? "Nothing is known yet." : "Connecting …"}</p>`}</main>
-      ${overlay === "search" && html`<${Search} state=${state} onClose=${() => this.setState({ overlay: "" })} />`}
+      ${overlay === "search" && html`<${Search} state=${state} connection=${connection} onClose=${() => this.setState({ overlay: "" })} />`}
       ${overlay === "keys" && html`<${Shortcuts} pages=${PAGES} onClose=${() => this.setState({ overlay: "" })} />`}`;
   }
 }

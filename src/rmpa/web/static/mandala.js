@@ -188,7 +188,12 @@ function concerns(state) {
       found.push({ id: `m${name}`, level: { refused: "ERROR", away: "STALE" }[module.state] || "WARN", text: `${known(module.state).word}${module.error ? `: ${module.error}` : ""}`, who: name, to: href("module", name), since: module.since });
     else if (module.error) found.push({ id: `m${name}`, level: "WARN", text: module.error, who: name, to: href("module", name) });
   }
-  for (const [name, topic] of entries(state, "topics")) if (topic.problem) found.push({ id: `t${name}`, level: "WARN", text: topic.problem, who: name, to: href("topic", name) });
+  const troubled = new Map(); // many topics have one trouble when a module is lost: that is one line
+  for (const [name, topic] of entries(state, "topics")) if (topic.problem) troubled.set(topic.problem, [...(troubled.get(topic.problem) || []), name]);
+  for (const [text, names] of troubled) {
+    const several = names.length > 1;
+    found.push({ id: `t${text}`, level: "WARN", text: several ? `${text}: ${names.slice(0, 3).join(", ")}${names.length > 3 ? " …" : ""}` : text, who: several ? `${names.length} topics` : names[0], to: several ? href("topics") : href("topic", names[0]) });
+  }
   for (const note of state.notes || []) found.push({ id: `n${note}`, level: "WARN", text: note, who: "the agent", to: href("module", section(state, "agent").name) });
   return found.sort((a, b) => URGENT.indexOf(a.level) - URGENT.indexOf(b.level));
 }

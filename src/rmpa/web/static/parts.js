@@ -106,11 +106,39 @@ export function Question({ connection, what, args, label, show, now }) {
     <div aria-live="polite"><${Failure} failure=${state.failure} />${state.value !== undefined && show(state.value)}</div></div>`;
 }
 
+// The answer to a question, asked again every `period` seconds while the page is seen; 0: once. Another `key` asks anew.
+export function useAnswer(connection, what, args, period = 0, key = "") {
+  const [state, set] = useState({});
+  const open = connection.phase === "open";
+  useEffect(() => {
+    if (!open) return undefined;
+    let ended = false, timer;
+    const ask = async () => {
+      if (!document.hidden) {
+        const next = await connection.ask(what, args).then((value) => ({ value }), (failure) => ({ failure }));
+        if (ended) return;
+        set(next);
+      }
+      if (period) timer = setTimeout(ask, period * 1000);
+    };
+    ask();
+    return () => { ended = true; clearTimeout(timer); };
+  }, [what, JSON.stringify(args), key, open]);
+  return state;
+}
+
+// A node as it is named in the state: `MODULE:/name` for a peer's.
+export const nodeKey = (module, node) => (module ? `${module}:${node}` : node);
+export const NodeLink = ({ name, children }) => html`<a class="mono" href=${href("node", name)}>${children?.length ? children : name}</a>`;
+export const NodeLinks = ({ names }) => names.map((name, at) => html`${at > 0 && ", "}<${NodeLink} key=${name} name=${name} />`);
+export const ModuleLink = ({ name }) => html`<a class="whole" href=${href("module", name)}>${name}</a>`;
+
 const VERDICTS = { ok: "OK", warn: "WARN", fail: "ERROR", unknown: "STALE" };
+const WORDS = { topic: ["It flows", "It does not flow"], service: ["It can be called", "It cannot be called"], module: ["It is reached", "It is not reached"] };
 export function Diagnosis({ value }) {
   if (!Array.isArray(value) || !value.length) return html`<p class="empty">There is nothing to say.</p>`;
-  return value.map((one) => html`<div class="diagnosis"><p><${Mark} state=${one.flows ? "OK" : "ERROR"} word=${one.flows ? "It flows" : "It does not flow"} />
-    ${one.node && html` <span class="muted">from ${one.node}${one.peer && ` of ${one.peer}`} to ${one.to}</span>`}</p>
+  return value.map((one) => html`<div class="diagnosis"><p><${Mark} state=${one.flows ? "OK" : "ERROR"} word=${(WORDS[one.kind] || WORDS.topic)[one.flows ? 0 : 1]} />
+    ${one.kind !== "module" && one.node && html` <span class="muted">from ${one.node}${one.peer && ` of ${one.peer}`} to ${one.to}</span>`}</p>
     <ol class="stages">${(one.stages || []).map((stage) => html`<li class=${known(VERDICTS[stage.verdict]).tone}>
       <span class="stage"><svg viewBox="0 0 16 16" aria-hidden="true">${shape(VERDICTS[stage.verdict])}</svg>${stage.name}</span>
       <span><span class="unseen">${stage.verdict}: </span>${stage.text}${stage.remedy && html`<br /><span class="remedy">${stage.remedy}</span>`}</span></li>`)}</ol></div>`);

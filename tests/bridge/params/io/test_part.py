@@ -15,6 +15,7 @@ from rmpa.bridge.messages import decode
 from rmpa.bridge.params import transfer
 from rmpa.bridge.params.io.core import read_text, write_text
 from rmpa.bridge.params.io.part import Params
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.session.peer_rpc import PeerRpc
 from rmpa.config.settings import FollowRule, ParamSettings, Settings, TimeSettings
 from rmpa.core.counters import Counters
@@ -69,7 +70,13 @@ class FakeCore:
 class Side:
     """One module."""
 
-    def __init__(self, name: str, params: ParamSettings | None = None, time: TimeSettings | None = None) -> None:
+    def __init__(
+        self,
+        name: str,
+        params: ParamSettings | None = None,
+        time: TimeSettings | None = None,
+        gate: PermissionGate = OPEN_GATE,
+    ) -> None:
         self.name = name
         self.core = FakeCore()
         self.counters = Counters()
@@ -83,6 +90,7 @@ class Side:
             self.counters,
             params or ParamSettings(),
             time or TimeSettings(),
+            gate=gate,
         )
         self.core.told = self.params.param_update
 

@@ -13,12 +13,15 @@ from rmpa.bridge.direct import requests
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
 from rmpa.bridge.direct.requests import CloseDirect, OpenDirect
 from rmpa.bridge.messages import Source
+from rmpa.bridge.permission_gate import PermissionGate
 from rmpa.bridge.topics.io import direct_exporter
 from rmpa.bridge.topics.io.direct_exporter import DirectExporter
+from rmpa.config.settings import TrustSettings
 from rmpa.core.contract import Contract, Contracts, Transport
 from rmpa.core.counters import Counters
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
+from rmpa.trust.permissions import Permissions
 from tests.ros.node.peers import until
 
 SOURCE = Source("/chatter", "/talker")
@@ -43,6 +46,7 @@ class Module:
         self.gate.set()
         self.handlers: dict[str, Any] = {}
         self.sessions = {number: self._session(number) for number in (1, 2)}
+        self.permissions = PermissionGate()
         state = SimpleNamespace(publishers=self.publishers, subscribers=self.subscribers)
         monkeypatch.setattr(direct_exporter, "end_from", self._end_from)
         self.sut = DirectExporter(
@@ -67,7 +71,12 @@ class Module:
                 ),
             ),
             Counters(),
+            self.permissions,
         )
+
+    def permit(self, trust: TrustSettings) -> None:
+        """The mesh is secured, with these permissions."""
+        self.permissions.permissions = Permissions(trust)
 
     @staticmethod
     def _session(number: int) -> Any:
@@ -231,3 +240,75 @@ async def test_new_rules_withdraw_and_let_others_try_again(module: Module) -> No
     module.sut.reload(Contracts((), Transport.AUTO))
     assert module.told[-1][:2] == (1, requests.RETRY)
     assert await module.open() == {"port": 45225, "probe": ""}
+
+
+async def test_a_secured_mesh_has_no_plain_connections_unless_both_allow_it(module: Module) -> None:
+    module.permit(TrustSettings())
+    refused = await module.open()
+    assert refused["why"] == Condition.TRUST
+    assert "trust.direct is false in the publisher's module" in refused["text"]
+    module.sessions[1].same_machine = True
+    assert await module.open() == {"port": 45225, "probe": ""}, "it does not leave the machine"
+    module.permit(TrustSettings(direct=True))
+    assert await module.open(2, "/other") == {"port": 45225, "probe": ""}
+
+
+async def test_a_reload_of_a_secured_mesh_withdraws_grants_and_ends_their_connections(module: Module) -> None:
+    module.permit(TrustSettings(direct=True))
+    await module.open(1)
+    await module.open(2, "/other")
+    module.sessions[2].same_machine = True
+    module.told.clear()
+    module.permit(TrustSettings(direct=False))
+    module.sut.reload(Contracts((), AUTO.transport))
+    assert module.granted == [(2, "/other")], "the other one is on this machine"
+    assert [(peer, what, args["why"]) for peer, what, args in module.told] == [(1, requests.CLOSED, Condition.TRUST)]
+    assert module.ended == [(45225, "10.0.0.1")]
+    module.offered.clear()
+    module.sut.policy_changed()
+    assert module.granted == []
+    assert module.ended == [(45225, "10.0.0.1")], "all nodes of a machine have one address"
+
+
+async def test_without_trust_a_withdrawn_connection_is_left_to_the_peers_agent(module: Module) -> None:
+    await module.open(1)
+    module.offered.clear()
+    module.sut.policy_changed()
+    assert (module.granted, module.ended) == ([], [])
+
+
+async def test_a_secured_peer_does_not_learn_when_a_topic_that_it_may_not_have_is_published(module: Module) -> None:
+    module.permit(TrustSettings(direct=True))
+    module.offered.clear()
+    assert (await module.open())["why"] == Condition.OFFERED
+    module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=False)
+    module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=True)
+    module.sut.reload(Contracts((), AUTO.transport))
+    assert module.told == []
+
+
+async def test_a_secured_peer_learns_no_more_of_a_topic_after_it_was_withdrawn(module: Module) -> None:
+    module.permit(TrustSettings(direct=True))
+    await module.open()
+    module.offered.clear()
+    module.sut.policy_changed()
+    assert [what for _, what, _ in module.told] == [requests.CLOSED]
+    module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=True)
+    assert [what for _, what, _ in module.told] == [requests.CLOSED]
+
+
+async def test_a_secured_peer_tries_again_what_it_may_have(module: Module) -> None:
+    module.permit(TrustSettings(direct=True))
+    module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=False)
+    assert (await module.open())["text"] == "/talker has just left"
+    module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=True)
+    assert [(peer, what) for peer, what, _ in module.told] == [(1, requests.RETRY)]
+
+
+async def test_without_trust_a_peer_tries_again_when_a_topic_is_published(module: Module) -> None:
+    offered = dict(module.offered)
+    module.offered.clear()
+    assert (await module.open())["why"] == Condition.OFFERED
+    module.offered.update(offered)
+    module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=True)
+    assert [(peer, what) for peer, what, _ in module.told] == [(1, requests.RETRY)]

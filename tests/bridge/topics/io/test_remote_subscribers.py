@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
@@ -15,18 +16,24 @@ from rmpa.bridge.messages import (
     CloseRoute,
     Description,
     OpenRoute,
+    Origin,
     RouteClosed,
     RouteOpened,
     Source,
     TopicOffer,
     decode,
 )
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.policy import Policy
+from rmpa.bridge.relay import LinkedPeer
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.bridge.topics.imports import Imports
 from rmpa.bridge.topics.io import remote_subscribers as module
 from rmpa.bridge.topics.io.remote_subscribers import RemoteSubscribers
-from rmpa.config.settings import PolicySettings
+from rmpa.config.permission_rules import PermissionRule
+from rmpa.config.settings import PolicySettings, TrustSettings
+from rmpa.core.guid import Guid
+from rmpa.trust.permissions import Permissions
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -70,9 +77,9 @@ def connected() -> list[str]:
 class World:
     """The plans of one bridge, and one peer."""
 
-    def __init__(self) -> None:
+    def __init__(self, gate: PermissionGate = OPEN_GATE) -> None:
         policy = Policy(PolicySettings())
-        self.exports, self.imports = Exports(policy), Imports(policy, lambda: 0.5)
+        self.exports, self.imports = Exports(policy, gate=gate), Imports(policy, lambda: 0.5, gate=gate)
         self.sent: list[object] = []
         self.warned: list[str] = []
         self.listeners: dict[Source, tuple[str, ...]] = {}
@@ -82,9 +89,9 @@ class World:
         topics = {1: SimpleNamespace(publication=self._publication)}
         refusals = SimpleNamespace(refuse=lambda _now, kind, _who, _text: self.warned.append(kind))
         self.presence = RemoteSubscribers(
-            self.exports, self.imports, cast("Any", {1: self.peer}), cast("Any", topics), cast("Any", refusals)
+            self.exports, self.imports, cast("Any", {1: self.peer}), cast("Any", topics), cast("Any", refusals), gate
         )
-        self.exports.link_up(1)
+        self.exports.link_up(1, "base" if gate.on else "")
         self.imports.link_up(1)
 
     def _publication(self, source: Source) -> object:
@@ -202,3 +209,19 @@ async def test_a_peer_can_make_us_connect_so_often_and_no_more(world: World, mon
     world.publish(GOAL, TYPE, 7)
     assert len(world.told(7, "/a", "/b", "/c", "/d")) == 3
     assert world.warned == ["audience.too_many"]
+
+
+def test_listeners_behind_a_relay_are_named_only_if_both_may(world: World) -> None:
+    goal_of_arm = TopicOffer("/x", "/n", TYPE, Origin("arm", "10.0.0.3:1#0", "3" * 32, "/n", ("2" * 32,)))
+    rule = PermissionRule(("arm", "base"), names={"subscribe": ("/count/goal",)})
+    for trust, expected in (
+        (TrustSettings(rules=(rule,), relays=("base",)), ["/rmpa/arm/server", "/rmpa/base/own"]),
+        (TrustSettings(rules=(rule,)), ["/rmpa/base/own"]),
+        (TrustSettings(rules=(replace(rule, modules=("base",)),), relays=("base",)), ["/rmpa/base/own"]),
+    ):
+        Connection.made.clear()
+        secured = World(PermissionGate(Permissions(trust)))
+        secured.imports.link_up(1, "base", LinkedPeer("base", "2" * 32, Guid(2)))
+        secured.imports.advertised(1, Advertise(added=(goal_of_arm,)))
+        secured.publish(GOAL, TYPE, 7)
+        assert secured.told(7, "/own", "/rmpa/arm/server", "/rmpa/leg/server") == expected

@@ -6,6 +6,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.mesh import limits
 
 if TYPE_CHECKING:
@@ -41,9 +42,13 @@ class AbsentPeers:
     Args:
         uncount: Called with a peer's number when its missed messages are no longer counted.
         forget: Called with a peer's number when it is forgotten.
+        gate: Whether the mesh is secured.
     """
 
-    def __init__(self, uncount: Callable[[int], None], forget: Callable[[int], None]) -> None:
+    def __init__(
+        self, uncount: Callable[[int], None], forget: Callable[[int], None], gate: PermissionGate = OPEN_GATE
+    ) -> None:
+        self._gate = gate
         self._absent: OrderedDict[int, Absent] = OrderedDict()
         self._uncount = uncount
         self._forget = forget
@@ -63,9 +68,9 @@ class AbsentPeers:
     def number_of(self, identity: Identity) -> int | None:
         """The number of this very run of a peer, if ``back`` would return it; else ``None``."""
         for peer, absent in self._absent.items():
-            if absent.identity.instance == identity.instance:
+            if absent.identity.is_same_run(identity):
                 return peer
-            if absent.identity.guid.place == identity.guid.place or absent.identity.name == identity.name:
+            if absent.identity.is_same_module(identity, secured=self._gate.on):
                 return None
         return None
 
@@ -73,9 +78,9 @@ class AbsentPeers:
         """Remove and return the absent peer of a new link: the same run, or an earlier run of its module."""
         for peer, absent in list(self._absent.items()):
             was = absent.identity
-            if was.instance == identity.instance:
+            if was.is_same_run(identity):
                 return self._absent.pop(peer)
-            if was.guid.place == identity.guid.place or was.name == identity.name:
+            if was.is_same_module(identity, secured=self._gate.on):
                 for past in absent.pasts.values():
                     past.forget_position(missed=past.missed)
                 return self._absent.pop(peer)

@@ -11,11 +11,14 @@ from typing import TYPE_CHECKING, Any
 from rmpa.bridge import limits
 from rmpa.bridge.params import transfer
 from rmpa.bridge.params.io.core import PEERS, ParamCore, read_text, write_text
-from rmpa.bridge.params.rules import key_problem, leaves
+from rmpa.bridge.params.rules import key_problem, leaves, replaced
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.config import limits as config_limits
 from rmpa.config.param_rules import overlap
+from rmpa.config.permission_rules import Access
 from rmpa.core.errors import LocalProtocolError, RmpaError
 from rmpa.runtime.event_loop import yield_to_data, yielding_to_data
+from rmpa.trust.permissions import refusal
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -36,11 +39,18 @@ class ParamOwner:
         policy: What peers may do.
         rpc: Carries the peers' requests, and notifications to them.
         followed_max: How many parameters one peer may follow.
+        gate: Decides which parameters each peer may read and set.
     """
 
     def __init__(
-        self, core: ParamCore, policy: ParamPolicy, rpc: PeerRpc, followed_max: int = config_limits.FOLLOWED_MAX
+        self,
+        core: ParamCore,
+        policy: ParamPolicy,
+        rpc: PeerRpc,
+        followed_max: int = config_limits.FOLLOWED_MAX,
+        gate: PermissionGate = OPEN_GATE,
     ) -> None:
+        self._gate = gate
         self._core = core
         self.followed_max = followed_max
         self.policy = policy
@@ -101,10 +111,10 @@ class ParamOwner:
     def judge_again(self) -> None:
         """Notify the peers of parameters that the new rules no longer let them follow."""
         for session, keys in self._followers.values():
-            for key in [key for key in keys if self.policy.why_not_follow(key)]:
-                keys.discard(key)
-                args = {"key": key, "exists": False, "size": 0, "refused": self.policy.why_not_follow(key)}
-                self._rpc.notify(session, transfer.VALUE, args)
+            for key in list(keys):
+                if why := self.policy.why_not_follow(key) or self._why_denied(session, key):
+                    keys.discard(key)
+                    self._rpc.notify(session, transfer.VALUE, _refusal(key, why))
         self._forget_unfollowed()
 
     async def close(self) -> None:
@@ -123,21 +133,31 @@ class ParamOwner:
     async def _get(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         key = self._key(args.get("key"))
         found, value = await self._core.get(key)
-        self._refuse(self._why_not_get(key, value))
+        # The permissions come first: the error of ``[params]`` may name a parameter that they hide.
+        self._refuse(self._why_denied(session, key, value) or self._why_not_get(key, value))
         if not found:
             raise RmpaError(f"there is no parameter {key}")
         return self._of(session).answer(await write_text(key, value), self._now())
 
     async def _names(self, session: PeerSession, _args: dict[str, Any]) -> dict[str, object]:
-        names = [name for name in yielding_to_data(await self._core.names()) if not self.policy.why_not_get(name)]
+        peer = session.link.name
+        names = [
+            name
+            for name in yielding_to_data(await self._core.names())
+            if not self.policy.why_not_get(name) and self._gate.judge(Access.PARAM, peer, name).allowed
+        ]
         return self._of(session).answer(await write_text("the list of parameters", names), self._now())
 
     async def _set(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         key = self._key(args.get("key"))
         value = await read_text(self._of(session).written(args, self._now()))
-        parameters = list(yielding_to_data(leaves(key, value)))
-        for name, _ in yielding_to_data(parameters):
-            self._refuse(key_problem(name) or self.policy.why_not_set(name.rstrip("/") or "/"))
+        parameters: list[tuple[str, XmlRpcValue]] = []
+        for given, one in yielding_to_data(leaves(key, value)):
+            # A member may be named "" or "a/": the core drops the slash at the end, so the name is judged without it.
+            name = given.rstrip("/") or "/"
+            self._refuse(key_problem(given) or self.policy.why_not_set(name) or self._why_denied(session, name))
+            parameters.append((name, one))
+        await self._keep_others(session, key, [name for name, _ in parameters])
         for number, (name, one) in enumerate(parameters):
             await self._core.set(name, one, PEERS)
             yield_to_data()
@@ -149,6 +169,10 @@ class ParamOwner:
     async def _delete(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         key = self._key(args.get("key"))
         self._refuse(self.policy.why_not_set(key))
+        if self._gate.on:
+            # All of a namespace, and the namespace itself: a rule may name either.
+            _, value = await self._core.get(key)
+            self._refuse(self._why_denied(session, key) or self._why_denied(session, key, value))
         if not await self._core.delete(key, PEERS):
             raise RmpaError(f"there is no parameter {key}")
         _log.info("< %s deletes parameter %s", session.link.name, key)
@@ -164,7 +188,7 @@ class ParamOwner:
         for given in keys:
             problem = key_problem(given)
             key = str(given).rstrip("/") or "/"
-            why = problem or self.policy.why_not_follow(key)
+            why = problem or self.policy.why_not_follow(key) or self._why_denied(session, key)
             if not why and key not in wanted and len(wanted) >= self.followed_max:
                 text = f"more parameters than limits.params = {self.followed_max} over there"
                 why = f"{text}; raise it, or follow a namespace"
@@ -188,6 +212,32 @@ class ParamOwner:
         return next(
             (why for name, _ in yielding_to_data(leaves(key, value)) if (why := self.policy.why_not_get(name))), ""
         )
+
+    def _why_denied(self, session: PeerSession, key: str, value: XmlRpcValue = None) -> str:
+        """Why the permissions do not let a peer have a parameter, or all of a namespace; empty if they do."""
+        if not self._gate.on:
+            return ""
+        names = [name for name, _ in leaves(key, value)] if isinstance(value, dict) and value else [key]
+        for name in yielding_to_data(names):
+            decision = self._gate.judge(Access.PARAM, session.link.name, name)
+            if not decision.allowed:
+                self._gate.refused(Access.PARAM, session.link.name, name, decision)
+                return refusal(Access.PARAM, session.link.name, key)  # not the name: it may be a secret
+        return ""
+
+    async def _keep_others(self, session: PeerSession, key: str, names: list[str]) -> None:
+        """Refuse to set parameters where others would be lost by it that the peer may not set.
+
+        Raises:
+            RmpaError: It may not.
+        """
+        if not self._gate.on:
+            return
+        around = "/".join(key.split("/")[:2])
+        _, present = await self._core.get(around)
+        for name in yielding_to_data(list(replaced(names, around, present))):
+            if self._why_denied(session, name):
+                raise RmpaError(refusal(Access.PARAM, session.link.name, key))
 
     def _key(self, given: object) -> str:
         self._refuse(key_problem(given))
@@ -219,6 +269,7 @@ class ParamOwner:
 
     async def _tell_one(self, key: str) -> None:
         args: dict[str, object] = {"key": key, "exists": False, "size": 0}
+        value: XmlRpcValue = None
         try:
             found, value = await self._core.get(key)
             why = self._why_not_get(key, value) if found and isinstance(value, dict) else ""
@@ -239,7 +290,8 @@ class ParamOwner:
             self._last[key] = text if text is None or len(text) <= limits.PARAM_SMALL else ""
         for session, keys in list(self._followers.values()):
             if key in keys:
-                self._rpc.notify(session, transfer.VALUE, args)
+                why = self._why_denied(session, key, value)
+                self._rpc.notify(session, transfer.VALUE, _refusal(key, why) if why else args)
 
     async def _small_text(self, key: str) -> str | None:
         text = await self._core.get_text(key)
@@ -256,3 +308,8 @@ class ParamOwner:
 
     def _now(self) -> float:
         return asyncio.get_running_loop().time()
+
+
+def _refusal(key: str, why: str) -> dict[str, object]:
+    """The notification that a peer may not follow a parameter."""
+    return {"key": key, "exists": False, "size": 0, "refused": why}

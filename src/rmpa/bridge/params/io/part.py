@@ -12,6 +12,7 @@ from rmpa.bridge.params.io.core import ParamCore
 from rmpa.bridge.params.io.follower import ParamFollower
 from rmpa.bridge.params.io.param_owner import ParamOwner
 from rmpa.bridge.params.rules import ParamPolicy, follow_rules
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.session.part import Part
 from rmpa.config import limits as config_limits
 from rmpa.core.errors import RmpaError, UnreachableError
@@ -43,6 +44,7 @@ class Params(Part):
         params: What peers may do, and what is followed.
         time: Whether time is shared, and which peer's is followed.
         followed_max: How many parameters one peer may follow here.
+        gate: Decides what each peer may do.
     """
 
     def __init__(
@@ -55,9 +57,10 @@ class Params(Part):
         params: ParamSettings,
         time: TimeSettings,
         followed_max: int = config_limits.FOLLOWED_MAX,
+        gate: PermissionGate = OPEN_GATE,
     ) -> None:
         self._core = ParamCore(core, node)
-        self._server = ParamOwner(self._core, ParamPolicy(params, time), rpc, followed_max)
+        self._server = ParamOwner(self._core, ParamPolicy(params, time), rpc, followed_max, gate)
         self._follower = ParamFollower(self._core, rpc, linked, follow_rules(params, time), counters)
         self._looking: asyncio.Task[None] | None = None
         self._run: XmlRpcValue = None

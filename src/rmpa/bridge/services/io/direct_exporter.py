@@ -6,11 +6,12 @@ import logging
 from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge.direct import service_requests as requests
-from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, reply_of
+from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, reply_of, unmet_by_trust
 from rmpa.bridge.direct.io.endpoints import LocalEndpoints
 from rmpa.bridge.direct.io.nodes import end_from
 from rmpa.bridge.direct.server_side import ReofferService, ServiceGrants, WithdrawService
 from rmpa.bridge.direct.service_requests import RetryService, ServiceDirectClosed
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.core.contract import Transport
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ class DirectServiceExporter:
         rpc: Carries the requests.
         on_warning: ``(kind, subject, text)``: logs and counts a warning.
         counters: Count ``direct.service_granted``, ``direct.service_withdrawn`` and ``direct.service_ended``.
+        gate: Whether the mesh is secured.
     """
 
     def __init__(
@@ -51,7 +53,9 @@ class DirectServiceExporter:
         *,
         on_warning: Callable[[str, str, str], None],
         counters: Counters,
+        gate: PermissionGate = OPEN_GATE,
     ) -> None:
+        self._gate = gate
         self._exports = exports
         self._rules = rules
         self._endpoints = LocalEndpoints(core)
@@ -67,7 +71,13 @@ class DirectServiceExporter:
     def reload(self, rules: ServiceRules) -> None:
         """Take new rules, and withdraw the grants that they do not allow."""
         self._rules = rules
-        self._act(self.grants.judge_again(self._unmet))
+        before = {(peer, told.port) for _, peer, told in self.grants if told.port is not None}
+        self._act(self.grants.judge_again(self._unmet, secured=self._gate.on))
+        if self._gate.on:
+            for peer, port in before - {(peer, told.port) for _, peer, told in self.grants}:
+                session = self._sessions.get(peer)
+                if session is not None and not session.same_machine:
+                    self._end(session, port)
 
     def server(self, service: str, server: LocalService | None) -> None:
         """Compare the grants for a service with its present server."""
@@ -80,10 +90,13 @@ class DirectServiceExporter:
         if crashed or session.same_machine:
             return  # over loopback there is nothing that could hang, and local clients have the same address
         for port in ports:
-            self._counters.add("direct.service_ended")
-            if problem := end_from(port, session.address):
-                text = "! %s: replies of local servers to it may hang: they cannot be ended (%s)"
-                _log.info(text, session.link.name, problem)
+            self._end(session, port)
+
+    def _end(self, session: PeerSession, port: int) -> None:
+        self._counters.add("direct.service_ended")
+        if problem := end_from(port, session.address):
+            text = "! %s: replies of local servers to it may hang: they cannot be ended (%s)"
+            _log.info(text, session.link.name, problem)
 
     # --- requests ------------------------------------------------------------------------------------------------
 
@@ -91,7 +104,9 @@ class DirectServiceExporter:
         asked = requests.read_ask(args)
         found = self._find(session, asked.service, asked.node)
         server = self._exports.offered.get(asked.service)
-        if server is not None:
+        # A peer is not told of a service that it may not have. Of one that it may have, the advertisement tells it.
+        hidden = self._gate.on and self._exports.local(session.peer, asked.service) is None
+        if server is not None and not hidden:
             self.grants.answered(session.peer, asked.service, asked.node, server.uri, found)
         if isinstance(found, Grant):
             self._counters.add("direct.service_granted")
@@ -126,7 +141,9 @@ class DirectServiceExporter:
             return Unmet(Condition.OWN_SOURCE, "it comes by a relay")
         if self._rules.transport(service) is Transport.RELAY:
             return Unmet(Condition.TRANSPORT, 'transport is "relay" in the server\'s module')
-        return None
+        session = self._sessions.get(peer)
+        same_machine = session is not None and session.same_machine
+        return unmet_by_trust(self._gate, "the server's module", same_machine=same_machine)
 
     # --- carrying out --------------------------------------------------------------------------------------------
 

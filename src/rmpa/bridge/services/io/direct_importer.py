@@ -20,9 +20,10 @@ from rmpa.bridge.direct.client_side import (
     ServiceFallback,
     ServiceKey,
 )
-from rmpa.bridge.direct.conditions import NO_LINK, Condition, Grant, Unmet, read_reply, read_unmet
+from rmpa.bridge.direct.conditions import NO_LINK, Condition, Grant, Unmet, read_reply, read_unmet, unmet_by_trust
 from rmpa.bridge.direct.io.nodes import connecting, end_these, end_to
 from rmpa.bridge.direct.service_requests import AskService, ReleaseService
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.policy import OWN_NODE, is_own
 from rmpa.bridge.session.peer_rpc import UNKNOWN_QUESTION
 from rmpa.core.contract import Transport
@@ -36,7 +37,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable
 
     from rmpa.bridge.direct.client_side import ServiceAction
-    from rmpa.bridge.services.imports import RemoteService, ServiceImports
+    from rmpa.bridge.services.imports import ServiceImports
+    from rmpa.bridge.services.remote_service import RemoteService
     from rmpa.bridge.services.rules import ServiceRules
     from rmpa.bridge.session.peer_rpc import PeerRpc
     from rmpa.bridge.session.peer_session import PeerSession
@@ -85,6 +87,7 @@ class DirectServiceImporter:
         on_lost: ``(peer, service, problem)``: removes a service whose agent has crashed and whose server is gone.
         on_warning: ``(kind, subject, text)``: logs and counts a warning.
         counters: Count ``direct.service_stopped``, ``direct.service_unreachable`` and ``direct.lookup_relayed``.
+        gate: Whether the mesh is secured.
     """
 
     def __init__(
@@ -99,7 +102,9 @@ class DirectServiceImporter:
         on_lost: Callable[[int, str, str], None],
         on_warning: Callable[[str, str, str], None],
         counters: Counters,
+        gate: PermissionGate = OPEN_GATE,
     ) -> None:
+        self._gate = gate
         self._imports = imports
         self._rules = rules
         self._sessions = sessions
@@ -177,7 +182,7 @@ class DirectServiceImporter:
         known = self.services.get(key)
         if known is not None:
             return known.unmet
-        return self._unmet_here(service, remote) if remote is not None else None
+        return self._unmet_here(peer, service, remote) if remote is not None else None
 
     # --- the local graph -----------------------------------------------------------------------------------------
 
@@ -194,22 +199,31 @@ class DirectServiceImporter:
         if wanted is Transport.RELAY:
             self._act(self.services.remove(key))  # nothing is kept of services that are relayed by rule
             return
-        unmet = self._unmet_here(service, remote)
+        unmet = self._unmet_here(peer, service, remote)
         if unmet is None and not session.linked:
             self.services.wait(key, remote.node, wanted)
             return
         self._act(self.services.consider(key, remote.node, wanted, unmet, self._now()))
 
-    def hidden(self, peer: int, service: str) -> None:
-        """Forget a service that leaves the local graph; clients keep the connections that they have."""
+    def hidden(self, peer: int, service: str, *, end: bool = False) -> None:
+        """Forget a service that leaves the local graph; clients keep the connections that they have.
+
+        Args:
+            peer: The peer.
+            service: The service.
+            end: End these connections, too: the peer may not serve it here any more.
+        """
+        found = self.answer(peer, service)
         self._stop(ServiceKey(peer, service))
         self._act(self.services.remove(ServiceKey(peer, service)))
+        if end and found is not None:
+            self._end(self._imports.peer_name(peer), (found.endpoint,), same_machine=found.nearby)
 
     def renewed(self, peer: int, service: str) -> None:
         """Ask again for a service that was offered again."""
         self._act(self.services.renewed(ServiceKey(peer, service)))
 
-    def _unmet_here(self, service: str, remote: RemoteService) -> Unmet | None:
+    def _unmet_here(self, peer: int, service: str, remote: RemoteService) -> Unmet | None:
         if self._rules.transport(service) is Transport.RELAY:
             return Unmet(Condition.TRANSPORT, 'transport is "relay" in this module')
         if not self._able:
@@ -221,7 +235,9 @@ class DirectServiceImporter:
             return Unmet(Condition.OWN_SOURCE, f"it is {remote.origin.name}'s, and comes by a relay")
         if remote.wire != service:
             return Unmet(Condition.NAME, f"it is {remote.wire} in the server's module")
-        return None
+        session = self._sessions.get(peer)
+        same_machine = session is not None and session.same_machine
+        return unmet_by_trust(self._gate, "this module", same_machine=same_machine)
 
     # --- links ---------------------------------------------------------------------------------------------------
 

@@ -25,6 +25,7 @@ from rmpa.bridge.messages import (
     Source,
 )
 from rmpa.bridge.naming import Names
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.policy import Policy, is_own
 from rmpa.bridge.services.exports import ExportAction, LocalService, ServiceAbout, ServiceExports
 from rmpa.bridge.services.imports import (
@@ -34,13 +35,13 @@ from rmpa.bridge.services.imports import (
     OpenedService,
     Provide,
     ServiceImports,
-    ServiceRouteState,
     Withdraw,
 )
 from rmpa.bridge.services.io.calls import Budgets, Caller, CallStats
 from rmpa.bridge.services.io.direct_exporter import DirectServiceExporter
 from rmpa.bridge.services.io.direct_importer import DirectServiceImporter
 from rmpa.bridge.services.io.serving import Serving
+from rmpa.bridge.services.remote_service import ServiceRouteState
 from rmpa.bridge.services.rules import ServiceRules
 from rmpa.bridge.session.graph_driver import GraphDriver
 from rmpa.bridge.session.part import Part
@@ -112,6 +113,7 @@ class Services(Part):
         rules: What may cross, under which names, and for how long.
         limit_settings: How much is taken of one peer, and how much is offered.
         counters: Counts what happens, by name.
+        gate: Decides what each peer may do.
     """
 
     advertisement = "services"
@@ -125,6 +127,7 @@ class Services(Part):
         rules: ServiceRules,
         limit_settings: LimitSettings,
         counters: Counters,
+        gate: PermissionGate = OPEN_GATE,
     ) -> None:
         self._limit_settings = limit_settings
         self._core = core
@@ -133,9 +136,9 @@ class Services(Part):
         self._relay = relay
         self.rules = rules
         """What may cross; read by snapshots too."""
-        self.exports = ServiceExports(rules, self._limit_settings)
+        self.exports = ServiceExports(rules, self._limit_settings, gate)
         """The outbound plan; read by snapshots too."""
-        self.imports = ServiceImports(rules, self._limit_settings)
+        self.imports = ServiceImports(rules, self._limit_settings, gate)
         """The inbound plan; read by snapshots too."""
         self._budgets: dict[int, Budgets] = {}
         self._shown: dict[tuple[int, str], ShownService] = {}
@@ -153,7 +156,7 @@ class Services(Part):
         self._act = self._driver.act
         self._serving = Serving(core, self.exports, sessions, self._budgets, self._act)
         self.direct_exports = DirectServiceExporter(
-            core, self.exports, rules, sessions, rpc, on_warning=self._driver.warn, counters=counters
+            core, self.exports, rules, sessions, rpc, on_warning=self._driver.warn, counters=counters, gate=gate
         )
         """Direct calls of peers' nodes to local servers."""
         self.direct_imports = DirectServiceImporter(
@@ -166,6 +169,7 @@ class Services(Part):
             on_lost=lambda peer, service, problem: self._act(self.imports.lost(peer, service, problem)),
             on_warning=self._driver.warn,
             counters=counters,
+            gate=gate,
         )
         """Direct calls of local nodes to peers' servers."""
         rpc.on_notification(_MISMATCH, self._told_of_mismatch)
@@ -429,7 +433,8 @@ class Services(Part):
         shown = self._shown.pop((action.peer, action.service), None)
         if shown is None:
             return
-        self.direct_imports.hidden(action.peer, action.service)
+        remote = self.imports.get(action.peer, action.service)
+        self.direct_imports.hidden(action.peer, action.service, end=remote is not None and remote.denied)
         proxy = shown.proxy
         text = f"service [{shown.service}] of {shown.peer_name}: {action.reason}"
         self._fail_waiting(shown, text)

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct import requests
-from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, reply_of, unmet_by_contract
+from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, reply_of, unmet_by_contract, unmet_by_trust
 from rmpa.bridge.direct.io.nodes import end_from
 from rmpa.bridge.direct.publisher_side import DirectGrants, EndConnections, Granted, Retry, WithdrawGrant
 from rmpa.bridge.direct.requests import DirectClosed, RetryDirect
 from rmpa.bridge.messages import Source
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.policy import is_own
 from rmpa.bridge.topics.audience import compares_names
 from rmpa.core.contract import combine
@@ -45,6 +46,7 @@ class DirectExporter:
         sessions: The peers.
         rpc: Carries the requests.
         counters: Count ``direct.granted``, ``direct.withdrawn``, ``direct.ended``.
+        gate: Whether the mesh is secured.
     """
 
     def __init__(
@@ -56,7 +58,9 @@ class DirectExporter:
         sessions: PeerSessions,
         rpc: PeerRpc,
         counters: Counters,
+        gate: PermissionGate = OPEN_GATE,
     ) -> None:
+        self._gate = gate
         self._core = core
         self._exports = exports
         self._contracts = contracts
@@ -74,7 +78,7 @@ class DirectExporter:
         """Take new contracts, and withdraw the grants that they do not allow."""
         self._contracts = contracts
         self._act(self.grants.retry_all())
-        self._act(self.grants.judge_again(self._unmet_by_rules))
+        self._act(self.grants.judge_again(self._unmet_by_rules, secured=self._gate.on))
 
     def graph_changed(self, change: GraphChange) -> None:
         """Compare the grants with a registration that came or went; the exports have not looked at it yet."""
@@ -93,7 +97,7 @@ class DirectExporter:
 
     def policy_changed(self) -> None:
         """Withdraw the grants for sources that are not offered any more to their peers."""
-        self._act(self.grants.judge_again(self._unmet_by_rules))
+        self._act(self.grants.judge_again(self._unmet_by_rules, secured=self._gate.on))
 
     def link_up(self, session: PeerSession) -> None:
         """Let the peer ask again for what it uses; the other grants from before its link end a little later."""
@@ -159,7 +163,9 @@ class DirectExporter:
         return found
 
     def _refused(self, session: PeerSession, asked: requests.OpenDirect, unmet: Unmet) -> Unmet:
-        self._act(self.grants.refused(session.peer, asked.source, asked.subscriber))
+        # A peer is not told of a topic that it may not have. Of one that it may have, the advertisement tells it.
+        hidden = self._gate.on and self._exports.local(session.peer, asked.source) is None
+        self._act(self.grants.refused(session.peer, asked.source, asked.subscriber, hidden=hidden))
         return unmet
 
     def _uri(self, source: Source) -> str:
@@ -187,9 +193,14 @@ class DirectExporter:
             return Unmet(Condition.OWN_SOURCE, "it comes by a relay")
         if compares_names(offered.type):
             return Unmet(Condition.ACTION, f"actions compare the names of the nodes at {offered.type}")
-        return unmet_by_contract(
-            combine(self._contracts.of(source.topic, offered.type), granted.asked), "the publisher's module"
-        )
+        where = "the publisher's module"
+        contract = combine(self._contracts.of(source.topic, offered.type), granted.asked)
+        return unmet_by_contract(contract, where) or self._unmet_by_trust(peer, where)
+
+    def _unmet_by_trust(self, peer: int, where: str) -> Unmet | None:
+        session = self._sessions.get(peer)
+        same_machine = session is not None and session.same_machine
+        return unmet_by_trust(self._gate, where, same_machine=same_machine)
 
     def _close(self, session: PeerSession, args: dict[str, Any]) -> None:
         closed = requests.read_close(args)
@@ -206,6 +217,8 @@ class DirectExporter:
             if session is None:
                 continue
             match action:
+                case EndConnections() if session.same_machine:
+                    pass  # all nodes of this machine have one address
                 case EndConnections():
                     self._counters.add("direct.ended")
                     if problem := end_from(action.port, session.address):

@@ -9,11 +9,21 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct import requests
-from rmpa.bridge.direct.conditions import NO_LINK, Condition, Grant, Unmet, read_reply, read_unmet, unmet_by_contract
+from rmpa.bridge.direct.conditions import (
+    NO_LINK,
+    Condition,
+    Grant,
+    Unmet,
+    read_reply,
+    read_unmet,
+    unmet_by_contract,
+    unmet_by_trust,
+)
 from rmpa.bridge.direct.direct_route import Ask, Decided, DirectKey, Fallback, HangUp, Move, Path, ProbeNode, Release
 from rmpa.bridge.direct.io.nodes import direct_links, end_links, kernel_tells, report_failure, standing, standing_at
 from rmpa.bridge.direct.requests import CloseDirect, OpenDirect
 from rmpa.bridge.direct.subscriber_side import DirectSubscriptions
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.policy import is_own
 from rmpa.bridge.session.peer_rpc import UNKNOWN_QUESTION
 from rmpa.bridge.topics.audience import compares_names
@@ -63,6 +73,7 @@ class DirectImporter:
         on_demand: ``(peer, source, wanted)``: opens the relayed route of a source, or lets it close.
         on_warning: ``(kind, subject, text)``: logs and counts a warning.
         counters: Count ``direct.moved`` and others.
+        gate: Whether the mesh is secured.
     """
 
     def __init__(
@@ -77,7 +88,9 @@ class DirectImporter:
         on_demand: Callable[[int, Source, bool], None],
         on_warning: Callable[[str, str, str], None],
         counters: Counters,
+        gate: PermissionGate = OPEN_GATE,
     ) -> None:
+        self._gate = gate
         self._core = core
         self._imports = imports
         self._topics = topics
@@ -177,6 +190,7 @@ class DirectImporter:
 
     def _unmet(self, session: PeerSession, source: Source, entry: RemoteTopic, node: str, uri: str) -> Unmet | None:
         unmet = unmet_by_contract(self._contracts.of(entry.topic, entry.type), "this module")
+        unmet = unmet or unmet_by_trust(self._gate, "this module", same_machine=session.same_machine)
         if unmet is not None:
             return unmet
         if entry.origin is not None:

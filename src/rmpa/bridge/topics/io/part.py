@@ -26,6 +26,7 @@ from rmpa.bridge.messages import (
     Source,
 )
 from rmpa.bridge.naming import Names
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.policy import Policy, is_own
 from rmpa.bridge.relay import LinkedPeer
 from rmpa.bridge.session.graph_driver import GraphDriver
@@ -84,6 +85,7 @@ class Topics(Part):
         limit_settings: Bounds what is taken from one peer, and what is offered.
         rng: Uniform numbers in [0, 1) for back-off jitter.
         counters: Counts what happens, by name.
+        gate: Decides what each peer may do.
     """
 
     advertisement = "advertise"
@@ -102,6 +104,7 @@ class Topics(Part):
         limit_settings: LimitSettings,
         rng: Callable[[], float],
         counters: Counters,
+        gate: PermissionGate = OPEN_GATE,
     ) -> None:
         self._core = core
         self._sessions = sessions
@@ -110,7 +113,7 @@ class Topics(Part):
         self.names = names
         """Translates names between this module and its peers; replaced by ``reload``."""
         self._peers: dict[int, PeerTopics] = {}
-        self.imports = Imports(policy, rng, contracts, self._position, names, limit_settings)
+        self.imports = Imports(policy, rng, contracts, self._position, names, limit_settings, gate)
         """The inbound plan."""
         self.outbound = LocalSubscriptions(
             core,
@@ -126,7 +129,7 @@ class Topics(Part):
             ),
         )
         """The subscriptions to local publishers, and the routes to the peers."""
-        self.exports = Exports(policy, contracts, names, limit_settings, self.outbound)
+        self.exports = Exports(policy, contracts, names, limit_settings, self.outbound, gate)
         """The outbound plan."""
         refusals = RefusalLog(_log, counters)
         self._driver: GraphDriver[act.Action, Advertise] = GraphDriver(
@@ -144,15 +147,15 @@ class Topics(Part):
             on_idle=self._settled,
         )
         self._act = self._driver.act
-        self._absent = AbsentPeers(lambda peer: self._act(self.exports.unclaimed(peer)), self.outbound.forget)
+        self._absent = AbsentPeers(lambda peer: self._act(self.exports.unclaimed(peer)), self.outbound.forget, gate)
         self._claims = ClaimDeadlines()
         self._claims_timer = MachineTimer(self._claims.next_timer, self._claims_over)
         self._mismatches = Mismatches()
         self.losses = LossReports(self.exports, sessions, self._peers, self._absent, rpc, counters, refusals)
         """Reports messages that do not reach their listeners."""
-        self._subscribers = RemoteSubscribers(self.exports, self.imports, sessions, self._peers, refusals)
+        self._subscribers = RemoteSubscribers(self.exports, self.imports, sessions, self._peers, refusals, gate)
         self.direct_exports = DirectExporter(
-            core, self.exports, contracts, LocalEndpoints(core), sessions, rpc, counters
+            core, self.exports, contracts, LocalEndpoints(core), sessions, rpc, counters, gate
         )
         """Direct connections of peers' nodes to local publishers."""
         self.direct_imports = DirectImporter(
@@ -165,6 +168,7 @@ class Topics(Part):
             on_demand=lambda peer, source, wanted: self._demand(peer, source, wanted=wanted),
             on_warning=self._driver.warn,
             counters=counters,
+            gate=gate,
         )
         """Direct connections of local nodes to peers' publishers."""
         self._local = LocalSources(core, relay, lambda source: self.exports.description(source) is not None)
@@ -239,7 +243,7 @@ class Topics(Part):
         peer, identity = session.peer, session.link.identity
         absent = self._absent.back(identity)
         if absent is not None:
-            again = absent.identity.instance == identity.instance
+            again = absent.identity.is_same_run(identity)
             if not again:
                 self.exports.inherit(absent.peer, peer)
                 self.outbound.inherit(absent.peer, peer)

@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
 from rmpa.bridge.messages import Audience, encode
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.proxy_names import proxied_node, proxy_name
 from rmpa.bridge.topics.audience import audience, is_watched
 from rmpa.bridge.topics.remote_topic import RouteState
+from rmpa.config.permission_rules import Access
 from rmpa.ros.node.subscription import PublisherConnection
 
 if TYPE_CHECKING:
@@ -56,6 +58,7 @@ class RemoteSubscribers:
         sessions: The peers.
         topics: The peers' topics in the local graph, by the numbers of their sessions.
         refusals: Logs and counts ``audience.too_many``.
+        gate: Decides which modules behind a relay may listen.
     """
 
     def __init__(
@@ -65,7 +68,9 @@ class RemoteSubscribers:
         sessions: PeerSessions,
         topics: Mapping[int, PeerTopics],
         refusals: RefusalLog,
+        gate: PermissionGate = OPEN_GATE,
     ) -> None:
+        self._gate = gate
         self._exports = exports
         self._imports = imports
         self._sessions = sessions
@@ -121,7 +126,7 @@ class RemoteSubscribers:
             return True
         if self._exports.description(source) is None:
             return True  # its publisher is not connected
-        names = {name for node in message.nodes if (name := self._name(session, node))}
+        names = {name for node in message.nodes if (name := self._name(session, node, source.topic))}
         shown = self._shown.setdefault((session.peer, source), {})
         for name in shown.keys() - names:
             shown.pop(name).close()
@@ -136,13 +141,15 @@ class RemoteSubscribers:
             del self._shown[session.peer, source]
         return True
 
-    def _name(self, session: PeerSession, node: str) -> str:
-        """The local name of a peer's listener; empty for a proxy of a module that the peer does not relay."""
+    def _name(self, session: PeerSession, node: str, topic: str) -> str:
+        """The local name of a peer's listener; empty for a proxy of a module that the peer may not speak for."""
         whose = proxied_node(node)
         if whose is None:
             return proxy_name(session.proxies.prefix, node)
         relay = session.link.name
-        return node if any((o.name, via) == (whose[0], relay) for o, via in self._imports.ways) else ""
+        if not any((o.name, via) == (whose[0], relay) for o, via in self._imports.ways):
+            return ""
+        return node if self._gate.admits(Access.SUBSCRIBE, whose[0], topic, relay=relay) else ""
 
     def _count(self, peer: int) -> int:
         return sum(len(shown) for (owner, _), shown in self._shown.items() if owner == peer)

@@ -18,7 +18,9 @@ from rmpa.discovery.io.interfaces import choose, list_interfaces
 from rmpa.observe import limits
 from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.observe.doctor.agents import judge_agents
+from rmpa.observe.doctor.exposed_nodes import judge_exposed_nodes
 from rmpa.observe.doctor.io import machine, network
+from rmpa.observe.doctor.io.exposed_nodes import exposed_nodes
 from rmpa.observe.doctor.io.firewall import check_firewall
 from rmpa.observe.doctor.io.multicast import hear_ourselves
 from rmpa.observe.doctor.io.programs import resolve
@@ -36,7 +38,9 @@ from rmpa.observe.doctor.stale_connections import judge_stale_connections
 from rmpa.observe.io.control_client import ControlClient, find_agents
 from rmpa.observe.snapshot import Snapshot
 from rmpa.ros.environment import DEFAULT_MASTER_URI, host_of
+from rmpa.runtime.state_dir import state_dir
 from rmpa.runtime.tcp_connections import may_end_connections
+from rmpa.trust.io.store import TrustStore
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -201,6 +205,16 @@ def _stale_connections(given: DoctorInput) -> Iterable[Check]:
     return judge_stale_connections(told, may_end_connections(), direct=given.settings.allows_direct)
 
 
+def _exposed_nodes(given: DoctorInput) -> Iterable[Check]:
+    state = state_dir(given.environ, given.settings.state_dir or None)
+    for name, shown in given.snapshots.items():
+        trusted = state is not None and TrustStore(state, name).exists
+        found = exposed_nodes(shown.agent.core_uri, shown.agent.pid) if trusted else None
+        yield judge_exposed_nodes(name, found, trusted=trusted, direct=given.settings.allows_direct)
+    if not given.snapshots:
+        yield Check("exposed nodes", SKIPPED, "no agent runs")
+
+
 CHECKS: Final = (
     DoctorCheck("settings", lambda given: given.settings_checks),
     DoctorCheck("agent", lambda given: judge_agents(given.agents, rmpa.__version__)),
@@ -215,5 +229,6 @@ CHECKS: Final = (
     DoctorCheck("clock", lambda _: judge_clock(machine.read_clock())),
     DoctorCheck("realtime", _rights),
     DoctorCheck("stale connections", _stale_connections),
+    DoctorCheck("exposed nodes", _exposed_nodes),
 )
 """All checks, in the order of the output."""

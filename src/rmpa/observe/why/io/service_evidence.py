@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import OWN_NODE, Policy, is_own
 from rmpa.bridge.services.rules import ServiceRules
+from rmpa.config.permission_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import RmpaError
 from rmpa.observe import limits as observe_limits
@@ -80,7 +81,9 @@ class ServiceEvidence:
             return ServiceAtClient(wire=wire)
         shown = self._services.shown(session.peer, service)
         if shown is None or shown.proxy is None:
-            return ServiceAtClient(wire=wire, offered=True, node=remote.node, hidden=remote.hidden)
+            return ServiceAtClient(
+                wire=wire, offered=True, node=remote.node, hidden=remote.hidden, denied=remote.denied
+            )
         uri = self._core.state().services.get(service, {}).get(shown.proxy.name, "")
         answer, refusal = await _probe(uri, service) if uri else ("", "")
         return ServiceAtClient(
@@ -120,8 +123,12 @@ class ServiceEvidence:
         """
         wire = name_in(args, "service")
         peer = session.link.name
-        seen = self._services.exports.seen
-        for service in self._bridge.topics.names.of(peer).locals_of(wire):
+        seen, gate = self._services.exports.seen, self._bridge.gate
+        services = self._bridge.topics.names.of(peer).locals_of(wire)
+        services = tuple(service for service in services if gate.judge(Access.CALL, peer, service).allowed)
+        if not services:
+            return ServiceAtServer(permitted=False)
+        for service in services:
             server = seen.get(service)
             if server is None:
                 for node in self._core.state().services.get(service, {}):
@@ -140,8 +147,13 @@ class ServiceEvidence:
                 crosses=decision.allowed,
                 rule=decision.rule,
                 refusal=refusal,
+                permitted=True if gate.on else None,
             )
-        known = {self._rules.wire_name(peer, service) for service in yielding_to_data(list(seen))}
+        known = {
+            self._rules.wire_name(peer, service)
+            for service in yielding_to_data(list(seen))
+            if gate.judge(Access.CALL, peer, service).allowed
+        }
         # In a thread: comparing thousands of names takes longer than a message may wait.
         similar = await asyncio.to_thread(did_you_mean, wire, known)
         return ServiceAtServer(similar=similar or "")

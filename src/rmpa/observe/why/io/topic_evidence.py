@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import Policy, is_own
 from rmpa.config import limits as config_limits
+from rmpa.config.permission_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.contract import Reliability
 from rmpa.core.errors import RemoteProtocolError
@@ -26,6 +27,7 @@ from rmpa.runtime.event_loop import yielding_to_data
 if TYPE_CHECKING:
     from rmpa.bridge.io.bridge import Bridge
     from rmpa.bridge.session.peer_session import PeerSession
+    from rmpa.bridge.topics.remote_topic import RemoteTopic
     from rmpa.config.settings import Settings
     from rmpa.observe.io.snapshot_builder import SnapshotBuilder
     from rmpa.observe.snapshot import PeerInfo
@@ -92,12 +94,22 @@ class TopicEvidence:
             name = session.proxies.name(node)
             proxies[node] = ProxyState(
                 name=name,
+                permission=self._permission(session.link.name, entry),
+                denied=entry.denied,
                 registered=node in standing and publishers.get(name) == standing[node].node.uri,
                 conflict=entry.conflict,
                 connections=self._connections(session, source),
                 mismatches=self._bridge.topics.mismatches(source),
             )
         return TopicAtSubscriber(snapshot, topic, session.link.name, proxies)
+
+    def _permission(self, peer: str, entry: RemoteTopic) -> str:
+        """The rule about who publishes a peer's topic; empty if trust is off."""
+        gate = self._bridge.gate
+        if not gate.on:
+            return ""
+        module, relay = (peer, "") if entry.origin is None else (entry.origin.name, peer)
+        return gate.judge(Access.PUBLISH, module, entry.topic, relay=relay).rule
 
     def _connections(self, session: PeerSession, source: Source) -> tuple[SubscriberConnection, ...]:
         publication = self._bridge.topics.of(session).publication(source)
@@ -129,8 +141,11 @@ class TopicEvidence:
         sources: list[PublisherReport] = []
         subscribers: list[str] = []
         awaited: list[str] = []
-        await self._snapshots.sampler.settle(names.locals_of(wire))
-        for topic in names.locals_of(wire):
+        topics = [topic for topic in names.locals_of(wire) if self._may_know(asker, topic)]
+        if not topics:
+            return TopicAtPublisher(permitted=False)
+        await self._snapshots.sampler.settle(topics)
+        for topic in topics:
             kind = self._core.type_of(topic)
             nodes = self._relayed(topic, instance) if instance else list(self.own(topic))
             if names.wire_name(topic, kind) == wire:
@@ -146,7 +161,12 @@ class TopicEvidence:
             subscribers=tuple(subscribers[: observe_limits.WHY_SOURCES_MAX]),
             similar="" if sources else await self._similar(session.link.name, wire),
             awaited=tuple(awaited[: observe_limits.WHY_SOURCES_MAX]),
+            permitted=True if self._bridge.gate.on else None,
         )
+
+    def _may_know(self, asker: str, topic: str) -> bool:
+        """Whether a peer may subscribe to a topic, and so be told of it."""
+        return self._bridge.gate.judge(Access.SUBSCRIBE, asker, topic).allowed
 
     async def _similar(self, asker: str, wire: str) -> str:
         """The topic of this module whose name on the wire is most like this one; empty if none is."""
@@ -154,7 +174,7 @@ class TopicEvidence:
         known = {
             names.wire_name(topic, state.types.get(topic, ""))
             for topic, nodes in yielding_to_data(list(state.publishers.items()))
-            if not all(map(is_own, nodes))
+            if not all(map(is_own, nodes)) and self._may_know(asker, topic)
         }
         # In a thread: comparing thousands of names takes longer than a message may wait.
         return await asyncio.to_thread(did_you_mean, wire, known) or ""

@@ -13,10 +13,13 @@ from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
 from rmpa.core.names import is_global_name
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, Check
-from rmpa.observe.why.diagnosis import BothEnds, Diagnosis, TopicAtPublisher
+from rmpa.observe.io.agent_requests import INFO as AGENT_INFO
+from rmpa.observe.peer_agent import PeerAgent
+from rmpa.observe.why.diagnosis import PERMISSION_THERE, BothEnds, Diagnosis, TopicAtPublisher, without_rules
 from rmpa.observe.why.direct_stages import connected_directly
 from rmpa.observe.why.io.service_evidence import ServiceEvidence
 from rmpa.observe.why.io.topic_evidence import TopicEvidence, name_in
+from rmpa.observe.why.modules import diagnose_module
 from rmpa.observe.why.services import ServiceAtServer, diagnose_service
 from rmpa.observe.why.topics import diagnose_topic, find_peer, peer_stages
 
@@ -36,6 +39,8 @@ SERVICE: Final = "why.service"
 """The request to a server's agent: what it knows of a service. Replied by ``ServiceAtServer``."""
 HERE: Final = "why.here"
 """The request to a subscriber's agent: how a topic of this module arrives there. Replied by ``Diagnosis``, a list."""
+_NO_PUBLISHER: Final = frozenset({"publisher", PERMISSION_THERE})
+"""The stages that fail where a peer has no publisher, or does not tell of one: the name may be something else's."""
 _MOVING: Final = frozenset({"open", "lingering", "opening"})
 
 
@@ -72,12 +77,15 @@ class WhyService:
 
         Args:
             args: ``name``: a topic or a service; ``peer``: one peer's name or GUID, or ``None`` for all peers that
-                have it or receive it; ``service``: whether a service is meant even where a topic has that name.
+                have it or receive it; ``service``: whether a service is meant even where a topic has that name. Or
+                ``module`` alone: a peer's name or GUID.
 
         Raises:
             ConfigError: The name is not a ROS name.
         """
         name, peer = args.get("name"), args.get("peer")
+        if isinstance(module := args.get("module"), str) and module:
+            return (await self._module(module),)
         if not isinstance(name, str) or not is_global_name(name):
             raise ConfigError("name", f"{name!r} is not a topic, nor a service", "write /name, or PEER:/name")
         wanted = str(peer) if peer is not None else None
@@ -85,12 +93,27 @@ class WhyService:
             return await self._service(name, wanted)
         found = await (self._everywhere(name) if wanted is None else self._one(wanted, name))
         failed = found[0].failed
-        if failed is not None and failed.name == "publisher":
+        if failed is not None and failed.name in _NO_PUBLISHER and not found[0].node:
             # No topic has this name anywhere; a service that does not cross may have it.
             service = await self._service(name, wanted)
             if any(diagnosis.node for diagnosis in service):
                 return service
+            # Whether there is a topic or a service of this name is not told to those who may not have it.
+            return (*found, *(diagnosis for diagnosis in service if _is_denied(diagnosis)))
         return found
+
+    async def _module(self, name: str) -> Diagnosis:
+        """A module itself: its link, and what its agent tells."""
+        told, refusal = None, ""
+        snapshot = self._snapshots.build(frozenset())
+        found = find_peer(snapshot, name)
+        session = next((s for s in self._bridge.sessions.linked() if found and str(s.link.guid) == found.guid), None)
+        if session is not None:
+            try:
+                told = msgspec.convert(await self._bridge.rpc.request(session, AGENT_INFO, {}), PeerAgent)
+            except (RmpaError, msgspec.ValidationError) as error:
+                refusal = str(error)
+        return diagnose_module(self._snapshots.build(frozenset()), name, told, refusal)
 
     def _is_service(self, name: str) -> bool:
         state = self._core.state()
@@ -104,7 +127,7 @@ class WhyService:
         """A topic of one peer; or, where only this module has a publisher, its own topic on its path to that peer."""
         found = await self._arrives(peer, topic)
         failed = found[0].failed
-        if failed is not None and failed.name == "publisher" and self._topics.own(topic):
+        if failed is not None and failed.name in _NO_PUBLISHER and self._topics.own(topic):
             return await self._leaves(topic, peer)
         return found
 
@@ -123,7 +146,9 @@ class WhyService:
         if not coming and not own and not self._adrift(topic):
             # No peer offers it; one may have it, and not let it cross.
             known = await asyncio.gather(*(self._both_ends(peer, topic) for peer in peers))
-            coming = [p.guid for p, e in zip(peers, known, strict=True) if e.there is not None and e.there.sources]
+            told = [(p.guid, e.there) for p, e in zip(peers, known, strict=True) if e.there is not None]
+            coming = [guid for guid, there in told if there.sources]
+            coming = coming or [guid for guid, there in told if there.permitted is False]
         coming += self._adrift(topic)
         ways = [self._arrives(guid, topic) for guid in coming]
         ways += [self._leaves(topic, peer.guid) for peer in peers if own and peer.state == "linked"]
@@ -214,7 +239,8 @@ class WhyService:
 
     async def _answer_here(self, session: PeerSession, args: dict[str, Any]) -> tuple[Diagnosis, ...]:
         topic = self._bridge.topics.names.local_name(session.link.name, name_in(args, "topic"))
-        return (await self._arrives(str(session.link.guid), topic))[: observe_limits.WHY_SOURCES_MAX]
+        found = await self._arrives(str(session.link.guid), topic)
+        return tuple(without_rules(one) for one in found[: observe_limits.WHY_SOURCES_MAX])
 
     # --- services ---------------------------------------------------------------------------------------------
 
@@ -228,6 +254,7 @@ class WhyService:
                 *(self._calls(guid, service) for guid in offering or [p.guid for p in peers])
             )
             served = tuple(diagnosis for diagnosis in found if diagnosis.node)
+            served = served or tuple(diagnosis for diagnosis in found if _is_denied(diagnosis))
             here = self._snapshots.build(frozenset()).agent.name
             return served or (await self._services.nowhere(here, service, [p.name for p in peers]),)
         return (await self._calls(name, service),)
@@ -262,6 +289,11 @@ class WhyService:
             return msgspec.convert(value, kind)
         except (msgspec.ValidationError, RecursionError) as error:
             raise RemoteProtocolError(f"it answers in another way: {error}; is it another version?") from None
+
+
+def _is_denied(found: Diagnosis) -> bool:
+    """Whether a peer tells nothing of a name, because its permissions do not let this module have it."""
+    return found.failed is not None and found.failed.name == PERMISSION_THERE
 
 
 def _no_link(peer: str) -> Check:

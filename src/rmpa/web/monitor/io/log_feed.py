@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.core.errors import RmpaError
 from rmpa.web.hub.clients import OWN_CLIENT
 from rmpa.web.monitor import limits
+from rmpa.web.monitor.messages import LOG_TOPIC
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
     from rmpa.web.hub.requests import ReceivedMessage
     from rmpa.web.monitor.io.values import MessageValues
 
-TOPIC: Final = "/rosout_agg"
-"""The messages of all nodes, from one publisher: ``/rosout`` would be a connection to each node."""
 _TYPE: Final = "rosgraph_msgs/Log"
 _LEVELS: Final = {1: "DEBUG", 2: "INFO", 4: "WARN", 8: "ERROR", 16: "FATAL"}
 _GATHER: Final = 0.1
@@ -46,13 +45,13 @@ class LogFeed:
 
     def start(self) -> None:
         """Begin to keep lines."""
-        self._hub.topics.subscribe((OWN_CLIENT, _HANDLE), TOPIC, _TYPE, self._take, _ignore)
+        self._hub.topics.subscribe((OWN_CLIENT, _HANDLE), LOG_TOPIC, _TYPE, self._take, _ignore)
 
     def close(self) -> None:
         """Keep no more."""
         if self._timer is not None:
             self._timer.cancel()
-        self._hub.topics.unsubscribe((OWN_CLIENT, _HANDLE), TOPIC)
+        self._hub.topics.unsubscribe((OWN_CLIENT, _HANDLE), LOG_TOPIC)
 
     def follow(self, page: object, show: Callable[[list[dict[str, Any]]], None]) -> None:
         """Give a page the lines that are kept, and each further one; ``show`` takes them, oldest first."""

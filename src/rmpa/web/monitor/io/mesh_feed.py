@@ -39,6 +39,7 @@ class MeshFeed:
         watch: Asks the agent.
         resources: Knows the Smart Resources.
         watched: Called with whether pages are open.
+        parameters: Says how often the parameters of this module's core have changed.
         clock: Seconds since the epoch.
     """
 
@@ -47,9 +48,11 @@ class MeshFeed:
         watch: AgentWatch,
         resources: ResourceWatch,
         watched: Callable[[bool], None],
+        parameters: Callable[[], int] = lambda: 0,
         clock: Callable[[], float] = time.time,
     ) -> None:
         self._watched = watched
+        self._parameters = parameters
         self._watch = watch
         self._resources = resources
         self._clock = clock
@@ -142,7 +145,7 @@ class MeshFeed:
                 self._builder = StateBuilder(reading.snapshot.agent.name)
             facts = tuple(self._resources.facts.values())
             standing, recorded = self._resources.alarms(), self._resources.recorded
-            self._state = self._builder.build(reading.snapshot, facts, standing, recorded)
+            self._state = self._builder.build(reading.snapshot, facts, standing, recorded, self._parameters())
         self._record_links(self._state)
         for show in [*self._pages.values()]:
             show(self._state)

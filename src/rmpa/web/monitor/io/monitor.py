@@ -41,7 +41,7 @@ class Monitor:
         self.values = MessageValues(hub)
         self.resources = ResourceWatch(hub, self.values)
         self.log = LogFeed(hub, self.values)
-        self.mesh = MeshFeed(watch, self.resources, watched)
+        self.mesh = MeshFeed(watch, self.resources, watched, lambda: hub.params.changes)
         self.answers = Answers(
             hub,
             self.resources,

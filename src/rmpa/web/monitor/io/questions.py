@@ -3,37 +3,52 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import math
 import time
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import msgspec
 
+from rmpa.bridge.io.node_requests import INFO
+from rmpa.bridge.policy import is_own
 from rmpa.bridge.proxy_names import proxied_peer
+from rmpa.config.permission_rules import Access
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.names import is_global_name
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.io.control_client import ControlClient, choose_agent
 from rmpa.observe.io.peer_params import PeerParams, parameters_in
 from rmpa.resource.run.dynamic_reconfigure import SERVICE_TYPE
+from rmpa.web.hub.rights import FULL
 from rmpa.web.monitor import limits
+from rmpa.web.monitor.nodes import node_key, shown_node
+from rmpa.web.monitor.visible import visible_history
 from rmpa.web.values.codec import codec_for
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping
+    from collections.abc import Awaitable, Callable
 
     from rmpa.ros.types.service_types import ServiceType
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.requests import ParamValue
+    from rmpa.web.hub.rights import Rights
     from rmpa.web.monitor.io.resource_watch import ResourceWatch
     from rmpa.web.monitor.session import Question
 
 Args = dict[str, Any]
 _CALL_TIMEOUT: Final = 30.0
 _READ_TIMEOUT: Final = 5.0
-_KINDS: Final = ("topic", "service")
+_KINDS: Final = ("topic", "service", "module")
+_SET_PARAMETERS: Final = "set_parameters"
+"""The service of a resource that takes another configuration (wiki.ros.org/dynamic_reconfigure)."""
+_RECONFIGURES: Final = ("profile", "context", "configure")
+_WITH_PARAMS: Final = ("params", "set_param", "delete_param")
+"""Questions whose answer has all parameters of a module."""
 _LISTS: Final = {"bool": "bools", "int": "ints", "double": "doubles", "str": "strs"}
 """The lists of a ``dynamic_reconfigure/Config`` by the types of parameters."""
 
@@ -56,26 +71,53 @@ class Answers:
         self._environ = environ
         self._agent = agent
         self._threads = ThreadPoolExecutor(limits.ANSWERS_AT_ONCE, "rmpa-answers")
+        self._changes: Mapping[str, Callable[[Args, Rights], Awaitable[Any]]] = {
+            "set_param": self._set_param,
+            "delete_param": self._delete_param,
+        }
         self._handlers: Mapping[str, Callable[[Args], Awaitable[Any]]] = {
             "why": self._why,
             "history": self._history,
             "describe": self._describe,
+            "agent": self._agent_of,
+            "contract": self._contract,
+            "node": self._node,
+            "param_names": self._param_names,
             "params": self._params,
             "call": self._call,
-            "set_param": self._set_param,
-            "delete_param": self._delete_param,
             "profile": self._profile,
             "context": self._context,
             "configure": self._configure,
         }
 
-    async def answer(self, question: Question) -> Any:
+    async def answer(self, question: Question, rights: Rights = FULL) -> Any:
         """The answer, as values for JSON.
 
+        Args:
+            question: One that the page may ask.
+            rights: What its client may do; names are judged here. A peer's parameters count by their names there.
+
         Raises:
-            RmpaError: There is none; the text says why.
+            RmpaError: There is none, or the client may not; the text says why.
         """
-        return await self._handlers[question.what](question.args)
+        self._check(question, rights)
+        change = self._changes.get(question.what)
+        asked = change(question.args, rights) if change is not None else self._handlers[question.what](question.args)
+        value = await asked
+        if question.what in _WITH_PARAMS:
+            return _with_digest(rights.visible_tree(value), question.args.get("has"))
+        if question.what == "param_names":
+            return {"names": sorted(rights.visible(dict.fromkeys(value)))}
+        if question.what == "history":
+            return visible_history(value, rights)
+        return value
+
+    def _check(self, question: Question, rights: Rights) -> None:
+        args = question.args
+        if question.what == "call":
+            rights.check_change(Access.CALL, _name(args, "service"))
+        elif question.what in _RECONFIGURES:
+            rights.check_change(Access.CALL, f"{_name(args, 'resource')}/{_SET_PARAMETERS}")
 
     def close(self) -> None:
         """End the threads, once what the agent was asked is answered or has timed out."""
@@ -86,12 +128,35 @@ class Answers:
     async def _why(self, args: Args) -> Any:
         kind = args.get("kind")
         if kind not in _KINDS:
-            raise ConfigError("kind", f"{str(kind)[:40]!r} is not a topic or a service")
+            raise ConfigError("kind", f"{str(kind)[:40]!r} is not a topic, a service or a module")
+        if kind == "module":
+            return await self._control_call("why", module=_text(args, "name"))
         name, peer = _name(args, "name"), _text(args, "peer")
+        return await self._control_call("why", name=name, peer=peer or None, service=kind == "service")
+
+    async def _agent_of(self, args: Args) -> Any:
+        return await self._control_call("agent", peer=_text(args, "peer"))
+
+    async def _contract(self, args: Args) -> Any:
+        return await self._control_call("contract", topic=_name(args, "topic"), type_name=_text(args, "type"))
+
+    async def _node(self, args: Args) -> Any:
+        """The facts about a node, with names of nodes as pages have them."""
+        name, peer = _name(args, "name"), _text(args, "peer")
+        if not peer and is_own(name):
+            raise RmpaError(f"{name} belongs to the agent of this module; nothing is asked of it")
+        about = await self._control_call("node", what=INFO, node=name, **({"peer": peer} if peer else {}))
+        for each in about.get("connections") or ():
+            other = str(each["other"])
+            each["other"] = shown_node(other) if not peer or is_own(other) else node_key(peer, other)
+        return about
+
+    async def _control_call(self, op: str, **args: object) -> Any:
+        """Call an operation of the agent, in a thread."""
 
         def ask() -> Any:
             with self._control() as client:
-                return client.call("why", object, name=name, peer=peer or None, service=kind == "service")
+                return client.call(op, object, **args)
 
         return await asyncio.get_running_loop().run_in_executor(self._threads, ask)
 
@@ -111,41 +176,64 @@ class Answers:
     # --- parameters -------------------------------------------------------------------------------------------
 
     async def _params(self, args: Args) -> Any:
+        """All parameters."""
         peer = _text(args, "peer")
-        if not peer:
-            self._hub.link.need()
-            try:
-                async with asyncio.timeout(_READ_TIMEOUT):
-                    await self._hub.params.loaded.wait()
-            except TimeoutError:
-                raise UnreachableError("parameters of the core", "its API", "is it busy? ask again") from None
-            return {"values": _plain(self._hub.params.tree)}
-        return {"values": _plain(await self._of_peer(peer, lambda params: params.get("/")))}
+        if peer:
+            return _plain(await self._of_peer(peer, lambda params: params.get("/")))
+        return _plain(await self._own_params())
 
-    async def _set_param(self, args: Args) -> Any:
+    async def _own_params(self) -> Mapping[str, ParamValue]:
+        self._hub.link.need()
+        try:
+            async with asyncio.timeout(_READ_TIMEOUT):
+                await self._hub.params.loaded.wait()
+        except TimeoutError:
+            raise _unknown_params() from None
+        return self._hub.params.tree
+
+    async def _param_names(self, _args: Args) -> Any:
+        await self._own_params()
+        return list(islice(self._hub.params.values((), "/"), limits.PARAMETER_NAMES_SHOWN))
+
+    async def _check_own(self, rights: Rights, name: str, after: ParamValue = None) -> None:
+        try:
+            async with asyncio.timeout(_READ_TIMEOUT):
+                await self._hub.check_param_change(rights, name, after)
+        except TimeoutError:
+            raise _unknown_params() from None
+
+    async def _set_param(self, args: Args, rights: Rights) -> Any:
         name, peer, value = _name(args, "name"), _text(args, "peer"), args.get("value")
         if value is None:
             raise ConfigError("value", "a parameter cannot be null", "delete it instead")
         if peer:
 
             def change(params: PeerParams) -> None:
+                _check_of_peer(params, rights, name, value)
                 present = params.get(name) if name in params.names() else None
                 params.set(name, cast("XmlRpcValue", _as_before(name, present, value)))
 
             await self._of_peer(peer, change)
         else:
+            await self._check_own(rights, name, value)
             kept = _as_before(name, self._hub.params.value(name), value)
             parameters_in(name, cast("XmlRpcValue", kept))
             await self._hub.params.set(name, cast("ParamValue", kept))
         return await self._params(args)
 
-    async def _delete_param(self, args: Args) -> Any:
+    async def _delete_param(self, args: Args, rights: Rights) -> Any:
         name, peer = _name(args, "name"), _text(args, "peer")
         if name == "/":
             raise ConfigError("name", "the root holds every parameter", "name the one that you mean")
         if peer:
-            await self._of_peer(peer, lambda params: params.delete(name))
+
+            def delete(params: PeerParams) -> None:
+                _check_of_peer(params, rights, name)
+                params.delete(name)
+
+            await self._of_peer(peer, delete)
         else:
+            await self._check_own(rights, name)
             await self._hub.params.delete(name)
         return await self._params(args)
 
@@ -196,7 +284,7 @@ class Answers:
 
     async def _reconfigure(self, args: Args, config: Args) -> None:
         resource = _name(args, "resource")
-        service = self._service({"service": f"{resource}/set_parameters", "peer": args.get("peer", "")})
+        service = self._service({"service": f"{resource}/{_SET_PARAMETERS}", "peer": args.get("peer", "")})
         kind = self._hub.types.service(SERVICE_TYPE)
         body = codec_for(kind.request).write({"config": config}, time.time_ns()).payload
         await self._hub.calls.call(service, kind.md5sum, body, _CALL_TIMEOUT)
@@ -227,6 +315,34 @@ class Answers:
         return await self._hub.types.find_service(found.type)
 
 
+def _unknown_params() -> UnreachableError:
+    return UnreachableError("parameters of the core", "its API", "is it busy? ask again")
+
+
+def _check_of_peer(params: PeerParams, rights: Rights, name: str, after: ParamValue = None) -> None:
+    """Check a change of a peer's parameters as ``Rights.check_param_change`` does, against all that the peer has.
+
+    The peer judges what this module may do, and knows nothing of the client. Where it hides some of its parameters
+    from this module, a client with rules changes none of them: what a namespace holds is not known.
+
+    Raises:
+        RmpaError: The client may not, or the peer does not tell its parameters.
+    """
+    if rights.change is None:
+        return
+    tree = params.get("/")
+
+    def value_of(name: str) -> ParamValue:
+        value: object = tree
+        for part in filter(None, name.split("/")):
+            if not isinstance(value, Mapping) or part not in value:
+                return None
+            value = value[part]
+        return cast("ParamValue", value)
+
+    rights.check_param_change(name, value_of, after)
+
+
 def _as_before(name: str, present: object, value: object) -> object:
     """A new value of a parameter, a float where it was one: a page writes 1.0 as 1.
 
@@ -251,6 +367,12 @@ def _name(args: Args, key: str) -> str:
     if value != "/" and not is_global_name(value):
         raise ConfigError(key, f"{value[:80]!r} is not a name", "write it as /name")
     return value
+
+
+def _with_digest(values: Mapping[str, ParamValue], has: object) -> Args:
+    """Parameters with their ``digest``; where the page ``has`` that digest they are not repeated."""
+    digest = hashlib.sha256(msgspec.json.encode(values, order="sorted")).hexdigest()[:16]
+    return {"digest": digest} if has == digest else {"values": values, "digest": digest}
 
 
 def _json(text: bytes) -> Any:

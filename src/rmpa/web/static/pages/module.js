@@ -1,10 +1,11 @@
 // A module: its link, its clock, what it offers, and what of it is hidden or dropped.
 
 import { html } from "../vendor/htm-preact.js";
-import { bandwidth, bounded, bytes, count, percent, seconds } from "../format.js";
+import { bandwidth, bounded, bytes, count, duration, percent, seconds } from "../format.js";
 import { entries, section } from "../state.js";
-import { Facts, Gone, Link, Mark, Page, Panel, Since, Table, Uptime } from "../parts.js";
-import { TopicRow } from "./topics.js";
+import { Facts, Gone, Link, Mark, Page, Panel, Since, Table, Uptime, Why, useAnswer } from "../parts.js";
+import { NODE_COLUMNS, NodeRow } from "./nodes.js";
+import { TopicRow, isData } from "./topics.js";
 import { Lines } from "../plot.js";
 
 const DIRECTIONS = [["bytes_in", "received"], ["bytes_out", "sent"]];
@@ -14,17 +15,24 @@ export function ModulePage({ name, state, connection }) {
   if (!module) return html`<${Page} title=${name} kind="Module"><${Gone} kind="module" name=${name} /><//>`;
   const own = section(state, "agent").name === name;
   const detail = section(section(state, "detail"), `module:${name}`);
-  const topics = entries(state, "topics").filter(([, one]) => (one.from || []).includes(name));
+  const all = entries(state, "topics").filter(([, one]) => (one.from || []).includes(name));
+  const topics = all.filter(([topic]) => isData(topic, state));
   const resources = entries(state, "resources").filter(([, one]) => one.module === name);
+  const nodes = entries(state, "nodes").filter(([, one]) => (one.module || section(state, "agent").name) === name);
   return html`<${Page} title=${name} kind="Module" aside=${html`<${Mark} state=${module.state} />`}><div class="grid">
     ${own ? html`<${Agent} agent=${section(state, "agent")} detail=${detail} />` : html`<${LinkPanel} module=${module} detail=${detail} />`}
+    ${!own && html`<${PeerAgent} name=${name} up=${module.state === "up" || module.state === "silent"} connection=${connection} version=${section(state, "agent").version} />
+    <${Panel} title="Lanes"><${Lanes} lanes=${section(detail, "link").lanes} linked=${Boolean(detail.link)} /><//>
+    <${Panel} title="Way to it"><${Why} connection=${connection} kind="module" name=${name} /><//>`}
     ${(module.error || (module.hidden || []).length > 0) && html`<${Panel} title="What is wrong">
       ${module.error && html`<p class="failure">${module.error}${module.remedy && html`<br /><span class="muted">${module.remedy}</span>`}</p>`}
       ${(module.hidden || []).map((text) => html`<p class="failure" key=${text}>${text}</p>`)}<//>`}
     ${!own && html`<${Panel} title="Bytes a second on the link" wide><${Lines} label="Bytes a second" series=${DIRECTIONS.map(([key, text]) => ({ label: text, value: module[key] }))} format=${bandwidth} /><//>`}
     ${resources.length > 0 && html`<${Panel} title="Smart Resources"><${Table} caption="Smart Resources" columns=${["Resource", "Quality", "Profile", "Says"]}>${resources.map(([key, one]) => html`<tr key=${key}><th scope="row"><${Link} page="resource" name=${key}>${one.name}<//></th><td><${Mark} state=${one.level} /></td><td>${one.profile || "none"}</td><td>${one.message}</td></tr>`)}<//><//>`}
+    ${nodes.length > 0 && html`<${Panel} title=${`Nodes of ${name}`}><${Table} caption="Nodes" columns=${NODE_COLUMNS}>${nodes.slice(0, 100).map(([key, one]) => html`<${NodeRow} key=${key} name=${key} node=${one} />`)}<//>${nodes.length > 100 && html`<p class="empty"><a href="#/nodes">${nodes.length - 100} more</a></p>`}<//>`}
     ${own && html`<${Counters} state=${state} connection=${connection} />`}
-    <${Panel} title=${`Topics of ${name}`} wide><${Table} caption="Topics" columns=${["Topic", "Type", "#Rate", "#Bytes", "#Latency", "#Lost", "From → to"]} empty="It publishes no topic.">${topics.map(([topic, one]) => html`<${TopicRow} key=${topic} name=${topic} topic=${one} />`)}<//><//>
+    <${Panel} title=${`Topics of ${name}`} wide><${Table} caption="Topics" columns=${["Topic", "Type", "#Rate", "#Bytes", "#Latency", "#Lost", "From → to"]} empty=${all.length ? "It publishes no data." : "It publishes no topic."}>${topics.map(([topic, one]) => html`<${TopicRow} key=${topic} name=${topic} topic=${one} />`)}<//>
+      ${all.length > topics.length && html`<details><summary>${all.length - topics.length} of its Smart Resources, about themselves, and of the log</summary><${Table} caption="Topics of Smart Resources" columns=${["Topic", "Type", "#Rate", "#Bytes", "#Latency", "#Lost", "From → to"]}>${all.filter((each) => !topics.includes(each)).map(([topic, one]) => html`<${TopicRow} key=${topic} name=${topic} topic=${one} />`)}<//></details>`}<//>
   </div><//>`;
 }
 
@@ -38,6 +46,20 @@ const LinkPanel = ({ module, detail }) => {
     ["Direct subscribers there", module.direct_out || undefined], ["Relayed by", module.via], ["Found by", module.source], ["Largest packet", link.packet && bytes(link.packet)],
     ["Dialled by", link.dialled === undefined ? undefined : link.dialled ? "this module" : "the peer"], ["Next attempt in", detail.next_attempt !== undefined ? seconds(detail.next_attempt) : undefined], ["GUID", html`<code>${module.guid}</code>`]]} /><//>`;
 };
+
+const PEER_PERIOD = 2; // seconds between two questions to a peer's agent while its page is open
+
+// What a peer's agent tells of itself. One of an earlier release does not know the question.
+function PeerAgent({ name, up, connection, version }) {
+  const { value, failure } = useAnswer(connection, "agent", { peer: name }, PEER_PERIOD, String(up));
+  return html`<${Panel} title="Agent">${value ? html`<${Facts} rows=${[["Version", value.version === version ? value.version : html`<${Mark} state="WARN" word=${`${value.version || "not told"}, here ${version}`} />`], ["Runs for", duration(value.uptime)],
+      ["CPU", value.cpu != null ? html`${percent(value.cpu)} of a core` : "not told by this peer"], ["Memory", value.rss != null ? bytes(value.rss) : "not told by this peer"], ["Open files", value.files_open != null && value.files_limit != null ? `${count(value.files_open)} of ${count(value.files_limit)}` : undefined], ["Proxies", value.proxies != null ? count(value.proxies) : undefined], ["Core", html`<code>${value.core_uri}</code>`]]} />`
+    : html`<p class="empty">${!failure ? "Asking …" : !up ? "Not known without a link." : `Version and CPU are not told by this peer: ${failure.error}`}</p>`}<//>`;
+}
+
+const PURPOSE = { express: "control, small messages", bulk: "large messages" };
+const Lanes = ({ lanes, linked }) => linked && !(lanes || []).length ? html`<p class="empty">The agent does not tell of lanes.</p>` : html`<${Table} caption="Lanes" columns=${["Lane", "State", "#In", "#Out", "#Waiting", "#Dropped"]} empty="It has no link.">${(lanes || []).map((lane) => html`<tr key=${lane.name}><th scope="row">${lane.name}<div class="muted">${PURPOSE[lane.name] || ""}</div></th>
+  <td><${Mark} state=${lane.connected ? "up" : "linking"} word=${lane.connected ? "connected" : "no connection"} /></td><td class="number">${bytes(lane.bytes_in)}</td><td class="number">${bytes(lane.bytes_out)}</td><td class="number">${lane.queued ? bytes(lane.queued) : "–"}</td><td class="number">${count(lane.dropped)}</td></tr>`)}<//>`;
 
 const Agent = ({ agent, detail }) => html`<${Panel} title="Agent"><${Facts} rows=${[
   ["Version", agent.version], ["Runs for", html`<${Since} moment=${agent.started} />`], ["CPU", agent.cpu !== undefined ? html`${percent(agent.cpu)} of a core` : undefined], ["Memory", bytes(agent.rss)],

@@ -1,6 +1,6 @@
 // The parameters of this module's core, or of a peer's, as a tree; each value can be changed.
 
-import { html, useEffect, useState } from "../vendor/htm-preact.js";
+import { html, useEffect, useRef, useState } from "../vendor/htm-preact.js";
 import { entries, section } from "../state.js";
 import { Choice, Failure, Page, Panel } from "../parts.js";
 
@@ -16,17 +16,33 @@ export function grow(values) {
   return root;
 }
 
-export function Params({ state, connection }) {
+const PEER_PERIOD = 3000; // milliseconds after which a peer's parameters are read again; this module's core tells its changes
+
+export function Params({ name, state, connection }) {
   const own = section(state, "agent").name;
   const [module, setModule] = useState(own);
   const [values, setValues] = useState(null);
   const [failure, setFailure] = useState(null);
-  const [text, setText] = useState("");
+  const [text, setText] = useState(name || "");
+  const shown = useRef({});
   const peer = module === own ? "" : module;
-  const ask = (what, args = {}) => connection.ask(what, { peer, ...args }).then((answer) => { setValues(answer.values); setFailure(null); return true; }, (failure) => { setFailure(failure); return false; });
-  useEffect(() => { setValues(null); ask("params"); }, [module, connection.phase]);
+  const take = (answer) => {
+    if (shown.current.peer !== peer) return; // another module has been chosen meanwhile
+    shown.current.digest = answer.digest;
+    if (answer.values) setValues(answer.values);
+    setFailure(null);
+  };
+  const ask = (what, args = {}) => connection.ask(what, { peer, ...args }).then((answer) => { take(answer); return true; }, (failure) => { setFailure(failure); return false; });
+  useEffect(() => { shown.current = { peer }; setValues(null); ask("params"); }, [module, connection.phase]);
+  // Changes by others: this module's core tells them, a peer is asked while the page is seen.
+  useEffect(() => { if (!peer && shown.current.digest) ask("params", { has: shown.current.digest }); }, [state.parameters]);
+  useEffect(() => {
+    if (!peer) return undefined;
+    const timer = setInterval(() => document.hidden || !shown.current.digest || ask("params", { has: shown.current.digest }), PEER_PERIOD);
+    return () => clearInterval(timer);
+  }, [module, connection.phase]);
   const choices = entries(state, "modules").filter(([, one]) => one.state === "up" || one.state === "here").map(([name]) => [name, name]);
-  return html`<${Page} title="Parameters" kind=${`Of the core of ${module}`} aside=${html`<button type="button" onClick=${() => ask("params")}>Read again</button>`}>
+  return html`<${Page} title="Parameters" kind=${`Of the core of ${module}`}>
     <div class="row filter-row"><${Choice} label="Module" value=${module} onChoose=${setModule} options=${choices} /></div>
     <${Failure} failure=${failure} />
     <${Panel}><input class="filter" type="search" placeholder="Filter by name" aria-label="Filter by name" value=${text} onInput=${(event) => setText(event.target.value)} />

@@ -3,9 +3,9 @@
 import { html, useState } from "../vendor/htm-preact.js";
 import { seconds } from "../format.js";
 import { entries, section } from "../state.js";
-import { Facts, Failure, Gone, Link, Mark, Page, Panel, Table, memo } from "../parts.js";
+import { Facts, Failure, Gone, Link, Mark, ModuleLink, Page, Panel, Table, memo } from "../parts.js";
 
-const Row = memo(({ name, one }) => html`<tr><th scope="row"><${Link} page="resource" name=${name}>${one.name}<//><div class="muted">${one.description}</div></th><td>${one.module}</td><td>${one.role}${one.physical ? "" : html` <span class="muted">simulated</span>`}</td>
+const Row = memo(({ name, one }) => html`<tr><th scope="row"><${Link} page="resource" name=${name}>${one.name}<//><div class="muted">${one.description}</div></th><td><${ModuleLink} name=${one.module} /></td><td>${one.role}${one.physical ? "" : html` <span class="muted">simulated</span>`}</td>
   <td><${Mark} state=${one.level} /><div class="muted">${one.message}</div></td><td>${one.profile || "none"}</td><td>${one.context || "–"}</td><td class="number">${one.clients || 0}</td></tr>`);
 
 export function Resources({ state }) {

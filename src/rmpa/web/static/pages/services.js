@@ -3,10 +3,12 @@
 import { html, useState } from "../vendor/htm-preact.js";
 import { count, seconds } from "../format.js";
 import { entries, section } from "../state.js";
-import { Facts, Failure, Gone, Link, Page, Panel, Question, Table, Why, memo } from "../parts.js";
+import { Facts, Failure, Gone, Link, ModuleLink, NodeLink, Page, Panel, Question, Table, Why, memo, nodeKey } from "../parts.js";
+
+const STATES = { home: "stays in its module", hidden: "hidden here", idle: "nobody calls it", open: "in use" };
 
 const Row = memo(({ name, service, own }) => html`<tr><th scope="row"><${Link} page="service" name=${name}>${service.name}<//>${service.problem && html`<div class="muted">${service.problem}</div>`}</th>
-  <td>${service.module || own}</td><td class="mono">${service.node}</td><td>${service.type || html`<span class="muted">not asked yet</span>`}</td><td>${service.state}</td><td class="number">${count(service.calls || 0)}</td><td class="number">${count(service.failed || 0)}</td></tr>`);
+  <td><${ModuleLink} name=${service.module || own} /></td><td><${NodeLink} name=${nodeKey(service.module, service.node)}>${service.node}<//></td><td>${service.type || html`<span class="muted">not asked yet</span>`}</td><td>${STATES[service.state] || service.state}</td><td class="number">${count(service.calls || 0)}</td><td class="number">${count(service.failed || 0)}</td></tr>`);
 
 export function Services({ state }) {
   const [text, setText] = useState("");
@@ -24,7 +26,7 @@ export function ServicePage({ name, state, connection }) {
   const detail = section(section(state, "detail"), `service:${name}`);
   const latency = section(detail, "latency");
   return html`<${Page} title=${service.name} kind=${`Service of ${service.module || section(state, "agent").name}${service.type ? ` · ${service.type}` : ""}`}><div class="grid">
-    <${Panel} title="Service"><${Facts} rows=${[["Node", html`<code>${service.node}</code>`], ["State", service.state], ["Transport", service.transport], ["Relayed because", detail.relayed_because], ["Address", detail.address], ["Calls across the mesh", count(service.calls || 0)],
+    <${Panel} title="Service"><${Facts} rows=${[["Node", html`<${NodeLink} name=${nodeKey(service.module, service.node)} />`], ["State", STATES[service.state] || service.state], ["Transport", service.transport], ["Relayed because", detail.relayed_because], ["Address", detail.address], ["Calls across the mesh", count(service.calls || 0)],
       ["Failed", service.failed ? count(service.failed) : undefined], ["Under way", detail.active || undefined], ["Latency, median", latency.p50 !== undefined ? seconds(latency.p50) : undefined], ["Latency, 99th percentile", latency.p99 !== undefined ? seconds(latency.p99) : undefined], ["Crosses", detail.crosses ? "yes" : "no"], ["Because", detail.policy], ["MD5 sum", detail.md5 && html`<code>${detail.md5}</code>`]]} />
       ${service.problem && html`<p class="failure">${service.problem}</p>`}<//>
     <${Panel} title="Way of a call"><${Why} connection=${connection} kind="service" name=${service.name} peer=${service.module} /><//>

@@ -1,0 +1,356 @@
+"""An agent's part in a secured mesh: spreads documents, renews its certificate, and answers ``rmpa trust``."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import logging
+import os
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+from rmpa.bridge.session.part import Part
+from rmpa.core.backoff import Backoff
+from rmpa.core.errors import RemoteProtocolError, RmpaError, StartError, UnreachableError
+from rmpa.core.token_bucket import TokenBucket
+from rmpa.mesh.frames import Frame, FrameKind
+from rmpa.mesh.handshake import Refuse
+from rmpa.runtime.state_dir import state_dir
+from rmpa.trust import limits
+from rmpa.trust.io.store import AuthorityPlace, TrustStore
+from rmpa.trust.reasons import TrustReason
+from rmpa.trust.spreading import DocumentSpreading, Notice, have_args, read_document, read_have
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Callable
+
+    from rmpa.bridge.io.bridge import Bridge
+    from rmpa.bridge.session.peer_session import PeerSession
+    from rmpa.config.settings import Settings
+    from rmpa.core.clock import Clock
+    from rmpa.trust.documents import DocumentKind
+    from rmpa.trust.io.authority import MeshAuthority
+    from rmpa.trust.io.join_server import JoinServer
+    from rmpa.trust.io.membership import Membership
+    from rmpa.trust.preface import Preface
+    from rmpa.trust.status import TrustStatus
+
+_log = logging.getLogger(__name__)
+
+RENEW: Final = "trust.renew"
+"""The request for a certificate, at the authority: ``{"request": BASE64}`` to ``{"certificate": BASE64}``."""
+NOT_AUTHORITY: Final = "this module is not the authority of its mesh"
+
+
+def trust_store(settings: Settings) -> TrustStore | None:
+    """Where the module's files of trust are; ``None``: there is no state directory."""
+    place = state_dir(os.environ, settings.state_dir)
+    return TrustStore(place, settings.name) if place is not None else None
+
+
+def open_membership(settings: Settings, clock: Clock) -> Membership | None:
+    """What this module has as a member of a secured mesh; ``None``: trust is off.
+
+    Raises:
+        StartError: Its files are broken, the library is missing, or trust is off and ``trust.require`` is set.
+    """
+    store = trust_store(settings)
+    if store is None or not store.exists:
+        if settings.trust.require:
+            raise StartError(
+                "trust.require",
+                f"the module {settings.name} has joined no secured mesh",
+                "join one: rmpa trust join TOKEN, with a token of rmpa trust invite at the authority",
+            )
+        return None
+    try:
+        from rmpa.trust.io.membership import Membership  # noqa: PLC0415 - its library takes memory: only when needed
+    except ModuleNotFoundError as error:
+        missing = f"the library {error.name} is not installed, but this module has joined a secured mesh"
+        raise StartError(str(store.folder), missing, "pip install 'rmpa[trust]'") from None
+    membership = Membership.load(store, clock, time.time)
+    if membership.name != settings.name:
+        text = f"is of {membership.name}, but this agent is named {settings.name}"
+        remedy = f"start it with --name {membership.name}, or let it join: rmpa trust leave, rmpa trust join TOKEN"
+        raise StartError(str(store.path("module.crt")), text, remedy)
+    return membership
+
+
+def read_refusal(data: bytes) -> tuple[str, str] | None:
+    """The word and the text of a plain refusal; ``None`` if the bytes are none."""
+    try:
+        parsed = Frame.parse(data)
+        if parsed is None or parsed[0].kind is not FrameKind.REFUSE:
+            return None
+        refuse = Refuse.parse(parsed[0].payload)
+    except RemoteProtocolError:
+        return None
+    try:
+        return TrustReason(refuse.code).label, refuse.text
+    except ValueError:
+        return refuse.label, refuse.text
+
+
+class AgentTrust(Part):
+    """The part of a bridge that keeps a membership up to date; it exists only in a secured mesh.
+
+    Args:
+        membership: This module's.
+        bridge: Its sessions and requests; counts ``trust.document_refused``.
+        clock: Monotonic seconds.
+        rng: Uniform numbers in [0, 1), for the delays of renewals.
+
+    Raises:
+        StartError: A file of the authority is broken.
+    """
+
+    def __init__(
+        self,
+        membership: Membership,
+        bridge: Bridge,
+        clock: Clock,
+        rng: Callable[[], float],
+    ) -> None:
+        from rmpa.trust.documents import DocumentKind  # noqa: PLC0415 - as in ``open_membership``
+        from rmpa.trust.io.authority import MeshAuthority  # noqa: PLC0415
+        from rmpa.trust.io.join_server import JoinServer  # noqa: PLC0415
+
+        self.membership = membership
+        self._bridge = bridge
+        self._clock = clock
+        self._kinds: dict[Notice, DocumentKind] = {Notice.DENY: DocumentKind.DENY, Notice.KEYS: DocumentKind.KEYS}
+        self._spreading = DocumentSpreading(self._number)
+        self._authority_peer: PeerSession | None = None
+        self.authority: MeshAuthority | None = None
+        """What the authority has; ``None``: this module is not it."""
+        self.joins: JoinServer | None = None
+        """The joins at the authority."""
+        if membership.store.is_authority:
+            self.authority = MeshAuthority.load(membership.store, membership)
+            self.joins = JoinServer(self.authority, membership, clock, self._is_linked)
+        self._backoff = Backoff(limits.RENEWAL_RETRY_FIRST, limits.RENEWAL_RETRY_CAP, rng)
+        self._retry_at = 0.0
+        self._renewals: dict[str, TokenBucket] = {}
+        self._wake = asyncio.Event()
+        self._renewing: asyncio.Task[None] | None = None
+        self._problem = ""
+        rpc = bridge.rpc
+        rpc.on_notification(Notice.HAVE, self._have)
+        rpc.on_notification(Notice.DENY, lambda session, args: self._document(session, Notice.DENY, args))
+        rpc.on_notification(Notice.KEYS, lambda session, args: self._document(session, Notice.KEYS, args))
+        rpc.on_request(RENEW, self._renew_other)
+
+    # --- life -------------------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Look after the certificate from now on."""
+        self._renewing = asyncio.create_task(self._look_after(), name="renew the certificate")
+
+    async def close(self) -> None:
+        """End joins and renewals."""
+        if self._renewing is not None:
+            self._renewing.cancel()
+            await asyncio.gather(self._renewing, return_exceptions=True)
+            self._renewing = None
+        if self.joins is not None:
+            await self.joins.close()
+
+    def on_join(self, sock: socket.socket, preface: Preface) -> None:
+        """Take a connection of a module that joins, or that renews a certificate that has ended."""
+        if self.joins is None:
+            _log.warning("! %s is refused: %s", preface, NOT_AUTHORITY)
+            sock.close()
+        else:
+            self.joins.accept(sock, preface)
+
+    def notes(self) -> tuple[str, ...]:
+        """What the user should do something about."""
+        from rmpa.trust.io.status import problems_of  # noqa: PLC0415
+
+        found = problems_of(self.membership, self.authority_name())
+        return (*found, self._problem) if found and self._problem else found
+
+    def status(self) -> TrustStatus:
+        """The state, as ``rmpa trust status`` and the snapshot show it."""
+        from rmpa.trust.io.status import status_of  # noqa: PLC0415
+
+        linked = {session.link.name for session in self._bridge.sessions.linked()}
+        return status_of(
+            self.membership, self.authority, agent="secured", linked=linked, authority_name=self.authority_name()
+        )
+
+    # --- documents --------------------------------------------------------------------------------------------
+
+    def link_up(self, session: PeerSession) -> None:
+        """Tell a new link what this module has."""
+        self._spreading.link_up(session.peer)
+        args = have_args(self._number, is_authority=self.authority is not None)
+        self._bridge.rpc.notify(session, Notice.HAVE, args)
+
+    def link_down(self, session: PeerSession) -> None:
+        """Forget what the peer has."""
+        self._spreading.link_down(session.peer)
+        if self._authority_peer is session:
+            self._authority_peer = None
+
+    def _number(self, kind: Notice) -> int:
+        return self.membership.numbers[self._kinds[kind]]
+
+    def _have(self, session: PeerSession, args: dict[str, Any]) -> None:
+        numbers, is_authority = read_have(args)
+        if is_authority and self.authority is None:
+            if session.link.name == self.membership.authority:
+                self._authority_found(session)
+            else:
+                _log.warning("! %s says that it is the authority, which it is not", session.link.name)
+        self._send(session, self._spreading.have(session.peer, numbers))
+
+    def _document(self, session: PeerSession, kind: Notice, args: dict[str, Any]) -> None:
+        data = read_document(args)
+        try:
+            newer = self.membership.accept_document(self._kinds[kind], data)
+        except RemoteProtocolError as error:
+            self._bridge.counters.add("trust.document_refused")
+            _log.warning("! %s sent a document that does not hold: %s", session.link.name, error)
+            return
+        if newer:
+            self._spreading.received(session.peer, kind, self._number(kind))
+            _log.info("= %s %d by %s", kind.removeprefix("trust."), self._number(kind), session.link.name)
+            self.spread()
+
+    def spread(self) -> None:
+        """Send newer documents to all that lack them."""
+        sessions = {session.peer: session for session in self._bridge.sessions.linked()}
+        for peer, kinds in self._spreading.changed():
+            if peer in sessions:
+                self._send(sessions[peer], kinds)
+
+    def _send(self, session: PeerSession, kinds: tuple[Notice, ...]) -> None:
+        for kind in kinds:
+            if session.linked:
+                document = self.membership.document(self._kinds[kind]).decode()
+                self._bridge.rpc.notify(session, kind, {"document": document})
+
+    # --- renewal ----------------------------------------------------------------------------------------------
+
+    def _authority_found(self, session: PeerSession) -> None:
+        self._authority_peer = session
+        place = AuthorityPlace(session.link.name, session.link.remote_endpoint[0], session.link.guid.port)
+        store = self.membership.store
+        if store.load_authority() != place:
+            try:
+                store.save_authority(place)
+            except StartError as error:
+                _log.warning("! %s", error)
+        self.look_now()
+
+    def look_now(self) -> None:
+        """See at once whether the certificate is to be renewed: something has changed since the last attempt."""
+        self._retry_at = 0.0
+        self._wake.set()
+
+    async def _look_after(self) -> None:
+        while True:
+            try:
+                await self._look()
+            except asyncio.CancelledError:
+                raise
+            except Exception:  # noqa: BLE001 - the task's top: the next look may succeed
+                _log.exception("! the certificate could not be renewed")
+            self._wake.clear()
+            try:
+                async with asyncio.timeout(limits.RENEWAL_LOOK):
+                    await self._wake.wait()
+            except TimeoutError:
+                pass
+
+    async def _look(self) -> None:
+        wall = self.membership.wall()
+        if wall is None or wall < self.membership.certificate.renew_at or self._clock.now() < self._retry_at:
+            return
+        try:
+            await self.renew()
+        except RmpaError as error:
+            delay = self._backoff.delay()
+            self._retry_at = self._clock.now() + delay
+            self._problem = f"the last attempt to renew it: {error}"
+            _log.warning("! the certificate is not renewed: %s; tried again in %.0f s", error, delay)
+
+    async def renew(self) -> None:
+        """Renew the certificate now.
+
+        Raises:
+            RmpaError: The authority cannot be reached, or refuses.
+        """
+        if self.authority is not None:
+            self.authority.renew_own()
+        elif self._authority_peer is not None and self._authority_peer.linked:
+            await self._renew_by_link(self._authority_peer)
+        else:
+            await self._renew_by_dial()
+        self._backoff.reset()
+        self._problem = ""
+        _log.info("= the certificate is renewed until %s", _when(self.membership.certificate.expires))
+
+    async def _renew_by_link(self, session: PeerSession) -> None:
+        request = base64.b64encode(self.membership.request()).decode()
+        reply = await self._bridge.rpc.request(session, RENEW, {"request": request}, limits.JOIN_STEP_TIMEOUT)
+        self.membership.renewed(_bytes(reply, "certificate"))
+
+    async def _renew_by_dial(self) -> None:
+        from rmpa.trust.io.joining import renew_at_authority  # noqa: PLC0415
+
+        place = self.membership.store.load_authority()
+        if place is None:
+            raise UnreachableError("authority", "any link", "start its agent; rmpa peer list shows who is linked")
+        grant = await renew_at_authority(self.membership, place.address, place.port, read_refusal)
+        self.membership.renewed(grant.certificate)
+        for kind, data in ((Notice.DENY, grant.deny), (Notice.KEYS, grant.keys)):
+            if data:
+                self.membership.accept_document(self._kinds[kind], data)
+        self.spread()
+
+    def _renew_other(self, session: PeerSession, args: dict[str, Any]) -> dict[str, str]:
+        """Renew the certificate of a linked module."""
+        if self.authority is None:
+            raise RmpaError(NOT_AUTHORITY)
+        name = session.link.name
+        presented = session.link.connection.certificate
+        if presented is not None:
+            self.membership.judge_member(presented, name)  # it may have been revoked, and its link is ending
+        while len(self._renewals) >= limits.ISSUED_MAX and name not in self._renewals:
+            del self._renewals[next(iter(self._renewals))]
+        bucket = self._renewals.setdefault(name, TokenBucket(limits.RENEWALS_RATE, limits.RENEWALS_BURST))
+        if not bucket.take(self._clock.now()):
+            raise RmpaError(f"{name} asks for certificates too often: once a minute is allowed")
+        _, certificate = self.authority.issue(_bytes(args, "request"), name)
+        _log.info("= %s has a new certificate", session.link.name)
+        return {"certificate": base64.b64encode(certificate).decode()}
+
+    def authority_name(self) -> str:
+        """The name of the authority, as far as it is known; empty: it is not."""
+        if self.authority is not None:
+            return self.membership.name
+        return self._authority_peer.link.name if self._authority_peer is not None else ""
+
+    def _is_linked(self, name: str) -> bool:
+        names = (self.membership.name, *(session.link.name for session in self._bridge.sessions.linked()))
+        return name.casefold() in {each.casefold() for each in names}
+
+
+def _bytes(args: object, key: str) -> bytes:
+    """Bytes in base64 in the arguments of a request, or in its reply.
+
+    Raises:
+        RemoteProtocolError: There are none.
+    """
+    text = args.get(key) if isinstance(args, dict) else None
+    try:
+        return base64.b64decode(text if isinstance(text, str) else "", validate=True)
+    except ValueError:
+        raise RemoteProtocolError(f"{key} is not in base64") from None
+
+
+def _when(wall: float) -> str:
+    return time.strftime("%Y-%m-%d %H:%M", time.localtime(wall))

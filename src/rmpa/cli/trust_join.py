@@ -1,0 +1,385 @@
+"""``rmpa trust invite`` and ``rmpa trust join``: a new module, by a token or by files."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import re
+import sys
+from base64 import b64encode
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import click
+
+from rmpa.cli.options import json_option
+from rmpa.cli.output import print_json, print_line, warn
+from rmpa.cli.trust_mesh import EXIT_CODES
+from rmpa.cli.trust_place import (
+    asked,
+    check_library,
+    config_option,
+    confirm,
+    date_of,
+    find_place,
+    grouped,
+    name_option,
+)
+from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError
+from rmpa.core.identity import peer_name_problem
+from rmpa.trust import limits
+from rmpa.trust.status import InviteReply, JoinStep, TrustReply
+
+if TYPE_CHECKING:
+    from rmpa.cli.trust_place import TrustPlace
+    from rmpa.trust.io.store import MemberFiles
+
+_LIFETIME: Final = re.compile(r"([0-9]{1,6})\s*(s|min|h|d)")
+_UNITS: Final = {"s": 1, "min": 60, "h": 3600, "d": 86_400}
+_FINGERPRINT: Final = 2 * limits.FINGERPRINT_BYTES
+
+
+# --- the authority --------------------------------------------------------------------------------------------------
+
+
+@click.command(
+    epilog=f"{EXIT_CODES}\n"
+    "\b\nExamples:\n"
+    "  rmpa trust invite                          print a token, wait, compare the code\n"
+    "  rmpa trust invite --module arm2 --for 2d   for one module, valid for two days\n"
+    "  rmpa trust invite --no-wait | ssh arm2 rmpa trust join --yes -\n"
+    "                                             by a script; the token alone decides\n"
+    "  rmpa trust invite --sign arm2.csr          answer a join by files\n"
+)
+@click.option(
+    "--for", "lifetime", metavar="TIME", default="15min", help="Validity: 90s, 15min, 2h, 3d. [default: 15min]"
+)
+@click.option("--module", metavar="MODULE", help="The only module that may use it. [default: any]")
+@click.option(
+    "--address", metavar="HOST[:PORT]", help="Where the module reaches this one. [default: as other agents do]"
+)
+@click.option("--yes", is_flag=True, help="Compare no code: the token alone decides.")
+@click.option("--no-wait", is_flag=True, help="Print the token and end; compare no code.")
+@click.option("--sign", metavar="FILE", help="Answer the request of rmpa trust join --request; no token is made.")
+@click.option("--out", metavar="FILE", help="Where --sign writes the answer, a secret. [default: FILE.answer]")
+@name_option
+@config_option
+@json_option
+def invite(
+    lifetime: str,
+    module: str | None,
+    address: str | None,
+    yes: bool,
+    no_wait: bool,
+    sign: str | None,
+    out: str | None,
+    name: str | None,
+    file: str | None,
+    as_json: bool,
+) -> None:
+    """Invite a module, at the authority: print a token that is valid once, and compare the code that both sides show.
+
+    The token goes to standard output, all else to standard error. Whoever has it may join: pass it on as a secret.
+    """
+    if module and (problem := peer_name_problem(module)):
+        raise ConfigError("--module", problem)
+    seconds = _seconds(lifetime)
+    host, port = _address(address)
+    place = find_place(name, file)
+    if sign is not None:
+        _sign(place, Path(sign), Path(out) if out else Path(f"{sign}.answer"), yes=yes, as_json=as_json)
+        return
+    if place.agent != "secured":
+        membership = place.membership()
+        place.authority(membership)  # the better error, if this module is none
+        problem = "runs without trust" if place.socket is not None else "does not run"
+        remedy = "start it again" if place.socket is not None else "start it: rmpa up"
+        raise StartError(f"the agent {place.name}", f"{problem}, so no module can join", remedy)
+    unattended = yes or no_wait
+    invited = place.call(
+        "invite",
+        InviteReply,
+        name=module or "",
+        lifetime=seconds,
+        address=host,
+        port=port,
+        unattended=unattended,
+    )
+    try:
+        _print_token(invited, module, as_json=as_json)
+        if not no_wait:
+            _await_join(place, invited, yes=yes, as_json=as_json)
+    except (KeyboardInterrupt, click.Abort):
+        with contextlib.suppress(RmpaError):
+            if place.call("withdraw", TrustReply, id=invited.id).done:
+                click.echo("\nthe token is withdrawn", err=True)
+        raise
+
+
+def _print_token(invited: InviteReply, module: str | None, *, as_json: bool) -> None:
+    if as_json:
+        print_json(invited)
+    else:
+        click.echo(invited.token)
+        whom = module or "one module"
+        click.echo(f"for {whom}, until {date_of(invited.expires)}; there: rmpa trust join TOKEN", err=True)
+    sys.stdout.flush()
+
+
+def _await_join(place: TrustPlace, invited: InviteReply, *, yes: bool, as_json: bool) -> None:
+    """Wait until a module has joined with the token, or was refused."""
+    import time
+
+    step = JoinStep(step=0, state="waiting")
+    if not as_json:
+        click.echo("waiting for the module; Ctrl-C withdraws the token", err=True)
+    while step.state in ("waiting", "code"):
+        following = place.call("step", JoinStep, id=invited.id, after=step.step)
+        if following.step == step.step:
+            if step.state == "waiting" and time.time() > invited.expires:
+                raise PeerRefused(
+                    "the authority", "the token has ended, and no module came", "rmpa trust invite again"
+                )
+            continue
+        step = following
+        if as_json:
+            print_json(step)
+        if step.state == "code":
+            click.echo(f"{step.module} joins; its code must be: {grouped(step.code)}", err=True)
+            if not yes:
+                agree = confirm(f"Does {step.module} show this code?")
+                with contextlib.suppress(PeerRefused):  # it has ended meanwhile: the next step says how
+                    place.call("answer", TrustReply, id=invited.id, agree=agree)
+    if step.state == "refused":
+        raise PeerRefused(
+            "the authority", f"the join failed: {step.text} ({step.reason})", "begin again with a new token"
+        )
+    if not as_json:
+        click.echo(f"{step.module} has joined", err=True)
+
+
+def _sign(place: TrustPlace, request: Path, out: Path, *, yes: bool, as_json: bool) -> None:
+    """Answer a join by files."""
+    check_library()
+    from rmpa.trust import certificates
+    from rmpa.trust.io.authority import request_der
+
+    try:
+        with request.open("rb") as stream:
+            data = request_der(stream.read(limits.JOIN_REQUEST_MAX))
+        wanted = certificates.read_request(data)
+    except OSError as error:
+        raise ConfigError(str(request), f"cannot be read: {error.strerror}") from None
+    except (ValueError, certificates.CertificateError) as error:
+        remedy = "make it by rmpa trust join --request FILE"
+        raise ConfigError(str(request), f"is no request: {error}", remedy) from None
+    key = wanted.key_hash[: limits.FINGERPRINT_BYTES].hex()
+    click.echo(f"{wanted.name} asks with the key {grouped(key)}", err=True)
+    if not yes and not confirm(f"Does {wanted.name} show this key?"):
+        raise ConfigError("rmpa trust invite --sign", "nothing was signed")
+    if place.agent == "secured":
+        answer = place.call("sign", dict[str, str], request=b64encode(data).decode())["answer"].encode()
+    else:
+        import msgspec
+
+        _, made = place.authority(place.membership()).join_file(data)
+        answer = msgspec.json.encode(made)
+    _write_secret(out, answer)
+    if as_json:
+        print_json({"module": wanted.name, "key": key, "file": str(out)})
+    else:
+        print_line(f"{out} is the answer, a secret: bring it to {wanted.name}, and delete it then")
+        print_line(f"there: rmpa trust join --accept {out.name} --ca {_ca_of(place)}")
+
+
+def _ca_of(place: TrustPlace) -> str:
+    """The fingerprint of this mesh's CA."""
+    from rmpa.trust.tokens import fingerprint_of
+
+    return fingerprint_of(place.membership().files.ca).hex()
+
+
+def _write_secret(path: Path, data: bytes) -> None:
+    """Write a new file that only this user can read."""
+    import os
+
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        with os.fdopen(descriptor, "wb") as stream:
+            stream.write(data)
+    except FileExistsError:
+        raise ConfigError(str(path), "exists already", "choose another --out, or remove it") from None
+    except OSError as error:
+        raise StartError(str(path), f"cannot be written: {error.strerror}") from None
+
+
+def _seconds(text: str) -> float:
+    match = _LIFETIME.fullmatch(text.strip())
+    seconds = int(match[1]) * _UNITS[match[2]] if match else 0
+    if not 0 < seconds <= limits.TOKEN_LIFETIME_MAX:
+        most = limits.TOKEN_LIFETIME_MAX / 86_400
+        raise ConfigError("--for", f"{text!r} is not a time up to {most:.0f} d", "write 90s, 15min, 2h or 3d")
+    return float(seconds)
+
+
+def _address(text: str | None) -> tuple[str, int | None]:
+    """The host as an IPv4 address, and the port, of ``--address``; empty and ``None`` where it is not given."""
+    if text is None:
+        return "", None
+    import socket
+
+    host, _, port = text.partition(":")
+    if port and not (port.isascii() and port.isdigit() and 0 < int(port) < 65_536):
+        raise ConfigError("--address", f"{port!r} is no port", "write HOST or HOST:PORT")
+    try:
+        return socket.gethostbyname(host), int(port) if port else None
+    except OSError as error:
+        raise ConfigError("--address", f"{host!r} has no IPv4 address: {error}") from None
+
+
+# --- the module that joins ------------------------------------------------------------------------------------------
+
+
+@click.command(
+    epilog=f"{EXIT_CODES}\n"
+    "\b\nExamples:\n"
+    "  rmpa trust join rmpa1-...                 with a token of rmpa trust invite\n"
+    "  rmpa trust join -                         the token from standard input, not in the process list\n"
+    "  rmpa trust join --request arm2.csr        offline: bring this file to the authority ...\n"
+    "  rmpa trust join --accept arm2.csr.answer --ca 4f2a...   ... and its answer back\n"
+)
+@click.argument("token", required=False)
+@click.option("--yes", is_flag=True, help="Compare no code: the token alone decides.")
+@click.option("--request", metavar="FILE", help="Join by files: write the request.")
+@click.option("--accept", metavar="FILE", help="Join by files: read the answer.")
+@click.option("--ca", metavar="FINGERPRINT", help="With --accept: of the CA, as rmpa trust invite --sign shows it.")
+@name_option
+@config_option
+@json_option
+def join(
+    token: str | None,
+    yes: bool,
+    request: str | None,
+    accept: str | None,
+    ca: str | None,
+    name: str | None,
+    file: str | None,
+    as_json: bool,
+) -> None:
+    """Join a secured mesh with a TOKEN of rmpa trust invite; - reads it from standard input.
+
+    Both sides show a code of six digits, and both users say that it is the same: so nothing between the machines has
+    taken part.
+    """
+    if sum(each is not None for each in (token, request, accept)) != 1:
+        raise ConfigError("rmpa trust join", "needs a TOKEN, --request or --accept", "see rmpa trust join --help")
+    check_library()
+    place = find_place(name, file)
+    if place.store.exists:
+        remedy = "rmpa trust status shows it; rmpa trust leave first, to join anew"
+        raise StartError(f"the module {place.name}", "is a member of a secured mesh already", remedy)
+    if request is not None:
+        _write_request(place, Path(request), as_json=as_json)
+        return
+    files = _accepted(place, Path(accept), ca) if accept is not None else _join_by_token(place, token or "", yes=yes)
+    place.store.save(files)
+    place.store.forget("request.key")
+    from rmpa.trust import certificates
+
+    found = certificates.verify(files.certificate, files.ca, None)
+    if as_json:
+        print_json(TrustReply(module=found.name, done=True, expires=int(found.expires)))
+        return
+    print_line(f"{found.name} has joined; its certificate ends {date_of(found.expires)}, and renews itself before")
+    if place.socket is not None:
+        warn(f"the agent {place.name} runs without trust until it is started again")
+    else:
+        print_line("Next: rmpa up; rmpa trust check says what other modules may do here.")
+
+
+def _join_by_token(place: TrustPlace, text: str, *, yes: bool) -> MemberFiles:
+    from rmpa.agent.trust import read_refusal
+    from rmpa.runtime.system_clock import SystemClock
+    from rmpa.trust.io.joining import join_mesh
+    from rmpa.trust.io.store import AuthorityPlace
+    from rmpa.trust.tokens import Token, TokenError
+
+    try:
+        token = Token.parse(sys.stdin.readline() if text == "-" else text)
+    except TokenError as error:
+        raise ConfigError("TOKEN", str(error)) from None
+    place.store.check_writable()  # before the token is used up
+
+    async def compare(code: str) -> bool:
+        click.echo(f"{place.name} joins; the code is: {grouped(code)}", err=True)
+        if yes:
+            click.echo("it is not compared (--yes): the token alone decides", err=True)
+            return True
+        return await asked(asyncio.get_running_loop(), lambda: confirm("Does the authority show this code?"))
+
+    files = asyncio.run(join_mesh(token, place.name, SystemClock(), compare, read_refusal))
+    place.store.save_authority(AuthorityPlace("", str(token.address), token.port))
+    return files
+
+
+def _write_request(place: TrustPlace, out: Path, *, as_json: bool) -> None:
+    from rmpa.trust import certificates
+    from rmpa.trust.io import store as files_of
+    from rmpa.trust.io.authority import request_pem
+    from rmpa.trust.io.private_keys import new_key, private_key
+
+    pem = new_key()
+    request = certificates.make_request(private_key(pem, files_of.REQUEST_KEY), place.name)
+    key = certificates.read_request(request).key_hash[: limits.FINGERPRINT_BYTES].hex()
+    place.store.write(files_of.REQUEST_KEY, pem)
+    try:
+        out.write_bytes(request_pem(request))
+    except OSError as error:
+        raise StartError(str(out), f"cannot be written: {error.strerror}") from None
+    if as_json:
+        print_json({"module": place.name, "key": key, "file": str(out)})
+    else:
+        print_line(f"{out} is the request of {place.name}, with the key {grouped(key)}; it is no secret")
+        print_line(f"at the authority: rmpa trust invite --sign {out.name}")
+
+
+def _accepted(place: TrustPlace, path: Path, ca: str | None) -> MemberFiles:
+    """The files of the answer in a join by files.
+
+    Raises:
+        ConfigError: It is no answer, or of another authority, another module or another key.
+    """
+    import msgspec
+
+    from rmpa.trust import certificates
+    from rmpa.trust.documents import read_deny_list, read_key_list
+    from rmpa.trust.io import store as files_of
+    from rmpa.trust.io.authority import JoinFile
+    from rmpa.trust.io.private_keys import private_key
+    from rmpa.trust.io.store import MemberFiles
+
+    digits = re.sub(r"[\s:]", "", ca or "").lower()
+    if not re.fullmatch(rf"[0-9a-f]{{{_FINGERPRINT}}}", digits):
+        raise ConfigError("--ca", f"is not {_FINGERPRINT} hexadecimal digits", "rmpa trust invite --sign shows them")
+    pem = place.store.load_request_key()
+    own = certificates.make_request(private_key(pem, files_of.REQUEST_KEY), place.name)
+    try:
+        with path.open("rb") as stream:
+            answer = msgspec.json.decode(stream.read(limits.JOIN_ANSWER_MAX + 1), type=JoinFile)
+        certificates.check_ca(answer.ca, bytes.fromhex(digits))
+        found = certificates.verify(answer.certificate, answer.ca, None, name=place.name)
+        key = certificates.ca_public_key(answer.ca)
+        read_key_list(answer.keys, key)
+        if answer.deny:
+            read_deny_list(answer.deny, key)
+    except OSError as error:
+        raise ConfigError(str(path), f"cannot be read: {error.strerror}") from None
+    except (msgspec.MsgspecError, UnicodeError) as error:
+        raise ConfigError(str(path), f"is no answer of rmpa trust invite --sign: {error!s:.100}") from None
+    except certificates.CertificateError as error:
+        text = str(error).replace("of the token", "of --ca")
+        raise ConfigError(str(path), text, "is it the answer to this module's last request?") from None
+    if found.public_key != certificates.read_request(own).public_key:
+        remedy = "begin again: rmpa trust join --request FILE"
+        raise ConfigError(str(path), "is the answer to another request than the last one", remedy)
+    return MemberFiles(pem, answer.certificate, answer.ca, answer.keys, answer.deny)

@@ -1,0 +1,242 @@
+"""``rmpa trust init|status|renew|revoke|leave``: the mesh, and this module's part in it."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import click
+
+from rmpa.cli.options import json_option
+from rmpa.cli.output import Column, duration, print_json, print_line, print_table, warn
+from rmpa.cli.trust_place import check_library, config_option, confirm, date_of, find_place, grouped, name_option
+from rmpa.core.errors import ConfigError, StartError
+from rmpa.trust.status import TrustReply, TrustStatus
+
+if TYPE_CHECKING:
+    from rmpa.cli.trust_place import TrustPlace
+
+EXIT_CODES = "\b\nExit codes: 0 done; 1 not done, with the reason on stderr; 2 a wrong option or name.\n"
+_RESTART = "the agent {} runs without trust until it is started again"
+
+
+@click.command(
+    epilog=f"{EXIT_CODES}\n\b\nExamples:\n  rmpa trust init\n  rmpa trust init --name base --label 'warehouse 3'\n"
+)
+@click.option("--label", metavar="TEXT", default="", help="What you call the mesh; it stands in its certificates.")
+@name_option
+@config_option
+@json_option
+def init(label: str, name: str | None, file: str | None, as_json: bool) -> None:
+    """Make a secured mesh. This module becomes its authority: it invites, renews and revokes.
+
+    Its key is needed for that alone: links come up without the authority, for as long as certificates are valid.
+    """
+    check_library()
+    place = find_place(name, file)
+    if place.store.exists:
+        remedy = "rmpa trust status shows it; rmpa trust leave removes it"
+        raise StartError(f"the module {place.name}", "is a member of a secured mesh already", remedy)
+    from rmpa.trust.io.authority import found_mesh
+
+    found_mesh(place.store, place.name, label or place.name, time.time())
+    status = _status(place)
+    if as_json:
+        print_json(status)
+        return
+    print_line(f"{place.name} is the authority of a new mesh; its files are in {place.store.folder}")
+    print_line(f"fingerprint of the CA: {grouped(status.fingerprint)}")
+    print_line("Keep a copy of that folder in a safe place: without ca.key no module can join or be renewed.")
+    if place.socket is not None:
+        warn(_RESTART.format(place.name))
+    again = " again" if place.socket is not None else ""
+    print_line(f"Next: start rmpa up here{again}, and rmpa trust invite for each module.")
+    print_line("Modules may do here only what [[permission]] in rmpa.toml allows: docs/permissions.md")
+
+
+@click.command(epilog=f"{EXIT_CODES}\n\b\nExamples:\n  rmpa trust status\n  rmpa trust status --json | jq .expires\n")
+@name_option
+@config_option
+@json_option
+def status(name: str | None, file: str | None, as_json: bool) -> None:
+    """Show this module's part in its mesh: certificate, keys, deny list; at the authority also members and tokens.
+
+    The exit code is 0 too if trust is off.
+    """
+    shown = _status(find_place(name, file))
+    if as_json:
+        print_json(shown)
+        return
+    if not shown.on:
+        print_line(f"trust is off: {shown.module} has joined no secured mesh")
+        print_line("make one: rmpa trust init; or join one: rmpa trust join TOKEN")
+    else:
+        _show(shown)
+    for problem in shown.problems:
+        warn(problem)
+
+
+def _status(place: TrustPlace) -> TrustStatus:
+    """The state by the agent, or by the files if none runs."""
+    if place.socket is not None:
+        shown = place.call("status", TrustStatus)
+        if shown.agent == "secured" or not place.store.exists:
+            return shown
+    if not place.store.exists:
+        return TrustStatus(on=False, module=place.name, folder=str(place.store.folder), agent=place.agent)
+    from rmpa.trust.io.status import status_of
+
+    membership = place.membership()
+    authority = place.authority(membership) if place.store.is_authority else None
+    agent = place.agent
+    shown = status_of(membership, authority, agent=agent)
+    if agent == "plain":
+        from msgspec.structs import replace
+
+        return replace(shown, problems=(*shown.problems, _RESTART.format(place.name)))
+    return shown
+
+
+def _show(shown: TrustStatus) -> None:
+    now = time.time()
+    role = ", the authority" if shown.is_authority else f"; authority: {shown.authority or 'not known yet'}"
+    print_line(f"{shown.module}{role}")
+    left = duration(shown.expires - now) if shown.expires > now else "ended"
+    print_line(f"certificate: until {date_of(shown.expires)} ({left}), renewed from {date_of(shown.renew_at)}")
+    print_line(f"CA: {grouped(shown.fingerprint)}")
+    revoked = ", ".join(shown.revoked) or "none"
+    print_line(f"group key {shown.key}; deny list {shown.deny_number}: {revoked}")
+    print_line(f"agent: {shown.agent}; files: {shown.folder}")
+    if shown.members:
+        rows = [
+            (
+                each.name,
+                {True: "linked", False: "not linked", None: "-"}[each.linked],
+                date_of(each.issued),
+                date_of(each.expires),
+            )
+            for each in shown.members
+        ]
+        print_line()
+        print_table([Column("MODULE"), Column("STATE"), Column("ISSUED"), Column("UNTIL")], rows)
+    if shown.tokens:
+        rows = [
+            (each.id[:8], each.state, each.used_by or each.name or "any module", date_of(each.expires))
+            for each in shown.tokens
+        ]
+        print_line()
+        print_table([Column("TOKEN"), Column("STATE"), Column("MODULE"), Column("UNTIL")], rows)
+
+
+@click.command(
+    epilog=f"{EXIT_CODES}\n\b\nExamples:\n  rmpa trust renew               after the authority was away\n"
+    "  rmpa trust renew --group-key   at the authority: a new group key for all\n"
+)
+@click.option("--group-key", is_flag=True, help="At the authority: make a new group key; no link falls.")
+@name_option
+@config_option
+@json_option
+def renew(group_key: bool, name: str | None, file: str | None, as_json: bool) -> None:
+    """Renew this module's certificate now. Agents do it by themselves after half of its time.
+
+    A module that was off for up to a year is renewed too, with its key alone; it needs the authority for that.
+    """
+    place = find_place(name, file)
+    if place.agent == "secured":
+        reply = place.call("rotate" if group_key else "renew", TrustReply)
+    else:
+        reply = _rotate_files(place) if group_key else _renew_files(place)
+    if as_json:
+        print_json(reply)
+    elif group_key:
+        print_line(f"group key {reply.number} is made; all linked modules get it, and use it in 30 s")
+    else:
+        print_line(f"{reply.module} has a new certificate until {date_of(reply.expires)}")
+
+
+def _rotate_files(place: TrustPlace) -> TrustReply:
+    membership = place.membership()
+    return TrustReply(module=place.name, done=True, number=place.authority(membership).rotate())
+
+
+def _renew_files(place: TrustPlace) -> TrustReply:
+    """Renew without an agent: the authority by its own key, others by a connection to it."""
+    membership = place.membership()
+    if place.store.is_authority:
+        place.authority(membership).renew_own()
+    else:
+        import asyncio
+
+        from rmpa.agent.trust import read_refusal
+        from rmpa.trust.documents import DocumentKind
+        from rmpa.trust.io.joining import renew_at_authority
+
+        known = place.store.load_authority()
+        if known is None:
+            remedy = "start the agent (rmpa up), or join again: rmpa trust invite at the authority"
+            raise StartError("the authority", "was never linked with this module: its address is not known", remedy)
+        grant = asyncio.run(renew_at_authority(membership, known.address, known.port, read_refusal))
+        membership.renewed(grant.certificate)
+        for kind, data in ((DocumentKind.DENY, grant.deny), (DocumentKind.KEYS, grant.keys)):
+            if data:
+                membership.accept_document(kind, data)
+    return TrustReply(module=place.name, done=True, expires=int(membership.certificate.expires))
+
+
+@click.command(
+    epilog=f"{EXIT_CODES}\n\b\nExamples:\n  rmpa trust revoke arm2          its links end everywhere at once\n"
+    "  rmpa trust revoke arm2 --force  also if no certificate of it is known here\n"
+)
+@click.argument("module")
+@click.option("--force", is_flag=True, help="Also if no certificate of that name is known here.")
+@name_option
+@config_option
+@json_option
+def revoke(module: str, force: bool, name: str | None, file: str | None, as_json: bool) -> None:
+    """Throw MODULE out of the mesh, at the authority: its certificates are refused everywhere from now on.
+
+    All linked modules get the deny list and a new group key within a second; others when they are linked again.
+    It may come back with a new token.
+    """
+    place = find_place(name, file)
+    if place.agent == "secured":
+        reply = place.call("revoke", TrustReply, name=module, force=force)
+    else:
+        membership = place.membership()
+        deny = place.authority(membership).revoke_known(module, force=force)
+        reply = TrustReply(module=module, done=True, number=deny.number)
+    if as_json:
+        print_json(reply)
+    else:
+        print_line(f"{module} is revoked (deny list {reply.number}); there is a new group key")
+        if place.socket is None:
+            warn("no agent runs here: the other modules learn it when it is started (rmpa up)")
+
+
+@click.command(epilog=f"{EXIT_CODES}\n\b\nExamples:\n  rmpa trust leave\n  rmpa trust leave --yes   in a script\n")
+@click.option("--yes", is_flag=True, help="Do not ask.")
+@name_option
+@config_option
+@json_option
+def leave(yes: bool, name: str | None, file: str | None, as_json: bool) -> None:
+    """Remove this module's keys and certificate: its agent starts without trust then.
+
+    At the authority that ends the whole mesh: nothing can be renewed after a week.
+    """
+    place = find_place(name, file)
+    if not place.store.exists:
+        raise StartError(f"the module {place.name}", "has joined no secured mesh", "there is nothing to remove")
+    if not yes:
+        what = (
+            "the AUTHORITY's keys: the mesh ends when its certificates do" if place.store.is_authority else "its keys"
+        )
+        if not confirm(f"Remove {place.name} from its mesh, with {what}?"):
+            raise ConfigError("rmpa trust leave", "nothing was removed")
+    removed = place.store.remove()
+    secured = place.socket is not None
+    if as_json:
+        print_json(TrustReply(module=place.name, done=True, text=", ".join(removed)))
+        return
+    print_line(f"{place.name} has left its mesh: {len(removed)} files are removed")
+    if secured:
+        warn(f"the agent {place.name} keeps its membership until it is started again")

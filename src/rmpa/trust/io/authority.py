@@ -1,0 +1,324 @@
+"""The authority of a mesh: the module that has the CA's key invites, renews and revokes."""
+
+from __future__ import annotations
+
+import logging
+import os
+import ssl
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from rmpa.config.values import did_you_mean
+from rmpa.core.errors import ConfigError, StartError
+from rmpa.trust import certificates, limits
+from rmpa.trust.certificates import CertificateError
+from rmpa.trust.documents import DenyList, DocumentKind, KeyList, sign
+from rmpa.trust.io import store as files_of
+from rmpa.trust.io.private_keys import new_key, private_key
+from rmpa.trust.io.store import Issued, MemberFiles
+from rmpa.trust.join import MeshSecrets
+from rmpa.trust.keyring import GroupKey
+from rmpa.trust.reasons import TrustReason
+from rmpa.trust.tokens import Token, fingerprint_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection
+    from ipaddress import IPv4Address
+
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    from rmpa.trust.certificates import CertificateRequest, ModuleCertificate
+    from rmpa.trust.io.membership import Membership
+    from rmpa.trust.io.store import TrustStore
+
+_log = logging.getLogger(__name__)
+_SERIAL_BITS: Final = 159
+_CLOCK: Final = "set it first (date, timedatectl): certificates with a wrong time are of no use elsewhere"
+
+
+class JoinFile(msgspec.Struct, frozen=True):
+    """The answer of the authority in a join by files. It is secret: it has the group keys.
+
+    Args:
+        certificate: The module's (DER).
+        ca: The CA's (DER).
+        keys: The signed list of group keys.
+        deny: The signed deny list; empty if nothing was revoked.
+    """
+
+    certificate: bytes
+    ca: bytes
+    keys: bytes
+    deny: bytes = b""
+
+    def __repr__(self) -> str:
+        """Without the keys."""
+        return f"JoinFile({len(self.certificate)} bytes of a certificate)"
+
+
+def found_mesh(store: TrustStore, name: str, label: str, wall: float) -> None:
+    """Make a new mesh, whose authority and first member is this module.
+
+    Args:
+        store: Where its files are written.
+        name: The module's name.
+        label: What users call the mesh.
+        wall: Seconds since 1970.
+
+    Raises:
+        StartError: The clock is not set, or a file cannot be written.
+    """
+    _check_clock(wall)
+    ca_pem, key_pem = new_key(), new_key()
+    ca_key, key = private_key(ca_pem, files_of.CA_KEY), private_key(key_pem, files_of.KEY)
+    ca = certificates.make_ca(ca_key, label, _serial(), wall)
+    request = certificates.read_request(certificates.make_request(key, name))
+    certificate = certificates.issue(request, ca, ca_key, _serial(), wall)
+    keys = KeyList.of(1, [GroupKey(1, os.urandom(limits.GROUP_KEY_BYTES))], name)
+    store.write(files_of.CA_KEY, ca_pem)
+    store.save(MemberFiles(key_pem, certificate, ca, sign(keys, ca_key)))
+    store.save_issued([_issued(name, wall)])
+
+
+class MeshAuthority:
+    """Issues certificates and signs documents; writes what it changes at once.
+
+    Args:
+        store: The files.
+        membership: This module's, which newer documents are given to.
+        ca_key: The CA's key.
+
+    Raises:
+        StartError: The CA's key is another one, or a file is broken.
+    """
+
+    def __init__(self, store: TrustStore, membership: Membership, ca_key: ec.EllipticCurvePrivateKey) -> None:
+        self._store = store
+        self._membership = membership
+        self._ca_key = ca_key
+        if ca_key.public_key() != certificates.ca_public_key(membership.files.ca):
+            raise StartError(str(store.path(files_of.CA_KEY)), "is not the key of ca.crt", "take it from a copy")
+        self._issued = store.load_issued()
+        self.book = membership.tokens = store.load_tokens()
+        """The tokens."""
+        self.on_revoked: list[Callable[[str], None]] = []
+        """Called with the name of a module that was revoked: its joins under way end."""
+
+    @classmethod
+    def load(cls, store: TrustStore, membership: Membership) -> MeshAuthority:
+        """Read the files of the authority; errors as for the class."""
+        return cls(store, membership, private_key(store.load_ca_key(), str(store.path(files_of.CA_KEY))))
+
+    @property
+    def secrets(self) -> MeshSecrets:
+        """What a joining module gets, and what signs it."""
+        member = self._membership
+        keys, deny = member.document(DocumentKind.KEYS), member.document(DocumentKind.DENY)
+        return MeshSecrets(member.files.ca, self._ca_key, keys, deny)
+
+    @property
+    def issued(self) -> tuple[Issued, ...]:
+        """The last certificate of each module, by name."""
+        return tuple(sorted(self._issued.values(), key=lambda each: each.name))
+
+    # --- invitations ------------------------------------------------------------------------------------------
+
+    def invite(
+        self, address: IPv4Address, port: int, lifetime: float, name: str = "", *, unattended: bool = False
+    ) -> Token:
+        """A new token.
+
+        Args:
+            address: Where the joining module reaches this one.
+            port: The mesh port.
+            lifetime: Seconds of its validity.
+            name: The module that it is for; empty for any.
+            unattended: Whether no user compares the code here.
+
+        Raises:
+            StartError: The clock is not set, or the file cannot be written.
+            ValueError: No module can have that name, or nothing can be reached at the address.
+        """
+        secret = os.urandom(limits.TOKEN_SECRET_BYTES)
+        token = Token(int(self.wall() + lifetime), address, port, fingerprint_of(self._membership.files.ca), secret)
+        self.book.invite(token, name, unattended=unattended)
+        self.save_tokens()
+        return token
+
+    def withdraw(self, token_id: bytes) -> bool:
+        """Make a token that was not used void; return whether there was one."""
+        withdrawn = self.book.withdraw(token_id)
+        if withdrawn:
+            self.save_tokens()
+        return withdrawn
+
+    def save_tokens(self) -> None:
+        """Write the tokens, one of which was used."""
+        self._store.save_tokens(self.book)
+
+    # --- certificates -----------------------------------------------------------------------------------------
+
+    def wall(self) -> float:
+        """Seconds since 1970.
+
+        Raises:
+            StartError: The clock is not set.
+        """
+        wall = self._membership.wall()
+        if wall is None:
+            raise StartError("the clock of this machine", "is not set", _CLOCK)
+        return wall
+
+    def wall_for(self, name: str) -> float:
+        """The time at which a certificate of a module is issued: behind its revocation, also in the same second."""
+        entry = next((entry for entry in self._membership.deny.entries if entry.name == name), None)
+        return self.wall() if entry is None else max(self.wall(), entry.before + 1.0)
+
+    def new_serial(self) -> int:
+        """A random number for a certificate."""
+        return _serial()
+
+    def was_issued(self, name: str) -> None:
+        """Remember that a module has a new certificate."""
+        self._issued[name] = _issued(name, self.wall_for(name))
+        while len(self._issued) > limits.ISSUED_MAX:
+            del self._issued[min(self._issued, key=lambda each: self._issued[each].expires)]
+        self._store.save_issued(self.issued)
+
+    def issue(self, request: bytes, name: str = "") -> tuple[CertificateRequest, bytes]:
+        """A certificate (DER) for a request (DER), which it returns too.
+
+        Args:
+            request: PKCS #10.
+            name: The module that it must be of; empty for any.
+
+        Raises:
+            CertificateError: The request is malformed or of another module.
+            StartError: The clock is not set, or a file cannot be written.
+        """
+        asked = certificates.read_request(request)
+        if name and asked.name != name:
+            raise CertificateError(TrustReason.NAME, f"{name} asks for a certificate of {asked.name}")
+        secrets = self.secrets
+        certificate = certificates.issue(asked, secrets.ca, self._ca_key, _serial(), self.wall_for(asked.name))
+        self.was_issued(asked.name)
+        return asked, certificate
+
+    def judge_renewal(self, certificate: bytes) -> ModuleCertificate:
+        """The certificate (DER) of a module that was away, if it may be renewed.
+
+        Raises:
+            CertificateError: It is of another CA, ended too long ago, or was revoked.
+        """
+        member = self._membership
+        return certificates.verify(
+            certificate, member.files.ca, self.wall(), deny=member.deny, grace=limits.RENEWAL_GRACE
+        )
+
+    def renew_own(self) -> None:
+        """Renew the certificate of the authority itself; raises as ``issue``."""
+        _, certificate = self.issue(self._membership.request())
+        self._membership.renewed(certificate)
+
+    def join_file(self, request: bytes) -> tuple[CertificateRequest, JoinFile]:
+        """The answer to a request (DER) in a join by files; raises as ``issue``."""
+        asked, certificate = self.issue(request)
+        secrets = self.secrets
+        return asked, JoinFile(certificate, secrets.ca, secrets.keys, secrets.deny)
+
+    # --- documents --------------------------------------------------------------------------------------------
+
+    def revoke_known(self, name: str, linked: Collection[str] = (), *, force: bool = False) -> DenyList:
+        """Revoke a module that a user names; return the new list.
+
+        Args:
+            name: The module's.
+            linked: The names of the linked modules.
+            force: Also if no certificate of that name is known here.
+
+        Raises:
+            ConfigError: It is this module, or no member is known by that name.
+            StartError: The clock is not set, or a file cannot be written.
+        """
+        if name == self._membership.name:
+            text = f"{name} is the authority itself"
+            raise ConfigError("NAME", text, "a new authority is a new mesh: rmpa trust leave, rmpa trust init")
+        known = {*self._issued, *linked} - {self._membership.name}
+        if name not in known and not force:
+            similar = did_you_mean(name, sorted(known))
+            remedy = f"did you mean {similar}?" if similar else "rmpa trust status lists them"
+            raise ConfigError("NAME", f"no module {name} has a certificate of this mesh", f"{remedy}; or add --force")
+        try:
+            return self.revoke(name)
+        except ValueError as error:
+            raise ConfigError("NAME", str(error)) from None
+
+    def revoke(self, name: str) -> DenyList:
+        """Refuse all certificates of a module from now on, and make a new group key; return the new list.
+
+        Its open tokens are withdrawn. A file that cannot be written is only logged.
+
+        Raises:
+            StartError: The clock is not set.
+            ValueError: No module can have that name, or the list is full.
+        """
+        last = self._issued.get(name)  # later than now, if the clock went back since
+        deny = self._membership.deny.with_name(name, max(self.wall(), last.issued if last is not None else 0.0))
+        self._membership.accept_document(DocumentKind.DENY, sign(deny, self._ca_key))
+        self._issued.pop(name, None)
+        self.rotate()  # before files are written: a full disk must not leave the old key in use
+        for call in tuple(self.on_revoked):
+            call(name)
+        unused = [each for each in self.book.invitations if not each.used_by]
+        for invitation in unused:
+            if invitation.name == name:
+                self.book.withdraw(invitation.token_id)
+        if open_to_all := sum(not each.name and each.expires > self.wall() for each in unused):
+            _log.warning("! %d open tokens are for any name: %s can join again with one", open_to_all, name)
+        try:
+            self._store.save_issued(self.issued)
+            self.save_tokens()
+        except StartError as error:
+            _log.error("! %s is revoked, but not all files are written: %s", name, error)
+        return deny
+
+    def rotate(self) -> int:
+        """Make a new group key, which signs ``limits.KEY_SPREAD`` later; return its number."""
+        ring = self._membership.ring
+        key = GroupKey(ring.newest.number + 1, os.urandom(limits.GROUP_KEY_BYTES))
+        number = self._membership.numbers[DocumentKind.KEYS] + 1
+        keys = KeyList.of(number, [*ring.keys, key][-limits.KEYS_MAX :], self._membership.name)
+        self._membership.accept_document(DocumentKind.KEYS, sign(keys, self._ca_key))
+        return key.number
+
+
+def request_pem(request: bytes) -> bytes:
+    """A request (DER) as PEM, for a file."""
+    pem = ssl.DER_cert_to_PEM_cert(request)
+    return pem.replace(" CERTIFICATE-", " CERTIFICATE REQUEST-").encode()
+
+
+def request_der(pem: bytes) -> bytes:
+    """The request (DER) in a file.
+
+    Raises:
+        ValueError: It is not PEM of a request.
+    """
+    text = pem.decode("ascii").strip()
+    if "BEGIN CERTIFICATE REQUEST" not in text:
+        raise ValueError("it does not begin with BEGIN CERTIFICATE REQUEST")
+    return ssl.PEM_cert_to_DER_cert(text.replace(" CERTIFICATE REQUEST-", " CERTIFICATE-"))
+
+
+def _serial() -> int:
+    return int.from_bytes(os.urandom(20), "big") >> (160 - _SERIAL_BITS) or 1
+
+
+def _issued(name: str, wall: float) -> Issued:
+    return Issued(name, int(wall), int(wall) + limits.CERTIFICATE_LIFETIME)
+
+
+def _check_clock(wall: float) -> None:
+    if wall < limits.EARLIEST_TIME:
+        raise StartError("the clock of this machine", "is not set", _CLOCK)

@@ -1,0 +1,290 @@
+"""What a module has as a member of a secured mesh: certificate, group keys, deny list, contexts of TLS."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import ssl
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Final
+
+from rmpa.core.errors import RemoteProtocolError, StartError
+from rmpa.trust import certificates, limits
+from rmpa.trust.documents import DenyList, DocumentKind, KeyList, read_deny_list, read_key_list
+from rmpa.trust.io import store as files_of
+from rmpa.trust.io.contexts import link_context
+from rmpa.trust.io.private_keys import private_key
+from rmpa.trust.keyring import KeyPurpose, KeyRing
+from rmpa.trust.packets import PacketSigner, PacketTrust, PacketVerifier
+from rmpa.trust.preface import Preface, PrefaceGuard, Purpose
+from rmpa.trust.reasons import TrustError, TrustReason
+from rmpa.trust.tokens import TokenBook
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from rmpa.core.clock import Clock
+    from rmpa.trust.io.store import MemberFiles, TrustStore
+
+_log = logging.getLogger(__name__)
+_FILES: Final = {DocumentKind.DENY: files_of.DENY, DocumentKind.KEYS: files_of.KEYS}
+_REMEDY: Final = "join again: rmpa trust invite at the authority, rmpa trust join TOKEN here"
+
+
+class Membership:
+    """This module's part in a secured mesh. Its parts are replaced at a renewal and by newer documents.
+
+    The machine's clock counts as *set* while it shows a time after the beginning of the module's own certificate.
+    While it is not, no times are checked: neither of packets nor of certificates.
+
+    Args:
+        store: The files, which newer documents are written to.
+        files: What is in them.
+        clock: Monotonic seconds.
+        wall: Seconds since 1970, by the machine's clock, set or not.
+
+    Raises:
+        StartError: A file is broken, or they do not belong together.
+    """
+
+    def __init__(self, store: TrustStore, files: MemberFiles, clock: Clock, wall: Callable[[], float]) -> None:
+        self.store = store
+        self.files = files
+        self._clock = clock
+        self._machine_wall = wall
+        with _named(store, files_of.CERTIFICATE):
+            self._ca_key = certificates.ca_public_key(files.ca)
+            self.certificate = certificates.verify(files.certificate, files.ca, None)
+        with _named(store, files_of.KEYS):
+            self._keys = read_key_list(files.keys, self._ca_key)
+        with _named(store, files_of.DENY):
+            self._deny = read_deny_list(files.deny, self._ca_key) if files.deny else DenyList()
+        self.ring = KeyRing(self._keys.group_keys, clock.now())
+        self.tokens = TokenBook()
+        """The open tokens; the authority puts its own here."""
+        self.guard = PrefaceGuard(self.ring, self._token_key)
+        self.packets = PacketTrust(PacketSigner(self.ring), PacketVerifier(self.ring), self.wall)
+        self.on_denied: list[Callable[[], None]] = []
+        """Called after a newer deny list holds: links that match end at once."""
+        self.save: Callable[[str, bytes], None] = store.write
+        """Writes one file of the store."""
+        self._old_failed: set[str] = set()
+        """Addresses that are dialled with the present group key next, though their beacons have an older one."""
+        self._contexts: dict[tuple[bool, bool], ssl.SSLContext] = {}
+        self._context(server_side=True)  # a key of another certificate is an error of the start
+
+    @classmethod
+    def load(cls, store: TrustStore, clock: Clock, wall: Callable[[], float]) -> Membership:
+        """Read the files of a member; arguments and errors as for the class."""
+        return cls(store, store.load(), clock, wall)
+
+    def __repr__(self) -> str:
+        """Name and numbers alone: secrets never come into a log."""
+        return f"Membership({self.name!r}, deny={self._deny.number}, keys={self._keys.number})"
+
+    @property
+    def name(self) -> str:
+        """The module's name, as its certificate proves it."""
+        return self.certificate.name
+
+    @property
+    def authority(self) -> str:
+        """The name of the authority, as the signed list of group keys has it; empty: the list does not say."""
+        return self._keys.authority
+
+    @property
+    def deny(self) -> DenyList:
+        """The deny list that holds."""
+        return self._deny
+
+    @property
+    def numbers(self) -> dict[DocumentKind, int]:
+        """The numbers of the documents that hold."""
+        return {DocumentKind.DENY: self._deny.number, DocumentKind.KEYS: self._keys.number}
+
+    def document(self, kind: DocumentKind) -> bytes:
+        """A document that holds, signed; empty: there is none yet."""
+        return self.files.deny if kind is DocumentKind.DENY else self.files.keys
+
+    # --- clock ------------------------------------------------------------------------------------------------
+
+    def wall(self) -> float | None:
+        """Seconds since 1970; ``None`` while the machine's clock is not set."""
+        wall = self._machine_wall()
+        return wall if wall > self.certificate.issued - limits.CERTIFICATE_BACKDATE else None
+
+    # --- connections ------------------------------------------------------------------------------------------
+
+    @property
+    def server_context(self) -> ssl.SSLContext:
+        """For links that are accepted."""
+        return self._context(server_side=True)
+
+    @property
+    def client_context(self) -> ssl.SSLContext:
+        """For links that are dialled."""
+        return self._context(server_side=False)
+
+    def preface(self, purpose: Purpose, host: str = "") -> bytes:
+        """The first bytes of a connection that is dialled, signed by the group key that signs now.
+
+        Args:
+            purpose: What the connection is for.
+            host: The address that is dialled. A module there whose beacons have an older key was away, and does not
+                know the present one: the connection is signed with the older key, and TLS proves the rest. If that
+                fails the present key is next, for anything with the older key can send beacons from that address.
+        """
+        key = self.ring.signing(self._clock.now())
+        old = self.packets.old_keys.get(host)
+        if old and host not in self._old_failed:
+            key = self.ring.find(old) or key
+        wall = self.wall()
+        nonce = os.urandom(limits.PREFACE_NONCE_BYTES)
+        preface = Preface(purpose, key.short, 0 if wall is None else int(wall * 1000), nonce)
+        return preface.serialize(key.key_for(KeyPurpose.PREFACE))
+
+    def dial_failed(self, host: str) -> None:
+        """Note that the TLS handshake with a module at this address failed: the other group key is next."""
+        if host in self._old_failed:
+            self._old_failed.discard(host)
+        elif host in self.packets.old_keys:
+            if len(self._old_failed) >= limits.OLD_KEYS_MAX:
+                self._old_failed.clear()
+            self._old_failed.add(host)
+
+    def judge_member(self, certificate: Mapping[str, Any] | bytes, claimed: str | None) -> None:
+        """Check the other end's certificate behind a TLS handshake, which has checked the chain.
+
+        Args:
+            certificate: As ``SSLObject.getpeercert()`` returns it, or in DER; its chain is then verified here.
+            claimed: The name in its hello; ``None``: not known yet.
+
+        Raises:
+            TrustError: It is malformed (``foreign``), not valid yet (``clock``), ``expired``, of another module
+                (``name``), or ``revoked``.
+        """
+        wall = self.wall()
+        if isinstance(certificate, bytes | bytearray):
+            certificates.verify(bytes(certificate), self.files.ca, wall, name=claimed or "", deny=self._deny)
+            return
+        name, begin, expires = member_name(certificate), *_times(certificate)
+        if wall is not None and wall < begin:
+            text = f"the certificate of {name} begins in {begin - wall:.0f} s: one of the clocks is off"
+            raise TrustError(TrustReason.CLOCK, text)
+        if wall is not None and wall > expires:
+            raise TrustError(TrustReason.EXPIRED, f"the certificate of {name} ended {wall - expires:.0f} s ago")
+        if claimed is not None and claimed != name:
+            raise TrustError(TrustReason.NAME, f"the certificate is of {name}, not of {claimed}")
+        if self._deny.denies(name, begin + limits.CERTIFICATE_BACKDATE):
+            raise TrustError(TrustReason.REVOKED, f"{name} was revoked (deny list {self._deny.number})")
+
+    def request(self) -> bytes:
+        """A request (DER) for a newer certificate of this module and its key."""
+        key = private_key(self.files.key, str(self.store.path(files_of.KEY)))
+        return certificates.make_request(key, self.name)
+
+    # --- what is newer ----------------------------------------------------------------------------------------
+
+    def accept_document(self, kind: DocumentKind, data: bytes) -> bool:
+        """Take a signed document if it is newer than the one that holds; return whether it is.
+
+        A new group key signs ``limits.KEY_SPREAD`` later. A document that cannot be written holds all the same,
+        until the agent ends.
+
+        Raises:
+            LimitExceeded: It is too long.
+            DocumentError: It is malformed, or not signed by this mesh's authority.
+        """
+        if kind is DocumentKind.DENY:
+            deny = read_deny_list(data, self._ca_key)
+            if deny.number <= self._deny.number:
+                return False
+            self._deny = deny
+            self.files = replace(self.files, deny=data)
+        else:
+            keys = read_key_list(data, self._ca_key)
+            if keys.number <= self._keys.number:
+                return False
+            self._take_keys(keys, data)
+        if kind is DocumentKind.DENY:  # before a slow disk is written
+            for call in tuple(self.on_denied):
+                call()
+        self._write(_FILES[kind], data)
+        return True
+
+    def renewed(self, certificate: bytes) -> None:
+        """Take a newer certificate (DER) of this module and its key: links that come up from now on have it.
+
+        Raises:
+            CertificateError: It is of another CA, another module, another key, or not valid now.
+            StartError: It cannot be written; the one before goes on.
+        """
+        found = certificates.verify(certificate, self.files.ca, self.wall(), name=self.name)
+        if found.public_key != self.certificate.public_key:
+            raise certificates.CertificateError(TrustReason.FOREIGN, "the certificate is of another key")
+        self.store.write(files_of.CERTIFICATE, ssl.DER_cert_to_PEM_cert(certificate).encode())
+        self.certificate, self.files = found, replace(self.files, certificate=certificate)
+        self._contexts = {}
+
+    def _token_key(self, token_id: bytes) -> bytes | None:
+        return self.tokens.key_of(token_id)
+
+    def _take_keys(self, keys: KeyList, data: bytes) -> None:
+        now = self._clock.now()
+        for key in sorted(keys.group_keys, key=lambda each: each.number):
+            self.ring.add(key, now)
+        self._keys = keys
+        self.files = replace(self.files, keys=data)
+
+    def _write(self, name: str, data: bytes) -> None:
+        try:
+            self.save(name, data)
+        except StartError as error:
+            _log.error("! %s", error)
+
+    def _context(self, *, server_side: bool) -> ssl.SSLContext:
+        kind = (server_side, self.wall() is not None)
+        context = self._contexts.get(kind)
+        if context is None:
+            context = self._contexts[kind] = link_context(
+                self.store.path(files_of.CERTIFICATE),
+                self.store.path(files_of.KEY),
+                self.files.ca,
+                server_side=server_side,
+                check_times=kind[1],
+            )
+        return context
+
+
+def member_name(certificate: Mapping[str, Any]) -> str:
+    """The module that a certificate is of.
+
+    Args:
+        certificate: As ``SSLObject.getpeercert()`` returns it.
+
+    Raises:
+        TrustError: It is not one of a module.
+    """
+    uris = [value for kind, value in certificate.get("subjectAltName", ()) if kind == "URI"]
+    if len(uris) != 1 or not uris[0].startswith(certificates.URN):
+        raise TrustError(TrustReason.FOREIGN, "the certificate is not one of a module")
+    return str(uris[0].removeprefix(certificates.URN))
+
+
+def _times(certificate: Mapping[str, Any]) -> tuple[float, float]:
+    """Begin and end of a certificate, seconds since 1970."""
+    try:
+        begin, end = (ssl.cert_time_to_seconds(certificate[key]) for key in ("notBefore", "notAfter"))
+    except (KeyError, ValueError):
+        raise TrustError(TrustReason.FOREIGN, "the certificate has no validity") from None
+    return float(begin), float(end)
+
+
+@contextlib.contextmanager
+def _named(store: TrustStore, name: str) -> Iterator[None]:
+    """Turns an error about what is in a file into one that names the file."""
+    try:
+        yield
+    except RemoteProtocolError as error:
+        raise StartError(str(store.path(name)), f"is broken: {error}", _REMEDY) from None

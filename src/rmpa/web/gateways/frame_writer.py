@@ -1,0 +1,218 @@
+"""Writes WebSocket frames to a client's connection without a copy of large payloads.
+
+Before Python 3.12 asyncio's transport copies what the socket does not take at once, for each client. Here a frame's
+header and payload go to the socket in one system call, and what it does not take waits as views of the payload, which
+all clients share. With TLS the transport writes, as it encrypts.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from itertools import islice
+from typing import TYPE_CHECKING, Final
+
+from aiohttp import WSCloseCode, web
+
+from rmpa.web import limits
+from rmpa.web.gateways.websocket_frames import Opcode, frame_header
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Awaitable, Callable, Sequence
+
+    from rmpa.web.hub.requests import Payload
+
+_log = logging.getLogger(__name__)
+_BUFFERS: Final = 64
+"""Buffers of one system call."""
+_TRIES: Final = 4
+"""System calls for one frame before others have their turn: a fast reader often makes room at once."""
+
+
+class FrameSocket(web.WebSocketResponse):
+    """A WebSocket whose close frame, which aiohttp writes, comes behind the frames of a ``FrameWriter``."""
+
+    before_close: Callable[[], None] | None = None
+    """Called before the close frame is written; see ``FrameWriter.hand_over``."""
+
+    async def close(self, *, code: int = WSCloseCode.OK, message: bytes = b"", drain: bool = True) -> bool:
+        """Close the WebSocket."""
+        if self.before_close is not None:
+            self.before_close()
+        return await super().close(code=code, message=message, drain=drain)
+
+
+class FrameWriter:
+    """Writes the frames of one WebSocket, each whole and in order.
+
+    Args:
+        transport: Of the connection. Nothing else writes to it until ``hand_over``.
+        drain: Waits until the transport's own buffer has room.
+    """
+
+    def __init__(self, transport: asyncio.Transport, drain: Callable[[], Awaitable[None]]) -> None:
+        self._transport = transport
+        self._drain = drain
+        self._loop = asyncio.get_running_loop()
+        self._socket = _socket_of(transport)
+        """A descriptor of our own, as asyncio does not let others wait for the transport's; ``None``: the transport
+        writes."""
+        self._waiting: deque[memoryview] = deque()
+        self._waiting_bytes = 0
+        self._room: asyncio.Future[None] | None = None
+
+    @property
+    def unsent(self) -> int:
+        """Bytes that the kernel has not taken yet."""
+        return self._waiting_bytes + self._transport.get_write_buffer_size()
+
+    @property
+    def is_closing(self) -> bool:
+        """Whether the connection has ended, or ends."""
+        return self._transport.is_closing()
+
+    def write(self, opcode: Opcode, parts: Sequence[Payload]) -> None:
+        """Write one frame, or keep what the socket does not take.
+
+        Args:
+            opcode: Its kind.
+            parts: Its payload; buffers of bytes, which must not change until they are sent.
+        """
+        if self._transport.is_closing():
+            return
+        header = frame_header(opcode, sum(map(len, parts)))
+        if self._socket is None or self._transport.get_write_buffer_size():
+            self._write_by_transport(header, parts)
+        elif self._waiting:
+            self._keep((header, *parts))
+        else:
+            self._write_to(self._socket, (header, *parts))
+
+    async def drain(self) -> None:
+        """Wait until at most ``limits.WRITE_BUFFER`` bytes wait, or the connection has ended."""
+        while self._waiting_bytes > limits.WRITE_BUFFER:
+            self._room = self._loop.create_future()
+            await self._room
+        if self._transport.get_write_buffer_size():
+            await self._drain()
+
+    def hand_over(self) -> None:
+        """Pass what waits on to the transport, behind which others may write to it, and write by it from now on."""
+        waiting = self._stop()
+        if not self._transport.is_closing():
+            for view in waiting:
+                self._transport.write(view)
+
+    def close(self) -> None:
+        """Forget what waits; the connection itself is not closed."""
+        self._stop()
+
+    def _write_to(self, sock: socket.socket, buffers: Sequence[Payload]) -> None:
+        left: Sequence[Payload] = buffers
+        for _ in range(_TRIES):
+            sent = self._send(sock, left)
+            if sent < 0:
+                return
+            left = _behind(left, sent)
+            if not left:
+                return
+            if not sent:
+                break
+        self._keep(left)
+        self._loop.add_writer(sock.fileno(), self._writable)
+
+    def _keep(self, buffers: Sequence[Payload]) -> None:
+        for buffer in buffers:
+            if buffer:
+                self._waiting.append(memoryview(buffer))
+                self._waiting_bytes += len(buffer)
+
+    def _writable(self) -> None:
+        sock = self._socket
+        if sock is None:
+            return
+        sent = self._send(sock, [*islice(self._waiting, _BUFFERS)])
+        if sent <= 0:
+            return
+        self._waiting_bytes -= sent
+        while sent:
+            first = self._waiting[0]
+            if sent < len(first):
+                self._waiting[0] = first[sent:]
+                break
+            sent -= len(first)
+            self._waiting.popleft()
+        if not self._waiting:
+            self._loop.remove_writer(sock.fileno())
+        if self._waiting_bytes <= limits.WRITE_BUFFER:
+            self._make_room()
+
+    def _send(self, sock: socket.socket, buffers: Sequence[Payload]) -> int:
+        """How many bytes the socket took; -1 where the connection has ended."""
+        if self._transport.is_closing():
+            self._stop()
+            return -1
+        try:
+            return sock.sendmsg(buffers)
+        except (BlockingIOError, InterruptedError):
+            return 0
+        except OSError as error:
+            _log.debug("! sending: %s", error)
+            self._stop()
+            self._transport.abort()
+            return -1
+
+    def _write_by_transport(self, header: bytes, parts: Sequence[Payload]) -> None:
+        small: list[Payload] = [header]
+        for part in parts:
+            if len(part) <= limits.JOINED_BYTES:
+                small.append(part)
+                continue
+            self._transport.write(b"".join(small))
+            self._transport.write(part)
+            small.clear()
+        if small:
+            self._transport.write(b"".join(small))
+
+    def _stop(self) -> Sequence[memoryview]:
+        """Write to the socket no more; returns what waits."""
+        waiting, self._waiting, self._waiting_bytes = self._waiting, deque(), 0
+        if self._socket is not None:
+            if waiting:
+                self._loop.remove_writer(self._socket.fileno())
+            self._socket.close()
+            self._socket = None
+        self._make_room()
+        return waiting
+
+    def _make_room(self) -> None:
+        if self._room is not None and not self._room.done():
+            self._room.set_result(None)
+
+
+def _behind(buffers: Sequence[Payload], sent: int) -> list[Payload]:
+    """The buffers without their first ``sent`` bytes."""
+    left: list[Payload] = []
+    for buffer in buffers:
+        size = len(buffer)
+        if sent >= size:
+            sent -= size
+        else:
+            left.append(memoryview(buffer)[sent:] if sent else buffer)
+            sent = 0
+    return left
+
+
+def _socket_of(transport: asyncio.Transport) -> socket.socket | None:
+    """A further descriptor of a connection without TLS; ``None`` where there is none."""
+    sock = transport.get_extra_info("socket")
+    if sock is None or transport.get_extra_info("sslcontext") is not None:
+        return None
+    try:
+        found: socket.socket = sock.dup()
+    except OSError as error:
+        _log.warning("! no further descriptor for a client, which costs a copy of each message: %s", error)
+        return None
+    return found

@@ -1,0 +1,313 @@
+"""Permissions between whole agents: what crosses, what is refused, and what each side is told of it.
+
+The links are plain: what makes a mesh secured has tests of its own. Here each agent is given its permissions as one
+of a secured mesh is.
+"""
+
+from __future__ import annotations
+
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING
+from unittest import mock
+
+import pytest
+
+from rmpa.agent import Agent
+from rmpa.agent.permission_notes import permission_notes
+from rmpa.bridge.io.node_requests import INFO
+from rmpa.bridge.io.proxy_kills import KILL
+from rmpa.bridge.params import transfer
+from rmpa.bridge.session.peer_session import PeerSession
+from rmpa.config.permission_rules import Effect, PermissionRule
+from rmpa.config.settings import NodeSettings, ParamSettings, ServiceSettings, Settings, TrustSettings
+from rmpa.core.contract import ContractRule, Transport
+from rmpa.core.errors import PeerRefused
+from rmpa.observe import limits as observe_limits
+from rmpa.ros.wire.xmlrpc import serialize_response
+from rmpa.trust.permissions import Permissions
+from tests.agent.test_agent import Sink, node, running, settings, until
+from tests.agent.test_services import serving
+from tests.agent.test_services_direct import about, transport
+from tests.agent.test_why import ask, stopped_at
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    from rmpa.observe.why.diagnosis import Diagnosis
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
+
+__all__ = ["settings"]
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(observe_limits, "WHY_WINDOW", 0.2)
+
+
+class SecuredAgent(Agent):
+    """An agent whose permissions hold."""
+
+    def __init__(self, its: Settings) -> None:
+        super().__init__(its)
+        self.bridge.gate.permissions = Permissions(its.trust)
+
+
+@asynccontextmanager
+async def secured(*all_settings: Settings) -> AsyncIterator[list[Agent]]:
+    with mock.patch("tests.agent.test_agent.Agent", SecuredAgent):
+        async with running(*all_settings) as agents:
+            yield agents
+
+
+def allow(modules: str, **names: str) -> PermissionRule:
+    return PermissionRule(tuple(modules.split()), names={key: tuple(globs.split()) for key, globs in names.items()})
+
+
+def deny(modules: str, **names: str) -> PermissionRule:
+    return replace(allow(modules, **names), effect=Effect.DENY)
+
+
+def with_rules(made: Settings, *rules: PermissionRule) -> Settings:
+    return replace(made, trust=TrustSettings(rules=rules))
+
+
+def stage(found: tuple[Diagnosis, ...], name: str) -> str:
+    return next(stage.text for one in found for stage in one.stages if stage.name == name)
+
+
+async def test_a_topic_flows_while_both_sides_permit_it_and_no_longer(
+    settings: Callable[..., Settings],
+) -> None:
+    a_settings = with_rules(settings("a"), allow("b", subscribe="/odom"), deny("b", subscribe="/secret/**"))
+    b_settings = with_rules(settings("b"), allow("a", publish="/**"))
+    async with secured(a_settings, b_settings) as (a, b), node("talker", a) as talker, node("hearer", b) as hearer:
+        odom = await talker.advertise("/odom", "std_msgs/String")
+        await talker.advertise("/secret/key", "std_msgs/String")
+        sink = Sink()
+        subscriber = await hearer.subscribe("/odom", "std_msgs/String", sink)
+        await until(lambda: odom.subscribers and subscriber.publishers)
+        odom.publish(odom.make({"data": "one"}))
+        await until(lambda: sink.count(1))
+        found = await ask(b, "/odom", "a")
+        assert stage(found, "permission there") == "a lets b subscribe to it"
+        assert stage(found, "permission here") == "[[permission]] 1 allows publish of '/**' to 'a'"
+        assert stage(await ask(a, "/odom", "b"), "permission here") == "b lets a publish it", "no rule of b for a"
+        assert a.bridge.counters["permission.subscribe"] == 1
+
+        a.apply_settings(with_rules(a_settings, allow("b", subscribe="/tf")))
+        await until(lambda: not odom.subscribers and not subscriber.publishers)
+        name, text = stopped_at((await ask(b, "/odom", "a"))[:1])
+        assert (name, text) == ("permission there", "the permissions of a do not let b subscribe to /odom")
+        a.apply_settings(a_settings)
+        await until(lambda: odom.subscribers and subscriber.publishers)
+
+        b.apply_settings(with_rules(b_settings, deny("a", publish="/odom"), allow("*", publish="/**")))
+        await until(lambda: not odom.subscribers and not subscriber.publishers)
+        name, text = stopped_at(await ask(b, "/odom", "a"))
+        assert name == "permission here"
+        assert text == "a may not publish /odom here: [[permission]] 1 denies publish of '/odom' to 'a'"
+        (there,) = await ask(a, "/odom", "b")
+        assert there.failed is not None
+        assert there.failed.text == "the permissions of b do not let a publish /odom"
+        assert "1 denies" not in str(there), "the rule is b's own"
+        b.apply_settings(b_settings)
+        await until(lambda: odom.subscribers and subscriber.publishers)
+
+
+async def test_why_tells_nothing_of_topics_and_services_that_the_asker_may_not_have(
+    settings: Callable[..., Settings],
+) -> None:
+    a_settings = with_rules(settings("a"), allow("b", subscribe="/odom", call="/stop"))
+    async with secured(a_settings, with_rules(settings("b"))) as (a, b), node("talker", a) as talker:
+        await talker.advertise("/secret", "std_msgs/String")
+        async with serving(a, "/open_door"):
+            for real, made_up in (("/secret", "/secrex"), ("/open_door", "/open_doox")):
+                for peer in ("a", None):
+                    answers = [
+                        [
+                            (one.kind, one.node, str(one.failed).replace(name, "NAME"))
+                            for one in await ask(b, name, peer)
+                        ]
+                        for name in (real, made_up)
+                    ]
+                    assert answers[0] == answers[1]
+                    said = str(answers[0])
+                    assert "the permissions of a do not let b" in said
+                    assert "talker" not in said
+                    assert "adder" not in said
+
+
+async def test_services_are_shown_and_called_only_as_both_sides_permit(
+    settings: Callable[..., Settings],
+) -> None:
+    a_settings = with_rules(settings("a"), allow("b", call="/add"))
+    b_settings = with_rules(settings("b"), allow("a", serve="/add"))
+    async with secured(a_settings, b_settings) as (a, b), serving(a, "/add"), serving(a, "/other", "/other_node"):
+
+        def here(service: str) -> bool:
+            return service in b.core.state().services
+
+        await until(lambda: here("/add"))
+        assert not here("/other")
+        assert stage(await ask(b, "/add", "a"), "permission there") == "a lets b call it"
+        a.apply_settings(with_rules(a_settings, allow("b", call="/other")))
+        await until(lambda: not here("/add"))
+        texts = [d.failed.text for d in await ask(b, "/add", "a") if d.failed is not None]
+        assert texts == [f"the permissions of a do not let b {word} /add" for word in ("subscribe to", "call")]
+        peer = next(iter(b.bridge.sessions.linked())).peer
+        await until(lambda: b.services.imports.get(peer, "/other"))
+        assert not here("/other")
+        assert stopped_at(await ask(b, "/other", "a")) == (
+            "permission here",
+            "a may not serve /other here: no [[permission]] lets a serve /other",
+        )
+        assert b.bridge.counters["permission.serve"] == 1
+        b.apply_settings(with_rules(b_settings, allow("a", serve="/**")))
+        await until(lambda: here("/other"))
+
+
+async def test_parameters_are_read_and_set_only_with_permission(
+    settings: Callable[..., Settings],
+) -> None:
+    params = ParamSettings(remote_get=("/**",), remote_set=("/**",))
+    a_settings = replace(
+        with_rules(settings("a"), allow("b", param="/arm/**"), deny("b", param="/arm/secret")), params=params
+    )
+    async with secured(a_settings, with_rules(settings("b"))) as (a, b):
+        link = next(iter(b.bridge.sessions.linked()))
+        for key, value in (("/arm/speed", 1), ("/arm/secret", 2), ("/arm/deep/x", 3), ("/other", 4)):
+            a.core.call("setParam", "/n", key, value)
+
+        async def asks(what: str, key: str) -> str:
+            try:
+                return str(await b.bridge.rpc.request(link, what, {"key": key}))
+            except PeerRefused as error:
+                return error.reason
+
+        async def sets(key: str, value: XmlRpcValue) -> str:
+            steps = transfer.writing(key, serialize_response(value).decode(), 1)
+            try:
+                question = next(steps)
+                while True:
+                    question = steps.send(await b.bridge.rpc.request(link, *question))
+            except StopIteration as done:
+                return f"set {done.value}"
+            except PeerRefused as error:
+                return error.reason
+
+        def no(key: str) -> str:
+            return f"the permissions there do not let b read or set {key}"
+
+        assert "1" in await asks(transfer.GET, "/arm/speed")
+        assert await asks(transfer.GET, "/arm/secret") == no("/arm/secret")
+        assert await asks(transfer.GET, "/arm") == no("/arm"), "it holds a secret, whose name is not told"
+        assert await asks(transfer.GET, "/nothing") == no("/nothing")
+        assert "/arm/speed" in (names := await asks(transfer.NAMES, ""))
+        assert "secret" not in names
+        assert "/other" not in names
+        assert await asks(transfer.DELETE, "/arm") == no("/arm")
+        assert await asks(transfer.DELETE, "/other") == no("/other")
+        assert a.bridge.counters["permission.param"] == 5
+        assert a.core.call("getParam", "/n", "/arm/secret")[2] == 2
+        assert await sets("/arm/speed", 5) == "set 1"
+        assert await sets("/arm/secret", 5) == no("/arm/secret")
+        assert await sets("/arm", {"speed": 6, "secret": 7}) == no("/arm/secret"), "a name of its own words"
+        assert await sets("/arm", 7) == no("/arm"), "the secret would be lost"
+        assert await sets("/arm/secret/deeper", 7) == no("/arm/secret/deeper"), "here too"
+        assert a.core.call("getParam", "/n", "/arm")[2] == {"speed": 5, "secret": 2, "deep": {"x": 3}}
+        assert await asks(transfer.DELETE, "/arm/deep") == "{}"
+
+
+async def test_facts_about_a_node_leave_out_what_the_asker_may_not_have(
+    settings: Callable[..., Settings],
+) -> None:
+    a_settings = with_rules(settings("a"), allow("b", subscribe="/odom", publish="/cmd_vel"))
+    async with secured(a_settings, with_rules(settings("b"))) as (a, b), node("base", a) as base:
+        for topic in ("/odom", "/secret"):
+            await base.advertise(topic, "std_msgs/String")
+        for topic in ("/cmd_vel", "/hidden"):
+            await base.subscribe(topic, "std_msgs/String", lambda _: None)
+        link = next(iter(b.bridge.sessions.linked()))
+        facts = await b.bridge.rpc.request(link, INFO, {"node": "/base"})
+        assert (list(facts["publications"]), list(facts["subscriptions"])) == (["/odom"], ["/cmd_vel"])
+        assert facts["services"] == []
+
+
+async def test_nodes_are_ended_only_with_permission(settings: Callable[..., Settings]) -> None:
+    nodes = NodeSettings(kill=("/**",))
+    a_settings = replace(with_rules(settings("a"), allow("b", kill="/demo/**")), nodes=nodes)
+    async with secured(a_settings, with_rules(settings("b"))) as (a, b), node("vital", a) as vital:
+        await vital.advertise("/x", "std_msgs/String")
+        link = next(iter(b.bridge.sessions.linked()))
+        with pytest.raises(PeerRefused, match="the permissions there do not let b end /vital"):
+            await b.bridge.rpc.request(link, KILL, {"node": "/vital"})
+        assert a.bridge.counters["permission.kill"] == 1
+        assert "/vital" in a.core.state().nodes
+
+
+def test_the_start_says_that_permissions_without_trust_have_no_effect_and_what_is_relayed_with_it() -> None:
+    ruled = with_rules(Settings(name="a"), allow("b", publish="/x"))
+    direct = replace(
+        Settings(name="a"),
+        contracts=(ContractRule(("/a",), (), {"transport": Transport.DIRECT}),),
+        services=ServiceSettings(transport=Transport.DIRECT),
+    )
+    (note,) = permission_notes(ruled, secured=False)
+    assert note.startswith("[[permission]] has no effect: this module has not joined a secured mesh")
+    (note,) = permission_notes(direct, secured=True)
+    assert note.startswith('[[contract]] and [services] ask for transport "direct"')
+    assert not list(permission_notes(replace(direct, trust=TrustSettings(direct=True)), secured=True))
+    for secure in (False, True):
+        assert not list(permission_notes(Settings(name="a"), secured=secure))
+    assert not list(permission_notes(ruled, secured=True))
+
+
+async def test_the_start_writes_it_once(
+    settings: Callable[..., Settings],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async with running(with_rules(settings("a"), allow("b", publish="/x"))):
+        pass
+    assert caplog.text.count("[[permission]] has no effect") == 1
+
+
+async def test_direct_transport_is_off_between_machines_until_both_modules_allow_it(
+    settings: Callable[..., Settings], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(PeerSession, "same_machine", property(lambda _: False))
+    services = ServiceSettings(transport=Transport.AUTO)
+    closed = TrustSettings(default="allow")
+    opened = replace(closed, direct=True)
+    a_settings, b_settings = (
+        replace(settings(name), services=services, transport=Transport.AUTO, trust=closed) for name in "ab"
+    )
+
+    def topic(agent: Agent) -> tuple[str, str]:
+        routes = [r for t in agent.operations.snapshot({}).topics if t.name == "/odom" for r in t.routes]
+        found = [one for route in routes for one in route.subscribers]
+        return (found[0].transport, found[0].condition) if found else ("", "")
+
+    async with (
+        secured(a_settings, b_settings) as (a, b),
+        serving(a),
+        node("talker", a) as talker,
+        node("hearer", b) as hearer,
+    ):
+        await talker.advertise("/odom", "std_msgs/String")
+        subscriber = await hearer.subscribe("/odom", "std_msgs/String", Sink())
+        await until(lambda: subscriber.publishers and transport(b) == ("relay", "trust"))
+        await until(lambda: topic(b) == ("relay", "trust"))
+        b.apply_settings(replace(b_settings, trust=opened))
+        await until(lambda: (found := about(b)) is not None and "server's module" in found.relayed_because)
+        assert transport(b) == ("relay", "trust"), "a does not allow it"
+        assert topic(b)[1] == "subscriber", "the next condition: this node is bound to loopback"
+        a.apply_settings(replace(a_settings, trust=opened))
+        await until(lambda: transport(b) == ("direct", ""))
+        a.apply_settings(a_settings)
+        await until(lambda: transport(b) == ("relay", "trust"))
+        a.apply_settings(replace(a_settings, trust=opened))
+        await until(lambda: transport(b) == ("direct", ""))
+        b.apply_settings(replace(b_settings, trust=replace(opened, rules=(deny("a", serve="/**", publish="/**"),))))
+        await until(lambda: not subscriber.publishers and not b.core.state().services.get("/add"))
+        assert b.bridge.counters["direct.service_stopped"] == 1, "also connections of persistent clients end"

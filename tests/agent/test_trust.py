@@ -1,0 +1,372 @@
+"""Secured modules, as whole agents on loopback: joined, linked over TLS, renewed, revoked."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import pytest
+
+pytest.importorskip("cryptography")
+
+from rmpa.agent import Agent
+from rmpa.agent.trust import RENEW, read_refusal, trust_store
+from rmpa.config.settings import Multicast, Settings, TrustSettings
+from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError
+from rmpa.ros.node.node import Node
+from rmpa.runtime.system_clock import SystemClock
+from rmpa.trust import limits
+from rmpa.trust.documents import DocumentKind
+from rmpa.trust.io import store as files_of
+from rmpa.trust.io.authority import found_mesh
+from rmpa.trust.io.joining import join_mesh
+from rmpa.trust.spreading import Notice
+from rmpa.trust.tokens import Token
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+    from pathlib import Path
+
+    from rmpa.trust.io.store import MemberFiles
+    from rmpa.trust.status import TrustStatus
+
+DEADLINE = 30.0
+
+
+async def until(condition: Callable[[], object]) -> None:
+    """Wait for a condition that the loop's other work makes true."""
+    async with asyncio.timeout(DEADLINE):
+        while not condition():
+            await asyncio.sleep(0.005)
+
+
+async def yes(_code: str) -> bool:
+    return True
+
+
+def peers_of(agent: Agent) -> set[str]:
+    return {session.link.name for session in agent.bridge.sessions.linked()}
+
+
+@dataclass
+class Fleet:
+    """Modules of one test: their settings, and those that run."""
+
+    folder: Path
+    agents: dict[str, Agent] = field(default_factory=dict)
+
+    def settings(self, name: str, **parts: object) -> Settings:
+        common = Settings(
+            name=name,
+            core_port=0,
+            interfaces=("lo",),
+            multicast=Multicast(port=20000 + os.getpid() % 20000),
+            runtime_dir=str(self.folder / "run"),
+            state_dir=str(self.folder / "state"),
+            trust=TrustSettings(default="allow"),
+        )
+        return replace(common, **parts)  # type: ignore[arg-type]
+
+    def found(self, name: str = "base") -> None:
+        store = trust_store(self.settings(name))
+        assert store is not None
+        found_mesh(store, name, "lab", time.time())
+
+    async def start(self, name: str, **parts: object) -> Agent:
+        agent = Agent(self.settings(name, **parts))
+        await agent.start()
+        self.agents[name] = agent
+        return agent
+
+    async def stop(self, name: str) -> None:
+        await self.agents.pop(name).close()
+
+    async def command(self, agent: str, what: str, **args: object) -> object:
+        return await self.agents[agent].operations.trust({"what": what, **args})
+
+    async def token(self, **args: object) -> Token:
+        reply = await self.command("base", "invite", **{"unattended": True, **args})
+        return Token.parse(reply.token)  # type: ignore[attr-defined]
+
+    async def join(self, name: str, token: Token | None = None) -> MemberFiles:
+        token = token or await self.token()
+        files = await join_mesh(token, name, SystemClock(), yes, read_refusal)
+        store = trust_store(self.settings(name))
+        assert store is not None
+        store.save(files)
+        return files
+
+    async def add(self, name: str, **parts: object) -> Agent:
+        """A module that joins and runs."""
+        await self.join(name)
+        return await self.start(name, **parts)
+
+    async def linked(self, *names: str) -> None:
+        """Wait until these modules are linked with each other, and with no other one."""
+        await until(lambda: all(peers_of(self.agents[name]) == set(names) - {name} for name in names))
+
+
+@asynccontextmanager
+async def a_fleet(folder: Path) -> AsyncIterator[Fleet]:
+    fleet = Fleet(folder)
+    fleet.found()
+    try:
+        await fleet.start("base")
+        yield fleet
+    finally:
+        for name in list(fleet.agents):
+            await fleet.stop(name)
+
+
+async def test_modules_that_joined_are_linked_over_tls_and_a_topic_crosses(tmp_path: Path) -> None:
+    async with a_fleet(tmp_path) as fleet, AsyncExitStack() as stack:
+        arm = await fleet.add("arm")
+        await fleet.linked("base", "arm")
+        base = fleet.agents["base"]
+        for agent in (base, arm):
+            [session] = agent.bridge.sessions.linked()
+            assert session.link.connection.certificate is not None
+        talker = await stack.enter_async_context(Node("talker", master_uri=arm.core.uri))
+        hearer = await stack.enter_async_context(Node("hearer", master_uri=base.core.uri))
+        heard: list[str] = []
+        publisher = await talker.advertise("/chatter", "std_msgs/String")
+        await hearer.subscribe("/chatter", "std_msgs/String", lambda got: heard.append(got.message.data))
+        await until(lambda: publisher.subscribers)
+        publisher.publish(publisher.make({"data": "over TLS"}))
+        await until(lambda: heard == ["over TLS"])
+
+
+async def test_a_revoked_module_is_gone_everywhere_within_a_second(tmp_path: Path) -> None:
+    async with a_fleet(tmp_path) as fleet, AsyncExitStack() as stack:
+        for name in ("arm", "stick", "thief"):
+            await fleet.add(name)
+        await fleet.linked("base", "arm", "stick", "thief")
+        thief = await stack.enter_async_context(Node("talker", master_uri=fleet.agents["thief"].core.uri))
+        await thief.advertise("/cmd_vel", "std_msgs/String")
+        honest = [fleet.agents[name] for name in ("base", "arm", "stick")]
+        await until(lambda: all("/cmd_vel" in agent.core.state().publishers for agent in honest))
+        began = time.monotonic()
+        await fleet.command("base", "revoke", name="thief")
+        await until(lambda: all("thief" not in peers_of(agent) for agent in honest))
+        await until(lambda: not any("/cmd_vel" in agent.core.state().publishers for agent in honest))
+        assert time.monotonic() - began < 1.0
+        await fleet.linked("base", "arm", "stick")  # … and nothing else has fallen
+        members = [agent.trust.membership for agent in honest if agent.trust is not None]
+        await until(lambda: all(member.numbers[DocumentKind.KEYS] == 2 for member in members))
+        robbed = fleet.agents["thief"].trust
+        assert robbed is not None
+        assert robbed.membership.numbers[DocumentKind.KEYS] == 1  # it did not get the new key
+        again = Agent(fleet.settings("thief"))
+        await fleet.stop("thief")
+        await again.start()
+        try:
+            await until(lambda: _refusals(fleet.agents["base"], "revoked") or _refusals(again, "revoked"))
+            assert not peers_of(again)
+        finally:
+            await again.close()
+
+
+def _refusals(agent: Agent, word: str) -> int:
+    return agent.snapshots.build().counters.get(f"link.refused.{word}", 0)
+
+
+async def test_a_revoked_module_may_come_back_with_a_new_token(tmp_path: Path) -> None:
+    async with a_fleet(tmp_path) as fleet:
+        await fleet.add("arm")
+        await fleet.linked("base", "arm")
+        await fleet.command("base", "revoke", name="arm")
+        await fleet.linked("base")
+        await fleet.stop("arm")
+        await fleet.add("arm")
+        await fleet.linked("base", "arm")
+
+
+async def test_a_module_that_was_away_learns_of_a_revocation_from_any_member(tmp_path: Path) -> None:
+    async with a_fleet(tmp_path) as fleet:
+        for name in ("arm", "stick", "thief"):
+            await fleet.add(name)
+        await fleet.linked("base", "arm", "stick", "thief")
+        await fleet.stop("stick")
+        await fleet.command("base", "revoke", name="thief")
+        await fleet.linked("base", "arm")
+        await fleet.stop("base")  # the authority is off: arm tells stick
+        stick = await fleet.start("stick")
+        await until(lambda: "arm" in peers_of(stick))
+        assert stick.trust is not None
+        member = stick.trust.membership
+        await until(lambda: member.deny.number == 1)
+        await until(lambda: "thief" not in peers_of(stick))
+        assert member.ring.newest.number == 2
+
+
+async def test_a_certificate_is_renewed_over_the_link_and_by_itself_in_time(tmp_path: Path) -> None:
+    async with a_fleet(tmp_path) as fleet:
+        arm = await fleet.add("arm")
+        await fleet.linked("base", "arm")
+        trust = arm.trust
+        assert trust is not None
+        await until(lambda: trust.authority_name() == "base")
+        before = trust.membership.certificate
+        await fleet.command("arm", "renew")
+        assert trust.membership.certificate.serial != before.serial
+        await fleet.command("base", "renew")
+        # After half of its time it is renewed without a command.
+        serial = trust.membership.certificate.serial
+        past = {"issued": before.issued - 4 * 86_400, "expires": before.expires - 4 * 86_400}
+        trust.membership.certificate = replace(trust.membership.certificate, **past)  # type: ignore[arg-type]
+        trust.look_now()
+        await until(lambda: trust.membership.certificate.serial not in (serial, before.serial))
+        assert peers_of(arm) == {"base"}
+
+
+async def test_a_member_cannot_keep_the_authority_busy_with_renewals(tmp_path: Path) -> None:
+    async with a_fleet(tmp_path) as fleet:
+        arm = await fleet.add("arm")
+        await fleet.linked("base", "arm")
+        trust = arm.trust
+        assert trust is not None
+        await until(lambda: trust.authority_name() == "base")
+        for _ in range(limits.RENEWALS_BURST):
+            await fleet.command("arm", "renew")
+        with pytest.raises(RmpaError, match="asks for certificates too often"):
+            await fleet.command("arm", "renew")
+
+
+async def test_a_member_that_says_it_is_the_authority_is_not_believed(tmp_path: Path) -> None:
+    async with a_fleet(tmp_path) as fleet:
+        arm, thief = await fleet.add("arm"), await fleet.add("thief")
+        await fleet.linked("base", "arm", "thief")
+        trust = arm.trust
+        assert trust is not None
+        await until(lambda: trust.authority_name() == "base")
+        await fleet.stop("base")
+        await fleet.linked("arm", "thief")
+        [session] = [each for each in thief.bridge.sessions.linked() if each.link.name == "arm"]
+        thief.bridge.rpc.notify(session, Notice.HAVE, {"deny": 0, "keys": 1, "authority": True})
+        with pytest.raises(RmpaError, match="not the authority"):  # behind this answer the lie was heard
+            await thief.bridge.rpc.request(session, RENEW, {"request": ""}, DEADLINE)
+        assert trust.authority_name() == ""
+        place = trust.membership.store.load_authority()
+        assert place is not None
+        assert place.name == "base"
+
+
+async def test_a_group_key_is_changed_without_a_pause(tmp_path: Path) -> None:
+    async with a_fleet(tmp_path) as fleet:
+        await fleet.add("arm")
+        await fleet.linked("base", "arm")
+        links = [session.link for session in fleet.agents["arm"].bridge.sessions.linked()]
+        await fleet.command("base", "rotate")
+        arm = fleet.agents["arm"].trust
+        assert arm is not None
+        await until(lambda: arm.membership.ring.newest.number == 2)
+        assert [session.link for session in fleet.agents["arm"].bridge.sessions.linked()] == links
+
+
+async def test_a_module_that_missed_changes_of_the_group_key_is_linked_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with a_fleet(tmp_path) as fleet:
+        await fleet.add("arm")
+        await fleet.linked("base", "arm")
+        await fleet.stop("arm")
+        monkeypatch.setattr(limits, "KEY_SPREAD", 0.0)
+        monkeypatch.setattr(limits, "KEY_OVERLAP", 0.0)
+        for _ in range(3):
+            await fleet.command("base", "rotate")
+        arm = await fleet.start("arm")  # it does not know the key that base signs with
+        await fleet.linked("base", "arm")
+        assert arm.trust is not None
+        member = arm.trust.membership
+        await until(lambda: member.ring.newest.number == 4)
+
+
+async def test_two_users_compare_the_code_over_the_control_socket(tmp_path: Path) -> None:
+    async with a_fleet(tmp_path) as fleet:
+        token = await fleet.token(unattended=False)
+        shown: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+
+        async def compare(code: str) -> bool:
+            shown.set_result(code)
+            return True
+
+        joining = asyncio.ensure_future(join_mesh(token, "arm", SystemClock(), compare, read_refusal))
+        step = await fleet.command("base", "step", id=token.token_id.hex(), after=0)
+        assert (step.state, step.code, step.module) == ("code", await shown, "arm")  # type: ignore[attr-defined]
+        await fleet.command("base", "answer", id=token.token_id.hex(), agree=True)
+        await joining
+        with pytest.raises(PeerRefused, match="no module is joining"):
+            await fleet.command("base", "answer", id=token.token_id.hex(), agree=True)
+
+
+async def test_a_module_without_trust_is_not_linked_and_told_why(tmp_path: Path) -> None:
+    async with a_fleet(tmp_path) as fleet:
+        plain = await fleet.start("plain")
+        base = fleet.agents["base"]
+        await until(lambda: base.snapshots.build().counters.get("beacon.untagged"))
+        await until(lambda: _refusals(base, "plain"))
+        assert not peers_of(base)
+        assert not peers_of(plain)
+        with pytest.raises(PeerRefused, match="it runs without trust; rmpa trust init, or rmpa trust join TOKEN"):
+            await fleet.command("plain", "invite")
+        status: TrustStatus = await fleet.command("plain", "status")  # type: ignore[assignment]
+        assert (status.on, status.agent, status.problems) == (False, "plain", ())
+
+
+async def test_only_the_authority_invites_and_revokes(tmp_path: Path) -> None:
+    async with a_fleet(tmp_path) as fleet:
+        arm = await fleet.add("arm")
+        await fleet.linked("base", "arm")
+        assert arm.trust is not None
+        await until(partial(arm.trust.authority_name))
+        for what in ("invite", "revoke", "rotate", "sign"):
+            with pytest.raises(PeerRefused, match="not the authority of its mesh; do it at base"):
+                await fleet.command("arm", what, name="base")
+        for name, words in (("base", "is the authority itself"), ("amr", "did you mean arm?")):
+            with pytest.raises(ConfigError, match=words):
+                await fleet.command("base", "revoke", name=name)
+
+
+async def test_the_snapshot_shows_the_membership_and_no_secret(tmp_path: Path) -> None:
+    async with a_fleet(tmp_path) as fleet:
+        await fleet.add("arm")
+        await fleet.linked("base", "arm")
+        shown = fleet.agents["base"].snapshots.build()
+        assert shown.trust is not None
+        assert (shown.trust.module, shown.trust.is_authority, shown.trust.clock_set) == ("base", True, True)
+        assert {member.name: member.linked for member in shown.trust.members} == {"arm": True, "base": True}
+        assert shown.notes == ()
+        trust = fleet.agents["base"].trust
+        assert trust is not None
+        trust.membership.certificate = replace(trust.membership.certificate, expires=time.time() + 3600)
+        assert "ends in 1 h, and could not be renewed" in " ".join(fleet.agents["base"].snapshots.build().notes)
+        trust.membership.certificate = replace(trust.membership.certificate, issued=time.time() + 86_400)
+        assert "clock is not set" in " ".join(fleet.agents["base"].snapshots.build().notes)
+
+
+def test_an_agent_never_starts_without_trust_because_its_files_are_broken(tmp_path: Path) -> None:
+    fleet = Fleet(tmp_path)
+    fleet.found("arm")
+    store = trust_store(fleet.settings("arm"))
+    assert store is not None
+    store.write(files_of.KEYS, b"{}")
+    with pytest.raises(StartError, match=r"keys\.json: is broken"):
+        Agent(fleet.settings("arm"))
+    store.remove()
+    with pytest.raises(StartError, match=r"trust\.require: the module arm has joined no secured mesh; join one"):
+        Agent(fleet.settings("arm", trust=TrustSettings(require=True)))
+
+
+def test_a_copied_folder_of_another_module_is_named(tmp_path: Path) -> None:
+    fleet = Fleet(tmp_path)
+    fleet.found("arm")
+    store = trust_store(fleet.settings("arm"))
+    assert store is not None
+    store.folder.parent.rename(tmp_path / "state" / "gripper")
+    with pytest.raises(StartError, match=r"is of arm, but this agent is named gripper; start it with --name arm"):
+        Agent(fleet.settings("gripper"))

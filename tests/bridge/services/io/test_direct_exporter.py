@@ -1,0 +1,87 @@
+"""The server's side of direct calls, with doubles for the peers and the offered services: what a peer is told."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
+
+import pytest
+
+from rmpa.bridge.direct import service_requests as requests
+from rmpa.bridge.direct.conditions import Condition
+from rmpa.bridge.direct.service_requests import AskService
+from rmpa.bridge.permission_gate import PermissionGate
+from rmpa.bridge.services.io.direct_exporter import DirectServiceExporter
+from rmpa.config.settings import TrustSettings
+from rmpa.core.contract import Transport
+from rmpa.core.counters import Counters
+from rmpa.trust.permissions import Permissions
+
+if TYPE_CHECKING:
+    from rmpa.bridge.services.exports import LocalService
+
+URI, RESTARTED = "rosrpc://10.0.0.1:45000", "rosrpc://10.0.0.1:45001"
+
+
+class Module:
+    """The module of /adder, which provides /add, and what its agent told peer 1."""
+
+    def __init__(self, *, secured: bool) -> None:
+        self.permitted = False
+        self.told: list[str] = []
+        self.handlers: dict[str, Any] = {}
+        self.offered = {"/add": SimpleNamespace(node="/adder", uri=URI, origin=None)}
+        link = SimpleNamespace(name="pad")
+        self.session: Any = SimpleNamespace(peer=1, link=link, linked=True, same_machine=False, address="10.0.0.2")
+        trust = Permissions(TrustSettings()) if secured else None
+        local = lambda _, service: service if self.permitted else None  # noqa: E731 - a double
+        rpc = SimpleNamespace(
+            on_request=self.handlers.__setitem__,
+            on_notification=self.handlers.__setitem__,
+            notify=lambda _, what, __: self.told.append(what),
+        )
+        self.sut = DirectServiceExporter(
+            cast("Any", SimpleNamespace()),
+            cast("Any", SimpleNamespace(offered=self.offered, local=local)),
+            cast("Any", SimpleNamespace(transport=lambda _: Transport.AUTO)),
+            cast("Any", SimpleNamespace(get={1: self.session}.get)),
+            cast("Any", rpc),
+            on_warning=lambda *_: None,
+            counters=Counters(),
+            gate=PermissionGate(trust),
+        )
+
+    def ask(self) -> str:
+        """Peer 1 asks for a direct call; returns the condition that is not met."""
+        args = requests.write(AskService("/add", "/adder", Transport.AUTO))
+        return str(self.handlers[requests.SERVICE](self.session, args)["why"])
+
+    def restart(self) -> None:
+        """The server is registered again, at another port."""
+        self.sut.server("/add", cast("LocalService", SimpleNamespace(node="/adder", uri=RESTARTED)))
+
+
+@pytest.mark.parametrize("secured", [True, False])
+def test_a_secured_peer_does_not_learn_of_a_service_that_it_may_not_have(*, secured: bool) -> None:
+    module = Module(secured=secured)
+    assert module.ask() == Condition.OFFERED
+    module.restart()
+    assert module.told == ([] if secured else [requests.SERVICE_RETRY])
+
+
+def test_a_secured_peer_is_told_when_to_ask_again_for_a_service_that_it_may_have() -> None:
+    module = Module(secured=True)
+    module.permitted = True
+    assert module.ask() == Condition.TRUST
+    module.restart()
+    assert module.told == [requests.SERVICE_RETRY]
+
+
+def test_what_a_reload_forbids_is_forgotten() -> None:
+    module = Module(secured=True)
+    module.permitted = True
+    assert module.ask() == Condition.TRUST
+    module.permitted = False
+    module.sut.reload(module.sut._rules)
+    module.restart()
+    assert module.told == []

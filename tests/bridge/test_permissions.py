@@ -1,0 +1,356 @@
+"""Permissions in the plans of topics and services: what is offered, shown, opened and closed by them."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+
+import pytest
+
+from rmpa.bridge.actions import Action, Disconnect, RemoveRoute, Send
+from rmpa.bridge.messages import (
+    Advertise,
+    Description,
+    OpenRoute,
+    OpenService,
+    RouteClosed,
+    ServiceClosed,
+    ServiceOffer,
+    Source,
+    TopicOffer,
+)
+from rmpa.bridge.naming import Names
+from rmpa.bridge.permission_gate import PermissionGate
+from rmpa.bridge.policy import Policy
+from rmpa.bridge.services.exports import EndRoute, LocalService, ServiceAbout, ServiceExports
+from rmpa.bridge.services.imports import ServiceImports
+from rmpa.bridge.services.rules import ServiceRules
+from rmpa.bridge.topics.exports import Exports, LocalSource
+from rmpa.bridge.topics.imports import Imports
+from rmpa.config.permission_rules import Access, Effect, PermissionRule
+from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings, TimeSettings, TrustSettings
+from rmpa.core.contract import Contract, Contracts
+from rmpa.core.counters import Counters
+from rmpa.trust.permissions import Permissions
+from tests.bridge.test_relay import Map
+
+TYPE = "a/B"
+ABOUT = Description(TYPE, "5a9ea5f83505693b71e785041e67a8bb", "", False)
+
+
+def allow(modules: str = "*", **names: str) -> PermissionRule:
+    return PermissionRule(tuple(modules.split()), names={key: tuple(globs.split()) for key, globs in names.items()})
+
+
+def deny(modules: str = "*", **names: str) -> PermissionRule:
+    return replace(allow(modules, **names), effect=Effect.DENY)
+
+
+class Secured:
+    """The plans of one secured module, with the links 1 to "joystick" and 2 to "arm"."""
+
+    def __init__(
+        self, *rules: PermissionRule, peers: tuple[PeerRule, ...] = (), relays: tuple[str, ...] = ()
+    ) -> None:
+        self.trust = TrustSettings(rules=rules, relays=relays)
+        self.counters = Counters()
+        self.gate = PermissionGate(Permissions(self.trust), self.counters)
+        self.policy, self.names = Policy(PolicySettings(), peers, TimeSettings("arm")), Names(peers)
+        self.rules = ServiceRules(ServiceSettings(), self.policy, self.names)
+        self.exports = Exports(self.policy, Contracts(), self.names, gate=self.gate)
+        self.imports = Imports(self.policy, lambda: 0.5, names=self.names, gate=self.gate)
+        self.service_exports = ServiceExports(self.rules, gate=self.gate)
+        self.service_imports = ServiceImports(self.rules, gate=self.gate)
+        for number, name in ((1, "joystick"), (2, "arm")):
+            self.exports.link_up(number, name)
+            self.imports.link_up(number, name)
+            self.service_exports.link_up(number, name)
+            self.service_imports.link_up(number, name, number)
+
+    def publishes(self, *topics: str) -> None:
+        for topic in topics:
+            self.exports.graph(topic, {"/n": LocalSource(TYPE, "http://127.0.0.1:4000/")})
+        self.tell()
+
+    def serves(self, *services: str) -> None:
+        for service in services:
+            self.service_exports.graph(service, LocalService("/n", "rosrpc://127.0.0.1:4001"))
+            self.service_exports.advertise()
+
+    def tell(self) -> list[Action]:
+        actions: list[Action] = []
+        while self.exports.pending:
+            actions += self.exports.advertise()
+        return actions
+
+    def told(self, peer: int) -> list[str]:
+        return [topic for topic in sorted(s.topic for s in self.exports.offered) if self._told(peer, topic)]
+
+    def _told(self, peer: int, topic: str) -> bool:
+        return self.exports.offer(peer, Source(topic, "/n")) is not None
+
+    def shown(self) -> list[tuple[int, str]]:
+        return sorted((peer, entry.topic) for peer, _, entry in self.imports if entry.shown)
+
+    def reload(self, *rules: PermissionRule, relays: tuple[str, ...] = ()) -> list[Action]:
+        self.gate.reload(TrustSettings(rules=rules, relays=relays))
+        actions = self.exports.apply_rules(self.policy, Contracts(), self.names)
+        for portion in self.imports.apply_rules(self.policy, Contracts(), self.names, 0.0):
+            actions += portion
+        return actions
+
+
+def closed(actions: list[Action]) -> dict[int, str]:
+    """The peers that were told of a closed route, and why."""
+    return {a.peer: a.message.reason for a in actions if isinstance(a, Send) and isinstance(a.message, RouteClosed)}
+
+
+def test_a_peer_hears_only_of_topics_that_it_may_have() -> None:
+    here = Secured(allow("joystick", subscribe="/odom"), allow(subscribe="/tf"), deny("arm", subscribe="/tf"))
+    here.publishes("/odom", "/tf", "/secret")
+    assert here.told(1) == ["/odom", "/tf"]
+    assert here.told(2) == []
+    assert here.counters["permission.subscribe"] == 1 + 3
+
+
+def test_rules_are_about_the_names_here_not_those_on_the_wire() -> None:
+    here = Secured(allow("arm", subscribe="/arm/odom", publish="/arm/state"), peers=(PeerRule("arm", "/arm"),))
+    here.publishes("/arm/odom", "/odom")
+    assert here.told(2) == ["/arm/odom"]
+    here.imports.advertised(2, Advertise((TopicOffer("/state", "/n", TYPE), TopicOffer("/odom", "/n", TYPE)), ()))
+    assert here.shown() == [(2, "/arm/state")]
+
+
+def test_who_asks_for_what_it_may_not_have_learns_no_more_than_of_what_is_not_there() -> None:
+    here = Secured(allow("joystick", subscribe="/odom"))
+    here.publishes("/odom", "/secret")
+    answers = []
+    for route, topic in enumerate(("/secret", "/nothing"), 1):
+        found = closed(here.exports.opened(1, OpenRoute(route, topic, "/n", Contract())))
+        answers.append(found[1].replace(topic, "NAME"))
+    assert answers[0] == answers[1]
+    assert here.counters["permission.subscribe"] >= 2
+
+
+def test_a_reload_closes_the_routes_of_those_that_may_not_have_them_any_more_and_of_no_others() -> None:
+    here = Secured(allow(subscribe="/odom /tf"))
+    here.publishes("/odom", "/tf")
+    for peer in (1, 2):
+        for route, topic in ((1, "/odom"), (2, "/tf")):
+            here.exports.opened(peer, OpenRoute(route, topic, "/n", Contract()))
+    for topic in ("/odom", "/tf"):
+        here.exports.described(Source(topic, "/n"), ABOUT)
+    actions = here.reload(allow("joystick", subscribe="/**"), allow("arm", subscribe="/tf"))
+    assert closed(actions) == {2: "the permissions there do not let arm subscribe to /odom"}
+    assert [(a.source.topic, a.peer) for a in actions if isinstance(a, RemoveRoute)] == [("/odom", 2)]
+    assert not any(isinstance(action, Disconnect) for action in actions), "joystick goes on"
+    again = OpenRoute(9, "/odom", "/n", Contract())
+    assert closed(here.exports.opened(2, again)), "before it is told that it is gone"
+    here.tell()
+    assert here.told(2) == ["/tf"]
+    here.reload(allow(subscribe="/**"))
+    here.tell()
+    assert here.told(2) == ["/odom", "/tf"], "and what is allowed again is offered again"
+
+
+def test_only_topics_that_a_peer_may_publish_are_shown_here() -> None:
+    here = Secured(allow("joystick", publish="/cmd_vel"))
+    for peer in (1, 2):
+        offers = (TopicOffer("/cmd_vel", "/n", TYPE), TopicOffer("/odom", "/n", TYPE))
+        here.imports.advertised(peer, Advertise(offers, ()))
+    assert here.shown() == [(1, "/cmd_vel")]
+    entry = here.imports.get(2, Source("/cmd_vel", "/n"))
+    assert entry is not None
+    assert (entry.denied, entry.hidden) == (True, "no [[permission]] lets arm publish /cmd_vel")
+    assert here.counters["permission.publish"] == 3
+    here.reload(allow("arm", publish="/**"))
+    assert here.shown() == [(2, "/cmd_vel"), (2, "/odom")]
+    assert here.counters["permission.publish"] == 4, "what was refused before is not counted again"
+
+
+def test_time_of_the_followed_module_needs_permission_too() -> None:
+    here = Secured(allow("arm", publish="/odom"))
+    here.imports.advertised(2, Advertise((TopicOffer("/clock", "/sim", "rosgraph_msgs/Clock"),), ()))
+    assert here.shown() == []
+    here.reload(allow("arm", publish="/clock"))
+    assert here.shown() == [(2, "/clock")]
+
+
+def test_an_action_crosses_with_all_of_its_topics_or_not_at_all() -> None:
+    topics = {name: f"/arm/move/{name}" for name in ("goal", "cancel", "status", "feedback", "result")}
+    client = Secured(allow("joystick", action="/arm/move"))
+    client.publishes(*(topics[name] for name in ("status", "feedback", "result")), "/arm/move/debug")
+    offers = tuple(TopicOffer(topics[name], "/n", TYPE) for name in ("goal", "cancel", "status"))
+    client.imports.advertised(1, Advertise(offers, ()))
+    assert client.told(1) == sorted(topics[name] for name in ("status", "feedback", "result"))
+    assert client.shown() == [(1, topics["cancel"]), (1, topics["goal"])], "it may not speak as the server"
+    server = Secured(allow("joystick", action_serve="/arm/move"))
+    server.publishes(topics["goal"], topics["cancel"])
+    offers = tuple(TopicOffer(topics[name], "/n", TYPE) for name in ("goal", "status", "feedback", "result"))
+    server.imports.advertised(1, Advertise(offers, ()))
+    assert server.told(1) == [topics["cancel"], topics["goal"]]
+    assert server.shown() == [(1, topics[name]) for name in ("feedback", "result", "status")]
+
+
+def test_only_services_that_a_peer_may_call_are_offered_and_a_reload_ends_its_calls() -> None:
+    here = Secured(allow("joystick", call="/stop /go"), deny("joystick", call="/go"))
+    here.serves("/stop", "/go")
+    assert (here.service_exports.local(1, "/stop"), here.service_exports.local(1, "/go")) == ("/stop", None)
+    assert here.service_exports.local(2, "/stop") is None
+    refusals = [
+        action.message.reason.replace(service, "NAME")
+        for service in ("/go", "/nothing")
+        for action in here.service_exports.opened(1, OpenService(1, service, 1.0))
+        if isinstance(action, Send) and isinstance(action.message, ServiceClosed)
+    ]
+    assert len(refusals) == 2
+    assert refusals[0] == refusals[1]
+    server = here.service_exports.offered["/stop"]
+    here.service_exports.opened(1, OpenService(3, "/stop", 1.0))
+    here.service_exports.described("/stop", server, ServiceAbout("a/Stop", "0" * 32))
+    assert here.service_exports.callers("/stop") == (1,)
+    here.gate.reload(TrustSettings(rules=(allow("joystick", call="/go"),)))
+    actions = [action for portion in here.service_exports.apply_rules(here.rules) for action in portion]
+    assert here.service_exports.callers("/stop") == ()
+    assert [action.route for action in actions if isinstance(action, EndRoute)] == [3]
+    reasons = [a.message.reason for a in actions if isinstance(a, Send) and isinstance(a.message, ServiceClosed)]
+    assert reasons == ["the permissions there do not let joystick call /stop"]
+    here.service_exports.advertise()
+    assert here.service_exports.local(1, "/go") == "/go"
+
+
+def test_only_services_that_a_peer_may_serve_are_shown_and_another_peer_may_take_the_place() -> None:
+    here = Secured(allow("arm", serve="/ik"))
+    for peer in (1, 2):
+        change = here.service_imports
+        for portion in change.portions(peer, _services("/ik")):
+            change.take_in(peer, portion)
+    first, second = here.service_imports.get(1, "/ik"), here.service_imports.get(2, "/ik")
+    assert first is not None
+    assert second is not None
+    assert (first.shown, first.denied, second.shown) == (False, True, True)
+    assert first.hidden == "no [[permission]] lets joystick serve /ik"
+    assert here.counters["permission.serve"] == 1
+    here.gate.reload(TrustSettings(rules=(allow("joystick", serve="/ik"),)))
+    for _ in here.service_imports.apply_rules(here.rules):
+        pass
+    assert (first.shown, second.shown) == (True, False)
+
+
+def _services(*names: str):  # type: ignore[no-untyped-def]
+    from rmpa.bridge.messages import AdvertiseServices
+
+    return AdvertiseServices(tuple(ServiceOffer(name, "/n") for name in names), (), full=True)
+
+
+# --- whole maps with relays ---------------------------------------------------------------------------------------
+
+_PICKS = ("/**", "/t*", "/u*", "/t1", "/u2", "/s*", "/v*", "/s1", "/v3")
+
+
+def _some_rules(rng: random.Random, count: int) -> TrustSettings:
+    rules = []
+    for _ in range(rng.randint(0, 4)):
+        words = rng.sample(("publish", "subscribe", "call", "serve"), rng.randint(1, 4))
+        names = {word: (rng.choice(_PICKS),) for word in words}
+        module = rng.choice(("*", *(f"m{number}" for number in range(1, count + 1))))
+        rules.append(PermissionRule((module,), (), rng.choice((Effect.ALLOW, Effect.ALLOW, Effect.DENY)), names))
+    relays = tuple(f"m{number}" for number in range(1, count + 1) if rng.random() < 0.5)
+    return TrustSettings(default=rng.choice(("allow", "deny")), rules=tuple(rules), relays=relays)
+
+
+class SecuredMap(Map):
+    """A map whose modules have permissions, which change."""
+
+    def __init__(self, count: int, relays: set[int], seed: int) -> None:
+        rng = random.Random(seed)
+        self.trust = {number: _some_rules(rng, count) for number in range(1, count + 1)}
+        super().__init__(count, relays, seed, lambda number: PermissionGate(Permissions(self.trust[number])))
+
+    def reload(self, here: int, trust: TrustSettings) -> None:
+        self.trust[here] = trust
+        module = self.modules[here]
+        policy = Policy(PolicySettings())
+        rules = ServiceRules(ServiceSettings(), policy)
+        module.gate.reload(trust)
+        self.act(here, module.exports.apply_rules(policy, Contracts(), Names()))
+        for actions in module.imports.apply_rules(policy, Contracts(), Names(), 0.0):
+            self.act(here, actions)
+        for answers in (module.service_exports.apply_rules(rules), module.service_imports.apply_rules(rules)):
+            for portion in answers:
+                self.act(here, portion)
+        self.act(here, module.look())
+
+    def allows(self, here: int, access: Access, module: int, name: str) -> bool:
+        return Permissions(self.trust[here]).judge(access, f"m{module}", name).allowed
+
+    def check(self) -> None:
+        for here, module in self.modules.items():
+            for there in module.links:
+                for name in sorted(self.modules[there].topics):
+                    lets = self.allows(there, Access.SUBSCRIBE, here, name)
+                    expected = lets and self.allows(here, Access.PUBLISH, there, name)
+                    assert ((name, f"/rmpa/m{there}/n") in module.visible()) is expected, (here, there, name)
+                for name in sorted(self.modules[there].services):
+                    lets = self.allows(there, Access.CALL, here, name)
+                    expected = lets and self.allows(here, Access.SERVE, there, name)
+                    assert ((name, f"/rmpa/m{there}/n") in module.callable()) is expected, (here, there, name)
+            for peer, source, entry in module.imports:
+                if entry.shown and entry.origin is not None:
+                    relay = next(m for m, number in module.links.items() if number == peer)
+                    self._check_relayed(
+                        here, relay, Access.PUBLISH, Access.SUBSCRIBE, entry.origin.name, source.topic
+                    )
+            for peer, remote in module.service_imports:
+                if remote.shown and remote.origin is not None:
+                    relay = next(m for m, number in module.links.items() if number == peer)
+                    self._check_relayed(here, relay, Access.SERVE, Access.CALL, remote.origin.name, remote.name)
+
+    def _check_relayed(self, here: int, relay: int, come: Access, go: Access, origin: str, name: str) -> None:
+        assert Permissions(self.trust[here]).may_relay(f"m{relay}").allowed, "the relay is trusted"
+        assert self.allows(here, come, int(origin[1:]), name), "the origin may"
+        assert self.allows(relay, go, here, name), "the relay lets it go on to here"
+        places = [*self.modules[relay].visible(), *self.modules[relay].callable()]
+        assert (name, f"/rmpa/{origin}/n") in places, "and has it itself"
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_in_any_map_exactly_the_permitted_crosses_also_after_reloads(seed: int) -> None:
+    rng = random.Random(seed + 1000)
+    count = rng.randint(3, 6)
+    world = SecuredMap(count, set(rng.sample(range(1, count + 1), rng.randint(0, count))), seed)
+    pairs = [(one, other) for one in range(1, count + 1) for other in range(one + 1, count + 1)]
+    linked: set[tuple[int, int]] = set()
+    for _ in range(14):
+        if rng.random() < 0.5:
+            pair = rng.choice(pairs)
+            (world.unlink if pair in linked else world.link)(*pair)
+            linked ^= {pair}
+        else:
+            world.reload(rng.randint(1, count), _some_rules(rng, count))
+        if rng.random() < 0.6:
+            world.settle()
+            world.check()
+    world.settle()
+    world.check()
+
+
+def test_an_untrusted_relay_does_not_stand_in_the_way_of_a_trusted_one() -> None:
+    world = SecuredMap(4, {3, 4}, 1)
+    everything = TrustSettings(default="allow")
+    for number in world.modules:
+        world.reload(number, everything)
+    world.reload(2, replace(everything, relays=("m4",)))
+    for pair in ((1, 3), (1, 4), (2, 3), (2, 4)):
+        world.link(*pair)
+    world.settle()
+    b = world.modules[2]
+    assert [(whose.name, via) for whose, via in b.imports.ways] == [("m1", "m4")], "m3 has the lower GUID"
+    world.reload(2, replace(everything, relays=("m3",)))
+    world.settle()
+    world.check()
+    assert [(whose.name, via) for whose, via in b.imports.ways] == [("m1", "m3")]
+    assert ("/t1", "/rmpa/m1/n") in b.visible()
+    world.reload(2, everything)
+    world.settle()
+    assert ("/t1", "/rmpa/m1/n") not in b.visible()

@@ -1,0 +1,44 @@
+"""docs/permissions.md: its examples are read, and what it says of them is what `rmpa trust check` says."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from rmpa.cli.trust import check
+from rmpa.config.permission_rules import NAME_KEYS, Access
+from rmpa.config.sources import load_settings
+
+DOCUMENT = (Path(__file__).parents[2] / "docs" / "permissions.md").read_text("utf-8")
+EXAMPLES = re.findall(r"```toml\n(.*?)```", DOCUMENT, re.DOTALL)
+CHECKS = re.findall(r"(?m)^\$ rmpa trust check (.*)\n(.*)$", DOCUMENT)
+
+
+@pytest.mark.parametrize("text", EXAMPLES, ids=range(len(EXAMPLES)))
+def test_each_example_is_read(text: str, tmp_path: Path) -> None:
+    (tmp_path / "rmpa.toml").write_text(text)
+    loaded = load_settings({}, {}, host_name="base", cwd=tmp_path)
+    assert loaded.notes == ()
+    trust = loaded.settings.trust
+    assert trust.rules or trust.direct
+
+
+@pytest.mark.parametrize(("words", "answer"), CHECKS)
+def test_what_is_said_of_the_first_example_is_so(words: str, answer: str, tmp_path: Path) -> None:
+    file = tmp_path / "rmpa.toml"
+    file.write_text(EXAMPLES[0])
+    result = CliRunner().invoke(check, [*shlex.split(words), "--config", str(file)])
+    assert result.output.strip() == answer
+    assert result.exit_code == (0 if answer.startswith("yes") else 1)
+
+
+def test_every_key_and_every_counter_is_named() -> None:
+    keys = re.findall(r"(?m)^\| `(\w+)` \|", DOCUMENT)
+    assert sorted(keys) == sorted(NAME_KEYS)
+    counters = set(re.findall(r"`permission\.(\w+)`", DOCUMENT))
+    assert counters == {*(str(access) for access in Access), "relay"}
+    assert len(CHECKS) >= 4

@@ -1,0 +1,56 @@
+"""Fuzz target: the signed documents of the authority, and the notifications that carry them."""
+
+from __future__ import annotations
+
+import msgspec
+
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.trust.spreading import read_document, read_have
+
+try:
+    from rmpa.trust.documents import DenyList, KeyList, read_deny_list, read_key_list, sign
+    from rmpa.trust.keyring import GroupKey
+    from tests.trust.authority import Authority
+except ImportError:  # the extra "trust" is not installed
+    SEEDS: list[bytes] = [b""]
+
+    def fuzz(data: bytes) -> None:
+        """Nothing reads documents without the library."""
+
+else:
+    _LAB, _OTHER = Authority(), Authority()
+    _DENY = DenyList().with_name("arm", 1.0).with_name("base", 2.0)
+    _KEYS = KeyList.of(3, [GroupKey(1, bytes(32)), GroupKey(2, b"k" * 32)])
+    _OURS = [sign(_DENY, _LAB.key), sign(_KEYS, _LAB.key)]
+    SEEDS = [
+        b"",
+        b"{}",
+        b'{"signed":"{}","signature":"AA=="}',
+        b'{"signed":' + b"[" * 2000,
+        b'{"deny":1,"keys":2,"authority":true}',
+        b'{"document":"{}"}',
+        sign(_DENY, _OTHER.key),
+        *_OURS,
+    ]
+
+    def fuzz(data: bytes) -> None:
+        """A document that our authority signed, byte for byte, or a documented error; nothing else is ever taken."""
+        key = _LAB.key.public_key()
+        for read in (read_deny_list, read_key_list):
+            try:
+                found = read(data, key)
+            except RemoteProtocolError as error:
+                str(error)
+            else:
+                text = msgspec.json.decode(data)["signed"]
+                if text not in [msgspec.json.decode(ours)["signed"] for ours in _OURS]:
+                    raise AssertionError(f"{found} was never signed")
+        try:
+            args = msgspec.json.decode(data)
+        except (msgspec.MsgspecError, UnicodeError, RecursionError):
+            return
+        for notification in (read_have, read_document):
+            try:
+                notification(args if isinstance(args, dict) else {"document": args})
+            except RemoteProtocolError as error:
+                str(error)

@@ -1,0 +1,332 @@
+"""Attacks on a secured mesh, by a program in a network namespace of its own; docs/security.md lists them."""
+
+from __future__ import annotations
+
+import functools
+import sys
+import time
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+pytest.importorskip("cryptography")
+
+from lab.bed.processes import Process, eventually
+from rmpa.trust import limits as trust_limits
+from rmpa.trust.io.store import CERTIFICATE, KEY
+from tests.interop.modules import Module, flows
+from tests.interop.ros import NODES
+from tests.interop.secured import (
+    GROUP,
+    UDP_PORT,
+    SecuredMesh,
+    attack,
+    control,
+    counter,
+    foreign_files,
+    place,
+    start_attack,
+)
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from lab.bed.namespaces import Host, Lab
+    from lab.bed.processes import Event
+    from rmpa.trust.io.store import TrustStore
+    from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
+
+pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
+
+OPEN = '[trust]\ndefault = "allow"\n'
+"""Every member may do everything: what is refused is refused for another reason."""
+REASONS = {"plain": 11, "unsecured": 12, "key": 13, "clock": 14, "revoked": 17, "name": 18, "flood": 20}
+
+
+class Fortress:
+    """Two secured modules, and an attacker on a host of its own in their network."""
+
+    def __init__(self, home: Path, modules: ModuleFactory, lab: Lab, config: str = OPEN) -> None:
+        self.home = home
+        self.mesh = SecuredMesh(home, "a")
+        self.mesh.add("b")
+        self.a, self.b = modules("a", "b", config=config, log_level="info")
+        self.eve = lab.host("eve", 0)
+
+    @property
+    def target(self) -> dict[str, Any]:
+        """Where the authority is reached."""
+        return place(self.a.agent)
+
+    def attack(self, mode: str, **arguments: object) -> Event:
+        """Let the attacker do something."""
+        return attack(self.eve, mode, **arguments)
+
+    def insider(self, store: TrustStore | None = None, name: str = "eve", **more: object) -> Event:
+        """Dial ``a`` with the group's key, and with the certificate of some files."""
+        files = {"cert": str(store.path(CERTIFICATE)), "private": str(store.path(KEY))} if store is not None else {}
+        key = {"key": self.mesh.group_key, "name": name, "here": self.eve.address}
+        return self.attack("insider", **self.target, **key, **files, **more)
+
+    def held(self) -> None:
+        """Fail unless the two modules are as before, and linked with each other alone."""
+        for module, other in ((self.a, "b"), (self.b, "a")):
+            assert module.agent.process.returncode is None
+            linked = {name for name, row in module.agent.peers().items() if row["state"] == "linked"}
+            assert linked == {other}
+            assert "Traceback" not in module.agent.process.output
+
+
+@pytest.fixture
+def fortress(tmp_path: Path, modules: ModuleFactory, lab: Lab) -> Fortress:
+    return Fortress(tmp_path, modules, lab)
+
+
+# --- from outside -----------------------------------------------------------------------------------------------
+
+
+def test_a_module_without_trust_is_told_so_and_stays_outside(fortress: Fortress, agent: AgentFactory) -> None:
+    answer = fortress.attack("plain", **fortress.target, here=fortress.eve.address)
+    assert (answer["answer"], answer["code"]) == ("refused", REASONS["plain"])
+    assert counter(fortress.a.agent, "link.refused.plain") == 1
+    seed = f"{fortress.target['address']}:{fortress.target['port']}"
+    outsider = agent(fortress.eve, name="eve", flags=("--seed", seed))
+    eventually(lambda: counter(fortress.a.agent, "beacon.untagged") > 0, what="beacons of eve are refused")
+    assert not any(row["state"] == "linked" for row in outsider.peers().values())
+    fortress.held()
+
+
+def test_a_secured_agent_never_goes_back_to_plain(fortress: Fortress) -> None:
+    with start_attack(fortress.eve, "lure", listen=40999, seconds=12) as lure:
+        lure.wait_event("ready", 20.0)
+        fortress.attack(
+            "tell_beacon", key=fortress.mesh.group_key, group=GROUP, udp=UDP_PORT, here=fortress.eve.address,
+            listen=40999, name="eve",
+        )  # fmt: skip
+        first = lure.wait_event("done", 60.0)["first"]
+    assert isinstance(first, list)
+    assert first, "the agents dialled what a member's beacon names"
+    assert set(first) == {b"RMPS".hex()}
+    fortress.held()
+
+
+def test_recorded_beacons_and_prefaces_do_nothing(fortress: Fortress, tmp_path: Path) -> None:
+    wire = fortress.b.host.cables[0]
+    tape = tmp_path / "tape.json"
+    tap = ["ip", "netns", "exec", wire.switch]
+    host = type("Wire", (), {"command": staticmethod(lambda argv: [*tap, *argv])})()
+    with start_attack(host, "record", interface=wire.port, file=str(tape), beacons=6, prefaces=1) as recording:
+        recording.wait_event("ready", 20.0)
+        fortress.b.agent.kill()
+        fortress.b.agent.restart()  # and dials, or is dialled, with a preface
+        recording.wait_event("done", 60.0)
+    fortress.b.agent.wait_peer("a")
+    before = counter(fortress.a.agent, "beacon.in")
+    refused = fortress.attack("replay", file=str(tape), times=50)
+    assert isinstance(refused["answers"], list)
+    for answer in refused["answers"]:
+        assert (answer["answer"], answer["code"]) == ("refused", REASONS["flood"])  # "the same preface came before"
+    told = sum(counter(module.agent, f"beacon.{kind}") for module in (fortress.a, fortress.b)
+               for kind in ("replayed", "repeated"))  # fmt: skip
+    assert told >= 100, told
+    assert counter(fortress.a.agent, "beacon.in") - before < 50
+    fortress.held()
+
+
+# --- with a stolen group key ------------------------------------------------------------------------------------
+
+
+def test_the_group_key_without_a_certificate_opens_nothing(fortress: Fortress) -> None:
+    answer = fortress.insider()
+    assert answer["answer"] in ("alert", "closed"), answer
+    assert counter(fortress.a.agent, "link.refused.foreign") == 1
+    fortress.held()
+
+
+def test_a_certificate_of_another_ca_is_refused(fortress: Fortress) -> None:
+    answer = fortress.insider(foreign_files(fortress.home, "b"), "b")
+    assert (answer["answer"], "UNKNOWN_CA" in str(answer.get("alert", ""))) == ("alert", True), answer
+    assert counter(fortress.a.agent, "link.refused.foreign") == 1
+    fortress.held()
+
+
+def test_an_expired_certificate_is_refused(fortress: Fortress) -> None:
+    answer = fortress.insider(fortress.mesh.expired("old"), "old")
+    assert (answer["answer"], "EXPIRED" in str(answer.get("alert", ""))) == ("alert", True), answer
+    assert counter(fortress.a.agent, "link.refused.expired") == 1
+    fortress.held()
+
+
+def test_a_member_cannot_take_the_name_of_another(fortress: Fortress) -> None:
+    fortress.mesh.add("eve")
+    answer = fortress.insider(fortress.mesh.store("eve"), "b")
+    assert (answer["answer"], answer["code"]) == ("refused", REASONS["name"]), answer
+    assert counter(fortress.a.agent, "link.refused.name") == 1
+    fortress.held()
+
+
+@pytest.mark.parametrize("downgrade", [{"old": True}, {"alpn": ""}, {"alpn": "http/1.1"}])
+def test_something_else_than_tls_1_3_with_our_protocol_is_refused(
+    fortress: Fortress, downgrade: dict[str, Any]
+) -> None:
+    fortress.mesh.add("eve")
+    answer = fortress.insider(fortress.mesh.store("eve"), **downgrade)
+    assert answer["answer"] in ("alert", "closed"), answer
+    assert counter(fortress.a.agent, "link.refused.downgrade") == 1
+    fortress.held()
+
+
+def test_a_preface_with_a_time_far_off_is_refused_with_both_times(fortress: Fortress) -> None:
+    answer = fortress.insider(skew=-120)
+    assert (answer["answer"], answer["code"]) == ("refused", REASONS["clock"]), answer
+    assert "120 s behind" in str(answer["text"])
+    fortress.held()
+
+
+# --- joins ------------------------------------------------------------------------------------------------------
+
+
+def test_tokens_that_were_invented_used_or_have_ended_let_none_in(fortress: Fortress) -> None:
+    token = control(fortress.a.agent, "invite", unattended=True)["token"]
+    answer = fortress.attack("join", token=token, name="eve", invented=True)
+    assert (answer["op"], answer["code"]) == ("refused", REASONS["key"]), answer
+    joined = fortress.attack("join", token=token, name="robot")
+    assert joined["op"] == "grant", joined  # the bearer of a token that needs no user: that is what it is for
+    again = fortress.attack("join", token=token, name="eve")
+    assert (again["op"], again["code"]) == ("refused", REASONS["key"]), again
+    short = control(fortress.a.agent, "invite", unattended=True, lifetime=1)["token"]
+    time.sleep(1.5)  # a token's time is the wall clock's, in whole seconds
+    for later in (False, True):  # nor if its text is changed to end later: the authority knows when it ends
+        late = fortress.attack("join", token=short, name="eve", later=later)
+        assert late["op"] in ("refused", "refuse"), late
+    names = {each["name"] for each in control(fortress.a.agent, "status")["members"]}
+    assert names == {"a", "b", "robot"}
+    fortress.held()
+
+
+def test_a_member_in_the_middle_of_a_join_makes_the_codes_differ(fortress: Fortress, agent: AgentFactory) -> None:
+    fortress.mesh.add("eve")
+    store = fortress.mesh.store("eve")
+    invited = control(fortress.a.agent, "invite")
+    files = {"cert": str(store.path(CERTIFICATE)), "private": str(store.path(KEY))}
+    given = {"token": invited["token"], "listen": 40998, "here": fortress.eve.address, "name": "victim"}
+    with start_attack(fortress.eve, "middle", **given, **files) as middle:
+        bent = str(middle.wait_event("ready", 20.0)["token"])
+        joiner: list[str | Path] = [sys.executable, NODES / "joiner.py", "victim"]
+        with Process(fortress.b.host.command(joiner), commands=True) as victim:
+            victim.tell(bent)
+            there = str(middle.wait_event("codes", 60.0)["authority"])
+            here = str(victim.wait_event("code", 60.0)["code"])
+            shown = control(fortress.a.agent, "step", id=invited["id"], after=0)["code"]
+            assert shown == there, "the attacker shows that it knows what the authority's user sees"
+            assert here != shown
+            victim.tell("no")
+            control(fortress.a.agent, "answer", id=invited["id"], agree=False)
+            assert "codes differ" in str(victim.wait_event("refused", 60.0)["text"])
+        done = middle.wait_event("done", 60.0)
+    assert done["authority"] != "grant"
+    assert "victim" not in {each["name"] for each in control(fortress.a.agent, "status")["members"]}
+
+
+# --- floods -----------------------------------------------------------------------------------------------------
+
+
+class Traffic:
+    """Messages from one module to the other, each of which is counted."""
+
+    def __init__(self, fortress: Fortress) -> None:
+        self.heard = fortress.a.ros.roscpp("listener", topic="/to_a")
+        fortress.b.ros.roscpp("talker", topic="/to_a", rate=100)
+        flows(self.heard)
+
+    def held(self) -> None:
+        """Fail unless every message arrived, each byte of it."""
+        report = flows(self.heard, 100)
+        assert (report["bad"], report["gaps"], report["doubled"]) == (0, 0, 0)
+
+
+@pytest.mark.parametrize("kind", ["beacons", "prefaces", "half"])
+def test_a_flood_costs_a_link_no_message(fortress: Fortress, kind: str) -> None:
+    traffic = Traffic(fortress)
+    key = {"key": fortress.mesh.group_key} if kind == "half" else {}
+    done = fortress.attack(
+        "flood", kind=kind, **fortress.target, **key, group=GROUP, udp=UDP_PORT, rate=3000, seconds=5
+    )
+    assert int(str(done["sent"])) > 500
+    counted = {
+        "beacons": ("beacon.unknown_key", "beacon.forged"),
+        "prefaces": ("link.refused.key", "link.pending_full"),
+        "half": ("link.unfinished", "link.refused.flood", "link.pending_full"),
+    }[kind]
+    assert sum(counter(fortress.a.agent, name) for name in counted) > 0
+    traffic.held()
+    fortress.held()
+
+
+def test_slow_handshakes_are_ended_and_hold_no_member_out(fortress: Fortress) -> None:
+    with start_attack(fortress.eve, "slow", **fortress.target, count=60) as slow:
+        fortress.b.agent.kill()
+        fortress.b.agent.restart()
+        fortress.b.agent.wait_peer("a")
+        done = slow.wait_event("done", 60.0)
+    assert done["open"] == 0
+    assert isinstance(done["lived"], list)
+    assert max(done["lived"]) < 5.0
+    fortress.held()
+
+
+# --- members that do what they may not --------------------------------------------------------------------------
+
+RULES = """
+[[permission]]
+modules = ["*"]
+publish = ["/tf"]
+subscribe = ["/odom"]
+"""
+
+
+def _member(fortress: Fortress, host: Host, agent: AgentFactory, shell: ShellFactory, config: str = OPEN) -> Module:
+    fortress.mesh.add(host.name)
+    member = Module(host, agent(host, name=host.name, config=config, log_level="info"), shell(host))
+    member.agent.wait_peer("a")
+    return member
+
+
+def test_what_a_member_may_not_publish_or_call_does_not_come_in(
+    tmp_path: Path, modules: ModuleFactory, lab: Lab, agent: AgentFactory, shell: ShellFactory
+) -> None:
+    fortress = Fortress(tmp_path, modules, lab, RULES)
+    server = fortress.a.ros.rospy("worker")  # a service of a
+    eve = _member(fortress, fortress.eve, agent, shell)
+    eve.ros.roscpp("talker", topic="/cmd_vel", rate=50)
+    eve.ros.roscpp("talker", "__name:=other", topic="/tf", rate=50)
+    fortress.a.wait_topic("/tf")
+    assert server.returncode is None
+    assert "/cmd_vel" not in fortress.a.topics()
+    services = eve.ros.tool("rosservice", "list").split()
+    assert not [name for name in services if name.startswith("/work")]
+    code, why = fortress.a.agent.rmpa("why", "/cmd_vel")
+    assert "permission" in why, (code, why)
+
+
+def test_a_revoked_member_is_gone_everywhere_within_a_second(
+    fortress: Fortress, agent: AgentFactory, shell: ShellFactory
+) -> None:
+    eve = _member(fortress, fortress.eve, agent, shell)
+    fortress.b.agent.wait_peer("eve")
+    revoked = time.monotonic()
+    control(fortress.a.agent, "revoke", name="eve")
+    ends = {}
+    for module in (fortress.a, fortress.b):
+        eventually(functools.partial(_is_gone, module, "eve"), 30.0, what=f"eve gone at {module.name}", every=0.02)
+        ends[module.name] = time.monotonic() - revoked
+    assert max(ends.values()) < 1.0, ends
+    eve.agent.kill()
+    eve.agent.restart()  # and it does not come back
+    eventually(lambda: counter(fortress.a.agent, "link.refused.revoked") > 0, what="eve is refused")
+    fortress.held()
+    assert trust_limits.KEY_SPREAD > 0
+
+
+def _is_gone(module: Module, name: str) -> bool:
+    return not any(peer.name == name and peer.link is not None for peer in module.agent.snapshot().peers)

@@ -1,0 +1,199 @@
+"""Nothing secret leaves its file: every file, log line, ``--json`` output and error of a run is searched for keys."""
+
+from __future__ import annotations
+
+import base64
+import json
+import stat
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+pytest.importorskip("cryptography")
+
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+
+from lab.bed.agents import RMPA
+from lab.bed.processes import Process
+from rmpa.trust.io import store as files_of
+from rmpa.trust.tokens import Token
+from tests.interop.secured import SecuredMesh, attack, control, place
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from lab.bed.agents import Agent
+    from lab.bed.namespaces import Lab
+    from rmpa.trust.io.store import TrustStore
+    from tests.interop.conftest import AgentFactory
+
+pytestmark = [pytest.mark.netns, pytest.mark.timeout(180)]
+
+MAY_HOLD: Final = {
+    "private key": {files_of.KEY},
+    "CA key": {files_of.CA_KEY},
+    "group key": {files_of.KEYS},
+    "key of a token": {files_of.TOKENS},
+    "web token": {"web-token"},
+}
+"""The files that have each secret, of the module that it belongs to."""
+COMMANDS: Final = (
+    ("peer", "list", "--json"),
+    ("peer", "list"),
+    ("why", "--module", "b"),
+    ("doctor", "--json"),
+    ("trust", "status", "--json"),
+    ("trust", "status"),
+    ("trust", "check", "b", "publish", "/cmd_vel", "--json"),
+    ("trust", "renew", "--json"),
+    ("config", "show"),
+)
+
+
+def forms(secret: bytes) -> Iterator[bytes]:
+    """How bytes may stand in a file: raw, hexadecimal, a ``repr``, base64 at each of its three alignments."""
+    yield secret
+    yield secret.hex().encode()
+    yield secret.hex().upper().encode()
+    yield repr(secret)[2:-1].encode()
+    for lead in range(3):
+        for encode in (base64.b64encode, base64.urlsafe_b64encode):
+            whole = encode(bytes(lead) + secret)
+            # The first and last characters depend on what stands around the secret.
+            yield whole[4 if lead else 0 : len(whole) - 4]
+    yield base64.b32encode(secret)[:-8].lower()
+
+
+def found_in(data: bytes, secrets: dict[str, list[bytes]]) -> set[str]:
+    """Which secrets some bytes have."""
+    return {
+        kind for kind, values in secrets.items() for value in values if any(form in data for form in forms(value))
+    }
+
+
+def scalar(pem: bytes) -> bytes:
+    """The number that a private key is."""
+    key = serialization.load_pem_private_key(pem, None)
+    assert isinstance(key, ec.EllipticCurvePrivateKey)
+    return key.private_numbers().private_value.to_bytes(32, "big")
+
+
+def pem_lines(pem: bytes) -> list[bytes]:
+    """The lines of a PEM that are the key's own: the first is the same in every key of the curve."""
+    return [line for line in pem.splitlines() if not line.startswith(b"-----")][1:]
+
+
+def test_the_search_finds_a_secret_in_each_form() -> None:
+    secret = bytes(range(100, 132))
+    for form in (secret, secret.hex().encode(), repr(secret).encode(), base64.b64encode(secret)):
+        assert found_in(b"x" + form + b"y", {"key": [secret]}) == {"key"}
+    for lead in range(4):
+        assert found_in(base64.b64encode(bytes(lead) + secret + b"more"), {"key": [secret]}) == {"key"}
+    assert found_in(base64.b64encode(bytes(64)) + secret[:20], {"key": [secret]}) == set()
+
+
+def run(agent: Agent, *words: str) -> bytes:
+    """The output of a command, whatever came of it."""
+    return agent.rmpa(*words)[1].encode()
+
+
+def test_no_key_and_no_token_leaves_its_file(tmp_path: Path, lab: Lab, agent: AgentFactory) -> None:
+    mesh = SecuredMesh(tmp_path, "a")
+    mesh.add("b")
+    hosts = lab.hosts("a", "b", "eve")
+    a, b = (agent(host, name=host.name, log_level="debug") for host in hosts[:2])
+    a.wait_peer("b")
+    words_of_web: list[str | Path] = [RMPA, "web", "--listen", "0.0.0.0", "--agent", "a", "--control", "--json"]
+    with Process(a.host.command(words_of_web), env=a.env, name="rmpa web") as served:
+        told = json.loads(served.wait_for(r"(\{.*\})", 90.0)[1])
+    assert told["url"].startswith("https://"), told
+    web_token = Path(told["token_file"]).read_bytes().strip()
+    outputs = {" ".join(words): run(each, *words) for each in (a, b) for words in COMMANDS}
+
+    # Joins that succeed and fail, with what is printed and answered.
+    invited = control(a, "invite", unattended=True)
+    token = Token.parse(invited["token"])
+    joined: list[str | Path] = [RMPA, "trust", "join", "-", "--name", "c", "--yes", "--json"]
+    c_state = tmp_path / "state" / "eve"
+    env = {**a.env, "RMPA_STATE_DIR": str(c_state), "RMPA_RUNTIME_DIR": str(tmp_path / "none")}
+    for number in range(2):  # the second time it is used
+        with Process(hosts[2].command(joined), env=env, commands=True) as process:
+            process.tell(invited["token"])
+            process.wait(60.0)
+            outputs[f"join {number}"] = process.output.encode()
+    attack(hosts[2], "join", token=invited["token"], name="d", invented=True)
+    attack(hosts[2], "insider", **place(a), key=mesh.group_key, here=hosts[2].address, name="b")
+    outputs["revoke"] = json.dumps(control(a, "revoke", name="c", force=True)).encode()
+
+    secrets = _secrets([mesh.store("a"), mesh.store("b")], token)
+    secrets["web token"] = [web_token]
+    # Errors about files that cannot be used: their content must not be in the text.
+    outputs |= _broken(b)
+    for name, data in outputs.items():
+        assert found_in(data, secrets) == set(), f"rmpa {name} tells a secret:\n{data.decode()}"
+    _check_files(tmp_path, secrets)
+    for each in (a, b):
+        for path in sorted((each.runtime_dir or tmp_path).iterdir()):
+            assert stat.S_IMODE(path.stat().st_mode) & 0o077 == 0, path
+    assert a.process.returncode is None
+    assert found_in("\n".join(a.process.lines).encode(), secrets) == set()
+
+
+def _secrets(stores: list[TrustStore], token: Token) -> dict[str, list[bytes]]:
+    found: dict[str, list[bytes]] = {"private key": [], "group key": [], "CA key": []}
+    for store in stores:
+        pem = store.path(files_of.KEY).read_bytes()
+        found["private key"] += [scalar(pem), *pem_lines(pem)]
+        signed = json.loads(json.loads(store.path(files_of.KEYS).read_bytes())["signed"])
+        found["group key"] += [base64.b64decode(each["key"]) for each in signed["keys"]]
+    pem = stores[0].load_ca_key()
+    found["CA key"] += [scalar(pem), *pem_lines(pem)]
+    found["key of a token"] = [token.key]
+    found["token"] = [token.secret, token.serialize()[10:60].encode()]
+    return found
+
+
+def _broken(agent: Agent) -> dict[str, bytes]:
+    """What commands say of a module whose key, documents and modes are wrong, one after the other."""
+    folder = Path(agent.env["RMPA_STATE_DIR"]) / agent.name / files_of.FOLDER
+    agent.terminate()
+    told = {}
+    for name in (files_of.KEY, files_of.KEYS, files_of.CERTIFICATE):
+        path = folder / name
+        whole = path.read_bytes()
+        for how, data in (("cut", whole[: len(whole) // 2]), ("mixed", whole[50:] + whole[:50])):
+            path.write_bytes(data)
+            with Process(agent.argv, env=agent.env) as process:
+                assert process.wait(60.0) != 0, f"an agent with {name} {how} starts"
+                told[f"up with {name} {how}"] = process.output.encode()
+                assert name in process.output
+            told[f"status with {name} {how}"] = run(agent, "trust", "status", "--json")
+        path.write_bytes(whole)
+    path = folder / files_of.KEY
+    path.chmod(0o644)
+    with Process(agent.argv, env=agent.env) as process:
+        assert process.wait(60.0) != 0
+        told["up with a key that others can read"] = process.output.encode()
+        assert "can be read by others" in process.output
+    path.chmod(0o600)
+    return told
+
+
+def _check_files(home: Path, secrets: dict[str, list[bytes]]) -> None:
+    """Fail if a file has a secret that is not its own, or if others may read a file of trust."""
+    seen = set()
+    for path in sorted(home.rglob("*")):
+        if not path.is_file() or path.is_symlink():
+            continue
+        mode = stat.S_IMODE(path.stat().st_mode)
+        allowed = {kind for kind, names in MAY_HOLD.items() if path.name in names}
+        found = found_in(path.read_bytes(), secrets)
+        assert found <= allowed, f"{path} has a {found - allowed}"
+        if found or path.parent.name == files_of.FOLDER:
+            assert mode & 0o077 == 0, f"{path} has mode {mode:o}"
+        if path.parent.name == files_of.FOLDER:
+            assert path.parent.stat().st_mode & 0o077 == 0, path.parent
+        seen |= found
+    assert seen >= {"private key", "group key", "CA key"}, "the search finds what is there"

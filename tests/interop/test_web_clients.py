@@ -1,0 +1,353 @@
+"""Clients that others wrote, unmodified, against ``rmpa web`` over two linked agents.
+
+They connect beside the agent ``base``; what they read, call and command is in the module of the agent ``arm``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import importlib.metadata
+import importlib.util
+import io
+import json
+import os
+import random
+import shutil
+import socket
+import subprocess
+import sys
+import tarfile
+from typing import TYPE_CHECKING, Any, Final
+
+import pytest
+from yarl import URL
+
+from lab.bed.agents import Agent
+from lab.bed.http_client import http_client
+from lab.bed.namespaces import MACHINE
+from lab.bed.processes import DEADLINE, Process
+from lab.bed.ros import free_port
+from rmpa.ros.environment import RosEnvironment
+from rmpa.ros.node.node import Node
+from rmpa.ros.types.definitions import known_specifications, known_types
+from tests.interop import npm
+from tests.interop.web import PORT, Web
+from tests.web.values.filled import filled, filled_message
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Iterator
+    from pathlib import Path
+
+    from lab.bed.namespaces import Host, Lab
+    from tests.interop.conftest import AgentFactory, WebFactory
+
+RUN: Final = 120.0
+pytestmark = pytest.mark.timeout(2 * RUN)
+
+
+@pytest.fixture(scope="module")
+def agents(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Agent, Agent]]:
+    """Two linked agents on this machine."""
+    home = tmp_path_factory.mktemp("agents")
+    with Agent(MACHINE, home, name="base") as base, Agent(MACHINE, home, name="arm") as arm:
+        for each in (base, arm):
+            each.start()
+        for each in (base, arm):
+            each.wait_ready()
+            each._close_notify()  # a test that is the first to need them would count it as a socket left open
+        base.wait_peer("arm")
+        yield base, arm
+
+
+@pytest.fixture(scope="module")
+def served(agents: tuple[Agent, Agent]) -> Iterator[Web]:
+    """``rmpa web --control`` beside ``base``."""
+    with Web(agents[0], "--control", port=free_port()) as web:
+        yield web
+
+
+@pytest.fixture
+async def arm(agents: tuple[Agent, Agent]) -> AsyncIterator[Node]:
+    """A node of the other module."""
+    async with node_of(agents[1]) as node:
+        yield node
+
+
+def node_of(agent: Agent) -> Node:
+    """A node of an agent's module."""
+    return Node("worker", master_uri=f"http://127.0.0.1:{agent.core_port}", environment=RosEnvironment())
+
+
+def url(web: Web) -> str:
+    """For clients that know only a URL."""
+    return f"ws://{web.host}/?token={web.token}"
+
+
+async def until(condition: Callable[[], Any], what: str) -> Any:
+    """Wait until something has happened; return what it is."""
+    try:
+        async with asyncio.timeout(DEADLINE):
+            while not (found := condition()):
+                await asyncio.sleep(0.05)
+    except TimeoutError:
+        raise AssertionError(what) from None
+    return found
+
+
+# --- JavaScript -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("package", ["roslib1", "roslib2", "@foxglove/roslibjs"])
+def test_roslibjs_works_unmodified(package: str, served: Web) -> None:
+    home = npm.packages() / package
+    with Process(["node", npm.CLIENTS / "roslib.mjs", home, url(served)], name=package) as client:
+        assert client.wait(RUN) == 0, client.output
+        assert client.lines[-1] == "ok"
+
+
+def test_foxglove_ws_protocols_client_works_unmodified(served: Web) -> None:
+    with Process(["node", npm.CLIENTS / "foxglove.mjs", npm.packages(), url(served)]) as client:
+        assert client.wait(RUN) == 0, client.output
+        assert client.lines[-1] == "ok"
+
+
+def example(*words: str | Path) -> Process:
+    """A program of @foxglove/ws-protocol-examples."""
+    home = npm.packages() / "@foxglove" / "ws-protocol-examples"
+    main = json.loads((home / "package.json").read_text())["main"]
+    return Process(["node", home / main, *words], name=str(words[0]))
+
+
+KINDS: Final = "/kinds"
+"""Each type has a topic of its own below this."""
+TYPES: Final = known_types()[::3]
+"""Of the shipped types a third, which has all kinds of fields."""
+
+
+@contextlib.asynccontextmanager
+async def all_kinds(node: Node) -> AsyncIterator[dict[str, bytes]]:
+    """Publish latched messages with a value in each field; yield them by type."""
+    messages = {name: filled_message(name) for name in TYPES}
+    for name, payload in messages.items():
+        publisher = await node.advertise(f"{KINDS}/{name}", name, latch=True)
+        publisher.publish_raw(payload)
+    yield messages
+
+
+def as_sent(values: Any) -> Any:
+    """Values of @foxglove/rosmsg-serialization as rosbags was given them: they differ in how a time is written."""
+    if isinstance(values, dict):
+        if values.keys() == {"sec", "nsec"}:
+            return {"secs": values["sec"], "nsecs": values["nsec"]}
+        return {name: as_sent(each) for name, each in values.items()}
+    return [as_sent(each) for each in values] if isinstance(values, list) else values
+
+
+async def test_messages_of_all_kinds_are_decoded_and_recorded_byte_by_byte(
+    served: Web, arm: Node, tmp_path: Path
+) -> None:
+    mcap_reader = pytest.importorskip("mcap.reader", reason="mcap is not installed (extra web-peers)")
+    mcap_ros1 = pytest.importorskip("mcap_ros1.decoder", reason="mcap-ros1-support is not installed (web-peers)")
+    decode: list[str | Path] = ["node", npm.CLIENTS / "decode.mjs", npm.packages(), url(served), f"{KINDS}/"]
+    filler = await arm.advertise("/filler", "std_msgs/String")
+    async with all_kinds(arm) as sent:
+        with Process(decode, name="decode.mjs") as decoder:
+            await until(lambda: len(decoder.events("message")) >= len(sent) or decoder.returncode, "each type")
+            assert decoder.returncode is None, decoder.output
+            for event in decoder.events("message"):
+                name = str(event["type"])
+                assert event["topic"] == f"{KINDS}/{name}"
+                assert event["received"] == event["again"] == sent[name].hex(), name
+                assert as_sent(event["values"]) == filled(known_specifications(name), name, 1), name
+
+            # The recorder of the examples keeps 5 MB until it writes: more follows behind what is looked for.
+            file = tmp_path / "all.mcap"
+            with example("mcap-record", "--output", file, url(served)) as recorder:
+                await recorder.expect("subscribing to /filler")
+                await filler.wait_for_subscriber()
+                text = filler.make({"data": random.randbytes(500_000).hex()})
+                while not file.exists() or file.stat().st_size < 1_000_000:
+                    filler.publish(text)
+                    await asyncio.sleep(0.05)
+                assert await asyncio.to_thread(recorder.interrupt) == 0, recorder.output
+    recorded: dict[str, list[bytes]] = {}
+    with file.open("rb") as stream:
+        reader = mcap_reader.make_reader(stream, decoder_factories=[mcap_ros1.DecoderFactory()])
+        for schema, channel, message in reader.iter_messages():
+            if channel.topic.startswith(f"{KINDS}/"):
+                assert channel.topic == f"{KINDS}/{schema.name}"
+                recorded.setdefault(schema.name, []).append(message.data)
+        decoded = [f"{KINDS}/{name}" for name in sorted(sent)[::4]]  # it compiles each type, which takes its time
+        for schema, _, message, values in reader.iter_decoded_messages(topics=[*decoded]):
+            again = io.BytesIO()
+            values.serialize(again)
+            assert again.getvalue() == message.data, schema.name
+            decoded.remove(f"{KINDS}/{schema.name}")
+        assert decoded == []
+    assert recorded == {name: [payload] for name, payload in sent.items()}
+
+
+# --- the examples of @foxglove/ws-protocol --------------------------------------------------------------------------
+
+
+async def test_the_publish_example_reaches_another_module(served: Web, arm: Node) -> None:
+    heard: list[str] = []
+    await arm.subscribe("/chatter", "std_msgs/String", lambda message: heard.append(message.message.data))
+    with example("publish-client", "--encoding", "ros1", url(served)) as client:
+        await until(lambda: len(heard) > 1, "two messages")
+        assert all(text.startswith("hello world ") for text in heard)
+        assert await asyncio.to_thread(client.interrupt) == 0, client.output
+
+
+async def test_the_service_example_calls_another_module(served: Web, arm: Node) -> None:
+    def switch(request: Any) -> dict[str, object]:
+        return {"success": request.data, "message": "on"}
+
+    await arm.advertise_service("/switch", "std_srvs/SetBool", switch)
+    with example("service-client", url(served)) as client:
+        assert await client.ended() == 0, client.output
+        assert "callId: 123" in client.output
+        assert "encoding: 'ros1'" in client.output
+
+
+async def test_the_parameter_example_follows_and_sets_parameters(
+    agents: tuple[Agent, Agent], served: Web, arm: Node
+) -> None:
+    async with node_of(agents[0]) as base:
+        await base.set_param("/lamp", False)
+        with example("param-client", url(served)) as client:
+            await client.expect("name: '/lamp', value: false")
+            await client.expect("Received 1 parameter updates")  # a second after, it switches what is a boolean
+            await client.expect("name: '/lamp', value: true")
+            await base.set_param("/lamp", "broken")
+            await client.expect("name: '/lamp', value: 'broken'")
+            assert "Assertion failed" not in client.output
+
+
+# --- roslibpy -------------------------------------------------------------------------------------------------------
+
+NEEDS_A_NODE_OF_ITS_OWN: Final = "tests/ros1/test_tf.py::test_tf_test"
+"""tf2_web_republisher has to run, which is a node in C++ of its own repository."""
+ROSBRIDGE_PORT: Final = 9090
+"""Where roslibpy's tests connect, without a token."""
+
+
+@contextlib.asynccontextmanager
+async def proxy(host: Host, web: Web) -> AsyncIterator[None]:
+    """A reverse proxy of a host that adds the token, as nginx does by ``proxy_set_header``."""
+    bearer = "".join(f"{name}: {value}\r\n" for name, value in web.bearer.items()).encode()
+
+    async def copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(ConnectionError):
+            while data := await reader.read(65536):
+                writer.write(data)
+                await writer.drain()
+        writer.close()
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        request = await reader.readuntil(b"\r\n")
+        upstream = host.open_socket()
+        upstream.setblocking(False)
+        await asyncio.get_running_loop().sock_connect(upstream, ("127.0.0.1", PORT))
+        behind, before = await asyncio.open_connection(sock=upstream)
+        before.write(request + bearer)
+        await asyncio.gather(copy(reader, before), copy(behind, writer))
+
+    listening = host.open_socket()
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    listening.bind(("127.0.0.1", ROSBRIDGE_PORT))
+    serving: set[asyncio.Task[None]] = set()
+
+    def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        serving.add(asyncio.create_task(serve(reader, writer)))
+
+    server = await asyncio.start_server(accept, sock=listening)
+    try:
+        yield
+    finally:
+        server.close()
+        await asyncio.wait(serving)
+
+
+@pytest.mark.netns
+async def test_roslibpys_own_tests_pass(lab: Lab, agent: AgentFactory, web: WebFactory, tmp_path: Path) -> None:
+    if importlib.util.find_spec("roslibpy") is None:
+        pytest.skip("roslibpy is not installed (extra web-peers)")
+    source = await asyncio.to_thread(roslibpy_source, tmp_path)
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", "/dev/null"]
+    command += ["--rootdir", str(source), str(source / "tests" / "ros1"), "--deselect", NEEDS_A_NODE_OF_ITS_OWN]
+
+    async def run(number: int, transport: str) -> None:
+        host = lab.host(transport, number)
+        served = web(agent(host), "--control")
+        environ = {**os.environ, "ROSLIBPY_TRANSPORT": transport}
+        async with proxy(host, served):
+            with Process(host.command(command), env=environ, name=f"roslibpy {transport}") as tests:
+                assert await tests.ended(RUN) == 0, tests.output
+                assert "24 passed" in tests.output
+
+    await asyncio.gather(*(run(number, transport) for number, transport in enumerate(("twisted", "asyncio"))))
+
+
+def roslibpy_source(folder: Path) -> Path:
+    """The source distribution of the version that is installed: it has the tests."""
+    version = importlib.metadata.version("roslibpy")
+    command = [sys.executable, "-m", "pip", "download", "-q", "--no-deps", "--no-binary", ":all:", "-d", str(folder)]
+    command += [f"roslibpy=={version}"]
+    done = subprocess.run(command, capture_output=True, timeout=RUN, text=True, check=False)
+    if done.returncode and "Failed to establish a new connection" in done.stderr:
+        pytest.skip("pip reaches no registry")
+    assert done.returncode == 0, done.stderr
+    with tarfile.open(next(folder.glob("roslibpy-*.tar.gz"))) as archive:
+        archive.extractall(folder, filter="data")
+    return folder / f"roslibpy-{version}"
+
+
+# --- HTTP -----------------------------------------------------------------------------------------------------------
+
+
+async def test_promtool_finds_nothing_wrong_with_the_metrics(
+    agents: tuple[Agent, Agent], served: Web, arm: Node
+) -> None:
+    promtool = shutil.which("promtool")
+    if promtool is None:
+        pytest.skip("no promtool here (apt install prometheus)")
+    numbers = await arm.advertise("/numbers", "std_msgs/Int32", latch=True)
+    numbers.publish(numbers.make({"data": 1}))
+    async with node_of(agents[0]) as base, http_client() as http:
+        heard = asyncio.Event()
+        await base.subscribe("/numbers", "std_msgs/Int32", lambda _: heard.set())
+        async with asyncio.timeout(DEADLINE):
+            await heard.wait()
+        await served.wait_counts(http, "rmpa_route_messages_total", "topic", lambda found: "/numbers" in found)
+        async with http.get(f"{served.url}/metrics", headers=served.bearer) as response:
+            body = await response.read()
+    done = await asyncio.to_thread(subprocess.run, [promtool, "check", "metrics"], input=body, capture_output=True)
+    assert (done.returncode, done.stderr) == (0, b""), done.stderr.decode()
+
+
+async def test_each_response_of_the_api_fits_its_openapi_document(served: Web, arm: Node) -> None:
+    openapi_core = pytest.importorskip("openapi_core", reason="openapi-core is not installed (extra web-peers)")
+    testing = pytest.importorskip("openapi_core.testing")
+    await arm.advertise("/odom", "nav_msgs/Odometry")
+    async with http_client() as http:
+
+        async def get(path: str) -> tuple[int, str, bytes]:
+            async with http.get(URL(f"{served.url}{path}", encoded=True), headers=served.bearer) as response:
+                return response.status, response.headers["Content-Type"], await response.read()
+
+        async with asyncio.timeout(DEADLINE):
+            while (await get("/api/v1/topics/odom"))[0] != 200:
+                await asyncio.sleep(0.05)
+        document = json.loads((await get("/openapi.json"))[2])
+        config = openapi_core.Config(extra_media_type_deserializers={"application/problem+json": json.loads})
+        api = openapi_core.OpenAPI.from_dict(document, config=config)  # it validates the document too
+        names = {"peers": "arm", "topics": "odom", "services": "rosout%2Fget_loggers"}
+        for path in document["paths"]:
+            known = path.replace("{name}", names.get(path.split("/")[3], ""))
+            for asked, wanted in [(known, 200), (path.replace("{name}", "none"), 404)][: 1 + ("{" in path)]:
+                status, kind, body = await get(asked)
+                assert status == wanted, (asked, body)
+                response = testing.MockResponse(body, status_code=status, content_type=kind)
+                api.validate_response(testing.MockRequest(served.url, "get", asked), response)

@@ -1,0 +1,408 @@
+"""Meshes with TLS on both lanes, over real sockets: links, and refusals with their reasons at both ends."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import ssl
+import time
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import pytest
+
+pytest.importorskip("cryptography")
+
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity
+from rmpa.core.sizes import MIB
+from rmpa.mesh import limits
+from rmpa.mesh.connection import ConnectionRole
+from rmpa.mesh.frames import Frame, FrameKind
+from rmpa.mesh.handshake import Lane, Refusal, Refuse
+from rmpa.trust.keyring import GroupKey
+from rmpa.trust.preface import PREFACE_BYTES, Purpose
+from rmpa.trust.reasons import TrustReason
+from tests.mesh.io.members import Member, meshes
+from tests.mesh.io.meshes import DEADLINE, Peer, introduce, until
+from tests.trust.authority import Authority
+from tests.trust.io.member_files import HandClock, SecuredMesh
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from rmpa.mesh.io.securing import MeshSecurity
+    from rmpa.mesh.peering import PeerStatus
+    from rmpa.trust.preface import Preface
+
+DAY = 86_400.0
+
+
+@pytest.fixture(scope="module")
+def lab() -> Authority:
+    return Authority()
+
+
+def _has_all(peer: Peer) -> bool:
+    return len(peer.data) == 2 and bool(peer.controls)
+
+
+def status(at: Peer, of: Peer) -> PeerStatus:
+    return next(s for s in at.mesh.peers() if s.identity.guid == of.identity.guid)
+
+
+async def test_members_link_by_both_lanes_and_messages_cross(lab: Authority) -> None:
+    async with meshes(Member(lab, "arm"), Member(lab, "base")) as (arm, base):
+        await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
+        large = bytes(range(256)) * (64 * MIB // 256)
+        for one, other in ((arm, base), (base, arm)):
+            one.link(other).express.send(1, 7, 0, b"small")
+            one.link(other).bulk.send(2, 8, 0, large)
+            one.link(other).send_control(b'{"op":"x"}')
+        for peer in (arm, base):
+            await until(partial(_has_all, peer), "all messages")
+            assert peer.messages(1) == [(7, b"small")]
+            assert peer.messages(2)[0][1] == large
+        assert arm.mesh.counters.as_dict() == base.mesh.counters.as_dict() == {}
+
+
+async def test_nothing_is_readable_on_the_wire(lab: Authority) -> None:
+    """A tap between two members sees neither names nor messages."""
+    async with meshes(Member(lab, "arm"), Member(lab, "base")) as (arm, base):
+        await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
+        sock = base.link(arm).connection.sock
+        seen = b""
+        arm.link(base).express.send(1, 7, 0, b"a secret text" * 100)
+        while b"\x17\x03\x03" not in seen:
+            try:
+                seen = sock.recv(65536, socket.MSG_PEEK)
+            except BlockingIOError:
+                break  # the stream was faster
+        assert b"secret" not in seen
+        await until(lambda: bool(base.data), "the message")
+        assert arm.link(base).connection.stream._secure is not None
+        bulk = base.link(arm).bulk_connection
+        assert bulk is not None
+        assert bulk.stream._secure is not None
+
+
+def _bad(lab: Authority, what: str) -> Member:
+    """A module that is no member, for one reason."""
+    if what == "foreign":
+        return Member(Authority(), "arm")
+    if what == "key":
+        return Member(lab, "arm", group_key=GroupKey(1, b"x" * 32))
+    return Member(lab, "arm", issued=8 * DAY if what == "expired" else 0.0, ahead=3600.0 if what == "clock" else 0.0)
+
+
+@pytest.mark.parametrize("other", ["foreign", "expired", "clock", "key", "name", "revoked"])
+@pytest.mark.parametrize("dials", [True, False])
+async def test_refusals_have_their_reason_at_both_ends(lab: Authority, other: str, dials: bool) -> None:
+    good = Member(lab, "base")
+    bad, name = _bad(lab, other), "crane" if other == "name" else "arm"
+    if other == "revoked":
+        good.deny("arm")
+    securities, names = ((bad, good), (name, "base")) if dials else ((good, bad), ("base", name))
+    async with meshes(*securities, names=names) as (low, high):
+        await until(
+            lambda: status(low, high).state == "refused" and other in status(low, high).last_error,
+            "the dialler shows it",
+        )
+        await until(lambda: high.mesh.counters[f"link.refused.{other}"] > 0, "the acceptor counts it")
+        assert low.mesh.counters[f"link.refused.{other}"] > 0
+        assert not low.ups or not low.linked(high)
+        if other not in {"clock", "key"}:  # those are refused before the acceptor knows more than an address
+            await until(lambda: other in status(high, low).last_error, "the acceptor shows it")
+
+
+@pytest.mark.parametrize("bad", ["foreign", "expired"])
+async def test_a_dialler_learns_why_its_certificate_is_refused(lab: Authority, bad: str) -> None:
+    """By the acceptor's alert, which comes when the dialler's own handshake is done; nobody dials the other way."""
+    mine = _bad(lab, bad)
+    judge = Member(lab, "base")
+    mine.client_context.verify_mode = ssl.CERT_NONE  # so that only the acceptor finds something wrong
+    async with meshes(mine, judge, found=False) as (low, high):
+        low.mesh.peer_found(high.identity)
+        for _ in range(3):
+            await until(lambda: bool(low.mesh.peers()[0].last_error), "refused")
+            assert status(low, high).last_error.startswith(f"{bad}:")
+            assert status(low, high).state == "refused"
+            low.mesh.peer_gone(high.identity.guid)
+            await until(lambda: not low.mesh.peers(), "forgotten")
+            low.mesh.peer_found(high.identity)
+
+
+async def test_a_plain_module_learns_that_the_mesh_is_secured(lab: Authority) -> None:
+    async with meshes(None, Member(lab, "base")) as (plain, secured):
+        await until(lambda: status(plain, secured).state == "refused", "refused")
+        assert "plain" in status(plain, secured).last_error
+        assert "rmpa trust join" in status(plain, secured).last_error
+        assert secured.mesh.counters["link.refused.plain"] > 0
+        assert not plain.ups
+
+
+async def test_a_member_never_falls_back_to_plain(lab: Authority) -> None:
+    async with meshes(Member(lab, "arm"), None) as (secured, plain):
+        await until(lambda: status(secured, plain).state == "refused", "refused")
+        assert "unsecured" in status(secured, plain).last_error
+        assert plain.mesh.counters["link.refused.unsecured"] > 0
+        assert not secured.ups
+        assert not plain.ups
+
+
+@pytest.mark.parametrize("answer", [Refusal.DUPLICATE, TrustReason.REVOKED, TrustReason.PLAIN, None])
+async def test_a_refusal_without_proof_is_shown_and_sets_no_pause(
+    lab: Authority, monkeypatch: pytest.MonkeyPatch, answer: int | None
+) -> None:
+    """Anything may answer instead of TLS, by a refusal in plain or by other bytes, and is dialled again as before."""
+    monkeypatch.setattr(limits, "REFUSED_RETRY", 1000.0)
+    refuse = Frame(FrameKind.REFUSE, Refuse(answer or 0, "go away").serialize()).serialize()
+    dials = 0
+
+    async def refused(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        nonlocal dials
+        with contextlib.suppress(OSError, asyncio.IncompleteReadError):
+            await reader.readexactly(PREFACE_BYTES)
+            dials += 1
+            writer.write(b"HTTP/1.1 400 Bad Request" if answer is None else refuse)
+            await writer.drain()
+        writer.close()
+
+    server = await asyncio.start_server(refused, "127.0.0.1", 0)
+    async with server, meshes(Member(lab, "arm"), found=False) as (arm,):
+        guid = Guid.of("127.0.0.1", server.sockets[0].getsockname()[1], 0)
+        arm.mesh.peer_found(Identity(guid, b"i" * 16, "base"))
+        await until(lambda: dials >= 3, "dialled again")
+        await until(lambda: arm.mesh.peers()[0].state == "refused", "shown")
+        shown = "plain" if answer == TrustReason.PLAIN else "downgrade"
+        assert arm.mesh.peers()[0].last_error.startswith(shown)
+        assert (answer is None) != ("go away" in arm.mesh.peers()[0].last_error)
+
+
+@pytest.mark.parametrize("dialler", [True, False])
+async def test_a_revoked_module_is_gone_at_once_at_both_ends(lab: Authority, dialler: bool) -> None:
+    members = Member(lab, "arm"), Member(lab, "base")
+    async with meshes(*members) as (arm, base):
+        await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
+        judge, other = (arm, base) if dialler else (base, arm)
+        members[not dialler].deny(other.mesh.identity.name)
+        assert not judge.linked(other), "without waiting for the other side"
+        assert judge.downs[0][1].startswith("revoked:")
+        await until(lambda: bool(other.downs), "the other side sees it")
+        assert "revoked" in other.downs[0][1]
+        await until(lambda: status(other, judge).last_error.startswith("revoked"), "it is shown there")
+        await until(lambda: not judge.mesh.connections(), "both lanes ended")
+
+
+async def test_another_modules_run_cannot_be_taken_over(lab: Authority) -> None:
+    """A member that claims the instance of another one, under its own name."""
+    async with meshes(Member(lab, "arm"), Member(lab, "base")) as (arm, base):
+        await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
+        thief = Peer(arm.number, name="thief", security=Member(lab, "thief"))
+        try:
+            assert thief.identity.instance == arm.identity.instance
+            await thief.mesh.start()
+            thief.mesh.peer_found(base.identity)
+            await until(lambda: base.mesh.counters["link.refused.name"] > 0, "refused")
+            assert base.linked(arm)
+            assert not thief.ups or not thief.linked(base)
+        finally:
+            await thief.mesh.close()
+
+
+@pytest.mark.parametrize("lane", [Lane.EXPRESS, Lane.BULK])
+async def test_nor_while_its_link_is_silent(lab: Authority, monkeypatch: pytest.MonkeyPatch, lane: Lane) -> None:
+    """A member that claims instance and address of another one, under its own name."""
+    async with meshes(Member(lab, "arm"), Member(lab, "base")) as (arm, base):
+        await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
+        monkeypatch.setattr(base.mesh, "_alive", lambda _: False)
+        thief = Peer(arm.number, name="thief", security=Member(lab, "thief"))
+        try:
+            await thief.mesh.start()
+            await _claim(thief, arm, base, lane)
+            await until(lambda: base.mesh.counters["link.refused.name"] > 0, "refused")
+            assert base.both_lanes(arm)
+            assert not base.downs
+        finally:
+            await thief.mesh.close()
+
+
+async def test_a_bulk_lane_joins_the_link_of_its_own_module_only(
+    lab: Authority, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also if its link came up after its hello was judged."""
+    async with meshes(Member(lab, "arm"), Member(lab, "base")) as (arm, base):
+        await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
+        lane = base.link(arm).bulk_connection
+        monkeypatch.setattr(base.mesh, "connection_prove", lambda *_: None)
+        thief = Peer(arm.number, name="thief", security=Member(lab, "thief"))
+        try:
+            await thief.mesh.start()
+            await _claim(thief, arm, base, Lane.BULK)
+            await until(lambda: not thief.mesh.connections(), "closed")
+            assert base.link(arm).bulk_connection is lane
+        finally:
+            await thief.mesh.close()
+
+
+async def _claim(thief: Peer, victim: Peer, at: Peer, lane: Lane) -> None:
+    """Dial with one's own name and certificate, and the run and address of another module."""
+    thief.mesh.identity = replace(victim.identity, name="thief")
+    sock = await _dial(at)
+    secured = await thief.mesh._secure_dialled(sock)
+    thief.mesh._open(sock, ConnectionRole.DIALLER, ("127.0.0.1", at.port), at.identity.guid, lane, secured=secured)
+
+
+async def test_a_test_of_reachability_is_no_failure(lab: Authority) -> None:
+    async with meshes(Member(lab, "base")) as (base,):
+        for _ in range(50):
+            (await _dial(base)).close()
+        sock = await _dial(base)
+        sock.send(b"RM")
+        sock.close()
+        await until(lambda: not unproven(base), "all are over")
+        assert base.mesh.counters["link.refused.plain"] == base.mesh.counters["link.unfinished"] == 0
+
+
+def unproven(peer: Peer) -> int:
+    """Connections whose preface is awaited."""
+    assert peer.mesh._securing is not None
+    return len(peer.mesh._securing._unproven)
+
+
+async def _dial(peer: Peer, source: str = "127.0.0.1") -> socket.socket:
+    sock = socket.socket()
+    sock.bind((source, 0))
+    sock.setblocking(False)
+    await asyncio.get_running_loop().sock_connect(sock, ("127.0.0.1", peer.port))
+    return sock
+
+
+async def test_a_preface_one_byte_at_a_time_is_read(lab: Authority) -> None:
+    joined: list[tuple[socket.socket, Preface]] = []
+    peer = Peer(0, security=Member(lab, "base"), on_join=lambda sock, preface: joined.append((sock, preface)))
+    try:
+        await peer.mesh.start()
+        sock = await _dial(peer)
+        for byte in Member(lab, "arm").preface(Purpose.RENEWAL):
+            sock.send(bytes([byte]))
+            await asyncio.sleep(0)
+        sock.send(b"behind it")
+        await until(lambda: bool(joined), "handed on")
+        taken, preface = joined[0]
+        assert preface.purpose is Purpose.RENEWAL
+        assert await asyncio.wait_for(asyncio.get_running_loop().sock_recv(taken, 100), DEADLINE) == b"behind it"
+        taken.close()
+        sock.close()
+    finally:
+        await peer.mesh.close()
+
+
+async def test_a_flood_of_forged_prefaces_costs_no_message_and_members_still_link(
+    lab: Authority, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "UNPROVEN_BURST", 20)
+    monkeypatch.setattr(limits, "UNPROVEN_RATE", 100.0)
+    members = Member(lab, "arm"), Member(lab, "base"), Member(lab, "crane")
+    async with meshes(*members, found=False) as (arm, base, crane):
+        introduce([arm, base])
+        await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
+        forged = Member(lab, "arm", group_key=GroupKey(1, b"x" * 32)).preface(Purpose.LINK)
+        sent = 0
+        paused = False
+        while base.mesh.counters["link.paused"] < 3 or not paused:
+            paused = paused or base.mesh._acceptor.paused
+            for _ in range(3):
+                sock = socket.socket()
+                sock.setblocking(False)
+                base.hand_made.append(sock)
+                with contextlib.suppress(OSError):
+                    sock.connect(("127.0.0.1", base.port))
+                    # a connection is there at once on loopback, unless the queue is full
+                with contextlib.suppress(OSError):
+                    sock.send(forged + b"x" * 300)
+            arm.link(base).express.send(1, sent, 0, b"x")
+            sent += 1
+            await asyncio.sleep(0)
+        assert base.mesh.counters["link.refused.key"] > 20
+        introduce([base, crane])
+        await until(lambda: base.linked(crane), "a new member")
+        await until(lambda: len(base.data) == sent, "all messages")
+        assert not base.downs
+
+
+async def test_silent_connections_leave_room_for_members(lab: Authority, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The oldest ones of the busiest address are closed, so that a member need not wait until they are given up."""
+    monkeypatch.setattr(limits, "PREFACE_TIMEOUT", 1000.0)
+    monkeypatch.setattr(limits, "PENDING_CONNECTIONS_MAX", limits.PENDING_PER_ADDRESS + 2)
+    members = Member(lab, "arm"), Member(lab, "base")
+    async with meshes(*members, found=False) as (arm, base):
+        silent = [await _dial(base) for _ in range(limits.PENDING_PER_ADDRESS + 4)]
+        await until(lambda: base.mesh.counters["link.pending_full"] == 4, "four closed")
+        assert unproven(base) == limits.PENDING_PER_ADDRESS
+        silent += [await _dial(base, "127.0.0.2") for _ in range(6)]
+        await until(lambda: base.mesh.counters["link.pending_full"] == 8, "the place is shared")
+        for sock in silent[:8]:
+            assert await asyncio.wait_for(asyncio.get_running_loop().sock_recv(sock, 1), DEADLINE) == b""
+        introduce([arm, base])
+        await until(lambda: base.both_lanes(arm), "linked at once")
+        assert base.mesh.counters["link.unfinished"] == 0
+        for sock in silent:
+            sock.close()
+
+
+@pytest.mark.parametrize("rest", [b"", b"\x16\x03\x01\x02\x00\x01", b"garbage" * 20])
+async def test_a_handshake_that_stands_still_or_is_none_is_given_up(
+    lab: Authority, monkeypatch: pytest.MonkeyPatch, rest: bytes
+) -> None:
+    monkeypatch.setattr(limits, "SECURING_TIMEOUT", 0.3)
+    async with meshes(Member(lab, "base")) as (base,):
+        sock = await _dial(base)
+        sock.send(Member(lab, "arm").preface(Purpose.LINK) + rest)
+        counters = base.mesh.counters
+        await until(lambda: counters["link.unfinished"] + counters["link.refused.downgrade"] == 1, "given up")
+        assert counters["link.refused.downgrade"] == (rest[:1] == b"g")
+        assert not base.mesh.connections()
+        sock.close()
+
+
+async def test_a_replayed_preface_is_refused(lab: Authority) -> None:
+    async with meshes(Member(lab, "base")) as (base,):
+        preface = Member(lab, "arm").preface(Purpose.LINK)
+        socks = [await _dial(base) for _ in range(2)]
+        for sock in socks:
+            sock.send(preface)
+        await until(lambda: base.mesh.counters["link.refused.flood"] == 1, "the second one")
+        for sock in socks:
+            sock.close()
+
+
+@pytest.fixture
+def memberships(tmp_path: Path) -> list[MeshSecurity]:
+    """Of modules with real files."""
+    mesh = SecuredMesh(tmp_path, clock=SystemHandClock())
+    return [mesh.member(name, time.time()) for name in ("arm", "base")]
+
+
+async def test_memberships_are_what_a_mesh_needs(memberships: list[MeshSecurity]) -> None:
+    made = [Peer(number, name=name, security=memberships[number]) for number, name in enumerate(("arm", "base"))]
+    try:
+        for peer in made:
+            await peer.mesh.start()
+        introduce(made)
+        await until(lambda: made[0].both_lanes(made[1]) and made[1].both_lanes(made[0]), "both lanes")
+    finally:
+        await asyncio.gather(*(peer.mesh.close() for peer in made))
+    assert not any(security.on_denied for security in memberships)
+
+
+class SystemHandClock(HandClock):
+    """The machine's clock, for handshakes that OpenSSL judges."""
+
+    def now(self) -> float:
+        return time.monotonic()
+
+    def wall(self) -> float:
+        return time.time()

@@ -1,0 +1,78 @@
+"""TLS between two ends of a test: contexts, finished handshakes, and a socket that takes little."""
+
+from __future__ import annotations
+
+import ssl
+import tempfile
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+from cryptography.hazmat.primitives import serialization
+
+from rmpa.runtime.record_layer import Buffer, DataSocket, SecureSocket, TlsHandshake
+from tests.trust.authority import Authority, new_key
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Sequence
+
+Contexts = tuple[ssl.SSLContext, ssl.SSLContext]
+"""Of the client and of the server."""
+NOW = datetime.now(UTC).timestamp()
+
+
+def make_context(ca: Authority, *, server_side: bool) -> ssl.SSLContext:
+    key = new_key()
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if server_side else ssl.PROTOCOL_TLS_CLIENT)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_REQUIRED
+    context.load_verify_locations(cadata=ca.certificate)
+    if server_side:
+        context.num_tickets = 0
+    pem = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    with tempfile.NamedTemporaryFile() as file:
+        file.write(pem + ssl.DER_cert_to_PEM_cert(ca.module("arm", NOW, key)).encode())
+        file.flush()
+        context.load_cert_chain(file.name)
+    return context
+
+
+def shake(contexts: Contexts) -> tuple[TlsHandshake, TlsHandshake]:
+    client, server = TlsHandshake(contexts[0], server_side=False), TlsHandshake(contexts[1], server_side=True)
+    client.receive(b"")
+    while not (client.done and server.done):
+        server.receive(client.take_output())
+        client.receive(server.take_output())
+    return client, server
+
+
+def secure_pair(contexts: Contexts, one: DataSocket, other: DataSocket) -> tuple[SecureSocket, SecureSocket]:
+    client, server = shake(contexts)
+    return client.secure(one), server.secure(other)
+
+
+class Slow:
+    """A socket that takes and gives only a few bytes a call."""
+
+    def __init__(self, sock: socket.socket, most: int) -> None:
+        self._sock, self._most = sock, most
+
+    def sendmsg(self, buffers: Sequence[Buffer], /) -> int:
+        return self._sock.send(b"".join(buffers)[: self._most])
+
+    def recv_into(self, buffer: memoryview, /) -> int:
+        return self._sock.recv_into(buffer[: self._most])
+
+    def shutdown(self, how: int, /) -> None:
+        self._sock.shutdown(how)
+
+    def close(self) -> None:
+        self._sock.close()
+
+
+def make_contexts() -> Contexts:
+    lab = Authority()
+    return make_context(lab, server_side=False), make_context(lab, server_side=True)

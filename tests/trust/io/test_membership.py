@@ -1,0 +1,218 @@
+"""A member: what it shows, which other members it takes, and how newer documents reach it."""
+
+from __future__ import annotations
+
+import ssl
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+pytest.importorskip("cryptography")
+
+from rmpa.core.errors import StartError
+from rmpa.runtime.record_layer import TlsHandshake
+from rmpa.trust import limits
+from rmpa.trust.documents import DenyList, DocumentError, DocumentKind, KeyList, sign
+from rmpa.trust.io import store as files_of
+from rmpa.trust.io.membership import Membership
+from rmpa.trust.keyring import GroupKey, KeyPurpose
+from rmpa.trust.packets import Verdict, Verification
+from rmpa.trust.preface import Preface, PrefaceError, Purpose
+from rmpa.trust.reasons import TrustError, TrustReason
+from tests.trust.authority import WALL
+from tests.trust.io.member_files import KEYS, SecuredMesh
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+DAY = 86_400.0
+PACKET = bytes(range(60))
+
+
+@pytest.fixture
+def mesh(tmp_path: Path) -> SecuredMesh:
+    return SecuredMesh(tmp_path)
+
+
+def shake(dialler: Membership, acceptor: Membership) -> tuple[ssl.SSLObject, ssl.SSLObject]:
+    """Both ends of a TLS connection; an error of either end is raised."""
+    ends = (
+        TlsHandshake(dialler.client_context, server_side=False),
+        TlsHandshake(acceptor.server_context, server_side=True),
+    )
+    client, server = ends
+    client.receive(b"")
+    while not (client.done and server.done):
+        server.receive(client.take_output())
+        client.receive(server.take_output())
+    return client.tls, server.tls
+
+
+def seen_by(tls: ssl.SSLObject) -> dict[str, Any]:
+    found = tls.getpeercert()
+    assert found
+    return dict(found)
+
+
+def reason_of(member: Membership, certificate: dict[str, Any] | bytes, claimed: str | None) -> TrustReason:
+    with pytest.raises(TrustError) as caught:
+        member.judge_member(certificate, claimed)
+    return caught.value.reason
+
+
+def test_two_members_link_and_know_each_other_by_name(mesh: SecuredMesh) -> None:
+    arm, base = mesh.member("arm"), mesh.member("base")
+    # OpenSSL judges times by this machine's clock; the test's certificates are of another year.
+    mesh.clock.wall_seconds = 0.0
+    at_arm, at_base = shake(arm, base)
+    mesh.clock.wall_seconds = WALL
+    assert at_arm.version() == "TLSv1.3"
+    assert at_arm.selected_alpn_protocol() == at_base.selected_alpn_protocol() == "rmpa/1"
+    arm.judge_member(seen_by(at_arm), "base")
+    base.judge_member(seen_by(at_base), "arm")
+    assert reason_of(base, seen_by(at_base), "joystick") is TrustReason.NAME
+
+
+def test_a_member_of_another_mesh_gets_no_connection(mesh: SecuredMesh, tmp_path: Path) -> None:
+    arm, thief = mesh.member("arm"), SecuredMesh(tmp_path / "other").member("base")
+    mesh.clock.wall_seconds = 0.0
+    with pytest.raises(ssl.SSLCertVerificationError):
+        shake(arm, thief)
+
+
+def test_certificates_are_judged_in_both_forms(mesh: SecuredMesh, tmp_path: Path) -> None:
+    base = mesh.member("base")
+    certificate = mesh.authority.module("arm")
+    base.judge_member(certificate, "arm")
+    base.judge_member(certificate, None)
+    assert reason_of(base, certificate, "joystick") is TrustReason.NAME
+    assert reason_of(base, SecuredMesh(tmp_path).authority.module("arm"), "arm") is TrustReason.FOREIGN
+    assert reason_of(base, {"notBefore": "x"}, None) is TrustReason.FOREIGN
+    mesh.clock.wall_seconds = WALL + 8 * DAY
+    assert reason_of(base, certificate, "arm") is TrustReason.EXPIRED
+    late = mesh.authority.module("arm", WALL + 9 * DAY)
+    assert reason_of(base, late, "arm") is TrustReason.CLOCK
+
+
+def test_a_clock_is_set_if_it_is_behind_the_begin_of_the_own_certificate(mesh: SecuredMesh) -> None:
+    base = mesh.member("base")
+    begin = WALL - limits.CERTIFICATE_BACKDATE
+    mesh.clock.wall_seconds = begin - 1
+    assert base.wall() is None
+    base.judge_member(mesh.authority.module("arm", WALL - 30 * DAY), "arm")  # its time cannot be judged
+    assert Purpose.LINK is base.guard.admit(base.preface(Purpose.LINK), 1.0, WALL + DAY).purpose
+    mesh.clock.wall_seconds = begin + 1
+    assert base.wall() == begin + 1
+    assert reason_of(base, mesh.authority.module("arm", WALL - 30 * DAY), "arm") is TrustReason.EXPIRED
+    with pytest.raises(PrefaceError, match="behind the acceptor's"):
+        base.guard.admit(base.preface(Purpose.LINK), 1.0, WALL + DAY)
+
+
+def test_a_beacon_with_an_old_key_does_not_decide_the_key_of_every_dial(mesh: SecuredMesh) -> None:
+    """A revoked module can send such beacons from the address of a member, again and again."""
+    base = mesh.member("base")
+    old, newer, host = base.ring.newest.short, GroupKey(base.ring.newest.number + 1, b"n" * 32), "10.0.0.2"
+    base.ring.add(newer, -2 * limits.KEY_OVERLAP)
+    base.packets.heard(host, Verification(Verdict.OLD_KEY, key=old))
+
+    def keys(failures: int) -> list[int]:
+        found = []
+        for _ in range(failures):
+            base.packets.heard(host, Verification(Verdict.OLD_KEY, key=old))
+            found.append(Preface.parse(base.preface(Purpose.LINK, host)).key)
+            base.dial_failed(host)
+        return found
+
+    assert keys(4) == [old, newer.short] * 2
+    base.dial_failed("10.0.0.3")
+    assert Preface.parse(base.preface(Purpose.LINK, "10.0.0.3")).key == newer.short
+
+
+def test_a_newer_deny_list_holds_at_once_and_after_a_restart(mesh: SecuredMesh) -> None:
+    base = mesh.member("base")
+    called: list[int] = []
+    base.on_denied.append(lambda: called.append(base.deny.number))
+    certificate = mesh.authority.module("arm")
+    newer = sign(DenyList().with_name("arm", WALL + 1), mesh.authority.key)
+    assert base.accept_document(DocumentKind.DENY, newer)
+    assert not base.accept_document(DocumentKind.DENY, newer)
+    assert called == [1]
+    assert base.document(DocumentKind.DENY) == newer
+    assert reason_of(base, certificate, "arm") is TrustReason.REVOKED
+    base.judge_member(mesh.authority.module("arm", WALL + 60), "arm")  # it was invited again
+    again = Membership.load(base.store, mesh.clock, mesh.clock.wall)
+    assert reason_of(again, certificate, "arm") is TrustReason.REVOKED
+
+
+def test_a_document_of_another_authority_changes_nothing(mesh: SecuredMesh, tmp_path: Path) -> None:
+    base, other = mesh.member("base"), SecuredMesh(tmp_path).authority
+    with pytest.raises(DocumentError):
+        base.accept_document(DocumentKind.DENY, sign(DenyList().with_name("arm", WALL), other.key))
+    with pytest.raises(DocumentError):
+        base.accept_document(DocumentKind.KEYS, sign(KEYS, other.key))
+    assert list(base.numbers.values()) == [0, 1]
+
+
+def test_a_new_group_key_is_taken_without_a_pause(mesh: SecuredMesh) -> None:
+    base, arm = mesh.member("base"), mesh.member("arm")
+    data = sign(KeyList.of(2, [*KEYS.group_keys, GroupKey(2, b"n" * 32)]), mesh.authority.key)
+    assert base.accept_document(DocumentKind.KEYS, data)
+
+    def heard_by_arm() -> Verdict:
+        now = mesh.clock.now()
+        packet = base.packets.signer.sign(PACKET, KeyPurpose.BEACON, now, WALL)
+        return arm.packets.verifier.verify(packet, KeyPurpose.BEACON, (0, 8), now, WALL).verdict
+
+    assert heard_by_arm() is Verdict.ACCEPTED  # the new key does not sign yet
+    mesh.clock.seconds += limits.KEY_SPREAD
+    assert heard_by_arm() is Verdict.UNKNOWN_KEY
+    assert arm.accept_document(DocumentKind.KEYS, data)
+    assert heard_by_arm() is Verdict.ACCEPTED
+    assert Membership.load(arm.store, mesh.clock, mesh.clock.wall).ring.newest.number == 2
+
+
+def test_a_renewed_certificate_is_used_and_kept(mesh: SecuredMesh) -> None:
+    from rmpa.trust.certificates import CertificateError, CertificateRequest, issue
+
+    base = mesh.member("base")
+    before = base.server_context
+    request = CertificateRequest("base", base.certificate.public_key)
+    mesh.clock.wall_seconds = WALL + 4 * DAY
+    newer = issue(request, mesh.authority.certificate, mesh.authority.key, 77, WALL + 4 * DAY)
+    base.renewed(newer)
+    assert base.certificate.expires == WALL + 11 * DAY
+    assert base.server_context is not before
+    assert Membership.load(base.store, mesh.clock, mesh.clock.wall).certificate.serial == 77
+    with pytest.raises(CertificateError, match="of another key"):
+        base.renewed(mesh.authority.module("base", WALL + 4 * DAY))
+    with pytest.raises(CertificateError, match="of arm, not of base"):
+        base.renewed(mesh.authority.module("arm", WALL + 4 * DAY))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        (files_of.KEYS, b"{}", "keys.json: is broken"),
+        (files_of.DENY, b"{}", "deny.json: is broken"),
+        (files_of.KEY, b"no key", "module.crt: does not fit module.key"),
+    ],
+)
+def test_broken_files_are_named(mesh: SecuredMesh, name: str, content: bytes, words: str) -> None:
+    store = mesh.save("base")
+    store.write(name, content)
+    with pytest.raises(StartError, match=words):
+        Membership.load(store, mesh.clock, mesh.clock.wall)
+
+
+def test_files_of_two_meshes_do_not_fit(mesh: SecuredMesh, tmp_path: Path) -> None:
+    store, other = mesh.save("base"), SecuredMesh(tmp_path / "other").save("base")
+    store.write(files_of.CA, other.path(files_of.CA).read_bytes())
+    with pytest.raises(StartError, match=r"module\.crt: is broken: the certificate is of another CA"):
+        Membership.load(store, mesh.clock, mesh.clock.wall)
+
+
+def test_no_secret_is_in_a_repr(mesh: SecuredMesh) -> None:
+    base = mesh.member("base")
+    assert repr(base) == "Membership('base', deny=0, keys=1)"
+    assert "PRIVATE" not in repr(base.files) + repr(base.ring)
+    assert "kkkk" not in repr(base.ring) + repr(base.files)

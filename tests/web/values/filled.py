@@ -1,0 +1,38 @@
+"""Values other than zero for each field of any message type."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rmpa.ros.types.definitions import known_specifications
+from rmpa.ros.types.messages import MessageType
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rmpa.ros.types.definitions import Field, Specification
+
+
+def filled(known: Mapping[str, Specification], name: str, seed: int) -> dict[str, Any]:
+    """Values for all fields of a type; ``seed`` makes them differ."""
+    values: dict[str, Any] = {}
+    for number, field in enumerate(known[name].fields):
+        mark = (seed + number) % 90 + 1
+
+        def one(mark: int, field: Field = field) -> Any:
+            if not field.primitive:
+                return filled(known, field.type, mark)
+            made: dict[str, Any] = {"string": f"é{mark}", "bool": bool(mark % 2)}
+            if field.type in ("time", "duration"):
+                return {"secs": mark, "nsecs": mark + 1}
+            return made.get(field.type, mark / 4 if field.type.startswith("float") else mark)
+
+        count = field.size or mark % 3 + 1
+        values[field.name] = [one(mark + index) for index in range(count)] if field.array else one(mark)
+    return values
+
+
+def filled_message(name: str, seed: int = 1) -> bytes:
+    """A message of a shipped type, serialized by rosbags."""
+    kind = MessageType(name)
+    return kind.serialize(kind.make(filled(known_specifications(name), name, seed)))
