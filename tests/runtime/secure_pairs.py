@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING
 
 from cryptography.hazmat.primitives import serialization
 
-from rmpa.runtime.record_layer import Buffer, DataSocket, SecureSocket, TlsHandshake
+from rmpa.runtime.record_layer import DataSocket, SecureSocket, TlsHandshake
 from tests.trust.authority import Authority, new_key
 
 if TYPE_CHECKING:
     import socket
     from collections.abc import Sequence
+
+    from rmpa.runtime.buffers import Buffer
 
 Contexts = tuple[ssl.SSLContext, ssl.SSLContext]
 """Of the client and of the server."""

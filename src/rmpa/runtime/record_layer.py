@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Callable, Sequence
 
-Buffer = bytes | bytearray | memoryview
+    from rmpa.runtime.buffers import Buffer
+
 
 _RECORD: Final = 16 * KIB
 """Plain bytes of the largest record (RFC 8446, section 5.1)."""

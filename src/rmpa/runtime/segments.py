@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-Buffer = bytes | bytearray | memoryview
+    from rmpa.runtime.buffers import Buffer
 
 
 class SegmentedSocket:

@@ -24,6 +24,7 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST, URGENT, Framer, Outbox, QueuedMessage
 from rmpa.core.sizes import KIB, MIB
 from rmpa.runtime import limits
+from rmpa.runtime.buffers import Buffer, unsent
 from rmpa.runtime.record_layer import RecordIncomplete, SecureSocket
 from rmpa.runtime.segments import SegmentedSocket
 
@@ -39,7 +40,6 @@ _CORK_MESSAGES: Final = 128
 _CORK_BYTES: Final = 512 * KIB
 _PART: Final = MIB
 
-Buffer = bytes | bytearray | memoryview
 OnBytes = Callable[[memoryview], tuple[int, int]]
 OnClose = Callable[[Exception | None], None]
 
@@ -223,7 +223,7 @@ class Stream:
         self._wait_for_room()
         if not sent and not part:
             return self._queue(b"".join(parts), key)
-        self._outbox.push_rest(_behind(parts, sent), key)
+        self._outbox.push_rest(b"".join(unsent(parts, sent)), key)
         return 0
 
     def _send_rest(self, parts: Sequence[Buffer], sent: int, size: int) -> int:
@@ -236,7 +236,7 @@ class Stream:
         """
         while sent < size:
             try:
-                more = self._sock.sendmsg(_rest(parts, sent))
+                more = self._sock.sendmsg(unsent(parts, sent))
             except (BlockingIOError, InterruptedError):
                 break
             except OSError as error:
@@ -385,7 +385,7 @@ class Stream:
             if sent >= length:
                 sent -= length
             elif sent > 0:
-                self._outbox.push_rest(_behind(parts, sent), key)
+                self._outbox.push_rest(b"".join(unsent(parts, sent)), key)
                 sent = 0
             elif index <= last_part:
                 self._outbox.commit(b"".join(parts))
@@ -582,16 +582,6 @@ class Stream:
         self._done_draining()
 
 
-def _rest(parts: Sequence[Buffer], sent: int) -> list[memoryview]:
-    """The parts without their first ``sent`` bytes."""
-    left: list[memoryview] = []
-    for part in parts:
-        if sent < len(part):
-            left.append(memoryview(part)[sent:])
-        sent = max(0, sent - len(part))
-    return left
-
-
 def _no_bytes(view: memoryview) -> tuple[int, int]:
     """``on_bytes`` of a closed stream."""
     return len(view), 0
@@ -599,8 +589,3 @@ def _no_bytes(view: memoryview) -> tuple[int, int]:
 
 def _no_close(_error: Exception | None) -> None:
     """``on_close`` of a closed stream."""
-
-
-def _behind(parts: Sequence[Buffer], sent: int) -> bytes:
-    """The parts without their first ``sent`` bytes, joined."""
-    return b"".join(_rest(parts, sent))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import socket
 import ssl
 import time
@@ -15,6 +16,7 @@ import pytest
 
 pytest.importorskip("cryptography")
 
+from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.core.sizes import MIB
@@ -22,6 +24,8 @@ from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionRole
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Lane, Refusal, Refuse
+from rmpa.mesh.io.securing import Securing
+from rmpa.runtime.system_clock import SystemClock
 from rmpa.trust.keyring import GroupKey
 from rmpa.trust.preface import PREFACE_BYTES, Purpose
 from rmpa.trust.reasons import TrustReason
@@ -406,3 +410,25 @@ class SystemHandClock(HandClock):
 
     def wall(self) -> float:
         return time.time()
+
+
+async def test_a_handshake_that_has_not_begun_leaves_no_socket_when_the_mesh_ends(lab: Authority) -> None:
+    member = Member(lab, "arm")
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        ours.setblocking(False)
+        securing = Securing(
+            member,
+            clock=SystemClock(),
+            refusals=RefusalLog(logging.getLogger(__name__), Counters()),
+            on_secured=lambda *_: None,
+            on_refused=lambda *_: None,
+            on_join=None,
+            pause=lambda _: None,
+        )
+        theirs.sendall(Member(lab, "base").preface(Purpose.LINK))
+        securing.accept(ours, ("127.0.0.1", 1))
+        (task,) = securing.close()
+        await asyncio.wait([task])
+        assert task.cancelled()
+        assert ours.fileno() == -1

@@ -123,6 +123,8 @@ def test_a_file_of_another_user_names_the_remedy(trust: TrustStore, monkeypatch:
         assert trust.exists
         with pytest.raises(StartError, match="cannot be read: Permission denied; run it as the user of the agent"):
             trust.load()
+        patch.setattr(os, "access", lambda path, _: path != trust.folder.parents[2])
+        assert not trust.exists, "a user who cannot see the state directory has no state there"
 
 
 def test_a_huge_file_is_not_read(trust: TrustStore) -> None:

@@ -15,7 +15,8 @@ from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, pack_fragment_header
 
 if TYPE_CHECKING:
-    from rmpa.runtime.stream import Buffer, Stream
+    from rmpa.runtime.buffers import Buffer
+    from rmpa.runtime.stream import Stream
 
 
 class LaneSender:

@@ -428,6 +428,8 @@ class Securing:
         task = asyncio.get_running_loop().create_task(self._secure(one), name=f"secure {host}")
         self._handshakes[task] = host
         task.add_done_callback(self._handshake_ended)
+        # A task that is cancelled before it begins runs no ``finally``.
+        task.add_done_callback(lambda done: one.sock.close() if done.cancelled() else None)
 
     def _refuse(self, sock: socket.socket, host: str, refuse: Refuse) -> None:
         """Count, answer unless there are many, and close."""

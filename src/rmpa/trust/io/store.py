@@ -104,6 +104,7 @@ class TrustStore:
     """
 
     def __init__(self, state: Path, module: str) -> None:
+        self._state = state
         self.folder = module_dir(state, module) / FOLDER
 
     def path(self, name: str) -> Path:
@@ -112,8 +113,12 @@ class TrustStore:
 
     @property
     def exists(self) -> bool:
-        """Whether trust is on here: there is any of the files, whole or not."""
-        return any(_is_there(self.path(name)) for name in _SIGNS)
+        """Whether trust is on here: there is any of the files, whole or not.
+
+        An error of the folder counts as yes, so that it never turns trust off. Where not even the state directory can
+        be seen, this user has no state of any kind there, and so no trust.
+        """
+        return any(_is_there(self.path(name)) for name in _SIGNS) and os.access(self._state.parent, os.X_OK)
 
     @property
     def is_authority(self) -> bool:

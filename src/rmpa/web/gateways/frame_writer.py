@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 from aiohttp import WSCloseCode, web
 
+from rmpa.runtime.buffers import unsent
 from rmpa.web import limits
 from rmpa.web.gateways.websocket_frames import Opcode, frame_header
 
@@ -115,7 +116,7 @@ class FrameWriter:
             sent = self._send(sock, left)
             if sent < 0:
                 return
-            left = _behind(left, sent)
+            left = unsent(left, sent)
             if not left:
                 return
             if not sent:
@@ -190,19 +191,6 @@ class FrameWriter:
     def _make_room(self) -> None:
         if self._room is not None and not self._room.done():
             self._room.set_result(None)
-
-
-def _behind(buffers: Sequence[Payload], sent: int) -> list[Payload]:
-    """The buffers without their first ``sent`` bytes."""
-    left: list[Payload] = []
-    for buffer in buffers:
-        size = len(buffer)
-        if sent >= size:
-            sent -= size
-        else:
-            left.append(memoryview(buffer)[sent:] if sent else buffer)
-            sent = 0
-    return left
 
 
 def _socket_of(transport: asyncio.Transport) -> socket.socket | None:

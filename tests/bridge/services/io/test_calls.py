@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.services.io.connection_pool import ServicePool
     from rmpa.ros.node.service_server import ServiceCall
-    from rmpa.runtime.stream import Buffer
+    from rmpa.runtime.buffers import Buffer
 
 SMALL = b"x" * 100
 MIDDLE = bytes(range(256)) * 64

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.data.io.link_time import LinkTime
     from rmpa.bridge.data.qos_events import QosEvent
-    from rmpa.runtime.stream import Buffer
+    from rmpa.runtime.buffers import Buffer
 
 _LENGTH: Final = 4
 _NONE: Final = -1

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.core.outbox import QueuedMessage
-    from rmpa.runtime.stream import Buffer
+    from rmpa.runtime.buffers import Buffer
 
 
 class DataLane(Protocol):

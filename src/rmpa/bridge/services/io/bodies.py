@@ -22,7 +22,7 @@ from rmpa.runtime.event_loop import yield_to_data
 
 if TYPE_CHECKING:
     from rmpa.core.outbox import Outbox, QueuedMessage
-    from rmpa.runtime.stream import Buffer
+    from rmpa.runtime.buffers import Buffer
 
 _LENGTH: Final = 4
 _HEAD_MAX: Final = 1

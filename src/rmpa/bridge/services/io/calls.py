@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.services.io.bodies import BodyLink
     from rmpa.bridge.services.io.connection_pool import ServicePool
     from rmpa.ros.node.service_server import ServiceCall
-    from rmpa.runtime.stream import Buffer
+    from rmpa.runtime.buffers import Buffer
 
 _OK: Final = b"\x01"
 _FAILED: Final = b"\x00"
