@@ -7,8 +7,9 @@ from typing import Any
 
 from rmpa.bridge import limits
 from rmpa.bridge.params import transfer
-from rmpa.bridge.params.rules import key_problem, leaves
+from rmpa.bridge.params.rules import key_problem
 from rmpa.core.errors import RmpaError
+from rmpa.ros.master.parameters import leaves
 
 SEEDS: list[bytes] = [
     json.dumps(seed).encode()

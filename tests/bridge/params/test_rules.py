@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.bridge.params.rules import ParamPolicy, follow_rules, key_problem, leaves, replaced
+from rmpa.bridge.params.rules import ParamPolicy, follow_rules, key_problem, replaced
 from rmpa.config.settings import FollowRule, ParamSettings, TimeSettings
+from rmpa.ros.master.parameters import leaves
 
 if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
@@ -65,8 +66,9 @@ def test_names_that_are_none(key: object) -> None:
 
 def test_leaves() -> None:
     value: XmlRpcValue = {"a": 1, "b": {"c": [1], "d": {}}, "e": {"f": "x"}}
+    root: XmlRpcValue = {"a": 1}
     assert list(leaves("/x", value)) == [("/x/a", 1), ("/x/b/c", [1]), ("/x/e/f", "x")]
-    assert list(leaves("/", {"a": 1})) == [("/a", 1)]
+    assert list(leaves("/", root)) == [("/a", 1)]
     assert list(leaves("/x", 5)) == [("/x", 5)]
 
 

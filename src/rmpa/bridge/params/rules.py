@@ -10,6 +10,7 @@ from rmpa.config.param_rules import SIM_TIME, overlap, untouchable
 from rmpa.config.settings import FollowRule, ParamSettings, TimeSettings
 from rmpa.core.names import matches
 from rmpa.ros import limits as ros_limits
+from rmpa.ros.master.parameters import leaves
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -17,17 +18,6 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 _OF_OTHERS: Final = "it is followed from {owner} ([[param]]); ask or set it there"
-
-
-def leaves(key: str, value: XmlRpcValue) -> Iterator[tuple[str, XmlRpcValue]]:
-    """Yield the parameters that a value at a key consists of: itself, or each member of a namespace, at any depth."""
-    waiting: list[tuple[str, XmlRpcValue]] = [(key, value)]
-    while waiting:
-        at, part = waiting.pop()
-        if isinstance(part, dict):
-            waiting.extend((f"{at.rstrip('/')}/{name}", member) for name, member in reversed(part.items()))
-        else:
-            yield at, part
 
 
 def replaced(names: Iterable[str], at: str, present: XmlRpcValue) -> Iterator[str]:

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge.params import transfer
-from rmpa.bridge.params.rules import key_problem, leaves
+from rmpa.bridge.params.rules import key_problem
 from rmpa.core.errors import LocalProtocolError, PeerRefused, RmpaError
+from rmpa.ros.master.parameters import leaves
 from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
 
 if TYPE_CHECKING:

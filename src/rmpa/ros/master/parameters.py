@@ -6,18 +6,20 @@ are. Keys are resolved names; a value that is a dict is a namespace.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from rmpa.ros.master.effects import ParamUpdate
 from rmpa.ros.master.resolution import join, with_slash
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
 
     from rmpa.core.yielding import Yielder
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 Tree: TypeAlias = "dict[str, XmlRpcValue]"
+_V = TypeVar("_V")
 
 
 def _parts(key: str) -> list[str]:
@@ -46,6 +48,17 @@ def _without(tree: Tree, parts: list[str]) -> Tree:
     else:
         del copy[first]
     return copy
+
+
+def leaves(key: str, value: _V) -> Iterator[tuple[str, _V]]:
+    """Yield the parameters that a value at a key consists of: itself, or each member of a namespace, at any depth."""
+    waiting: list[tuple[str, Any]] = [(key, value)]
+    while waiting:
+        at, part = waiting.pop()
+        if isinstance(part, Mapping):
+            waiting.extend((f"{at.rstrip('/')}/{name}", part[name]) for name in reversed(list(part)))
+        else:
+            yield at, part
 
 
 def holds_nil(value: XmlRpcValue, yielder: Yielder = iter) -> bool:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, cast
 
 from rmpa.core.errors import RmpaError
-from rmpa.ros.master.parameters import Parameters
+from rmpa.ros.master.parameters import Parameters, leaves
 from rmpa.web import limits
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ class ParamMirror:
         if names:
             return {name: value for name in names if (value := self.value(name)) is not None}
         value = self.value(prefix)
-        return dict(_leaves(prefix.rstrip("/"), value)) if value is not None else {}
+        return dict(leaves(prefix.rstrip("/"), value)) if value is not None else {}
 
     def updated(self, key: str, value: XmlRpcValue) -> None:
         """The master tells a change; ``{}`` for a parameter that was deleted."""
@@ -218,14 +218,6 @@ def _get(tree: object, name: str) -> object:
     return tree
 
 
-def _leaves(name: str, value: object) -> Iterator[tuple[str, ParamValue]]:
-    if isinstance(value, Mapping):
-        for key, each in value.items():
-            yield from _leaves(f"{name}/{key}", each)
-    else:
-        yield name, cast("ParamValue", value)
-
-
 def _differences(name: str, before: object, after: object) -> Iterator[tuple[str, ParamValue]]:
     """The leaves that differ, each with its new value; ``None`` for those that are gone."""
     if before is after or (not isinstance(after, Mapping) and _same(before, after)):
@@ -233,7 +225,7 @@ def _differences(name: str, before: object, after: object) -> Iterator[tuple[str
     old = before if isinstance(before, Mapping) else {}
     new = after if isinstance(after, Mapping) else {}
     for key in old.keys() - new.keys():
-        yield from ((leaf, None) for leaf, _ in _leaves(f"{name}/{key}", old[key]))
+        yield from ((leaf, None) for leaf, _ in leaves(f"{name}/{key}", old[key]))
     for key, value in new.items():
         yield from _differences(f"{name}/{key}", old.get(key, _MISSING), value)
     if not isinstance(before, Mapping) and before is not _MISSING and isinstance(after, Mapping):

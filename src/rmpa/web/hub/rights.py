@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.config.permission_rules import Access
 from rmpa.core.errors import PeerRefused
+from rmpa.ros.master.parameters import leaves
+from rmpa.ros.master.resolution import canonical
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from rmpa.trust.permissions import Permissions
     from rmpa.web.hub.requests import ParamValue
 
@@ -104,7 +104,8 @@ class Rights:
             )
             raise PeerRefused(_WHO, text, "write a namespace as a value of values")
         name = _resolved(name)
-        changed = {*_leaves(name, value_of(name)), *_leaves(name, after)}
+        values = value_of(name), after
+        changed = {leaf for value in values for leaf, each in leaves(name, value) if each is not None}
         # A parameter that stands where a namespace is needed is replaced by one.
         above = [name[:at] for at in range(1, len(name)) if name[at] == "/"]
         changed |= {each for each in above if not isinstance(value_of(each), Mapping | None)}
@@ -134,16 +135,7 @@ _HIDDEN: Final[ParamValue] = object()  # type: ignore[assignment] # it is compar
 
 def _resolved(name: str) -> str:
     """A name as the core resolves it: ``//a/`` is ``/a``, and so is ``a``."""
-    return "/" + "/".join(part for part in name.split("/") if part)
-
-
-def _leaves(name: str, value: ParamValue) -> Iterator[str]:
-    """The names of the parameters below a name, which is one itself if it is no namespace."""
-    if isinstance(value, Mapping):
-        for key, each in value.items():
-            yield from _leaves(f"{name.rstrip('/')}/{key}", each)
-    elif value is not None:
-        yield name
+    return canonical(f"/{name}")
 
 
 def _bad_key(value: ParamValue) -> str | None:

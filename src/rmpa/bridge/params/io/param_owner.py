@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any
 from rmpa.bridge import limits
 from rmpa.bridge.params import transfer
 from rmpa.bridge.params.io.core import PEERS, ParamCore, read_text, write_text
-from rmpa.bridge.params.rules import key_problem, leaves, replaced
+from rmpa.bridge.params.rules import key_problem, replaced
 from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.config import limits as config_limits
 from rmpa.config.param_rules import overlap
 from rmpa.config.permission_rules import Access
 from rmpa.core.errors import LocalProtocolError, RmpaError
+from rmpa.ros.master.parameters import leaves
 from rmpa.runtime.event_loop import yield_to_data, yielding_to_data
 from rmpa.trust.permissions import refusal
 
