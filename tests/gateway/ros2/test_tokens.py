@@ -1,4 +1,4 @@
-"""Liveliness tokens and keys of ROS 2: golden texts, and what is no token."""
+"""Ros2Liveliness tokens and keys of ROS 2: golden texts, and what is no token."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
-from rmpa.gateway.ros2.qos import Durability, History, Liveliness, Reliability, Ros2Qos
+from rmpa.gateway.ros2.qos import Ros2Durability, Ros2History, Ros2Liveliness, Ros2Qos, Ros2Reliability
 from rmpa.gateway.ros2.tokens import (
     EntityKind,
     Ros2Endpoint,
@@ -96,11 +96,11 @@ def test_any_text_is_a_token_or_refused(key: str) -> None:
     ("qos", "text"),
     [
         (Ros2Qos(), "::,10:,:,:,,"),
-        (Ros2Qos(durability=Durability.TRANSIENT_LOCAL, depth=1), ":1:,1:,:,:,,"),
-        (Ros2Qos(reliability=Reliability.BEST_EFFORT, depth=5), "2::,5:,:,:,,"),
-        (Ros2Qos(history=History.KEEP_ALL, depth=0), "::2,0:,:,:,,"),
+        (Ros2Qos(durability=Ros2Durability.TRANSIENT_LOCAL, depth=1), ":1:,1:,:,:,,"),
+        (Ros2Qos(reliability=Ros2Reliability.BEST_EFFORT, depth=5), "2::,5:,:,:,,"),
+        (Ros2Qos(history=Ros2History.KEEP_ALL, depth=0), "::2,0:,:,:,,"),
         (Ros2Qos(deadline=1_500_000_000, lifespan=2), "::,10:1,500000000:0,2:,,"),
-        (Ros2Qos(liveliness=Liveliness.MANUAL_BY_TOPIC, lease=3_000_000_000), "::,10:,:,:3,3,0"),
+        (Ros2Qos(liveliness=Ros2Liveliness.MANUAL_BY_TOPIC, lease=3_000_000_000), "::,10:,:,:3,3,0"),
     ],
 )
 def test_a_qos_and_its_text(qos: Ros2Qos, text: str) -> None:
@@ -121,12 +121,12 @@ def test_a_latched_publisher_is_transient_local() -> None:
 @given(
     st.builds(
         Ros2Qos,
-        st.sampled_from(Reliability),
-        st.sampled_from(Durability),
-        st.sampled_from(History),
+        st.sampled_from(Ros2Reliability),
+        st.sampled_from(Ros2Durability),
+        st.sampled_from(Ros2History),
         st.integers(0, limits.QOS_NUMBER_MAX),
         *[st.integers(0, 2**63 - 1)] * 2,
-        st.sampled_from(Liveliness),
+        st.sampled_from(Ros2Liveliness),
         st.integers(0, 2**63 - 1),
     )
 )

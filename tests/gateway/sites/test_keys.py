@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
+from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.sites.keys import (
     SiteGateway,
     SiteModule,
     SiteSource,
-    SourceKind,
     data_key,
     parse_token,
     tokens_key,

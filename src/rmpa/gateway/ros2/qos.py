@@ -23,28 +23,28 @@ DEFAULT_DEPTH: Final = 10
 """Messages that *keep last* keeps by default."""
 
 
-class Reliability(IntEnum):
+class Ros2Reliability(IntEnum):
     """Whether a message that is lost on the way is sent again."""
 
     RELIABLE = 1
     BEST_EFFORT = 2
 
 
-class Durability(IntEnum):
+class Ros2Durability(IntEnum):
     """Whether a later subscriber gets earlier messages; ``TRANSIENT_LOCAL`` is what ROS 1 calls latched."""
 
     TRANSIENT_LOCAL = 1
     VOLATILE = 2
 
 
-class History(IntEnum):
+class Ros2History(IntEnum):
     """How many messages an endpoint keeps."""
 
     KEEP_LAST = 1
     KEEP_ALL = 2
 
 
-class Liveliness(IntEnum):
+class Ros2Liveliness(IntEnum):
     """How a publisher shows that it is alive."""
 
     AUTOMATIC = 1
@@ -60,29 +60,29 @@ class Ros2Qos:
     """The QoS of one endpoint; the defaults are rmw's for topics.
 
     Args:
-        reliability: See :class:`Reliability`.
-        durability: See :class:`Durability`.
-        history: See :class:`History`.
+        reliability: See :class:`Ros2Reliability`.
+        durability: See :class:`Ros2Durability`.
+        history: See :class:`Ros2History`.
         depth: Messages that *keep last* keeps.
         deadline: The longest time between two messages, in nanoseconds.
         lifespan: How long a message is of use, in nanoseconds.
-        liveliness: See :class:`Liveliness`.
+        liveliness: See :class:`Ros2Liveliness`.
         lease: Silence after which a publisher counts as dead, in nanoseconds.
     """
 
-    reliability: Reliability = Reliability.RELIABLE
-    durability: Durability = Durability.VOLATILE
-    history: History = History.KEEP_LAST
+    reliability: Ros2Reliability = Ros2Reliability.RELIABLE
+    durability: Ros2Durability = Ros2Durability.VOLATILE
+    history: Ros2History = Ros2History.KEEP_LAST
     depth: int = DEFAULT_DEPTH
     deadline: int = INFINITE
     lifespan: int = INFINITE
-    liveliness: Liveliness = Liveliness.AUTOMATIC
+    liveliness: Ros2Liveliness = Ros2Liveliness.AUTOMATIC
     lease: int = INFINITE
 
     @property
     def latched(self) -> bool:
         """Whether a later subscriber gets the last messages, as of a latched publisher of ROS 1."""
-        return self.durability is Durability.TRANSIENT_LOCAL
+        return self.durability is Ros2Durability.TRANSIENT_LOCAL
 
     def serialize(self) -> str:
         """The text in a liveliness token."""
@@ -114,13 +114,13 @@ class Ros2Qos:
         history, _, depth = parts[2].partition(",")
         liveliness, _, lease = parts[5].partition(",")
         return cls(
-            _kind(Reliability, parts[0], default.reliability),
-            _kind(Durability, parts[1], default.durability),
-            _kind(History, history, default.history),
+            _kind(Ros2Reliability, parts[0], default.reliability),
+            _kind(Ros2Durability, parts[1], default.durability),
+            _kind(Ros2History, history, default.history),
             _number(depth, DEFAULT_DEPTH),
             _nanoseconds(parts[3]),
             _nanoseconds(parts[4]),
-            _kind(Liveliness, liveliness, default.liveliness),
+            _kind(Ros2Liveliness, liveliness, default.liveliness),
             _nanoseconds(lease),
         )
 

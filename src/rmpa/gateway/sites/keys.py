@@ -16,13 +16,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Final
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import peer_name_problem
 from rmpa.core.names import is_global_name, is_type_name
 from rmpa.gateway import limits
+from rmpa.gateway.neighbour import SourceKind
 
 ROOT: Final = "rmpa/1"
 """The first two chunks of each key; the number is that of the format."""
@@ -30,13 +30,6 @@ GATEWAY: Final = "-gateway"
 """Stands in the place of the module in the tokens of gateways."""
 _INSTANCE: Final = re.compile(r"[0-9a-f]{32}")
 _RANK_MAX: Final = 999
-
-
-class SourceKind(StrEnum):
-    """What a source is; the value is its chunk in keys."""
-
-    TOPIC = "t"
-    SERVICE = "s"
 
 
 @dataclass(frozen=True, slots=True)
