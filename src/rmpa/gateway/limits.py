@@ -21,3 +21,11 @@ SITE_NAME_MAX: Final = 63
 """Characters of a site's name, as for a module's name and for a label of DNS."""
 NODE_NAME_MAX: Final = 255
 """Bytes of a node's name in an attachment."""
+ROS2_NAME_MAX: Final = 255
+"""Characters of a node, topic or service of ROS 2; its own limit is about that for topics."""
+ROS2_NODES_MAX: Final = 2000
+"""Nodes of ROS 2 that are shown; any program that reaches the router can declare more."""
+ROS2_ENDPOINTS_MAX: Final = 20000
+"""Publishers, subscriptions, services and clients of ROS 2 that are looked at; each costs some 3 KB."""
+ROS2_PROBLEMS_MAX: Final = 500
+"""Problems of the neighbour ROS 2 that are kept for ``rmpa site``; the oldest go first."""
