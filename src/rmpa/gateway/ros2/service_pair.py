@@ -31,7 +31,7 @@ _ROS2_WITHOUT_USE: Final = {
 _ACTION_PART: Final = "/_action/"
 
 
-def ros1_without_use(service_type: str, ruled: bool = False) -> str:
+def ros1_without_use(service_type: str, *, ruled: bool = False) -> str:
     """Why ROS 2 has no use of a service of ROS 1; empty if it has.
 
     Args:
