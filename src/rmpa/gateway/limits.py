@@ -35,3 +35,11 @@ SITE_CALL_GRACE: Final = 1.0
 """Seconds that the calling site waits longer than the serving one, whose error text tells more."""
 DESCRIBE_TIMEOUT: Final = 10.0
 """Seconds for the description of another site's service; its server may be probed for it over two meshes."""
+ROS2_NAME_MAX: Final = 255
+"""Characters of a node, topic or service of ROS 2; its own limit is about that for topics."""
+ROS2_NODES_MAX: Final = 2000
+"""Nodes of ROS 2 that are shown; any program that reaches the router can declare more."""
+ROS2_ENDPOINTS_MAX: Final = 20000
+"""Publishers, subscriptions, services and clients of ROS 2 that are looked at; each costs some 3 KB."""
+ROS2_PROBLEMS_MAX: Final = 500
+"""Problems of the neighbour ROS 2 that are kept for ``rmpa site``; the oldest go first."""
