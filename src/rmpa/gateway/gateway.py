@@ -15,6 +15,7 @@ from rmpa.core.backoff import Backoff
 from rmpa.core.errors import StartError
 from rmpa.gateway import limits
 from rmpa.gateway.graph.own_graph import AgentGraph
+from rmpa.gateway.joining import make_neighbours, open_gateway_session
 from rmpa.gateway.zenoh_api import ZenohSession
 
 if TYPE_CHECKING:
@@ -177,7 +178,7 @@ async def _discard(opening: asyncio.Future[OwnedSession]) -> None:
 async def _main(
     settings: Settings, requests: tuple[SchedulingRequest, ...], load: Callable[[], Loaded] | None
 ) -> None:
-    gateway = Gateway(settings, requests, load, open_session=open_session, make_neighbours=make_neighbours)
+    gateway = Gateway(settings, requests, load, open_session=open_gateway_session, make_neighbours=make_neighbours)
     await serve(gateway.start, gateway.close, gateway.agent.reloader)
 
 
