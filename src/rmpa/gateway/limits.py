@@ -43,3 +43,31 @@ ROS2_ENDPOINTS_MAX: Final = 20000
 """Publishers, subscriptions, services and clients of ROS 2 that are looked at; each costs some 3 KB."""
 ROS2_PROBLEMS_MAX: Final = 500
 """Problems of the neighbour ROS 2 that are kept for ``rmpa site``; the oldest go first."""
+LAST_VALUE_MAX: Final = 32 * MIB
+"""Bytes of a message that is kept as a last value: a map of 5,000 by 5,000 cells. Larger ones are not kept."""
+LAST_VALUES_MAX: Final = 4096
+"""Last values that are kept; the oldest go first. A module has some 20 latched topics."""
+LAST_VALUES_BYTES_MAX: Final = 256 * MIB
+"""Bytes of all last values in the file; the oldest go first."""
+LAST_VALUES_PENDING_MAX: Final = 64 * MIB
+"""Bytes of last values that wait while the disk takes none; above it the oldest are not written."""
+LAST_VALUES_INTERVAL: Final = 0.5
+"""Seconds between writes: a topic that publishes quickly is written once in each."""
+LAST_VALUES_OPEN_TIMEOUT: Final = 5.0
+"""Seconds for the file of last values to open; a disk that hangs must not stop the gateway."""
+LAST_VALUES_CLOSE_TIMEOUT: Final = 3.0
+"""Seconds for the last write; a disk that hangs must not keep the gateway from ending."""
+LAST_VALUES_READ_TIMEOUT: Final = 4.0
+"""Seconds for one query of last values: less than the session waits for its answer."""
+LAST_VALUES_ANSWER_MAX: Final = 64 * MIB
+"""Bytes of all answers to one query of last values; the newest are given first."""
+LATCH_LOOK_AFTER: Final = 5.0
+"""Seconds that a topic is there before the gateway asks its publisher whether it is latched."""
+LATCH_LOOK_TIMEOUT: Final = 10.0
+"""Seconds for the publisher's answer to that."""
+LATCH_LOOKS_AT_ONCE: Final = 2
+"""Publishers that are asked that at once: each opens a route in the mesh for a moment."""
+VALUE_HEADER_MAX: Final = 1 * MIB
+"""Bytes of the header of another site's last value: most of it is the definition of its type."""
+LAST_VALUES_RETRY_MAX: Final = 30.0
+"""Seconds between attempts to write to a disk that takes nothing."""
