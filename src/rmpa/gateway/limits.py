@@ -43,3 +43,10 @@ ROS2_ENDPOINTS_MAX: Final = 20000
 """Publishers, subscriptions, services and clients of ROS 2 that are looked at; each costs some 3 KB."""
 ROS2_PROBLEMS_MAX: Final = 500
 """Problems of the neighbour ROS 2 that are kept for ``rmpa site``; the oldest go first."""
+ROS2_CALL_TIMEOUT: Final = 600.0
+"""Seconds of one call of a service between the mesh and ROS 2. Clients of ROS 1 and of rmw_zenoh wait without end; a
+server that dies ends its calls at once."""
+ROS2_CALLS_MAX: Final = 64
+"""Calls of one service that are under way at one time, each way; the next one gets an error."""
+ROS2_DESCRIBE_AGAIN: Final = (0.5, 30.0)
+"""Seconds until a service that could not be asked for its type is asked again: at first, and at most; it doubles."""
