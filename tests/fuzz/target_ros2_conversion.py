@@ -38,7 +38,7 @@ def _seeds() -> list[bytes]:
     made = [b"", b"\0", b"\1\0\1\0\0"]
     for number, conversion in enumerate(_CONVERSIONS):
         kind = conversion.ros1
-        raw = kind.serialize(kind.make(_VALUES.get(kind.name)))  # type: ignore[arg-type]
+        raw = kind.serialize(kind.make(_VALUES.get(kind.name)))
         made += [bytes((number,)) + raw, bytes((number,)) + conversion.to_ros2(raw)]
     return made
 
