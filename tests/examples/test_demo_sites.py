@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import pytest
 
 from lab.bed.processes import Process
 from tests.examples.test_demo import (
     DEMO,
+    all_linked,
     assert_gone,
     family,
     flows,
@@ -20,22 +21,18 @@ from tests.examples.test_demo import (
 )
 
 if TYPE_CHECKING:
+    from pathlib import Path
     from typing import Any
 
 pytest.importorskip("zenoh", reason="the libraries of rmpa[zenoh] are not installed")
 pytest.importorskip("xxhash", reason="the libraries of rmpa[zenoh] are not installed")
 pytestmark = pytest.mark.timeout(180)
 
-ARGUMENTS = [sys.executable, DEMO, "--no-web", "--sites", "--json"]
+ARGUMENTS: Final[list[str | Path]] = [sys.executable, DEMO, "--no-web", "--sites", "--json"]
 
 
 def all_there(view: dict[str, Any]) -> bool:
-    return flows(view) and states(view) == {
-        "joystick": "linked",
-        "velocity": "linked",
-        "base": "linked",
-        "pc": "here",
-    }
+    return flows(view) and all_linked(view)
 
 
 def command(tidy: dict[str, str], *words: str) -> str:
