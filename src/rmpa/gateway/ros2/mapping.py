@@ -82,7 +82,7 @@ class TypeMapping:
         """
         try:
             rules = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
             raise ConfigError("gateway.ros2.mapping", f"cannot be read: {error}", path=path) from error
         if not isinstance(rules, list):
             raise ConfigError("gateway.ros2.mapping", "is not a list of rules", "as ros1_bridge has them", path=path)
