@@ -29,3 +29,9 @@ ROS2_ENDPOINTS_MAX: Final = 20000
 """Publishers, subscriptions, services and clients of ROS 2 that are looked at; each costs some 3 KB."""
 ROS2_PROBLEMS_MAX: Final = 500
 """Problems of the neighbour ROS 2 that are kept for ``rmpa site``; the oldest go first."""
+ROS2_TYPES_MAX: Final = 500
+"""Types that are learnt from publishers and ROS 2 nodes, and pairs that are kept; ROS has some 160 of its own."""
+ROS2_DESCRIPTION_MAX: Final = 1024 * 1024
+"""Bytes of a type's description from a ROS 2 node; the largest of ROS 2's own types has 30 KB."""
+ROS2_ARRAY_MAX: Final = 2**31 - 1
+"""Elements of an array, or bytes of a bounded string, in a described type."""
