@@ -47,5 +47,5 @@ ROS2_TYPES_MAX: Final = 500
 """Types that are learnt from publishers and ROS 2 nodes, and pairs that are kept; ROS has some 160 of its own."""
 ROS2_DESCRIPTION_MAX: Final = 1024 * 1024
 """Bytes of a type's description from a ROS 2 node; the largest of ROS 2's own types has 30 KB."""
-ROS2_ARRAY_MAX: Final = 2**31 - 1
-"""Elements of an array, or bytes of a bounded string, in a described type."""
+ROS2_ARRAY_MAX: Final = 1_000_000
+"""Elements of all arrays of fixed size in a type that a ROS 2 node describes: an empty message must have them all."""

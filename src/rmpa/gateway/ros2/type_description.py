@@ -70,8 +70,8 @@ def parse_type_response(raw: Buffer) -> dict[str, Any]:
         raise RemoteProtocolError(f"the node does not describe the type: {message.failure_reason[:200]}")
     described = message.type_description
     all_types = (described.type_description, *described.referenced_type_descriptions)
-    made = {_type_name(each.type_name): ([], _fields(each)) for each in all_types}
-    _check_depth(made)
+    made: dict[str, Any] = {_type_name(each.type_name): ([], _fields(each)) for each in all_types}
+    _check_size(made)
     return made
 
 
@@ -90,32 +90,34 @@ def _fields(described: Any) -> list[tuple[str, Any]]:
     return [(field.name, _desc(field.type)) for field in described.fields]
 
 
-def _check_depth(types: dict[str, Any]) -> None:
-    """Check that no type contains itself, in time linear in their number."""
-    depth: dict[str, int] = {}
+def _check_size(types: dict[str, Any]) -> None:
+    """Check that no type contains itself, and that arrays of fixed size are not too large; in linear time."""
+    sizes: dict[str, int] = {}
 
     def measure(name: str, inside: tuple[str, ...]) -> int:
         if name in inside or len(inside) > DEFINITION_DEPTH_MAX:
             raise RemoteProtocolError(f"{name} contains itself, or is nested too deeply")
-        if name not in depth:
-            kinds = [
-                desc[1][0] if desc[0] != Nodetype.BASE and desc[0] != Nodetype.NAME else desc
-                for _, desc in types.get(name, ((), ()))[1]
-            ]
-            inner = [measure(str(kind[1]), (*inside, name)) for kind in kinds if kind[0] == Nodetype.NAME]
-            depth[name] = max(inner, default=0) + 1
-        return depth[name]
+        if name not in sizes:
+            fields = types[name][1] if name in types else ()
+            sizes[name] = 1 + sum(size(desc, (*inside, name)) for _, desc in fields)
+        return sizes[name]
+
+    def size(desc: Any, inside: tuple[str, ...]) -> int:
+        count, inner = 1, desc
+        if desc[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            inner, bound = desc[1]
+            count = bound if desc[0] == Nodetype.ARRAY else 1
+        return count * (measure(str(inner[1]), inside) if inner[0] == Nodetype.NAME else 1)
 
     for name in types:
-        measure(name, ())
+        if measure(name, ()) > limits.ROS2_ARRAY_MAX:
+            raise RemoteProtocolError(f"{name} has arrays of more than {limits.ROS2_ARRAY_MAX} elements")
 
 
 def _desc(kind: Any) -> Any:
     number, capacity = int(kind.type_id), int(kind.capacity)
     for base, node in ((_UNBOUNDED, Nodetype.SEQUENCE), (_BOUNDED, Nodetype.SEQUENCE), (_ARRAY, Nodetype.ARRAY)):
         if number > base:
-            if capacity > limits.ROS2_ARRAY_MAX:
-                raise RemoteProtocolError(f"a field has room for {capacity} elements")
             return (node, (_inner(kind, number - base), 0 if base == _UNBOUNDED else capacity))
     return _inner(kind, number)
 
@@ -126,7 +128,7 @@ def _inner(kind: Any, number: int) -> Any:
     if number not in _BASES:
         raise RemoteProtocolError(f"a field has the type {number} of REP 2016, which ROS 1 lacks (wide characters)")
     bound = int(kind.string_capacity) if number == _BOUNDED_STRING else 0
-    return (Nodetype.BASE, (_BASES[number], min(bound, limits.ROS2_ARRAY_MAX)))
+    return (Nodetype.BASE, (_BASES[number], bound))
 
 
 @functools.cache
