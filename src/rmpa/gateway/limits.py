@@ -49,3 +49,10 @@ ROS2_DESCRIPTION_MAX: Final = 1024 * 1024
 """Bytes of a type's description from a ROS 2 node; the largest of ROS 2's own types has 30 KB."""
 ROS2_ARRAY_MAX: Final = 1_000_000
 """Elements of all arrays of fixed size in a type that a ROS 2 node describes: an empty message must have them all."""
+ROS2_CALL_TIMEOUT: Final = 600.0
+"""Seconds of one call of a service between the mesh and ROS 2. Clients of ROS 1 and of rmw_zenoh wait without end; a
+server that dies ends its calls at once."""
+ROS2_CALLS_MAX: Final = 64
+"""Calls of one service that are under way at one time, each way; the next one gets an error."""
+ROS2_DESCRIBE_AGAIN: Final = (0.5, 30.0)
+"""Seconds until a service that could not be asked for its type is asked again: at first, and at most; it doubles."""

@@ -53,3 +53,12 @@ class Ros2Crossing:
         if name in PLUMBING and not any(name in rule.names for rule in self._rules):
             return CrossingDecision(False, f"{name} is of each ROS 2 node; a gateway.rule that names it lets it cross")
         return self._incoming.incoming(kind, SITE, SITE, name, type_name, node)
+
+    def goes_out(self, module: str, name: str) -> bool:
+        """Whether a service of a module crosses to ROS 2; ``name`` is the one in its module."""
+        return self.outgoing(SourceKind.SERVICE, module, name, "*", "").allowed
+
+    def name_here(self, name: str) -> str | None:
+        """The name here of a service of ROS 2; ``None`` if it does not cross."""
+        decision = self.incoming(SourceKind.SERVICE, name, "*", "")
+        return decision.name if decision.allowed else None
