@@ -56,3 +56,9 @@ ROS2_CALLS_MAX: Final = 64
 """Calls of one service that are under way at one time, each way; the next one gets an error."""
 ROS2_DESCRIBE_AGAIN: Final = (0.5, 30.0)
 """Seconds until a service that could not be asked for its type is asked again: at first, and at most; it doubles."""
+ROS2_PUBLISHERS_MAX: Final = 1000
+"""Publishers of one topic of ROS 2 whose sequence numbers are followed; the one silent for longest is forgotten."""
+ROS2_SERVICE_WAIT: Final = 3.0
+"""Seconds in which a ROS 2 node's get_type_description may appear after its first publisher, and in which it answers:
+a node declares one after the other."""
+LIMIT_BURST: Final = 0.5

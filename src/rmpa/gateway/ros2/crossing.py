@@ -51,7 +51,9 @@ class Ros2Crossing:
     def incoming(self, kind: SourceKind, name: str, type_name: str, node: str) -> CrossingDecision:
         """Decide whether a topic or service of ROS 2 is shown here, and under which name."""
         if name in PLUMBING and not any(name in rule.names for rule in self._rules):
-            return CrossingDecision(False, f"{name} is of each ROS 2 node; a gateway.rule that names it lets it cross")
+            return CrossingDecision(
+                False, f"{name} is of each ROS 2 node; a gateway.rule that names it lets it cross"
+            )
         return self._incoming.incoming(kind, SITE, SITE, name, type_name, node)
 
     def goes_out(self, module: str, name: str) -> bool:

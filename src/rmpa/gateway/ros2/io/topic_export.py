@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from typing import TYPE_CHECKING, Final
 
@@ -10,10 +11,12 @@ from rmpa.gateway.ros2.attachment import Ros2Attachment
 from rmpa.gateway.ros2.contract_qos import ros2_qos, zenoh_qos
 from rmpa.gateway.ros2.conversion import Conversion, ConversionError, NoConversion
 from rmpa.gateway.ros2.tokens import EntityKind
-from rmpa.gateway.rate_limit import CrossingLimit
+from rmpa.gateway.sites.topic_limits import TopicLimits
 from rmpa.ros.types.header_types import type_of_header
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rmpa.gateway.neighbour import MeshSource, Tap
     from rmpa.gateway.ros2.io.own_nodes import OwnEndpoint
     from rmpa.gateway.ros2.io.part import Ros2Context
@@ -26,23 +29,32 @@ if TYPE_CHECKING:
 class Ros2TopicExport:
     """Declares the topic in ROS 2's graph, and sends its messages while a ROS 2 node subscribes.
 
-    A type that ROS 2's distribution does not have is learnt first from the publisher's header: its hash is part of the
-    key. A topic that turns out to be latched becomes transient local, and stays subscribed to once it was wanted, so
-    that what is kept for late subscribers is the last message.
+    A type that ROS 2's distribution does not have is learnt first from the publisher's header: its hash is part of
+    the key. A topic that turns out to be latched becomes transient local, and stays subscribed to once it was wanted,
+    so that what is kept for late subscribers is the last message.
 
     Args:
         context: What the parts share.
         pairs: The pairs of types.
         source: The topic.
         decision: The rule that lets it cross.
+        on_declared: Called with this once it has another type or hash in ROS 2's graph.
     """
 
-    def __init__(self, context: Ros2Context, pairs: Ros2Pairs, source: MeshSource, decision: CrossingDecision) -> None:
+    def __init__(
+        self,
+        context: Ros2Context,
+        pairs: Ros2Pairs,
+        source: MeshSource,
+        decision: CrossingDecision,
+        on_declared: Callable[[Ros2TopicExport], None],
+    ) -> None:
+        self._on_declared = on_declared
         self._context = context
         self._pairs = pairs
         self.source: Final = source
         self._why = decision.why
-        self._limit = CrossingLimit(decision.rate, decision.size)
+        self._limit = TopicLimits(decision.rate, decision.size)
         self._latching = False
         self._tap: Tap | None = None
         self._publisher: ZenohPublisher | None = None
@@ -73,6 +85,11 @@ class Ros2TopicExport:
             self._open_tap()
         else:
             self._declare(*found)
+
+    def retry(self) -> None:
+        """Types were learnt: try again if its own was missing."""
+        if self._endpoint is None and self._tap is None and not self._closed:
+            self.start()
 
     def close(self) -> None:
         """Take it out of ROS 2's graph."""
@@ -126,6 +143,7 @@ class Ros2TopicExport:
         publisher.append(self._publisher)
         self._sequence = 0
         self._drop(old_endpoint, old_publisher)
+        self._on_declared(self)
 
     def _withdraw(self) -> None:
         endpoint, publisher = self._endpoint, self._publisher
@@ -160,6 +178,11 @@ class Ros2TopicExport:
         if tap is not None:
             tap.close()
 
+    def _close_unwanted(self) -> None:
+        """Disconnect if nothing is wanted, or nothing can be done with it. Not within the tap's own callback."""
+        if self._endpoint is None or not (self._wanted or self._latching):
+            self._close_tap()
+
     def _lost(self, reason: str) -> None:
         self._conversion = None
         self.problem = f"the publisher in the mesh: {reason}"
@@ -185,14 +208,14 @@ class Ros2TopicExport:
         if changed or (description.latching and not self._latching):
             self._latching = self._latching or description.latching
             self._declare(*found)
-        if not self._wanted and not self._latching:
-            self._close_tap()  # it was only asked for its type
+        asyncio.get_running_loop().call_soon(self._close_unwanted)  # it may have been asked for its type only
 
     def _message(self, body: memoryview) -> None:
         publisher, conversion, endpoint = self._publisher, self._conversion, self._endpoint
         if publisher is None or conversion is None or endpoint is None:
             return
-        if not self._limit.passes(len(body), time.monotonic()):
+        if not self._limit.admit(time.monotonic(), len(body)):
+            self._limit.dropped += 1
             return
         try:
             payload = conversion.to_ros2(body)
@@ -212,5 +235,5 @@ class Ros2TopicExport:
         """No ROS 2 node can get it: it is not in ROS 2's graph either, but told."""
         self.problem = text
         self._context.say(self._subject, text)
-        self._close_tap()
         self._withdraw()
+        asyncio.get_running_loop().call_soon(self._close_unwanted)
