@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
+from rmpa.core.sizes import MIB
+
 KEY_MAX: Final = 2048
 """Characters of a key expression or a liveliness token that another site or a ROS 2 node sent. Longer ones are not
 read; the longest that ROS names and types make is some 900."""
@@ -21,6 +23,27 @@ SITE_NAME_MAX: Final = 63
 """Characters of a site's name, as for a module's name and for a label of DNS."""
 NODE_NAME_MAX: Final = 255
 """Bytes of a node's name in an attachment."""
+SERVICE_DESCRIPTION_MAX: Final = 8192
+"""Bytes of the description of another site's service: four names."""
+SITE_CALLS_AT_ONCE: Final = 32
+"""Calls of other sites that one service gets at once, as many as an agent opens connections to a server for."""
+SITE_CALLS_WAITING: Final = 1024
+"""Calls of other sites that may wait for one service; further ones are refused at once."""
+SITE_CALL_BYTES: Final = 256 * MIB
+"""Bytes of the requests of other sites that are under way here: four of the largest."""
+SITE_CALL_GRACE: Final = 1.0
+"""Seconds that the calling site waits longer than the serving one, whose error text tells more."""
+DESCRIBE_TIMEOUT: Final = 10.0
+"""Seconds for the description of another site's service; its server may be probed for it over two meshes."""
+ROS2_NAME_MAX: Final = 255
+"""Characters of a node, topic or service of ROS 2; its own limit is about that for topics."""
+ROS2_NODES_MAX: Final = 2000
+"""Nodes of ROS 2 that are shown; any program that reaches the router can declare more."""
+ROS2_ENDPOINTS_MAX: Final = 20000
+"""Publishers, subscriptions, services and clients of ROS 2 that are looked at; each costs some 3 KB."""
+ROS2_PROBLEMS_MAX: Final = 500
+"""Problems of the neighbour ROS 2 that are kept for ``rmpa site``; the oldest go first."""
+
 
 # --- other sites ---------------------------------------------------------------------------------------------------
 

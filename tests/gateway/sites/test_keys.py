@@ -43,6 +43,15 @@ def test_tokens_are_read_back(each: SiteModule | SiteSource | SiteGateway) -> No
     assert parse_token(each.token()) == each
 
 
+def test_a_service_whose_type_is_unknown_is_announced_and_called_by_any_type() -> None:
+    stop = SiteSource(ARM, SourceKind.SERVICE, "*", "/driver", "/stop")
+    assert stop.token() == f"{ARM.token()}/s/-/%driver/%stop"
+    assert stop.key() == "rmpa/1/warehouse/arm/s/*/stop"
+    assert parse_token(stop.token()) == stop
+    with pytest.raises(RemoteProtocolError):
+        parse_token(f"{ARM.token()}/t/-/%driver/%stop")
+
+
 def test_a_module_may_be_called_gateway() -> None:
     module = SiteModule("home", "gateway", RUN)
     assert parse_token(module.token()) == module

@@ -29,7 +29,7 @@ DISTRIBUTIONS: Final = {
     if name.startswith("ROS2_")
 }
 """The ROS 2 distributions whose types are known, with rosbags' store of each."""
-_WITHOUT_HASH: Final = frozenset(("dashing", "eloquent", "foxy", "galactic", "humble"))
+WITHOUT_HASH: Final = frozenset(("dashing", "eloquent", "foxy", "galactic", "humble"))
 """Distributions before REP 2016: their endpoints have no type hash."""
 _TIMES: Final = {"time": "builtin_interfaces/msg/Time", "duration": "builtin_interfaces/msg/Duration"}
 _BASES: Final = {"char": "uint8", "byte": "octet"}
@@ -88,7 +88,7 @@ class Ros2Types:
         Raises:
             KeyError: The type is not known.
         """
-        if self.distribution in _WITHOUT_HASH:
+        if self.distribution in WITHOUT_HASH:
             return NO_HASH
         if name not in self._hashes:
             self._hashes[name] = self.store.hash_rihs01(name)
@@ -103,7 +103,7 @@ class Ros2Types:
         Args:
             service: The ROS 1 type of the same name.
         """
-        if self.distribution in _WITHOUT_HASH:
+        if self.distribution in WITHOUT_HASH:
             return NO_HASH
         package, _, base = service.name.partition("/")
         name = f"{package}/srv/{base}"

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rmpa.core.names import is_type_name
 from rmpa.gateway import limits
-from rmpa.gateway.sites.keys import SiteModule, SiteSource
+from rmpa.gateway.neighbour import SourceKind
+from rmpa.gateway.sites.keys import UNKNOWN_TYPE, SiteModule, SiteSource
 from rmpa.gateway.sites.part import SiteExport
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.gateway.neighbour import MeshSource, SourceKind
+    from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.sites.rules import CrossingRules
 
-_Key = tuple["SourceKind", str, str]
+_Key = tuple[SourceKind, str, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,14 +81,6 @@ class SiteExports:
         elif old is not None:
             self._retry()
 
-    def type_found(self, source: MeshSource, type_name: str) -> None:
-        """A service, which is known without its type at first, was asked for it."""
-        key = (source.kind, source.here, source.proxy)
-        if self._sources.get(key) == source:
-            self._drop(key)
-            self._sources[key] = source
-            self._judge(key, replace(source, type=type_name))
-
     def _drop(self, key: _Key) -> None:
         self._sources.pop(key, None)
         self._refused.pop(key, None)
@@ -143,8 +136,9 @@ class SiteExports:
 
 def _problem(announced: SiteSource) -> str:
     """Why a source cannot be announced; empty if it can."""
-    if not is_type_name(announced.type):
-        return f"its type is not known yet ({announced.type!r})"
+    unasked = announced.kind is SourceKind.SERVICE and announced.type == UNKNOWN_TYPE
+    if not unasked and not is_type_name(announced.type):
+        return f"its type is not known ({announced.type!r})"
     if len(announced.node.encode()) > limits.NODE_NAME_MAX:
         return f"its node's name has more than {limits.NODE_NAME_MAX} bytes"
     if len(announced.token()) > limits.KEY_MAX:

@@ -9,7 +9,8 @@
     rmpa/1/<site>/-gateway/<rank>/<instance>                   token: a gateway; the lowest rank leads
 
 Names of sites and modules are ROS base names, so they need no escape, and none is ``-gateway``. In the last chunks of
-a token ``/`` is ``%``, which no ROS name has.
+a token ``/`` is ``%``, which no ROS name has. The type of a service that no program has asked for is ``-`` in its
+token: a ROS master does not know it. Queryables of services have ``*`` in the place of the type.
 """
 
 from __future__ import annotations
@@ -28,6 +29,9 @@ ROOT: Final = "rmpa/1"
 """The first two chunks of each key; the number is that of the format."""
 GATEWAY: Final = "-gateway"
 """Stands in the place of the module in the tokens of gateways."""
+UNKNOWN_TYPE: Final = "*"
+"""The type of a service whose server was not asked."""
+_UNKNOWN: Final = "-"
 _INSTANCE: Final = re.compile(r"[0-9a-f]{32}")
 _RANK_MAX: Final = 999
 
@@ -58,7 +62,7 @@ class SiteSource:
     Args:
         module: The module.
         kind: What it is.
-        type: ``package/Name``.
+        type: ``package/Name``; ``*`` for a service whose server was not asked.
         node: The node, ``/like/this``.
         name: The topic or service, ``/like/this``.
     """
@@ -71,7 +75,8 @@ class SiteSource:
 
     def token(self) -> str:
         """The source's liveliness token."""
-        parts = (self.kind, _chunk(self.type), _chunk(self.node), _chunk(self.name))
+        type_name = _UNKNOWN if self.type == UNKNOWN_TYPE else _chunk(self.type)
+        parts = (self.kind, type_name, _chunk(self.node), _chunk(self.name))
         return "/".join((self.module.token(), *parts))
 
     def key(self) -> str:
@@ -149,7 +154,9 @@ def _source(module: SiteModule, chunks: list[str], key: str) -> SiteSource | Non
     except ValueError:
         return None
     type_name, node, name = (chunk.replace("%", "/") for chunk in chunks[1:])
-    if not is_type_name(type_name):
+    if kind is SourceKind.SERVICE and type_name == _UNKNOWN:
+        type_name = UNKNOWN_TYPE
+    elif not is_type_name(type_name):
         raise RemoteProtocolError(f"{key[:200]!r}: {type_name[:80]!r} is not a type")
     for each in (node, name):
         if not is_global_name(each):
