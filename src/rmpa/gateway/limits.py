@@ -68,13 +68,18 @@ HEADER_MAX: Final = 512 * 1024
 HEADER_TIMEOUT: Final = 5.0
 """Seconds that a query for a publisher's header waits for it: the gateway there connects to the publisher first."""
 HEADER_RETRY: Final = 2.0
-"""Seconds until a header is asked for again, when there was no answer and nodes wait for it."""
+"""Seconds at most until a header is asked for again, when there was no answer and nodes wait for it; at first a
+sixteenth."""
 HEADER_QUERIES_MAX: Final = 64
 """Queries that wait for the header of one publisher; further ones are refused at once."""
 TAP_LINGER: Final = 2.0
 """Seconds for which a publisher stays connected after its header was asked for: its subscriber comes right after."""
 HELD_MESSAGES_MAX: Final = 1000
 """Messages that wait at the receiver for the publisher's header; above it the oldest is dropped, and counted."""
+HELD_BYTES: Final = 64 * 1024 * 1024
+"""Bytes that wait likewise; one message always fits."""
+DEMAND_LINGER: Final = 1.0
+"""Seconds for which a topic of another site stays subscribed after its last subscriber left, as in the mesh."""
 LIMIT_BURST: Final = 0.5
 """Seconds of a topic's limit of rate or size that may cross at once after a rest: jitter must not cost messages."""
 BEST_EFFORT_BYTES: Final = 8 * 1024 * 1024

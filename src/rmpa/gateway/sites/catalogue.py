@@ -155,7 +155,7 @@ class SiteCatalogue:
 
     def handle_timer(self, now: float) -> None:
         """End what is due."""
-        for key in self._ending.take(now):
+        while (key := self._ending.pop(now)) is not None:
             item = self._by_token.pop(key)
             name = item.module.site if isinstance(item, SiteSource) else item.site
             site = self._sites[name]

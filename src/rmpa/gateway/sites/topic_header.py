@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
     from rmpa.ros.wire.tcpros import Buffer
 
+REFUSED: Final = "refused: "
+"""What an error begins with that a rule causes: asking again is of no use."""
 _HEX: Final = frozenset("0123456789abcdef")
 _COUNT_MAX: Final = 2**63 - 1
 
