@@ -50,7 +50,7 @@ class _Exported:
     problem: str = ""
 
 
-class ServiceExports:
+class SiteServiceExports:
     """The services of this site, as queryables.
 
     Args:

@@ -36,7 +36,7 @@ class _Imported:
     problem: str = ""
 
 
-class ServiceImports:
+class SiteServiceImports:
     """The services of other sites in the gateway's graph.
 
     Args:

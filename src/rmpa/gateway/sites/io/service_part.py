@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rmpa.gateway.neighbour import SourceKind
-from rmpa.gateway.sites.io.service_exports import ServiceExports
-from rmpa.gateway.sites.io.service_imports import ServiceImports
+from rmpa.gateway.sites.io.service_exports import SiteServiceExports
+from rmpa.gateway.sites.io.service_imports import SiteServiceImports
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -40,8 +40,8 @@ class SiteServices:
         why_not: Callable[[str, MeshSource], str],
         stamp: Callable[[], int],
     ) -> None:
-        self._exports = ServiceExports(site, session, graph, timeout, why_not)
-        self._imports = ServiceImports(site, session, graph, timeout, stamp)
+        self._exports = SiteServiceExports(site, session, graph, timeout, why_not)
+        self._imports = SiteServiceImports(site, session, graph, timeout, stamp)
 
     def export(self, entry: SiteExport) -> None:
         """Let other sites call a service."""
