@@ -60,7 +60,7 @@ class Ros2TopicExport:
         self._publisher: ZenohPublisher | None = None
         self._endpoint: OwnEndpoint | None = None
         self._conversion: Conversion | None = None
-        self._wanted = False
+        self._wanted = self._was_wanted = False
         self._closed = False
         self._sequence = 0
         self._sent_before = 0
@@ -163,11 +163,17 @@ class Ros2TopicExport:
             return
         self._wanted = there
         if there:
+            self._was_wanted = True
             self._open_tap()
-        elif not self._latching:
+        elif not self._keeps:
             self._close_tap()
 
     # --- in the mesh ---------------------------------------------------------------------------------------------
+
+    @property
+    def _keeps(self) -> bool:
+        """Whether its messages are kept for late subscribers, once one has come."""
+        return self._was_wanted and self._endpoint is not None and self._endpoint.endpoint.qos.latched
 
     def _open_tap(self) -> None:
         if self._tap is None:
@@ -180,7 +186,7 @@ class Ros2TopicExport:
 
     def _close_unwanted(self) -> None:
         """Disconnect if nothing is wanted, or nothing can be done with it. Not within the tap's own callback."""
-        if self._endpoint is None or not (self._wanted or self._latching):
+        if self._endpoint is None or not (self._wanted or self._keeps):
             self._close_tap()
 
     def _lost(self, reason: str) -> None:
