@@ -12,10 +12,14 @@ from rmpa.gateway.ros2.mapping import TypeMapping
 SEEDS: list[bytes] = [
     b"",
     b"-\n  ros1_package_name: 'a_msgs'\n  ros2_package_name: 'b_interfaces'\n",
-    (b"-\n  ros1_package_name: a_msgs\n  ros1_message_name: Foo\n  ros2_package_name: b\n  ros2_message_name: Bar\n"
-    b"  fields_1_to_2:\n    header.stamp: stamp\n    foo: bar\n"),
-    (b"-\n  ros1_package_name: a\n  ros1_service_name: Do\n  ros2_package_name: b\n  ros2_service_name: Do\n"
-    b"  request_fields_1_to_2: {x: y}\n  response_fields_1_to_2: {}\n  enable_foreign_mappings: true\n"),
+    (
+        b"-\n  ros1_package_name: a_msgs\n  ros1_message_name: Foo\n  ros2_package_name: b\n"
+        b"  ros2_message_name: Bar\n  fields_1_to_2:\n    header.stamp: stamp\n    foo: bar\n"
+    ),
+    (
+        b"-\n  ros1_package_name: a\n  ros1_service_name: Do\n  ros2_package_name: b\n  ros2_service_name: Do\n"
+        b"  request_fields_1_to_2: {x: y}\n  response_fields_1_to_2: {}\n  enable_foreign_mappings: true\n"
+    ),
     b"&a [*a]\n",
     b"[[[[{",
 ]
