@@ -1,7 +1,7 @@
 """Say when nodes come into the graph and go out of it (rospy).
 
-Asks the master 50 times a second. Events: ``up``; ``there`` and ``gone`` at each change, with ``node`` and ``ns`` of the
-steady clock; ``there`` also for the nodes that are there at first.
+Asks the master 50 times a second. Events: ``up``; ``there`` and ``gone`` at each change, with ``node`` and ``ns`` of
+the steady clock; ``there`` also for the nodes that are there at first.
 """
 
 import sys
