@@ -1,7 +1,7 @@
 """Say when nodes come into the graph and go out of it (rospy).
 
-Asks the master 50 times a second. Events: ``up``; ``there`` and ``gone`` at each change, with ``node`` and ``ns`` of
-the steady clock; ``there`` also for the nodes that are there at first.
+Asks the master each ``--period`` seconds. Events: ``up``; ``there`` and ``gone`` at each change, with ``node`` and
+``ns`` of the steady clock; ``there`` also for the nodes that are there at first.
 """
 
 import sys
@@ -13,6 +13,7 @@ from payload import parser, say
 
 def main() -> None:
     options = parser(__doc__)
+    options.add_argument("--period", type=float, default=0.02)
     args = options.parse_args(rospy.myargv(sys.argv)[1:])
     rospy.init_node(args.name or "watcher", anonymous=not args.name)
     master = rospy.get_master()
@@ -26,7 +27,7 @@ def main() -> None:
         for node in sorted(known - now):
             say("gone", node=node, ns=ns)
         known = now
-        time.sleep(0.02)
+        time.sleep(args.period)
 
 
 if __name__ == "__main__":
