@@ -103,6 +103,12 @@ INTERNAL: Final = {
     "TOKENS_MAX",
     "TOKEN_LIFETIME_MAX",
     "TOKEN_TEXT_MAX",
+    "ENTITY_ID_MAX",
+    "GATEWAY_BYTES_MAX",
+    "GID_MAX",
+    "KEY_MAX",
+    "NODE_NAME_MAX",
+    "QOS_NUMBER_MAX",
 }
 """Of parsers, packets, retries and caches: nothing that a user could notice or mend."""
 

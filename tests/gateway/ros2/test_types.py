@@ -55,3 +55,16 @@ def test_names() -> None:
     assert ros2_name("std_msgs/String") == "std_msgs/msg/String"
     assert ros2_name("Header") == "std_msgs/msg/Header"
     assert [snake_case(name) for name in ("K", "frameId", "frame_id", "x2")] == ["k", "frame_id", "frame_id", "x2"]
+
+
+def test_bytes_are_hashed_as_rosidl_names_them(jazzy: Ros2Types) -> None:
+    """``char`` is an unsigned byte to rosidl, ``byte`` an octet: the hashes of std_msgs of ROS 2 Jazzy."""
+    published = {
+        "Char": "RIHS01_3ad2d04dd29ba19d04b16659afa3ccaedd691914b02a64e82e252f2fa6a586a9",
+        "Byte": "RIHS01_41e1a3345f73fe93ede006da826a6ee274af23dd4653976ff249b0f44e3e798f",
+    }
+    for name, value in published.items():
+        assert jazzy.type_hash(f"std_msgs/msg/{name}") == value
+        kind = MessageType.learn(f"my_msgs/{name}", MessageType(f"std_msgs/{name}").definition)
+        jazzy.learn(kind.specifications)
+        assert jazzy.store.fielddefs[f"my_msgs/msg/{name}"][1] == jazzy.store.fielddefs[f"std_msgs/msg/{name}"][1]

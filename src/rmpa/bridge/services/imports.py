@@ -210,6 +210,14 @@ class ServiceImports:
         """
         return self._choose_of(self.ways.unlinked(peer))
 
+    def reached_here(self, instance: str, *, reached: bool) -> list[ImportAction]:
+        """Set whether this module reaches another one outside the mesh; what relays bring of that one is hidden."""
+        if reached:
+            self.ways.reached_here.add(instance)
+        else:
+            self.ways.reached_here.discard(instance)
+        return self._choose_of((instance,))
+
     def _choose_of(self, instances: Collection[str]) -> list[ImportAction]:
         """Choose again among the services of these modules: another path to them may be the best now."""
         touched = [

@@ -112,6 +112,10 @@ class TypeMapping:
             return found
         return TypePair(_USUAL.get(name) or next(iter(self._candidates(name, "srv"))))
 
+    def has_service_rule(self, name: str) -> bool:
+        """Whether a mapping file has a rule for a service type of ROS 1 or its package."""
+        return name in self._services or name.partition("/")[0] in self._packages
+
     def ros1_message(self, name: str, known: Iterable[str] = ()) -> str:
         """The ROS 1 type of a message type of ROS 2, ``package/msg/Name``; the same name without a rule.
 

@@ -18,7 +18,7 @@ from rosbags.typesys.store import Typestore
 from rmpa.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
     from rmpa.ros.types.definitions import Field, Specification
     from rmpa.ros.types.service_types import ServiceType
@@ -29,11 +29,11 @@ DISTRIBUTIONS: Final = {
     if name.startswith("ROS2_")
 }
 """The ROS 2 distributions whose types are known, with rosbags' store of each."""
-_WITHOUT_HASH: Final = frozenset(("dashing", "eloquent", "foxy", "galactic", "humble"))
+WITHOUT_HASH: Final = frozenset(("dashing", "eloquent", "foxy", "galactic", "humble"))
 """Distributions before REP 2016: their endpoints have no type hash."""
 _TIMES: Final = {"time": "builtin_interfaces/msg/Time", "duration": "builtin_interfaces/msg/Duration"}
-_BASES: Final = {"char": "uint8", "byte": "octet"}
-"""ROS 1's names of bytes: its ``char`` is unsigned, its ``byte`` is ROS 2's ``byte`` (an octet)."""
+_BASES: Final = {"char": "uint8"}
+"""rosidl makes ``char`` of a definition an unsigned byte (rosidl_adapter), and hashes it so; ROS 1's is one too."""
 _EMPTY_MEMBER: Final = "structure_needs_at_least_one_member"
 _EVENT_INFO: Final = "service_msgs/msg/ServiceEventInfo"
 NO_HASH: Final = "TypeHashNotSupported"
@@ -57,7 +57,10 @@ class Ros2Types:
         self.distribution = distribution
         known_types = get_typestore(DISTRIBUTIONS[distribution])
         self.store = Typestore()
-        self.store.fielddefs = dict(known_types.fielddefs)
+        self.store.fielddefs = {
+            name: (constants, [(field, _rosidl(desc)) for field, desc in fields])
+            for name, (constants, fields) in known_types.fielddefs.items()
+        }
         self.store.types = dict(known_types.types)
         self._hashes: dict[str, str] = {}
 
@@ -88,63 +91,67 @@ class Ros2Types:
         Raises:
             KeyError: The type is not known.
         """
-        if self.distribution in _WITHOUT_HASH:
+        if self.distribution in WITHOUT_HASH:
             return NO_HASH
         if name not in self._hashes:
             self._hashes[name] = self.store.hash_rihs01(name)
         return self._hashes[name]
 
-    def service_hash(self, service: ServiceType) -> str:
-        """The hash of a service type, as it stands in keys and tokens.
-
-        rosidl hashes a service as a message with three members: request, response and the event that service
-        introspection publishes (rosidl_generator_type_description). The fields of request and response are learnt.
+    def service_hash(self, service: ServiceType, name: str = "") -> str:
+        """The hash of a service type, as it stands in keys and tokens; its request and response are learnt.
 
         Args:
-            service: The ROS 1 type of the same name.
+            service: The ROS 1 type that has the fields.
+            name: ``package/srv/Name`` of ROS 2; by default of ROS 1's name.
         """
-        if self.distribution in _WITHOUT_HASH:
-            return NO_HASH
         package, _, base = service.name.partition("/")
-        name = f"{package}/srv/{base}"
-        if name not in self._hashes:
-            self._learn_service(name, service)
-            self._hashes[name] = self.store.hash_rihs01(name)
-        return self._hashes[name]
+        name = name or f"{package}/srv/{base}"
+        if name not in self:
+            for kind in (service.request, service.response):
+                self.learn({key: each for key, each in kind.specifications.items() if key != kind.name})
+            self.define_service(name, _fields(service.request.fields), _fields(service.response.fields))
+        return self.type_hash(name)
 
-    def _learn_service(self, name: str, service: ServiceType) -> None:
-        request, response, event = (f"{name}_{part}" for part in ("Request", "Response", "Event"))
-        made: dict[str, Any] = {}
-        for part, kind in ((request, service.request), (response, service.response)):
-            self.learn({key: each for key, each in kind.specifications.items() if key != kind.name})
-            made[part] = ([], [_field(field) for field in kind.fields] or [_EMPTY_FIELD])
-        # rosbags has ROS 2's char for the GID; rosidl says uint8, and that is what is hashed.
-        gid = ((Nodetype.BASE, ("uint8", 0)), 16)
-        made[_EVENT_INFO] = (
-            [],
-            [
-                ("event_type", (Nodetype.BASE, ("uint8", 0))),
-                ("stamp", (Nodetype.NAME, _TIMES["time"])),
-                ("client_gid", (Nodetype.ARRAY, gid)),
-                ("sequence_number", (Nodetype.BASE, ("int64", 0))),
-            ],
-        )
-        made[event] = (
-            [],
-            [
-                ("info", (Nodetype.NAME, _EVENT_INFO)),
-                ("request", (Nodetype.SEQUENCE, ((Nodetype.NAME, request), 1))),
-                ("response", (Nodetype.SEQUENCE, ((Nodetype.NAME, response), 1))),
-            ],
-        )
-        members = (("request_message", request), ("response_message", response), ("event_message", event))
-        made[name] = ([], [(member, (Nodetype.NAME, kind)) for member, kind in members])
-        self.store.fielddefs.pop(_EVENT_INFO, None)
-        self.store.types.pop(_EVENT_INFO, None)
-        self.store.register({key: each for key, each in made.items() if key not in self})
+    def define(self, name: str, fields: Fields) -> None:
+        """Take in a type of ROS 2 by its fields; one that is known stays as it is.
+
+        Args:
+            name: ``package/msg/Name``, or what rosidl makes of actions and services.
+            fields: Each field's name and what rosbags calls its description.
+        """
+        if name not in self:
+            self.store.register({name: ([], fields or [_EMPTY_FIELD])})
+
+    def define_service(self, name: str, request: Fields, response: Fields) -> None:
+        """Take in a service type.
+
+        rosidl describes it as a message with three members: request, response, and the event that service
+        introspection publishes (rosidl_generator_type_description).
+
+        Args:
+            name: ``package/srv/Name``, or ``package/action/Name_SendGoal``.
+            request: The request's fields.
+            response: The response's fields.
+        """
+        event = f"{name}_Event"
+        parts = {f"{name}_Request": request, f"{name}_Response": response}
+        for part, fields in parts.items():
+            self.define(part, fields)
+        one = [(Nodetype.SEQUENCE, ((Nodetype.NAME, part), 1)) for part in parts]
+        self.define(event, [("info", (Nodetype.NAME, _EVENT_INFO)), ("request", one[0]), ("response", one[1])])
+        members = zip(("request_message", "response_message", "event_message"), (*parts, event), strict=True)
+        self.define(name, [(member, (Nodetype.NAME, kind)) for member, kind in members])
 
 
-_EMPTY_FIELD: Final = (_EMPTY_MEMBER, (Nodetype.BASE, ("uint8", 0)))
+Fields = list[tuple[str, Any]]
+"""The fields of a type of ROS 2, each with what rosbags calls its description."""
+
+
+def _fields(fields: Iterable[Field]) -> Fields:
+    return [_field(field) for field in fields]
+
+
+_EMPTY_FIELD: Final[tuple[str, Any]] = (_EMPTY_MEMBER, (Nodetype.BASE, ("uint8", 0)))
 
 
 def ros2_name(name: str) -> str:
@@ -163,6 +170,13 @@ def _field(field: Field) -> tuple[str, Any]:
     if field.array:
         kind = (Nodetype.ARRAY if field.size else Nodetype.SEQUENCE, (kind, field.size))
     return snake_case(field.name), kind
+
+
+def _rosidl(desc: Any) -> Any:
+    """A description of rosbags, which has ``char`` as a type of its own, as rosidl has it."""
+    if desc[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        return desc[0], (_rosidl(desc[1][0]), desc[1][1])
+    return (desc[0], (_BASES.get(desc[1][0], desc[1][0]), desc[1][1])) if desc[0] == Nodetype.BASE else desc
 
 
 _HUMP: Final = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")

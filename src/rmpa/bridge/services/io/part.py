@@ -27,6 +27,7 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.naming import Names
 from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.policy import Policy, is_own
+from rmpa.bridge.relay import service_place
 from rmpa.bridge.services.exports import ExportAction, LocalService, ServiceAbout, ServiceExports
 from rmpa.bridge.services.imports import (
     EndedService,
@@ -192,6 +193,10 @@ class Services(Part):
         """Counts and latencies of the peers' calls, by service of this module."""
         return self._serving.stats
 
+    def reached_here(self, instance: str, *, reached: bool) -> None:
+        """Set whether this module reaches another one outside the mesh; see ``ServiceImports.reached_here``."""
+        self._act(self.imports.reached_here(instance, reached=reached))
+
     def reload(self, settings: Settings) -> None:
         """Apply other settings."""
         policy, names = Policy(settings.policy, settings.peers, settings.time), Names(settings.peers)
@@ -353,7 +358,7 @@ class Services(Part):
     def _to_relay(self, service: str, providers: Mapping[str, str]) -> LocalService | None:
         """The server of a service that is relayed for another module; ``None`` if there is none."""
         for node, uri in providers.items():
-            if (origin := self._relay.origin(_relayed(service, node))) is not None:
+            if (origin := self._relay.origin(service_place(service, node))) is not None:
                 return LocalService(node, uri, origin)
         return None
 
@@ -391,7 +396,7 @@ class Services(Part):
         remote = self.imports.get(action.peer, action.service)
         origin = remote.origin if remote is not None else None
         name = self._sessions.proxy_name(session, action.node, origin)
-        source, place = Source(f"service {action.service}", action.node), _relayed(action.service, name)
+        source, place = Source(f"service {action.service}", action.node), service_place(action.service, name)
         self._relay.pass_on(session.peer, session.link.identity, source, place, origin)
         shown = self._shown[action.peer, action.service] = ShownService(
             action.peer, action.service, action.node, self.imports.peer_name(action.peer)
@@ -530,11 +535,6 @@ class Services(Part):
     def _told_of_mismatch(self, session: PeerSession, args: dict[str, Any]) -> None:
         text = printable(str(args.get("text", ""))[: limits.CONTROL_TEXT_MAX])
         self._driver.warn("service.mismatch_remote", session.link.name, f"{session.link.name}: {text}")
-
-
-def _relayed(service: str, node: str) -> tuple[str, str]:
-    """The key of a service in ``Relay``, which also holds topics: a topic may have the same name."""
-    return f"service {service}", node
 
 
 def _description(about: ServiceAbout) -> ServiceDescription:

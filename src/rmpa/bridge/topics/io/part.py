@@ -206,6 +206,10 @@ class Topics(Part):
         self._subscribers.close()
         self.outbound.close()
 
+    def reached_here(self, instance: str, *, reached: bool) -> None:
+        """Set whether this module reaches another one outside the mesh; see ``Imports.reached_here``."""
+        self._act(self.imports.reached_here(instance, reached=reached))
+
     def reload(self, settings: Settings) -> None:
         """Takes new settings; sources and routes that they do not change go on untouched."""
         policy, contracts = Policy(settings.policy, settings.peers, settings.time), settings.make_contracts()

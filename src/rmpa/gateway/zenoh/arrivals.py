@@ -1,0 +1,177 @@
+"""The way of what Zenoh delivers from its threads into the event loop.
+
+Zenoh calls back in threads of its own. Each subscriber has a queue there, and one wake-up of the loop is enough for
+all that came until the loop runs. The queues take turns, so that a flood on one does not delay the others.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from typing import TYPE_CHECKING, Generic, TypeVar
+
+from rmpa.gateway.zenoh import limits
+
+if TYPE_CHECKING:
+    import asyncio
+    from collections.abc import Callable
+
+_T = TypeVar("_T")
+_log = logging.getLogger(__name__)
+
+
+class ArrivalQueue(Generic[_T]):
+    """What arrived for one subscriber, and waits for the event loop.
+
+    Args:
+        arrivals: The loop's side.
+        deliver: Called in the loop with each item.
+        messages: Items that wait at most; above it the oldest is dropped.
+        size: Bytes that wait at most; one item always fits.
+        discard: Called in the loop with each item that was dropped.
+    """
+
+    def __init__(
+        self,
+        arrivals: Arrivals,
+        deliver: Callable[[_T], None],
+        messages: int,
+        size: int,
+        discard: Callable[[_T], None] | None = None,
+    ) -> None:
+        self._arrivals = arrivals
+        self._deliver = deliver
+        self._messages = messages
+        self._bytes = size
+        self._discard = discard
+        self._items: deque[tuple[_T, int]] = deque()
+        self._waiting_bytes = 0
+        self._scheduled = False
+        self._closed = False
+        self.dropped = 0
+        """Items that found no room."""
+
+    def add(self, item: _T, size: int = 0) -> None:
+        """Queue one item, from any thread."""
+        with self._arrivals.lock:
+            if self._closed:
+                return
+            self._items.append((item, size))
+            self._waiting_bytes += size
+            while len(self._items) > self._messages or (self._waiting_bytes > self._bytes and len(self._items) > 1):
+                old, old_size = self._items.popleft()
+                self._waiting_bytes -= old_size
+                self.dropped += 1
+                if self._discard is not None:
+                    self._arrivals.discarded.append((self._discard, old))
+            if not self._scheduled:
+                self._scheduled = True
+                self._arrivals.schedule(self)
+
+    def close(self) -> None:
+        """Forget what waits; nothing is delivered afterwards."""
+        with self._arrivals.lock:
+            self._closed = True
+            if self._discard is not None:
+                self._arrivals.discarded.extend((self._discard, item) for item, _ in self._items)
+                self._arrivals.wake()
+            self._items.clear()
+            self._waiting_bytes = 0
+
+    def take(self) -> tuple[_T, int] | None:
+        """Take the oldest item and its size; ``None`` if none waits. The caller has the lock."""
+        if not self._items:
+            return None
+        item = self._items.popleft()
+        self._waiting_bytes -= item[1]
+        return item
+
+    def reschedule(self) -> None:
+        """Queue up for another turn if something waits. The caller has the lock."""
+        self._scheduled = bool(self._items)
+        if self._scheduled:
+            self._arrivals.schedule(self)
+
+    def deliver(self, item: _T) -> None:
+        """Hand one item to the subscriber; an error of the subscriber is logged."""
+        if self._closed:
+            if self._discard is not None:
+                self._discard(item)
+            return
+        try:
+            self._deliver(item)
+        except Exception:  # noqa: BLE001 - the last frame of the loop: others must get theirs
+            _log.exception("zenoh: what arrived could not be handled")
+
+
+class Arrivals:
+    """The loop's side of all queues of a session.
+
+    Args:
+        loop: The event loop that everything is delivered in.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self.lock = threading.Lock()
+        self.discarded: deque[tuple[Callable[..., None], object]] = deque()
+        """What was dropped, with the function that is told; guarded by ``lock``."""
+        self._ready: deque[ArrivalQueue[object]] = deque()
+        self._woken = False
+        self._closed = False
+
+    def schedule(self, queue: ArrivalQueue[_T]) -> None:
+        """Give a queue its turn. The caller has the lock."""
+        self._ready.append(queue)  # type: ignore[arg-type] # what it takes is what it delivers
+        self.wake()
+
+    def wake(self) -> None:
+        """Let the loop look at the queues. The caller has the lock."""
+        if not self._woken and not self._closed:
+            self._woken = True
+            try:
+                self._loop.call_soon_threadsafe(self._drain)
+            except RuntimeError:  # the loop was closed before the session
+                self._closed = True
+
+    def close(self) -> None:
+        """Deliver nothing more."""
+        with self.lock:
+            self._closed = True
+            self._ready.clear()
+
+    def _drain(self) -> None:
+        messages, size = limits.DRAIN_MESSAGES, limits.DRAIN_BYTES
+        with self.lock:
+            self._woken = False
+            discarded = tuple(self.discarded)
+            self.discarded.clear()
+        for discard, item in discarded:
+            discard(item)
+        while messages > 0 and size > 0:
+            with self.lock:
+                if not self._ready:
+                    return
+                queue = self._ready.popleft()
+                taken, taken_bytes = self._take_turn(queue, min(messages, limits.TURN_MESSAGES))
+                queue.reschedule()
+            for item in taken:
+                queue.deliver(item)
+            messages -= len(taken)
+            size -= taken_bytes
+        with self.lock:
+            if self._ready:
+                self.wake()
+
+    @staticmethod
+    def _take_turn(queue: ArrivalQueue[object], messages: int) -> tuple[list[object], int]:
+        taken: list[object] = []
+        taken_bytes = 0
+        while len(taken) < messages and taken_bytes < limits.TURN_BYTES:
+            entry = queue.take()
+            if entry is None:
+                break
+            taken.append(entry[0])
+            taken_bytes += entry[1]
+        return taken, taken_bytes

@@ -1,0 +1,41 @@
+"""Every bound of the gateway's Zenoh session, with unit and reason."""
+
+from __future__ import annotations
+
+from typing import Final
+
+LEASE: Final = 1.0
+"""Seconds without a sign of life after which a Zenoh transport counts as dead: a frozen site is seen within 1.5 s.
+Zenoh sends a keep-alive four times in that time, and any data counts too."""
+BLOCK_MAX: Final = 5.0
+"""Seconds that a put of a reliable publisher may wait for a transport before Zenoh closes that transport. It is
+Zenoh's own value: a thin link must have the time for one batch. The lease notices a frozen other side before."""
+RECONNECT_FIRST: Final = 0.2
+"""Seconds before the first attempt to reach a router again."""
+RECONNECT_MAX: Final = 2.0
+"""Seconds between two later attempts at most; a router that was restarted is reached again within that time."""
+RECONNECT_GROWTH: Final = 1.5
+"""Factor between the waits of two attempts."""
+TURN_MESSAGES: Final = 64
+"""Messages of one publisher that are sent in one turn, while others of its priority wait."""
+TURN_BYTES: Final = 65_536
+"""Bytes of one publisher in one turn: one batch of Zenoh. One message always fits."""
+ARRIVED_MESSAGES: Final = 10_000
+"""Messages of one subscriber that wait for the event loop; above it the oldest is dropped, and counted. It is several
+bursts of 1,000, and 30 ms of what the loop can take."""
+ARRIVED_BYTES: Final = 64 * 1024 * 1024
+"""Bytes of one subscriber that wait for the event loop; one message always fits. It is 64 images of 1 MB."""
+ARRIVED_QUERIES: Final = 1_000
+"""Queries of one queryable that wait for the event loop; above it the oldest is finished without an answer."""
+ARRIVED_TOKENS: Final = 200_000
+"""Changes of tokens of one watcher that wait for the event loop: a hundred sites of a thousand sources, twice."""
+DRAIN_MESSAGES: Final = 256
+"""Messages that the event loop takes before it looks at its other work: at most a millisecond or so."""
+DRAIN_BYTES: Final = 8 * 1024 * 1024
+"""Bytes that the event loop takes before it looks at its other work."""
+FLUSH_MAX: Final = 1.0
+"""Seconds that a publisher which is closed may still send what waits."""
+CLOSE_MAX: Final = 3.0
+"""Seconds that closing a session may take before it is given up; its threads do not keep the process from ending."""
+GET_GRACE: Final = 1.0
+"""Seconds beyond a query's own time-out after which its answers are no longer waited for."""
