@@ -344,7 +344,7 @@ def _conversion(run: _Run) -> None:
         pair = mapping.message(name, types)
         assert pair is not None, name
         conversion = Conversion(kind, pair.name, types, pair.fields)
-        raw = bytes(kind.serialize(values))
+        raw = bytes(kind.serialize(kind.make(values)))
         cdr = conversion.to_ros2(raw)
         there = _median_us(partial(conversion.to_ros2, raw), run.plan.conversions)
         back = _median_us(partial(conversion.to_ros1, cdr), run.plan.conversions)
