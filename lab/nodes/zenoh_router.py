@@ -18,7 +18,12 @@ if TYPE_CHECKING:
 def settings_of(mode: str, settings: Mapping[str, object]) -> zenoh.Config:
     """Settings of a session that does not scout."""
     config = zenoh.Config()
-    for key, value in {"mode": mode, "scouting/multicast/enabled": False, **settings}.items():
+    for key, value in {
+        "mode": mode,
+        "scouting/multicast/enabled": False,
+        "transport/shared_memory/enabled": False,
+        **settings,
+    }.items():
         config.insert_json5(key, json.dumps(value))
     return config
 
