@@ -73,6 +73,7 @@ def test_without_a_name_it_is_the_hosts(tmp_path: Path) -> None:
 def test_a_wrong_command_line_ends_with_code_2_and_what_to_write(
     place: Place, arguments: tuple[str, ...], words: str
 ) -> None:
+    pytest.importorskip("zenoh", reason="the libraries of rmpa[zenoh] are not installed")
     code, _, err = place.run("gateway", *arguments)
     assert code == 2, err
     assert words in err

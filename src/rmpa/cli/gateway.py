@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import importlib
 import importlib.util
 import logging
 import os
@@ -86,11 +85,10 @@ def gateway(context: click.Context, /, **options: object) -> int:
     for note in loaded.notes:
         _log.warning("%s", note)
     gc.disable()  # as in rmpa up: the start takes a third less time; the agent turns it on again
-    run = importlib.import_module("rmpa.gateway.gateway").run
+    from rmpa.gateway.gateway import run
 
     try:
-        code: int = run(loaded.settings, load)
-        return code
+        return run(loaded.settings, load)
     finally:
         writer.close()
 
