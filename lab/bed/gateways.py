@@ -133,7 +133,7 @@ class JoinedSites:
         self.sites: list[Site] = []
         for network, module in zip(networks, modules.values(), strict=True):
             agent = Agent(network.host(lab, module), home, name=module, log_level=log_level)
-            gateway = self._gateway(network, f"{network.name}-gateway")
+            gateway = self._gateway(network, f"{network.name}_gateway")
             self.sites.append(Site(network, agent, gateway))
             started += [agent, gateway]
         for agent in started:
@@ -147,7 +147,7 @@ class JoinedSites:
 
     def second_gateway(self, site: Site, rank: int = 200) -> GatewayProcess:
         """One more gateway at a site; ready when this returns."""
-        made = self._gateway(site.network, f"{site.name}-second", ["--rank", str(rank)])
+        made = self._gateway(site.network, f"{site.name}_second", ["--rank", str(rank)])
         self._start(made)
         made.wait_ready()
         return made
