@@ -90,3 +90,7 @@ ROS2_CALLS_MAX: Final = 64
 """Calls of one service that are under way at one time, each way; the next one gets an error."""
 ROS2_DESCRIBE_AGAIN: Final = (0.5, 30.0)
 """Seconds until a service that could not be asked for its type is asked again: at first, and at most; it doubles."""
+OPEN_RETRY_FIRST: Final = 0.5
+"""Seconds until a session is opened again, at first, whose router did not answer."""
+OPEN_RETRY_MAX: Final = 5.0
+"""The longest time in seconds between two attempts to open a session."""
