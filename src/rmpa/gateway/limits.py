@@ -67,6 +67,15 @@ VALUE_READING_IDLE: Final = 60.0
 """Seconds for which a last value that is read in portions is kept without another question for it."""
 SITE_ASK_TIMEOUT: Final = 5.0
 """Seconds for a question to another site's gateway."""
+SITE_PARAMS_AT_ONCE: Final = 256
+"""Questions of other sites about parameters that are answered at once, and parameters of other sites that modules
+here may follow."""
+SITE_PARAM_BYTES_MAX: Final = 64 * MIB
+"""Bytes of one question or answer about parameters between gateways: some of the largest values."""
+SITE_PARAM_TRANSFERS_MAX: Final = 64
+"""Modules of other sites whose parameters are read or written in portions at once."""
+SITE_FOLLOW_INTERVAL: Final = 1.0
+"""Seconds between questions for followed parameters of other sites: one question for each module."""
 SITE_PARAM_TIMEOUT: Final = 20.0
 """Seconds for a question about a parameter to another site: less than the module that asks waits for this gateway."""
 LAST_VALUES_RETRY_MAX: Final = 30.0

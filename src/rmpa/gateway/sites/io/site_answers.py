@@ -1,4 +1,4 @@
-"""Answers ``rmpa site``, ``rmpa param`` and ``rmpa why`` about other sites: to this machine, and to linked modules."""
+"""Answers ``rmpa site``, ``rmpa param`` and ``rmpa why`` about other sites, to this machine and to linked modules."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rmpa.gateway.sites.attachment import SiteAttachment
 from rmpa.gateway.sites.last_values import HEADER, ValueHeader, value_key
 from rmpa.gateway.sites.services import NO_MD5
 from rmpa.observe.io.site_requests import BODY, INFO, LAST, PARAM, REPORT, WHY
-from rmpa.observe.sites import LastValueInfo, SiteInfo, SiteModuleInfo, SitesReport, SiteSourceInfo, ValuePortion
+from rmpa.observe.sites import LastValueInfo, SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport, ValuePortion
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -130,7 +130,9 @@ class SiteAnswers:
             return
         ago = self._history.since_ago(site)
         if ago is not None:
-            raise UnreachableError(f"gateway of site {site}", f"its keys since {ago:.0f} s", "`rmpa site list` shows all")
+            raise UnreachableError(
+                f"gateway of site {site}", f"its keys since {ago:.0f} s", "`rmpa site list` shows all"
+            )
         known = ", ".join(self._sites.catalogue.sites) or "none"
         raise UnreachableError(f"site {site!r}", "any Zenoh router that this gateway reaches", f"known are: {known}")
 
@@ -144,7 +146,9 @@ class SiteAnswers:
             problem="" if self._endpoints() else "it is connected to no other Zenoh session",
             endpoints=self._endpoints(),
             sites=tuple(
-                self._this_site(sources=sources, parts=found.get("parts")) if name == self._own.site else self._other(name, sources=sources)
+                self._this_site(sources=sources, parts=found.get("parts"))
+                if name == self._own.site
+                else self._other(name, sources=sources)
                 for name in names
             ),
         )
