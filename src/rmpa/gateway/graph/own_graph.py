@@ -116,11 +116,13 @@ class AgentGraph(Part):
         on_message: Callable[[memoryview], None],
         on_described: Callable[[TopicDescription], None],
         on_lost: Callable[[str], None],
+        *,
+        listener: str = "",
     ) -> TopicTap:
         """Subscribe to a local topic; see ``neighbour.OwnGraph.tap``."""
         tap = TopicTap(
             source,
-            TAP_NODE,
+            listener or TAP_NODE,
             self._node.next_number,
             on_message=on_message,
             on_described=on_described,

@@ -120,5 +120,5 @@ class ActionPair:
 
 
 def action_name(type_name: str, part: str) -> str:
-    """``package/Name`` of the action that a topic of ``package/NameActionGoal`` or another part is of; empty for none."""
+    """``package/Name`` of the action that has a topic of this type of ROS 1; empty for none."""
     return type_name.removesuffix(part) if type_name.endswith(part) and not type_name.endswith(f"/{part}") else ""

@@ -259,10 +259,10 @@ class GoalsToRos1:
             self._end(goal, state.status, self.pair.no_result, stamp, now)
             return True
         self._accept(goal, stamp)
-        changed = goal.status is not state.status
-        if not state.status.ended:  # an end is told with its result
-            goal.status = state.status
-        return changed
+        if state.status.ended or goal.status is state.status:
+            return False  # an end is told with its result
+        goal.status = state.status
+        return True
 
     def _accept(self, goal: _Goal, stamp: int, *, accepted: bool = True) -> None:
         if goal.asked is not None:

@@ -99,7 +99,7 @@ class GoalsToRos2:
         """Goals that have not ended."""
         return sum(goal.ended is None for goal in self._goals.values())
 
-    # --- from the clients of ROS 1 --------------------------------------------------------------------------------
+    # --- from the clients of ROS 1 -------------------------------------------------------------------------------
 
     def goal(self, raw: Buffer, stamp: int, now: float) -> None:
         """A client publishes an ``ActionGoal``.
@@ -121,12 +121,12 @@ class GoalsToRos2:
         if uuid in self._goals:
             return
         goal = _Goal(goal_id, uuid)
-        full = len(self._goals) >= limits.ROS2_GOALS_MAX
-        if not full:
-            self._goals[uuid] = goal
+        if len(self._goals) >= limits.ROS2_GOALS_MAX:
+            text = f"{len(self._goals)} goals are known"
+            self._end(goal, Ros1Status.REJECTED, text, self.pair.no_result, stamp, now)
+            return
+        self._goals[uuid] = goal
         try:
-            if full:
-                raise ConversionError(f"{len(self._goals)} goals are known")  # noqa: TRY301 - one way to reject
             self._events.append(AskServer("send_goal", uuid, with_uuid(uuid, self.pair.goal.to_ros2(body))))
         except ConversionError as error:
             self._end(goal, Ros1Status.REJECTED, str(error), self.pair.no_result, stamp, now)
@@ -145,7 +145,7 @@ class GoalsToRos2:
                 if goal.status is not Ros1Status.PENDING:
                     self._cancel(goal)
 
-    # --- from the server of ROS 2 ---------------------------------------------------------------------------------
+    # --- from the server of ROS 2 --------------------------------------------------------------------------------
 
     def accepted(self, uuid: bytes, stamp: int, now: float, *, accepted: bool) -> None:
         """The server has answered ``send_goal``."""
@@ -219,7 +219,7 @@ class GoalsToRos2:
                 goal.status = Ros1Status.PREEMPTING
                 self._status(stamp)
 
-    # --- time ------------------------------------------------------------------------------------------------------
+    # --- time -----------------------------------------------------------------------------------------------------
 
     def show_status(self, now: float, *, wanted: bool) -> None:
         """Begin or stop to publish the status five times a second."""
@@ -238,7 +238,7 @@ class GoalsToRos2:
             self._next_status = now + limits.ROS2_STATUS_PERIOD
             self._status(stamp)
 
-    # --- inside ----------------------------------------------------------------------------------------------------
+    # --- inside ---------------------------------------------------------------------------------------------------
 
     def _cancel(self, goal: _Goal) -> None:
         self._events.append(AskServer("cancel_goal", goal.uuid, cancel_request(goal.uuid)))
