@@ -71,6 +71,12 @@ ROS2_ENDPOINTS_MAX: Final = 20000
 """Publishers, subscriptions, services and clients of ROS 2 that are looked at; each costs some 3 KB."""
 ROS2_PROBLEMS_MAX: Final = 500
 """Problems of the neighbour ROS 2 that are kept for ``rmpa site``; the oldest go first."""
+ROS2_TYPES_MAX: Final = 500
+"""Types that are learnt from publishers and ROS 2 nodes, and pairs that are kept; ROS has some 160 of its own."""
+ROS2_DESCRIPTION_MAX: Final = 1024 * 1024
+"""Bytes of a type's description from a ROS 2 node; the largest of ROS 2's own types has 30 KB."""
+ROS2_ARRAY_MAX: Final = 1_000_000
+"""Elements of all arrays of fixed size in a type that a ROS 2 node describes: an empty message must have them all."""
 
 
 # --- other sites ---------------------------------------------------------------------------------------------------
@@ -132,6 +138,11 @@ ROS2_CALLS_MAX: Final = 64
 """Calls of one service that are under way at one time, each way; the next one gets an error."""
 ROS2_DESCRIBE_AGAIN: Final = (0.5, 30.0)
 """Seconds until a service that could not be asked for its type is asked again: at first, and at most; it doubles."""
+ROS2_PUBLISHERS_MAX: Final = 1000
+"""Publishers of one topic of ROS 2 whose sequence numbers are followed; the one silent for longest is forgotten."""
+ROS2_SERVICE_WAIT: Final = 3.0
+"""Seconds in which a ROS 2 node's get_type_description may appear after its first publisher, and in which it answers:
+a node declares one after the other."""
 OPEN_RETRY_FIRST: Final = 0.5
 """Seconds until a session is opened again, at first, whose router did not answer."""
 OPEN_RETRY_MAX: Final = 5.0
