@@ -109,6 +109,13 @@ INTERNAL: Final = {
     "KEY_MAX",
     "NODE_NAME_MAX",
     "QOS_NUMBER_MAX",
+    "LAST_VALUES_PENDING_MAX",
+    "LAST_VALUES_RETRY_MAX",
+    "ROS2_DESCRIPTION_MAX",
+    "ROS2_PROBLEMS_MAX",
+    "ROS2_PUBLISHERS_MAX",
+    "SERVICE_DESCRIPTION_MAX",
+    "VALUE_HEADER_MAX",
 }
 """Of parsers, packets, retries and caches: nothing that a user could notice or mend."""
 

@@ -10,11 +10,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.config.gateway_rules import GatewaySettings
+from rmpa.config.gateway_rules import Crossing, CrossingRule, GatewaySettings
 from rmpa.core.errors import StartError
 from rmpa.gateway.gateway import Gateway
-from rmpa.gateway.joining import zenoh_config
-from rmpa.gateway.zenoh.config import ZenohMode
 from rmpa.observe.io.control_client import ControlClient
 from tests.agent.conftest import pytest_asyncio_loop_factories
 from tests.agent.test_agent import settings, until
@@ -67,6 +65,8 @@ class Bed:
     def __init__(self, settings: Settings, gateway: GatewaySettings, failures: int = 0) -> None:
         self.events: list[str] = []
         self.failures = failures
+        self.rules: list[tuple[CrossingRule, ...]] = []
+        """Of each time that the neighbours were made."""
         self.settings = replace(settings, gateway=gateway)
         self.gateway = Gateway(self.settings, open_session=self._open, make_neighbours=self._make)
 
@@ -76,7 +76,8 @@ class Bed:
             raise StartError("zenoh", "no router answers")
         return OpenedSession(self.events)
 
-    def _make(self, graph: AgentGraph, _session: ZenohSession, _settings: Settings) -> Mapping[str, Neighbour]:
+    def _make(self, graph: AgentGraph, _session: ZenohSession, settings: Settings) -> Mapping[str, Neighbour]:
+        self.rules.append(settings.gateway.rules)
         return {"sites": RecordedNeighbour(graph, self.events)}
 
 
@@ -110,6 +111,19 @@ async def test_the_control_socket_reports_what_is_joined(settings: Callable[...,
         assert report["neighbours"] == {"sites": {"sites": ["warehouse"]}}
 
 
+async def test_other_rules_make_the_neighbours_anew(settings: Callable[..., Settings]) -> None:
+    bed = Bed(settings("g"), CONNECT)
+    async with started(bed) as gateway:
+        other = replace(bed.settings, log_level="warning")
+        gateway.agent.apply_settings(other)  # nothing that neighbours are made with
+        rules = (CrossingRule(crossing=Crossing.NONE),)
+        gateway.agent.apply_settings(replace(other, gateway=replace(CONNECT, rules=rules)))
+        await until(lambda: len(bed.events) == 3)
+        assert bed.events == ["started in g", "closed", "started in g"]
+        assert bed.rules == [(), rules]
+    assert bed.events[3:] == ["closed", "session closed"]
+
+
 async def test_a_router_that_comes_later_is_joined_then(settings: Callable[..., Settings]) -> None:
     bed = Bed(settings("g"), CONNECT, failures=2)
     async with started(bed) as gateway:
@@ -137,12 +151,3 @@ async def test_a_session_is_closed_if_the_agent_cannot_start(settings: Callable[
         with pytest.raises(StartError):
             await second.gateway.start()
         assert second.events == ["session closed"]
-
-
-def test_without_certificates_only_this_machine_is_joined_unless_it_is_said() -> None:
-    assert zenoh_config(CONNECT).mode is ZenohMode.CLIENT
-    far = GatewaySettings(listen=("tcp/0.0.0.0:7447",))
-    with pytest.raises(StartError, match="--insecure"):
-        zenoh_config(far)
-    assert zenoh_config(replace(far, insecure=True)).mode is ZenohMode.PEER
-    assert zenoh_config(replace(far, insecure=True, router=True)).mode is ZenohMode.ROUTER

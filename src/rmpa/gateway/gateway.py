@@ -17,6 +17,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.graph.own_graph import AgentGraph
 from rmpa.gateway.joining import make_neighbours, open_gateway_session
 from rmpa.gateway.zenoh_api import ZenohSession
+from rmpa.observe.control import GATEWAY_ROLE, ROLE
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator, Mapping
@@ -68,7 +69,7 @@ class Gateway:
         self.agent = Agent(self._settings, requests, load)
         self.graph = AgentGraph(self.agent, self._settings)
         self.agent.bridge.add(self.graph)
-        self.agent.add_operations({REPORT: lambda _: self.report()})
+        self.agent.add_operations({REPORT: lambda _: self.report(), ROLE: lambda _: GATEWAY_ROLE})
         self.agent.other_notes.append(self._notes)
         self.session: OwnedSession | None = None
         """The session; ``None`` until it is open."""
@@ -76,6 +77,9 @@ class Gateway:
         """The neighbours by their names; empty until the session is open."""
         self._problem = ""
         self._opening: asyncio.Task[None] | None = None
+        self.graph.reloaded = self._reloaded
+        self._rejoining: asyncio.Task[None] | None = None
+        self._changed = False
 
     async def start(self) -> None:
         """Start the agent and the neighbours; where only ``connect`` is set, a router may come later.
@@ -114,15 +118,36 @@ class Gateway:
         if self._opening is not None:
             self._opening.cancel()
             await asyncio.wait([self._opening])
+        if self._rejoining is not None:
+            await self._rejoining
+        await self._close_neighbours()
+        if self.session is not None:
+            await self.session.close()
+        await self.graph.end()
+        await self.agent.close()
+
+    async def _close_neighbours(self) -> None:
         for name, neighbour in reversed(list(self.neighbours.items())):
             try:
                 await neighbour.close()
             except Exception:  # noqa: BLE001 - the others have to be closed too
                 _log.exception("! %s could not be closed", name)
-        if self.session is not None:
-            await self.session.close()
-        await self.graph.end()
-        await self.agent.close()
+        self.neighbours = {}
+
+    def _reloaded(self, settings: Settings) -> None:
+        """Have other rules hold: the neighbours are made anew, and what crosses pauses for a moment."""
+        before, self._settings = self._settings, replace(settings, relay=True)
+        if _rules(before) != _rules(settings):
+            self._changed = True
+            if self._rejoining is None or self._rejoining.done():
+                self._rejoining = asyncio.get_running_loop().create_task(self._rejoin(), name="take other rules")
+
+    async def _rejoin(self) -> None:
+        while self._changed and self.session is not None:
+            self._changed = False
+            await self._close_neighbours()
+            self.graph.unwatch()
+            self._join(self.session)
 
     def report(self) -> dict[str, object]:
         """What the gateway joins, as JSON values: the reply to the operation ``gateway``."""
@@ -167,6 +192,11 @@ class Gateway:
                 self._failed(error)
             else:
                 self._join(session)
+
+
+def _rules(settings: Settings) -> tuple[object, ...]:
+    """The settings that neighbours are made with and that may change while they run."""
+    return settings.gateway.rules, settings.policy, settings.peers, settings.services, settings.contracts
 
 
 async def _discard(opening: asyncio.Future[OwnedSession]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.core.sizes import MIB
+from rmpa.core.sizes import KIB, MIB
 
 KEY_MAX: Final = 2048
 """Characters of a key expression or a liveliness token that another site or a ROS 2 node sent. Longer ones are not
@@ -57,6 +57,27 @@ LATCH_LOOKS_AT_ONCE: Final = 2
 """Publishers that are asked that at once: each opens a route in the mesh for a moment."""
 VALUE_HEADER_MAX: Final = 1 * MIB
 """Bytes of the header of another site's last value: most of it is the definition of its type."""
+SITES_REMEMBERED_MAX: Final = 256
+"""Sites that are remembered as unreachable; those that left first are forgotten first."""
+SITE_REPORT_SOURCES_MAX: Final = 5000
+"""Topics and services of one site in ``rmpa site info``: some 2 MB of JSON."""
+VALUE_PORTION: Final = 256 * KIB
+"""Bytes of a last value in one message to a module that asks for it: 20 ms on a 100 Mbit/s link."""
+VALUE_READING_IDLE: Final = 60.0
+"""Seconds for which a last value that is read in portions is kept without another question for it."""
+SITE_ASK_TIMEOUT: Final = 5.0
+"""Seconds for a question to another site's gateway."""
+SITE_PARAMS_AT_ONCE: Final = 256
+"""Questions of other sites about parameters that are answered at once, and parameters of other sites that modules
+here may follow."""
+SITE_PARAM_BYTES_MAX: Final = 64 * MIB
+"""Bytes of one question or answer about parameters between gateways: some of the largest values."""
+SITE_PARAM_TRANSFERS_MAX: Final = 64
+"""Modules of other sites whose parameters are read or written in portions at once."""
+SITE_FOLLOW_INTERVAL: Final = 1.0
+"""Seconds between questions for followed parameters of other sites: one question for each module."""
+SITE_PARAM_TIMEOUT: Final = 20.0
+"""Seconds for a question about a parameter to another site: less than the module that asks waits for this gateway."""
 LAST_VALUES_RETRY_MAX: Final = 30.0
 """Seconds between attempts to write to a disk that takes nothing."""
 SITE_NAME_MAX: Final = 63
@@ -71,6 +92,63 @@ ROS2_ENDPOINTS_MAX: Final = 20000
 """Publishers, subscriptions, services and clients of ROS 2 that are looked at; each costs some 3 KB."""
 ROS2_PROBLEMS_MAX: Final = 500
 """Problems of the neighbour ROS 2 that are kept for ``rmpa site``; the oldest go first."""
+ROS2_TYPES_MAX: Final = 500
+"""Types that are learnt from publishers and ROS 2 nodes, and pairs that are kept; ROS has some 160 of its own."""
+ROS2_DESCRIPTION_MAX: Final = 1024 * 1024
+"""Bytes of a type's description from a ROS 2 node; the largest of ROS 2's own types has 30 KB."""
+ROS2_ARRAY_MAX: Final = 1_000_000
+"""Elements of all arrays of fixed size in a type that a ROS 2 node describes: an empty message must have them all."""
+
+
+# --- other sites ---------------------------------------------------------------------------------------------------
+
+SITES_MAX: Final = 256
+"""Other sites that are shown; tokens of further ones are counted and left out."""
+SITE_MODULES_MAX: Final = 512
+"""Modules of one other site that are shown, as many as the mesh has peers."""
+SITE_SOURCES_MAX: Final = 16_384
+"""Topics (once for each publisher) and services of one other site that are shown, or of this one that are offered."""
+SITE_SETTLE: Final = 0.05
+"""Seconds from the end of a token to the end of what it stands for. The tokens of a gateway that was killed go one by
+one, within some milliseconds: its own may be the last, and then the others are lost and not withdrawn."""
+SITE_GRACE: Final = 0.5
+"""Seconds for which the sources of a site stay when its leading gateway, or the way to it, is lost: longer than
+another gateway of that site needs to take over. A site that is frozen is noticed within 1 s by Zenoh's lease, and
+must be gone within 1.5 s."""
+LEADER_PATIENCE: Final = 0.3
+"""Seconds for which a gateway must have been the first of its site before it leads; below ``SITE_GRACE``, so that the
+other sites keep the sources."""
+HEADER_MAX: Final = 512 * 1024
+"""Bytes of a publisher's header from another site, with the definition; the longest of ROS 1 has some 30 KB."""
+HEADER_TIMEOUT: Final = 5.0
+"""Seconds that a query for a publisher's header waits for it: the gateway there connects to the publisher first."""
+HEADER_RETRY: Final = 2.0
+"""Seconds at most until a header is asked for again, when there was no answer and nodes wait for it; at first a
+sixteenth."""
+HEADER_QUERIES_MAX: Final = 64
+"""Queries that wait for the header of one publisher; further ones are refused at once."""
+TAP_LINGER: Final = 2.0
+"""Seconds for which a publisher stays connected after its header was asked for: its subscriber comes right after."""
+HELD_MESSAGES_MAX: Final = 1000
+"""Messages that wait at the receiver for the publisher's header; above it the oldest is dropped, and counted."""
+HELD_BYTES: Final = 64 * 1024 * 1024
+"""Bytes that wait likewise; one message always fits."""
+DEMAND_LINGER: Final = 1.0
+"""Seconds for which a topic of another site stays subscribed after its last subscriber left, as in the mesh."""
+LIMIT_BURST: Final = 0.5
+"""Seconds of a topic's limit of rate or size that may cross at once after a rest: jitter must not cost messages."""
+BEST_EFFORT_BYTES: Final = 8 * 1024 * 1024
+"""Bytes of one best-effort topic that wait for a slow link: what is older than that is of no use. One message always
+fits, and a burst of 1,000 small ones."""
+RELIABLE_BYTES: Final = 64 * 1024 * 1024
+"""Bytes of one reliable topic that wait for a slow link, as in a lane of the mesh."""
+LARGE_MESSAGE: Final = 64 * 1024
+"""Bytes from which on a topic's messages yield to those of others, if its contract has no priority."""
+IDLE_CHECK: Final = 1.0
+"""Seconds without a message after which a receiver asks for the last sequence number: losses at the end of a burst
+leave no gap."""
+LATENCIES_KEPT: Final = 512
+"""Latencies of one topic from which the report's percentiles are computed."""
 ROS2_CALL_TIMEOUT: Final = 600.0
 """Seconds of one call of a service between the mesh and ROS 2. Clients of ROS 1 and of rmw_zenoh wait without end; a
 server that dies ends its calls at once."""
@@ -78,6 +156,11 @@ ROS2_CALLS_MAX: Final = 64
 """Calls of one service that are under way at one time, each way; the next one gets an error."""
 ROS2_DESCRIBE_AGAIN: Final = (0.5, 30.0)
 """Seconds until a service that could not be asked for its type is asked again: at first, and at most; it doubles."""
+ROS2_PUBLISHERS_MAX: Final = 1000
+"""Publishers of one topic of ROS 2 whose sequence numbers are followed; the one silent for longest is forgotten."""
+ROS2_SERVICE_WAIT: Final = 3.0
+"""Seconds in which a ROS 2 node's get_type_description may appear after its first publisher, and in which it answers:
+a node declares one after the other."""
 OPEN_RETRY_FIRST: Final = 0.5
 """Seconds until a session is opened again, at first, whose router did not answer."""
 OPEN_RETRY_MAX: Final = 5.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
-from rmpa.gateway.sites.attachment import SiteAttachment
+from rmpa.gateway.sites.attachment import AttachmentReader, SiteAttachment
 
 ATTACHMENT = SiteAttachment(
     7, 123456789, "992ce8a1687cec8c8bd883ec73ca41d1", "/talker", ("warehouse", "cloud"), latched=True
@@ -62,3 +63,12 @@ def test_a_loop_is_bounded() -> None:
 def test_any_bytes_are_an_attachment_or_refused(data: bytes) -> None:
     with contextlib.suppress(RemoteProtocolError):
         SiteAttachment.parse(data)
+
+
+def test_the_run_is_read_back_and_a_reader_knows_each_source_again() -> None:
+    first = replace(ATTACHMENT, run=2**63 - 1)
+    second = replace(first, sequence=8, node="/other", latched=False)
+    reader = AttachmentReader()
+    for _ in range(2):
+        assert [reader.read(each.serialize()) for each in (first, second)] == [first, second]
+    assert first.serialize() == GOLDEN + (2**63 - 1).to_bytes(8, "little")

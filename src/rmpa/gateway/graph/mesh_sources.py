@@ -61,6 +61,10 @@ class MeshSources:
         for source in list(self.known.values()):
             on_change(source, True)
 
+    def unwatch(self, kept: Callable[[MeshSource, bool], None]) -> None:
+        """Report to one watcher alone."""
+        self._watchers = [kept]
+
     def begin(self) -> None:
         """Begin to report; the agent's place in the network is known."""
         self._begun = True

@@ -81,6 +81,8 @@ class AgentGraph(Part):
         self._bridge = agent.bridge
         self._sources = MeshSources(agent, settings)
         self._sources.watch(self._source_changed)
+        self.reloaded: Callable[[Settings], None] = lambda _: None
+        """Called with other rules, after the graph has taken them."""
         self._taps: dict[str, set[TopicTap]] = {}
         self._pools: dict[str, ServicePool] = {}
         self._sites: dict[str, _Site] = {}
@@ -204,6 +206,10 @@ class AgentGraph(Part):
         await self._node.start()
         self._sources.begin()
 
+    def unwatch(self) -> None:
+        """Forget all that ``watch`` was given: the neighbours are closed."""
+        self._sources.unwatch(self._source_changed)
+
     async def end(self) -> None:
         """Take everything back, before the agent closes; the neighbours are closed."""
         self._sources.close()
@@ -224,6 +230,7 @@ class AgentGraph(Part):
     def reload(self, settings: Settings) -> None:
         """Take other rules."""
         self._sources.reload(settings)
+        self.reloaded(settings)
 
     def graph_changed(self, change: GraphChange) -> None:
         """Follow publishers and services that come, go or move."""

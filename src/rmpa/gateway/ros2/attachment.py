@@ -8,6 +8,9 @@
     17 gid       16 bytes   which publisher or client it is
 
 A reply repeats sequence and GID of its request, and has a stamp of its own.
+
+Up to rmw_zenoh_cpp 0.2.3 of Jazzy each of the three has its name in front, with a length of one byte:
+``sequence_number``, ``source_timestamp``, ``source_gid`` (ros2/rmw_zenoh#605). That is read too, and not written.
 """
 
 from __future__ import annotations
@@ -25,6 +28,8 @@ if TYPE_CHECKING:
 GID_BYTES: Final = 16
 """Bytes of a GID since ROS 2 Jazzy."""
 _HEAD: Final = struct.Struct("<qqB")
+_LABELS: Final = (b"\x0fsequence_number", b"\x10source_timestamp", b"\x0asource_gid")
+_NUMBER: Final = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +58,8 @@ class Ros2Attachment:
             RemoteProtocolError: It is shorter than it says.
         """
         raw = memoryview(data)
+        if bytes(raw[: len(_LABELS[0])]) == _LABELS[0]:
+            raw = _without_labels(raw)
         if len(raw) < _HEAD.size:
             raise RemoteProtocolError(f"an attachment of ROS 2 has {len(raw)} bytes; the least are {_HEAD.size}")
         sequence, stamp, length = _HEAD.unpack_from(raw)
@@ -60,3 +67,16 @@ class Ros2Attachment:
         if len(gid) < length or length > limits.GID_MAX:
             raise RemoteProtocolError(f"an attachment of ROS 2 has {len(gid)} bytes of a GID of {length}")
         return cls(sequence, stamp, gid)
+
+
+def _without_labels(raw: memoryview) -> memoryview:
+    """The older form without the names."""
+    made = b""
+    for label in _LABELS:
+        if bytes(raw[: len(label)]) != label:
+            raise RemoteProtocolError(f"an attachment of ROS 2 has no {label[1:].decode()} where it should be")
+        raw = raw[len(label) :]
+        if label is not _LABELS[-1]:
+            made += bytes(raw[:_NUMBER])
+            raw = raw[_NUMBER:]
+    return memoryview(made + bytes(raw))

@@ -1,13 +1,14 @@
 """Conversion of messages between ROS 1's serialization and ROS 2's CDR.
 
-Where both types have the same fields, but for ``seq`` in a header, rosbags converts the bytes without making
-objects. Else each field goes to the one of the same name, or as a mapping file says; numbers are checked for their
-range, a field that only one side has is 0 or empty there. As in ros1_bridge, two types of which *each* has fields
-that the other lacks are no pair: a rule must say what goes where.
+Where the fields that both types have are in one order and of one size, the bytes are converted without making
+objects (``transcoder``). Else each field goes to the one of the same name, or as a mapping file says; numbers are
+checked for their range. A field that only one side has, as ``seq`` of a header, is 0 or empty there. As in
+ros1_bridge, two types of which *each* has fields that the other lacks are no pair: a rule must say what goes where.
 """
 
 from __future__ import annotations
 
+import struct
 from typing import TYPE_CHECKING, Any, Final
 
 from rosbags.interfaces import Nodetype
@@ -15,6 +16,8 @@ from rosbags.serde import SerdeError
 from rosbags.typesys.base import normalize_fieldname
 
 from rmpa.core.errors import RmpaError
+from rmpa.gateway.ros2.layout import HEADER, TIMES, Layouts, name2_of
+from rmpa.gateway.ros2.transcoder import Transcoder
 from rmpa.gateway.ros2.types import ros2_name, snake_case
 
 if TYPE_CHECKING:
@@ -24,23 +27,8 @@ if TYPE_CHECKING:
     from rmpa.ros.types.messages import MessageType
     from rmpa.ros.wire.tcpros import Buffer
 
-_HEADER: Final = "std_msgs/msg/Header"
 _EMPTY_MEMBER: Final = "structure_needs_at_least_one_member"
-_TIMES: Final = {"time": "builtin_interfaces/msg/Time", "duration": "builtin_interfaces/msg/Duration"}
 _LITTLE_ENDIAN: Final = b"\x00\x01"
-_WIDTHS: Final = {
-    "bool": "bool",
-    "int8": "i1",
-    "uint8": "i1",
-    "byte": "i1",
-    "char": "i1",
-    "octet": "i1",
-    "string": "string",
-    **{f"{sign}int{bits}": f"{sign}i{bits}" for sign in ("", "u") for bits in (16, 32, 64)},
-    "float32": "f4",
-    "float64": "f8",
-}
-"""Base types whose bytes mean the same on both sides have the same value here."""
 
 
 class NoConversion(RmpaError):  # noqa: N818 - the name says what happened
@@ -68,14 +56,19 @@ class Conversion:
         self.ros1 = ros1
         self.ros2 = ros2
         self._store = types.store
-        self.direct = fields is None and self._same(ros1.name, ros2)
-        """Whether the bytes are converted without making objects."""
         self._fields = fields
-        if not self.direct:
-            if fields is None:
-                self._check_fields(ros1.name, ros2)
-            else:
-                self._check_paths(fields)
+        if fields is None:
+            self._check_fields(ros1.name, ros2)
+        else:
+            self._check_paths(fields)
+        layouts = Layouts(ros1.specifications, self._store.fielddefs)
+        parts = layouts.of(ros1.name, ros2) if fields is None else None
+        self._transcoder = Transcoder(parts) if parts is not None else None
+
+    @property
+    def direct(self) -> bool:
+        """Whether the bytes are converted without making objects."""
+        return self._transcoder is not None
 
     def to_ros2(self, raw: Buffer) -> bytes:
         """Convert a serialized message of ROS 1, without a length in front, to CDR (little-endian, with its head).
@@ -84,8 +77,8 @@ class Conversion:
             ConversionError: The bytes are not such a message, or a value does not fit ROS 2's type.
         """
         try:
-            if self.direct:
-                return bytes(self._store.ros1_to_cdr(memoryview(raw), self.ros2))
+            if self._transcoder is not None:
+                return self._transcoder.to_cdr(raw)
             message = self.ros1.deserialize(raw)
             if self._fields is None:
                 made = self._make(self.ros1.name, self.ros2, message)
@@ -104,10 +97,9 @@ class Conversion:
             ConversionError: The bytes are not such a message, or a value does not fit ROS 1's type.
         """
         try:
-            view = memoryview(raw)
-            if self.direct and bytes(view[:2]) == _LITTLE_ENDIAN:
-                return bytes(self._store.cdr_to_ros1(view, self.ros2))
-            message = self._store.deserialize_cdr(bytes(view), self.ros2)
+            if self._transcoder is not None and bytes(raw[:2]) == _LITTLE_ENDIAN:
+                return self._transcoder.to_ros1(raw)
+            message = self._store.deserialize_cdr(bytes(raw), self.ros2)
             if self._fields is None:
                 values = self._values(self.ros1.name, self.ros2, message)
             else:
@@ -126,37 +118,11 @@ class Conversion:
     def _ros2_fields(self, name: str) -> dict[str, Any]:
         return {key: desc for key, desc in self._store.fielddefs[name][1] if key != _EMPTY_MEMBER}
 
-    def _same(self, ros1: str, ros2: str) -> bool:
-        """Whether the bytes of both types have the same fields in the same order."""
-        if ros2_name(ros1) == ros2 == _HEADER:
-            return True
-        fields1, fields2 = self._ros1_fields(ros1), self._ros2_fields(ros2)
-        if len(fields1) != len(fields2):
-            return False
-        pairs = zip(fields1, fields2.items(), strict=True)
-        return all(snake_case(one.name) == name and self._same_field(one, desc) for one, (name, desc) in pairs)
-
-    def _same_field(self, field: Field, desc: Any) -> bool:
-        inner = desc
-        if field.array:
-            kind = Nodetype.ARRAY if field.size else Nodetype.SEQUENCE
-            if desc[0] != kind or desc[1][1] != field.size:  # a bound of ROS 2 must be checked
-                return False
-            inner = desc[1][0]
-        if inner[0] == Nodetype.NAME:
-            if field.primitive:
-                return bool(_TIMES.get(field.type) == inner[1])
-            return self._same(field.type, inner[1])
-        if inner[0] != Nodetype.BASE or not field.primitive:
-            return False
-        base, bound = inner[1]
-        return not bound and _WIDTHS.get(field.type) == _WIDTHS.get(base)
-
     def _check_fields(self, ros1: str, ros2: str) -> None:
         """Check that the fields of one type are all in the other, at any depth."""
         fields2 = self._ros2_fields(ros2)
-        ones = {self._name2(field.name, fields2): field for field in self._ros1_fields(ros1)}
-        if ros2_name(ros1) == _HEADER:
+        ones = {name2_of(field.name, fields2): field for field in self._ros1_fields(ros1)}
+        if ros2_name(ros1) == HEADER:
             ones.pop("seq", None)
         only1, only2 = sorted(ones.keys() - fields2.keys()), sorted(fields2.keys() - ones.keys())
         if only1 and only2:
@@ -176,11 +142,11 @@ class Conversion:
             if desc[0] == Nodetype.ARRAY and field.size != desc[1][1]:
                 raise NoConversion(f"{where} has {field.size or 'any number of'} elements, or {desc[1][1]}")
         if inner[0] == Nodetype.NAME:
-            if field.primitive and _TIMES.get(field.type) != inner[1]:
+            if field.primitive and TIMES.get(field.type) != inner[1]:
                 raise NoConversion(f"{where} is a {field.type}, or a {inner[1]}")
-            if not field.primitive and not self._same(field.type, inner[1]):
+            if not field.primitive:
                 self._check_fields(field.type, inner[1])
-        elif not field.primitive or field.type in _TIMES or (field.type == "string") != (inner[1][0] == "string"):
+        elif not field.primitive or field.type in TIMES or (field.type == "string") != (inner[1][0] == "string"):
             raise NoConversion(f"{where} is a {field.type}, or a {inner[1][0]}")
 
     def _check_paths(self, fields: FieldPaths) -> None:
@@ -210,10 +176,6 @@ class Conversion:
                 raise NoConversion(f"{self.ros2} has no field {path}")
             desc = fields[part]
         return desc
-
-    @staticmethod
-    def _name2(name: str, fields2: dict[str, Any]) -> str:
-        return name if name in fields2 else snake_case(name)
 
     # --- ROS 1 to ROS 2 ------------------------------------------------------------------------------------------
 
@@ -245,9 +207,9 @@ class Conversion:
         if desc[0] == Nodetype.NAME:
             if field.primitive:  # a time
                 return self._store.types[desc[1]](sec=_signed(value.sec), nanosec=value.nanosec)
-            if ros2_name(field.type) == desc[1] == _HEADER:
-                stamp = self._store.types[_TIMES["time"]](_signed(value.stamp.sec), value.stamp.nanosec)
-                return self._store.types[_HEADER](stamp=stamp, frame_id=value.frame_id)
+            if ros2_name(field.type) == desc[1] == HEADER:
+                stamp = self._store.types[TIMES["time"]](_signed(value.stamp.sec), value.stamp.nanosec)
+                return self._store.types[HEADER](stamp=stamp, frame_id=value.frame_id)
             return self._make(field.type, desc[1], value)
         base, bound = desc[1]
         if base == "string":
@@ -292,7 +254,7 @@ class Conversion:
         fields2 = self._ros2_fields(ros2)
         values = {}
         for field in self._ros1_fields(ros1):
-            name = self._name2(field.name, fields2)
+            name = name2_of(field.name, fields2)
             if name in fields2:
                 value = getattr(message, normalize_fieldname(name))
                 values[field.name] = self._value1(field, fields2[name], value)
@@ -363,5 +325,14 @@ def _as_number(value: Any, base: str, where: str) -> Any:
     return int(value)
 
 
-_ERRORS: Final = (SerdeError, RmpaError, ValueError, KeyError, IndexError, AssertionError, OverflowError)
+_ERRORS: Final = (
+    SerdeError,
+    RmpaError,
+    struct.error,
+    ValueError,
+    KeyError,
+    IndexError,
+    AssertionError,
+    OverflowError,
+)
 """What rosbags raises for bytes that are not a message; it does not check everything itself."""

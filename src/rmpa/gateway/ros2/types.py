@@ -9,6 +9,7 @@ reports that instead of sending what the other side would misread.
 from __future__ import annotations
 
 import re
+from copy import copy
 from typing import TYPE_CHECKING, Any, Final
 
 from rosbags.interfaces import Nodetype
@@ -80,6 +81,25 @@ class Ros2Types:
             if ros2_name(name) not in self
         }
         if made:
+            self.store.register(made)
+
+    def variant(self, fields: Mapping[str, Any]) -> Ros2Types:
+        """Another version of some types: a copy in which they have other fields.
+
+        Args:
+            fields: ``package/msg/Name`` to its constants and fields, in rosbags' form.
+        """
+        made = copy(self)
+        made.store = Typestore()
+        made.store.fielddefs = {key: each for key, each in self.store.fielddefs.items() if key not in fields}
+        made.store.types = {key: each for key, each in self.store.types.items() if key not in fields}
+        made._hashes = {}  # noqa: SLF001 - its own class
+        made.take(fields)
+        return made
+
+    def take(self, fields: Mapping[str, Any]) -> None:
+        """Take in types of ROS 2 in rosbags' form; those that are known stay as they are."""
+        if made := {key: each for key, each in fields.items() if key not in self}:
             self.store.register(made)
 
     def type_hash(self, name: str) -> str:

@@ -9,6 +9,7 @@ Little-endian::
     18 md5       16 bytes   the md5 sum of the message type
     34 node       1 + n     its publisher, UTF-8
      … path       1         sites that it passed, each 1 + n bytes of UTF-8, the first one is its origin
+     … run        8 bytes   the run of its exporter, in which the sequence counts from 1; may be missing
 
 The md5 sum is here and not in the key, because a gateway knows it only once a node has subscribed.
 """
@@ -30,6 +31,9 @@ if TYPE_CHECKING:
 VERSION: Final = 1
 _LATCHED: Final = 1
 _HEAD: Final = struct.Struct("<BBQq16s")
+_RUN: Final = struct.Struct("<Q")
+_TAILS_KEPT: Final = 64
+"""Ends of attachments that a reader remembers: those of one source are all the same."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +47,7 @@ class SiteAttachment:
         node: Its publisher, ``/like/this``.
         path: The sites that it passed, its origin first; at most ``limits.PATH_MAX``.
         latched: Whether its publisher is latched.
+        run: The run of its exporter, by which sequence numbers are told apart; 0: not told.
     """
 
     sequence: int
@@ -51,43 +56,96 @@ class SiteAttachment:
     node: str
     path: tuple[str, ...]
     latched: bool = False
+    run: int = 0
 
     def serialize(self) -> bytes:
         """The bytes of the attachment."""
-        flags = _LATCHED if self.latched else 0
-        head = _HEAD.pack(VERSION, flags, self.sequence, self.stamp, bytes.fromhex(self.md5))
-        return b"".join((head, _text(self.node), bytes([len(self.path)]), *map(_text, self.path)))
+        writer = AttachmentWriter(self.md5, self.node, self.path, latched=self.latched, run=self.run)
+        return writer.write(self.sequence, self.stamp)
 
     @classmethod
     def parse(cls, data: Buffer) -> SiteAttachment:
-        """Read an attachment; bytes behind the path are ignored, so that later versions may add to it.
+        """Read an attachment; bytes behind the run are ignored, so that later versions may add to it.
 
         Raises:
             RemoteProtocolError: It is shorter than it says, of another version, or has a name that is none in ROS.
         """
-        raw = memoryview(data)
-        if len(raw) < _HEAD.size:
-            raise RemoteProtocolError(f"an attachment of a site has {len(raw)} bytes; the least are {_HEAD.size + 2}")
-        version, flags, sequence, stamp, md5 = _HEAD.unpack_from(raw)
+        return AttachmentReader().read(data)
+
+
+class AttachmentWriter:
+    """Writes the attachments of one source; all but sequence and stamp is made once.
+
+    Args:
+        md5: The md5 sum of its type, 32 hexadecimal digits.
+        node: Its publisher.
+        path: The sites that its messages passed, with this one.
+        latched: Whether its publisher is latched.
+        run: The run of its exporter; 0: not told.
+    """
+
+    def __init__(self, md5: str, node: str, path: tuple[str, ...], *, latched: bool = False, run: int = 0) -> None:
+        self._flags = _LATCHED if latched else 0
+        self._md5 = bytes.fromhex(md5)
+        told = _RUN.pack(run) if run else b""
+        self._tail = b"".join((_text(node), bytes([len(path)]), *map(_text, path), told))
+
+    def write(self, sequence: int, stamp: int) -> bytes:
+        """The attachment of one message."""
+        return _HEAD.pack(VERSION, self._flags, sequence, stamp, self._md5) + self._tail
+
+
+class AttachmentReader:
+    """Reads the attachments of sources; what is the same in all of one source's is read once."""
+
+    def __init__(self) -> None:
+        self._tails: dict[bytes, tuple[str, tuple[str, ...], int]] = {}
+
+    def read(self, data: Buffer) -> SiteAttachment:
+        """Read an attachment; bytes behind the run are ignored, so that later versions may add to it.
+
+        Raises:
+            RemoteProtocolError: It is shorter than it says, of another version, or has a name that is none in ROS.
+        """
+        if len(data) < _HEAD.size:
+            raise RemoteProtocolError(
+                f"an attachment of a site has {len(data)} bytes; the least are {_HEAD.size + 2}"
+            )
+        version, flags, sequence, stamp, md5 = _HEAD.unpack_from(data)
         if version != VERSION:
             raise RemoteProtocolError(
                 f"an attachment of a site is of version {version}; this gateway reads {VERSION}"
             )
-        node, at = _read(raw, _HEAD.size)
-        if not is_global_name(node):
-            raise RemoteProtocolError(f"an attachment of a site has the node {node[:80]!r}, which is no global name")
-        if at >= len(raw):
-            raise RemoteProtocolError("an attachment of a site ends before its path")
-        count, at = raw[at], at + 1
-        if not 0 < count <= limits.PATH_MAX:
-            raise RemoteProtocolError(f"a message passed {count} sites; 1 to {limits.PATH_MAX} are allowed")
-        path = []
-        for _ in range(count):
-            site, at = _read(raw, at)
-            if peer_name_problem(site) is not None:
-                raise RemoteProtocolError(f"an attachment of a site names the site {site[:80]!r}")
-            path.append(site)
-        return cls(sequence, stamp, md5.hex(), node, tuple(path), bool(flags & _LATCHED))
+        tail = bytes(data[_HEAD.size :])
+        known = self._tails.get(tail)
+        if known is None:
+            known = _read_tail(tail)
+            if len(self._tails) >= _TAILS_KEPT:
+                self._tails.clear()
+            self._tails[tail] = known
+        node, path, run = known
+        return SiteAttachment(sequence, stamp, md5.hex(), node, path, bool(flags & _LATCHED), run)
+
+
+def _read_tail(tail: bytes) -> tuple[str, tuple[str, ...], int]:
+    """Node, path and run."""
+    raw = memoryview(tail)
+    node, at = _read(raw, 0)
+    if not is_global_name(node):
+        raise RemoteProtocolError(f"an attachment of a site has the node {node[:80]!r}, which is no global name")
+    if at >= len(raw):
+        raise RemoteProtocolError("an attachment of a site ends before its path")
+    count, at = raw[at], at + 1
+    if not 0 < count <= limits.PATH_MAX:
+        raise RemoteProtocolError(f"a message passed {count} sites; 1 to {limits.PATH_MAX} are allowed")
+    path = []
+    for _ in range(count):
+        site, at = _read(raw, at)
+        if peer_name_problem(site) is not None:
+            raise RemoteProtocolError(f"an attachment of a site names the site {site[:80]!r}")
+        path.append(site)
+    run = _RUN.unpack_from(raw, at)[0] if len(raw) >= at + _RUN.size else 0
+    return node, tuple(path), run
 
 
 def _text(text: str) -> bytes:

@@ -1,0 +1,264 @@
+"""One topic of ROS 2 in the gateway's graph: a source for each node that publishes it.
+
+All publishers of one topic, type and hash share a key. What comes is given to the node whose publisher's GID is in
+the attachment; a GID that fits no token (plain Zenoh programs choose their own) is given to a publisher without
+messages of its own.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.gateway.neighbour import ForeignSource, SourceKind
+from rmpa.gateway.ros2.attachment import GID_BYTES, Ros2Attachment
+from rmpa.gateway.ros2.conversion import Conversion, ConversionError
+from rmpa.gateway.ros2.crossing import SITE
+from rmpa.gateway.ros2.io.own_nodes import gid_of
+from rmpa.gateway.ros2.qos import Ros2Durability, Ros2Qos
+from rmpa.gateway.ros2.sequences import Ros2Sequences
+from rmpa.gateway.ros2.tokens import EntityKind
+from rmpa.ros.wire.tcpros import TopicDescription
+
+if TYPE_CHECKING:
+    from rmpa.gateway.neighbour import ForeignTopic
+    from rmpa.gateway.ros2.io.own_nodes import OwnEndpoint
+    from rmpa.gateway.ros2.io.part import Ros2Context
+    from rmpa.gateway.ros2.tokens import Ros2Endpoint
+    from rmpa.gateway.sites.rules import CrossingDecision
+    from rmpa.gateway.zenoh_api import Declared, ZenohSample
+
+
+class _Publisher:
+    """What one node publishes of the topic; it may have several publishers of it."""
+
+    def __init__(self, node: str) -> None:
+        self.node: Final = node
+        self.endpoints: list[Ros2Endpoint] = []
+        self.topic: ForeignTopic | None = None
+        self.wanted = False
+        self.kept: bytes | None = None
+        self.received = 0
+        self.dropped = 0
+
+    @property
+    def latched(self) -> bool:
+        return any(each.qos.latched for each in self.endpoints)
+
+
+class Ros2TopicImport:
+    """Shows the publishers of one key, and subscribes to it while a node or module wants one of them.
+
+    Args:
+        context: What the parts share.
+        first: A publisher of the topic.
+        ros1_type: ``package/Name`` of ROS 1.
+        decision: The rule that lets it cross, and its name here.
+    """
+
+    def __init__(self, context: Ros2Context, first: Ros2Endpoint, ros1_type: str, decision: CrossingDecision) -> None:
+        self._context = context
+        self.name: Final = first.name
+        self.type: Final = first.type
+        self.type_hash: Final = first.type_hash
+        self._key = first.key()
+        self._ros1_type = ros1_type
+        self._decision = decision
+        self._publishers: dict[str, _Publisher] = {}
+        self._by_gid: dict[bytes, _Publisher] = {}
+        self._gids: dict[Ros2Endpoint, bytes] = {}
+        self._adopted: dict[bytes, _Publisher] = {}
+        self._conversion: Conversion | None = None
+        self._subscription: Declared | None = None
+        self._endpoint: OwnEndpoint | None = None
+        self._history = False
+        self._sequences = Ros2Sequences()
+        self._failed = 0
+        self.problem = ""
+        """Why its messages do not come; empty for nothing."""
+
+    @property
+    def publishers(self) -> int:
+        """The publishers of ROS 2."""
+        return len(self._gids)
+
+    def add(self, endpoint: Ros2Endpoint) -> None:
+        """A publisher appeared."""
+        node = endpoint.node.name
+        publisher = self._publishers.get(node)
+        if publisher is None:
+            publisher = self._publishers[node] = _Publisher(node)
+        publisher.endpoints.append(endpoint)
+        gid = self._gids[endpoint] = gid_of(endpoint.token())
+        self._by_gid[gid] = publisher
+        if publisher.topic is None:
+            source = ForeignSource(SourceKind.TOPIC, SITE, "", node, self._decision.name, self._ros1_type)
+            shown = publisher  # for the callback
+            publisher.topic = self._context.graph.show_topic(source, lambda wanted: self._demand(shown, wanted))
+        self._describe(publisher)
+        if publisher.latched and not self._history and self._subscription is not None:
+            self._unsubscribe()  # again, with the history
+        self._follow_demand()
+
+    def remove(self, endpoint: Ros2Endpoint) -> None:
+        """A publisher is gone."""
+        publisher = self._publishers.get(endpoint.node.name)
+        gid = self._gids.pop(endpoint, None)
+        if publisher is None or gid is None:
+            return
+        self._by_gid.pop(gid, None)
+        publisher.endpoints.remove(endpoint)
+        self._adopted = {key: each for key, each in self._adopted.items() if each is not publisher}
+        if not publisher.endpoints:
+            del self._publishers[publisher.node]
+            if publisher.topic is not None:
+                publisher.topic.close()
+        self._follow_demand()
+
+    def converted(self, conversion: Conversion | None, problem: str) -> None:
+        """The conversion of its type was found, or why there is none."""
+        self._conversion = conversion
+        self.problem = problem
+        self._context.say(self._subject, problem)
+        for publisher in self._publishers.values():
+            self._describe(publisher)
+        self._follow_demand()
+
+    def close(self) -> None:
+        """Take it out of the gateway's graph."""
+        publishers, self._publishers = self._publishers, {}
+        for publisher in publishers.values():
+            if publisher.topic is not None:
+                publisher.topic.close()
+        self._unsubscribe()
+        self._context.say(self._subject, "")
+
+    def report(self) -> list[dict[str, object]]:
+        """Its state, as JSON values: one row for each node."""
+        common: dict[str, object] = {
+            "direction": "in",
+            "topic": self.name,
+            "here": self._decision.name,
+            "type": self._ros1_type,
+            "ros2_type": self.type,
+            "type_hash": self.type_hash,
+            "rule": self._decision.why,
+            "lost": self._sequences.lost,
+            "repeated": self._sequences.repeated,
+            "unconverted": self._failed,
+        }
+        return [
+            common
+            | {
+                "node": each.node,
+                "publishers": len(each.endpoints),
+                "latched": each.latched,
+                "wanted": each.wanted,
+                "received": each.received,
+                "dropped": each.dropped,
+                "problem": self.problem or (each.topic.problem if each.topic is not None else ""),
+            }
+            for each in self._publishers.values()
+        ]
+
+    # --- demand --------------------------------------------------------------------------------------------------
+
+    def _describe(self, publisher: _Publisher) -> None:
+        if self._conversion is not None and publisher.topic is not None:
+            kind = self._conversion.ros1
+            publisher.topic.describe(
+                TopicDescription(kind.name, kind.md5sum, kind.definition, latching=publisher.latched)
+            )
+
+    def _demand(self, publisher: _Publisher, wanted: bool) -> None:
+        publisher.wanted = wanted
+        kept, publisher.kept = publisher.kept, None
+        if not wanted and publisher.topic is not None:
+            publisher.topic.forget_latched()
+        self._follow_demand()
+        if wanted and kept is not None:  # this key was subscribed to already: its history came then
+            self._deliver(publisher, kept)
+
+    def _follow_demand(self) -> None:
+        wanted = self._conversion is not None and any(each.wanted for each in self._publishers.values())
+        if wanted and self._subscription is None:
+            self._subscribe()
+        elif not wanted:
+            self._unsubscribe()
+
+    def _subscribe(self) -> None:
+        context = self._context
+        self._history = any(each.latched for each in self._publishers.values())
+        durability = Ros2Durability.TRANSIENT_LOCAL if self._history else Ros2Durability.VOLATILE
+        self._subscription = context.session.subscribe(self._key, self._sample, history=self._history)
+        self._endpoint = context.nodes.declare(
+            context.nodes.own_name,
+            EntityKind.SUBSCRIPTION,
+            self.name,
+            self.type,
+            self.type_hash,
+            Ros2Qos(durability=durability),
+        )
+
+    def _unsubscribe(self) -> None:
+        if self._subscription is not None:
+            self._subscription.close()
+            self._subscription = None
+        if self._endpoint is not None:
+            self._endpoint.close()
+            self._endpoint = None
+        self._sequences.forget()
+        self._adopted.clear()
+        for publisher in self._publishers.values():
+            publisher.kept = None
+
+    # --- messages ------------------------------------------------------------------------------------------------
+
+    def _sample(self, sample: ZenohSample) -> None:
+        gid = b""
+        if sample.attachment:
+            try:
+                attachment = Ros2Attachment.parse(sample.attachment)
+            except RemoteProtocolError as error:
+                self._fail(str(error))
+                return
+            gid = attachment.gid
+            if gid in self._context.nodes.gids or not self._sequences.accept(attachment, history=self._history):
+                return
+        publisher = self._by_gid.get(gid[:GID_BYTES]) or self._adopted.get(gid) or self._adopt(gid)
+        if publisher is None:
+            return
+        if publisher.wanted:
+            self._deliver(publisher, sample.payload)
+        elif publisher.latched:
+            publisher.kept = sample.payload
+
+    def _adopt(self, gid: bytes) -> _Publisher | None:
+        """The publisher of a GID that is of no token: one that has none yet, else the first."""
+        taken = {id(each) for each in self._adopted.values()}
+        free = (each for each in self._publishers.values() if id(each) not in taken)
+        found = next(free, None) or next(iter(self._publishers.values()), None)
+        if found is not None and len(self._adopted) < len(self._gids):
+            self._adopted[gid] = found
+        return found
+
+    def _deliver(self, publisher: _Publisher, payload: bytes) -> None:
+        conversion, topic = self._conversion, publisher.topic
+        if conversion is None or topic is None:
+            return
+        try:
+            body = conversion.to_ros1(payload)
+        except ConversionError as error:
+            self._fail(str(error))
+            return
+        publisher.received += 1
+        publisher.dropped += topic.publish(body)
+
+    def _fail(self, text: str) -> None:
+        self._failed += 1
+        if self._failed == 1:
+            self._context.say(self._subject, text)
+
+    @property
+    def _subject(self) -> str:
+        return f"{self.name} of ROS 2 ({self.type})"
