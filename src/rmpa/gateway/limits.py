@@ -184,6 +184,6 @@ ROS2_ACTIONS_MAX: Final = 500
 ROS2_GOAL_TIMEOUT: Final = 86_400.0
 """Seconds of one goal of an action at a server of ROS 2: a day. A server that dies ends its goals at once."""
 ROS2_LAST_RESULTS: Final = 1.0
-"""Seconds for which an action's topics stay in ROS 1's graph once its server is gone, so that the last results leave."""
+"""Seconds for which an action's topics stay in ROS 1's graph once its server is gone: its last results leave."""
 ROS2_ACTION_READY: Final = 5.0
 """Seconds for an action server of ROS 1 to connect to the gateway's topics; then a goal is refused."""
