@@ -26,5 +26,5 @@ def gateway_options(name: str, router_port: int) -> list[str]:
     """The options of ``rmpa gateway`` for the router or a site's gateway, without those of the mesh."""
     endpoint = f"tcp/127.0.0.1:{router_port}"
     if name == ROUTER:
-        return ["--router", "--listen", endpoint, "--insecure"]
-    return ["--site", GATEWAYS[name], "--connect", endpoint, "--insecure"]
+        return ["--router", "--listen", endpoint]
+    return ["--site", GATEWAYS[name], "--connect", endpoint]

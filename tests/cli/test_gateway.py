@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from typing import TYPE_CHECKING
 
@@ -67,6 +68,8 @@ def test_without_a_name_it_is_the_hosts(tmp_path: Path) -> None:
         (("--ros2",), "add --connect, such as tcp/localhost:7447 for rmw_zenohd here"),
         (("--router",), "a router that listens nowhere; add --listen"),
         (("--site", "ros2", "--connect", "tcp/a:1"), "--site: ros2 is reserved"),
+        (("--site", "a", "zenoh-config"), "--site: stands before zenoh-config"),
+        (("zenoh-conf",), "Did you mean zenoh-config?"),
         (("--site", "a", "--connect", "fleet:7447"), "did you mean --connect tls/fleet:7447?"),
     ],
 )
@@ -95,3 +98,17 @@ def test_help_shows_all_options_and_needs_no_library(place: Place, tmp_path: Pat
     assert code == 0, err
     for option in ("--site", "--connect", "--listen", "--router", "--rank", "--insecure", "--ros2-domain", "--seed"):
         assert option in out
+    assert "zenoh-config" in out
+
+
+def test_a_configuration_for_zenohd_is_printed(place: Place) -> None:
+    zenoh = pytest.importorskip("zenoh", reason="the libraries of rmpa[zenoh] are not installed")
+    code, _, err = place.run("gateway", "zenoh-config", "--name", "fleet")
+    assert code == 1
+    assert "rmpa trust" in err
+    assert "--insecure" in err
+    code, out, err = place.run("gateway", "zenoh-config", "--listen", "tcp/0.0.0.0:7448", "--insecure")
+    assert code == 0, err
+    config = zenoh.Config.from_json5(out)
+    assert json.loads(config.get_json("listen/endpoints")) == ["tcp/0.0.0.0:7448"]
+    assert json.loads(config.get_json("mode")) == "router"

@@ -13,8 +13,6 @@ import pytest
 from rmpa.config.gateway_rules import Crossing, CrossingRule, GatewaySettings
 from rmpa.core.errors import StartError
 from rmpa.gateway.gateway import Gateway
-from rmpa.gateway.joining import zenoh_config
-from rmpa.gateway.zenoh.config import ZenohMode
 from rmpa.observe.io.control_client import ControlClient
 from tests.agent.conftest import pytest_asyncio_loop_factories
 from tests.agent.test_agent import settings, until
@@ -153,12 +151,3 @@ async def test_a_session_is_closed_if_the_agent_cannot_start(settings: Callable[
         with pytest.raises(StartError):
             await second.gateway.start()
         assert second.events == ["session closed"]
-
-
-def test_without_certificates_only_this_machine_is_joined_unless_it_is_said() -> None:
-    assert zenoh_config(CONNECT).mode is ZenohMode.CLIENT
-    far = GatewaySettings(listen=("tcp/0.0.0.0:7447",))
-    with pytest.raises(StartError, match="--insecure"):
-        zenoh_config(far)
-    assert zenoh_config(replace(far, insecure=True)).mode is ZenohMode.PEER
-    assert zenoh_config(replace(far, insecure=True, router=True)).mode is ZenohMode.ROUTER

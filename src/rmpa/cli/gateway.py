@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
+from rmpa.cli.lazy_group import LazyGroup
 from rmpa.cli.setting_options import config_option, setting_options
 from rmpa.config.settings import WebSettings
 from rmpa.config.sources import load_settings
@@ -33,6 +34,9 @@ _LIBRARIES: Final = {"zenoh": "eclipse-zenoh", "xxhash": "xxhash"}
 _OF_THE_AGENT: Final = ("core_mode", "core_master", "core_fresh", "web.enabled")
 """Settings whose options a gateway has not: its core is its own, and only for its proxies."""
 _SUFFIX: Final = "_gateway"
+COMMANDS: Final = {
+    "zenoh-config": ("rmpa.cli.zenoh_config", "Print a configuration for zenohd, Zenoh's own router."),
+}
 EPILOG = """\
 \b
 The gateway is a peer of the mesh with a core of its own, beside this machine's agent. It reads the same rmpa.toml and
@@ -58,7 +62,7 @@ _options = setting_options(
 )
 
 
-@click.group(epilog=EPILOG, invoke_without_command=True)
+@click.group(cls=LazyGroup, commands_at=COMMANDS, epilog=EPILOG, invoke_without_command=True)
 @_options
 @config_option
 @click.pass_context

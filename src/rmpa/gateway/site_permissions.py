@@ -1,8 +1,8 @@
 """What other sites may do here, by ``[[permission]]``: the rules of the module that the gateway is.
 
-Zenoh proves which gateway is connected, but not which site or module a message is of. So a site has the permissions of
-a module with the site's name, and a denial of the module that it names holds on top: a rule that allows something to
-the module ``arm`` of this site allows nothing to one that is named so elsewhere.
+Zenoh proves which gateway is connected, but not which site or module a message is of. So a site has the permissions
+of a module with the site's name, and a denial of the module that it names holds on top: a rule that allows something
+to the module ``arm`` of this site allows nothing to one that is named so elsewhere.
 """
 
 from __future__ import annotations
