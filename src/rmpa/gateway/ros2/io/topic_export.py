@@ -57,10 +57,13 @@ class Ros2TopicExport:
         self._limit = TopicLimits(decision.rate, decision.size)
         self._latching = False
         self._tap: Tap | None = None
+        self._opening = False
         self._publisher: ZenohPublisher | None = None
         self._endpoint: OwnEndpoint | None = None
         self._conversion: Conversion | None = None
-        self._wanted = self._was_wanted = False
+        self._matched = False
+        self._subscribed = False
+        self._was_wanted = False
         self._closed = False
         self._sequence = 0
         self._sent_before = 0
@@ -158,11 +161,23 @@ class Ros2TopicExport:
             self._dropped_before += publisher.dropped
             publisher.close()
 
+    def subscribed(self, *, there: bool) -> None:
+        """Tokens of subscriptions to its key are there, or none: a first one is seen before Zenoh has matched it."""
+        self._subscribed = there
+        self._follow_demand()
+
     def _matching(self, *, there: bool) -> None:
-        if self._closed:
+        self._matched = there
+        self._follow_demand()
+
+    @property
+    def _wanted(self) -> bool:
+        return self._matched or self._subscribed
+
+    def _follow_demand(self) -> None:
+        if self._closed or self._endpoint is None:
             return
-        self._wanted = there
-        if there:
+        if self._wanted:
             self._was_wanted = True
             self._open_tap()
         elif not self._keeps:
@@ -176,8 +191,10 @@ class Ros2TopicExport:
         return self._was_wanted and self._endpoint is not None and self._endpoint.endpoint.qos.latched
 
     def _open_tap(self) -> None:
-        if self._tap is None:
+        if self._tap is None and not self._opening:
+            self._opening = True
             self._tap = self._context.graph.tap(self.source, self._message, self._described, self._lost)
+            self._opening = False
 
     def _close_tap(self) -> None:
         tap, self._tap = self._tap, None
