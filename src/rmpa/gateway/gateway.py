@@ -17,6 +17,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.graph.own_graph import AgentGraph
 from rmpa.gateway.joining import make_neighbours, open_gateway_session
 from rmpa.gateway.zenoh_api import ZenohSession
+from rmpa.observe.control import GATEWAY_ROLE, ROLE
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator, Mapping
@@ -68,7 +69,7 @@ class Gateway:
         self.agent = Agent(self._settings, requests, load)
         self.graph = AgentGraph(self.agent, self._settings)
         self.agent.bridge.add(self.graph)
-        self.agent.add_operations({REPORT: lambda _: self.report()})
+        self.agent.add_operations({REPORT: lambda _: self.report(), ROLE: lambda _: GATEWAY_ROLE})
         self.agent.other_notes.append(self._notes)
         self.session: OwnedSession | None = None
         """The session; ``None`` until it is open."""
