@@ -61,9 +61,7 @@ class Ros2TopicExport:
         self._publisher: ZenohPublisher | None = None
         self._endpoint: OwnEndpoint | None = None
         self._conversion: Conversion | None = None
-        self._matched = False
-        self._subscribed = False
-        self._was_wanted = False
+        self._wanted = self._was_wanted = False
         self._closed = False
         self._sequence = 0
         self._sent_before = 0
@@ -128,7 +126,7 @@ class Ros2TopicExport:
     # --- in ROS 2's graph ----------------------------------------------------------------------------------------
 
     def _declare(self, type_name: str, type_hash: str) -> None:
-        """Declare the publisher before its token, so that it is ready once it is seen."""
+        """Declare it, or declare it anew with another type or QoS; messages that wait are sent before."""
         context, source = self._context, self.source
         contract = context.contracts.of(source.name, source.type)
         qos = ros2_qos(context.contracts, source.name, source.type, latching=self._latching)
@@ -161,23 +159,12 @@ class Ros2TopicExport:
             self._dropped_before += publisher.dropped
             publisher.close()
 
-    def subscribed(self, *, there: bool) -> None:
-        """Tokens of subscriptions to its key are there, or none: a first one is seen before Zenoh has matched it."""
-        self._subscribed = there
-        self._follow_demand()
-
     def _matching(self, *, there: bool) -> None:
-        self._matched = there
-        self._follow_demand()
-
-    @property
-    def _wanted(self) -> bool:
-        return self._matched or self._subscribed
-
-    def _follow_demand(self) -> None:
+        """Zenoh's matching tells of demand, not the tokens of subscriptions: what is sent before it is lost."""
         if self._closed or self._endpoint is None:
             return
-        if self._wanted:
+        self._wanted = there
+        if there:
             self._was_wanted = True
             self._open_tap()
         elif not self._keeps:

@@ -105,13 +105,6 @@ class Ros2Topics:
         if self._context is not None:
             for other in list(self._context.ros2.at(export.source.here, *_TOPIC_ENDS)):
                 self._compare(export, other)
-            self._follow_subscriptions(export)
-
-    def _follow_subscriptions(self, export: Ros2TopicExport) -> None:
-        if self._context is not None and export.endpoint is not None:
-            key = export.endpoint.endpoint.key()
-            subscriptions = self._context.ros2.at(export.source.here, EntityKind.SUBSCRIPTION)
-            export.subscribed(there=any(each.key() == key for each in subscriptions))
 
     def _compare(self, export: Ros2TopicExport, other: Ros2Endpoint) -> None:
         if self._context is not None and export.endpoint is not None:
@@ -130,11 +123,8 @@ class Ros2Topics:
             return False
         if not there:
             self._context.say(f"{endpoint.name} of {endpoint.node.name}", "")
-        for export in self._exports_named.get(endpoint.name, {}).values():
-            if there:
-                self._compare(export, endpoint)
-            if endpoint.kind is EntityKind.SUBSCRIPTION:
-                self._follow_subscriptions(export)
+        for export in self._exports_named.get(endpoint.name, {}).values() if there else ():
+            self._compare(export, endpoint)
         if endpoint.kind is EntityKind.PUBLISHER and not _hidden(endpoint.name):
             (self._publisher_there if there else self._publisher_gone)(endpoint)
         return True
