@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.core.sizes import MIB
+from rmpa.core.sizes import KIB, MIB
 
 KEY_MAX: Final = 2048
 """Characters of a key expression or a liveliness token that another site or a ROS 2 node sent. Longer ones are not
@@ -57,6 +57,27 @@ LATCH_LOOKS_AT_ONCE: Final = 2
 """Publishers that are asked that at once: each opens a route in the mesh for a moment."""
 VALUE_HEADER_MAX: Final = 1 * MIB
 """Bytes of the header of another site's last value: most of it is the definition of its type."""
+SITES_REMEMBERED_MAX: Final = 256
+"""Sites that are remembered as unreachable; those that left first are forgotten first."""
+SITE_REPORT_SOURCES_MAX: Final = 5000
+"""Topics and services of one site in ``rmpa site info``: some 2 MB of JSON."""
+VALUE_PORTION: Final = 256 * KIB
+"""Bytes of a last value in one message to a module that asks for it: 20 ms on a 100 Mbit/s link."""
+VALUE_READING_IDLE: Final = 60.0
+"""Seconds for which a last value that is read in portions is kept without another question for it."""
+SITE_ASK_TIMEOUT: Final = 5.0
+"""Seconds for a question to another site's gateway."""
+SITE_PARAMS_AT_ONCE: Final = 256
+"""Questions of other sites about parameters that are answered at once, and parameters of other sites that modules
+here may follow."""
+SITE_PARAM_BYTES_MAX: Final = 64 * MIB
+"""Bytes of one question or answer about parameters between gateways: some of the largest values."""
+SITE_PARAM_TRANSFERS_MAX: Final = 64
+"""Modules of other sites whose parameters are read or written in portions at once."""
+SITE_FOLLOW_INTERVAL: Final = 1.0
+"""Seconds between questions for followed parameters of other sites: one question for each module."""
+SITE_PARAM_TIMEOUT: Final = 20.0
+"""Seconds for a question about a parameter to another site: less than the module that asks waits for this gateway."""
 LAST_VALUES_RETRY_MAX: Final = 30.0
 """Seconds between attempts to write to a disk that takes nothing."""
 SITE_NAME_MAX: Final = 63
@@ -112,6 +133,9 @@ HELD_MESSAGES_MAX: Final = 1000
 """Messages that wait at the receiver for the publisher's header; above it the oldest is dropped, and counted."""
 HELD_BYTES: Final = 64 * 1024 * 1024
 """Bytes that wait likewise; one message always fits."""
+LATCHED_NODES_MAX: Final = 64
+"""Nodes that publish one latched topic of another site, and of which no node here wants one, whose last message is
+kept."""
 DEMAND_LINGER: Final = 1.0
 """Seconds for which a topic of another site stays subscribed after its last subscriber left, as in the mesh."""
 LIMIT_BURST: Final = 0.5
@@ -144,3 +168,22 @@ OPEN_RETRY_FIRST: Final = 0.5
 """Seconds until a session is opened again, at first, whose router did not answer."""
 OPEN_RETRY_MAX: Final = 5.0
 """The longest time in seconds between two attempts to open a session."""
+ROS2_GOALS_MAX: Final = 1000
+"""Goals of one action that are known at one time, each way; the next one is rejected."""
+ROS2_GOAL_KEPT: Final = 5.0
+"""Seconds for which a goal that has ended stays in the status of ROS 1; actionlib's ``status_list_timeout``."""
+ROS2_RESULT_KEPT: Final = 60.0
+"""Seconds for which a client of ROS 2 may ask for the result of a goal that has ended; rcl's default is 10."""
+ROS2_STATUS_PERIOD: Final = 0.2
+"""Seconds between two messages of an action's status in ROS 1; actionlib's ``status_frequency`` is 5 Hz, and its
+clients count a server as lost after 5 s without one."""
+ROS2_ACCEPT_TIMEOUT: Final = 10.0
+"""Seconds for an action server of ROS 1 to show a goal in its status; then the goal counts as not accepted."""
+ROS2_ACTIONS_MAX: Final = 500
+"""Actions that are joined, each way; the others are reported."""
+ROS2_GOAL_TIMEOUT: Final = 86_400.0
+"""Seconds of one goal of an action at a server of ROS 2: a day. A server that dies ends its goals at once."""
+ROS2_LAST_RESULTS: Final = 1.0
+"""Seconds for which an action's topics stay in ROS 1's graph once its server is gone: its last results leave."""
+ROS2_ACTION_READY: Final = 5.0
+"""Seconds for an action server of ROS 1 to connect to the gateway's topics; then a goal is refused."""
