@@ -159,6 +159,13 @@ ROS2_CALLS_MAX: Final = 64
 """Calls of one service that are under way at one time, each way; the next one gets an error."""
 ROS2_DESCRIBE_AGAIN: Final = (0.5, 30.0)
 """Seconds until a service that could not be asked for its type is asked again: at first, and at most; it doubles."""
+ROS2_LINGER: Final = 5.0
+"""Seconds for which a topic of ROS 2 that is wanted stays subscribed after a publisher came or went: messages of a
+publisher that restarts are held until nodes have subscribed to it anew, which takes a module some 0.1 s."""
+ROS2_EARLY_MESSAGES: Final = 1000
+"""Messages of one topic of ROS 2 that are held so; the oldest are dropped, and counted as unheard."""
+ROS2_EARLY_BYTES: Final = 16 * 1024 * 1024
+"""Bytes of these."""
 ROS2_PUBLISHERS_MAX: Final = 1000
 """Publishers of one topic of ROS 2 whose sequence numbers are followed; the one silent for longest is forgotten."""
 ROS2_SERVICE_WAIT: Final = 3.0
