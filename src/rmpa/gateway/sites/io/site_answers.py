@@ -57,7 +57,7 @@ class SiteAnswers:
         history: Since when sites are there or away.
         endpoints: The Zenoh endpoints that the session is connected to.
         ask_param: Asks a module of another site about a parameter: site, module, question, arguments.
-        why: The ways of a topic or a service through this gateway: name, site, module, whether a service.
+        why: The ways of a topic or a service through this gateway: name, site, module, who asks, whether a service.
         stamp: The wall clock, nanoseconds since 1970.
     """
 
@@ -70,7 +70,7 @@ class SiteAnswers:
         history: SiteHistory,
         endpoints: Callable[[], tuple[str, ...]],
         ask_param: Callable[[str, str, str, dict[str, Any]], Awaitable[object]],
-        why: Callable[[str, str, str, bool], Awaitable[list[Diagnosis]]],
+        why: Callable[[str, str, str, str, bool], Awaitable[list[Diagnosis]]],
         stamp: Callable[[], int],
     ) -> None:
         self._gateway = gateway
@@ -96,8 +96,8 @@ class SiteAnswers:
         if what == REPORT:
             return self._report(self._site_names(), sources=False)
         if what == WHY:
-            name, site, module = (str(args.get(key) or "") for key in ("name", "site", "module"))
-            return await self._why(name, site, module, args.get("service") is True)
+            name, site, module, asker = (str(args.get(key) or "") for key in ("name", "site", "module", "asker"))
+            return await self._why(name, site, module, asker, args.get("service") is True)
         site = str(args.get("site", ""))
         if what == INFO:
             known = self._site_names()
