@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rmpa.core.clock import Clock
     from rmpa.core.contract import Contracts
     from rmpa.gateway.neighbour import OwnGraph
-    from rmpa.gateway.sites.io.exported_topic import OnValue
+    from rmpa.gateway.sites.attachment import SiteAttachment
     from rmpa.gateway.sites.keys import SiteModule
     from rmpa.gateway.sites.part import SiteExport, SiteImport
     from rmpa.gateway.sites.rules import CrossingRules
@@ -34,6 +34,8 @@ class _Subscription:
     declared: Declared
     topics: dict[str, ImportedTopic] = field(default_factory=dict)
     """By node."""
+    latched: dict[str, tuple[bytes, SiteAttachment]] = field(default_factory=dict)
+    """The last latched message of nodes that are not wanted: they were told once, and would not be again."""
 
 
 class SiteTopics:
@@ -46,7 +48,6 @@ class SiteTopics:
         rules: Tell which site may have which topic.
         contracts: The contracts of topics, which become Zenoh's QoS.
         clock: Both clocks.
-        on_value: Called with each message that goes out: entry, description, body, wall clock in nanoseconds.
     """
 
     name = "topics"
@@ -59,7 +60,6 @@ class SiteTopics:
         rules: CrossingRules,
         contracts: Contracts,
         clock: Clock,
-        on_value: OnValue | None = None,
     ) -> None:
         self._site = site
         self._graph = graph
@@ -67,7 +67,6 @@ class SiteTopics:
         self._rules = rules
         self._contracts = contracts
         self._clock = clock
-        self._on_value = on_value
         self._exported: dict[tuple[str, str], dict[str, ExportedTopic]] = {}
         """By module and topic, then by node."""
         self._imported: dict[tuple[str, str, str, str], ImportedTopic] = {}
@@ -77,7 +76,7 @@ class SiteTopics:
         self._reader = AttachmentReader()
         self._check_timer: asyncio.TimerHandle | None = None
         self.counters = Counters()
-        """``site.message.malformed``, ``site.message.looped``, ``site.message.unknown_node``."""
+        """``site.message.malformed``, ``site.message.looped``, ``site.message.unwanted_node``."""
 
     # --- SitePart -------------------------------------------------------------------------------------------------
 
@@ -88,9 +87,7 @@ class SiteTopics:
         self.withdraw(entry)
         contract = self._contracts.of(entry.source.here, entry.announced.type)
         nodes = self._exported.setdefault((entry.source.module, entry.source.name), {})
-        nodes[entry.source.node] = ExportedTopic(
-            entry, self._graph, self._session, contract, self._clock, self._on_value
-        )
+        nodes[entry.source.node] = ExportedTopic(entry, self._graph, self._session, contract, self._clock)
 
     def withdraw(self, entry: SiteExport) -> None:
         """Undeclare it."""
@@ -170,6 +167,9 @@ class SiteTopics:
                 subscription = self._subscriptions[key] = _Subscription(declared)
             subscription.topics[announced.node] = topic
             self._check_later()
+            known = subscription.latched.pop(announced.node, None)
+            if known is not None:
+                topic.take(*known)
         elif subscription is not None:
             subscription.topics.pop(announced.node)
             if not subscription.topics:
@@ -186,11 +186,16 @@ class SiteTopics:
             self.counters.add("site.message.looped")
             return
         subscription = self._subscriptions.get(key)
-        topic = subscription.topics.get(attachment.node) if subscription is not None else None
-        if topic is None:
-            self.counters.add("site.message.unknown_node")
+        if subscription is None:
             return
-        topic.take(sample.payload, attachment)
+        topic = subscription.topics.get(attachment.node)
+        if topic is not None:
+            topic.take(sample.payload, attachment)
+            return
+        self.counters.add("site.message.unwanted_node")
+        known = subscription.latched
+        if attachment.latched and (attachment.node in known or len(known) < limits.LATCHED_NODES_MAX):
+            known[attachment.node] = sample.payload, attachment
 
     def _check_later(self) -> None:
         if self._check_timer is None and self._subscriptions:
