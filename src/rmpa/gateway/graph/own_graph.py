@@ -97,6 +97,11 @@ class AgentGraph(Part):
     # --- neighbour.OwnGraph -----------------------------------------------------------------------------------
 
     @property
+    def agent(self) -> Agent:
+        """The gateway's agent."""
+        return self._agent
+
+    @property
     def name(self) -> str:
         """The gateway's name among its peers."""
         return self._name
