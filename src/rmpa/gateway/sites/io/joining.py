@@ -12,8 +12,10 @@ from rmpa.bridge.policy import Policy
 from rmpa.bridge.services.rules import ServiceRules
 from rmpa.core.errors import UnreachableError
 from rmpa.gateway import limits
+from rmpa.gateway.graph.own_graph import AgentGraph
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.sites.history import SiteHistory
+from rmpa.gateway.sites.io.action_part import SiteActions
 from rmpa.gateway.sites.io.last_value_store import LastValueStore
 from rmpa.gateway.sites.io.last_values_part import SiteLastValues
 from rmpa.gateway.sites.io.neighbour import SiteNeighbour
@@ -77,6 +79,8 @@ def make_site_neighbour(
     ]
     own = SiteGateway(gateway.site, gateway.rank, secrets.token_hex(16))
     neighbour = SiteNeighbour(graph, session, own, rules, parts)
+    if isinstance(graph, AgentGraph):
+        neighbour.add(SiteActions(graph.attend))
     if agent is not None:
         _add_questions(neighbour, agent, session, own, rules, history, clock, settings.name)
     return neighbour
