@@ -124,33 +124,13 @@ class AgentGraph(Part):
         on_message: Callable[[memoryview], None],
         on_described: Callable[[TopicDescription], None],
         on_lost: Callable[[str], None],
+        *,
+        listener: str = "",
     ) -> TopicTap:
         """Subscribe to a local topic; see ``neighbour.OwnGraph.tap``."""
-        return self._tap(source, TAP_NODE, on_message, on_described, on_lost)
-
-    def attend(self, source: MeshSource, listener: ForeignSource) -> TopicTap:
-        """Listen under the name that a foreign node has here, and drop what comes.
-
-        Publishers of actions accept a server by the name of its connections; see ``bridge.topics.audience``.
-
-        Args:
-            source: The topic.
-            listener: A source of the node that listens to it.
-        """
-        _, (_, _, name) = self._place(listener)
-        return self._tap(source, name, lambda _: None, lambda _: None, lambda _: None)
-
-    def _tap(
-        self,
-        source: MeshSource,
-        caller_id: str,
-        on_message: Callable[[memoryview], None],
-        on_described: Callable[[TopicDescription], None],
-        on_lost: Callable[[str], None],
-    ) -> TopicTap:
         tap = TopicTap(
             source,
-            caller_id,
+            listener or TAP_NODE,
             self._node.next_number,
             self._bridge.proxy_nodes.publication,
             on_message=on_message,
@@ -164,6 +144,18 @@ class AgentGraph(Part):
             self._register_subscriber(source.here)
         tap.follow(self._core.publishers(source.here).get(source.proxy, ""))
         return tap
+
+    def attend(self, source: MeshSource, listener: ForeignSource) -> TopicTap:
+        """Listen under the name that a foreign node has here, and drop what comes.
+
+        Publishers of actions accept a server by the name of its connections; see ``bridge.topics.audience``.
+
+        Args:
+            source: The topic.
+            listener: A source of the node that listens to it.
+        """
+        _, (_, _, name) = self._place(listener)
+        return self.tap(source, lambda _: None, lambda _: None, lambda _: None, listener=name)
 
     async def describe(self, source: MeshSource) -> ServiceDescription:
         """Ask a local service for its type."""
