@@ -110,6 +110,11 @@ def test_an_action_runs_at_the_other_site(joined: JoinedModules) -> None:
         done = client.wait_event("done", LONG, since=since)
         assert (done["state"], done["result"]) == ("SUCCEEDED", 10)
         assert len(client.events("feedback", since=since)) == 10
+        since = client.mark_events()
+        client.tell("send 100000")
+        client.wait_event("feedback", LONG, since=since)
+        client.tell("cancel")
+        assert client.wait_event("done", LONG, since=since)["state"] == "PREEMPTED"
 
 
 def test_nothing_crosses_without_a_subscriber(joined: JoinedModules) -> None:

@@ -65,6 +65,8 @@ VALUE_PORTION: Final = 256 * KIB
 """Bytes of a last value in one message to a module that asks for it: 20 ms on a 100 Mbit/s link."""
 VALUE_READING_IDLE: Final = 60.0
 """Seconds for which a last value that is read in portions is kept without another question for it."""
+SITE_ACTIONS_MAX: Final = 1024
+"""Connections under the names of other sites' action servers: two for each pair of a client and a server."""
 SITE_ASK_TIMEOUT: Final = 5.0
 """Seconds for a question to another site's gateway."""
 SITE_PARAMS_AT_ONCE: Final = 256
