@@ -34,6 +34,7 @@ from rmpa.observe.io.graph_revision import GraphRevisions
 from rmpa.observe.io.peer_clocks import PeerClocks
 from rmpa.observe.io.peer_credentials import control_access
 from rmpa.observe.io.runtime_dir import runtime_dir
+from rmpa.observe.io.site_requests import SiteRequests
 from rmpa.observe.io.snapshot_builder import SnapshotBuilder, SnapshotSources
 from rmpa.observe.why.io.why import WhyService
 from rmpa.ros.node.logger_services import LoggerServices
@@ -147,6 +148,8 @@ class Agent:
         self._nodes = NodeRequests(settings, self.core, self.bridge.rpc, self.bridge.gate)
         AgentRequests(self.bridge.rpc, self.snapshots)
         self._why = WhyService(settings, self.core, self.bridge, self.services, self.snapshots)
+        self.sites = SiteRequests(self.bridge.rpc, self.bridge.sessions.linked)
+        """Answers questions about other sites; a gateway answers them itself."""
         self.operations = ControlOperations(
             settings.name,
             self.bridge,
@@ -157,6 +160,7 @@ class Agent:
             GraphRevisions(self.core, rows=settings.core_mode == "embedded"),
             self._trust_operations(),
             self._nodes,
+            self.sites,
         )
         self._control = ControlServer(
             runtime_dir(os.environ, settings.runtime_dir),

@@ -37,6 +37,7 @@ COMMANDS = {
     "profile": (_GROUPS, "See and choose the System Profile of a resource."),
     "context": (_GROUPS, "See and choose the context of a resource."),
     "alarm": (_GROUPS, "See the alarms of resources."),
+    "site": (_GROUPS, "See other sites that gateways join, and values of modules that are off."),
     "trust": (_GROUPS, "Secure the mesh: who may join, and what other modules may do here."),
     "why": ("rmpa.cli.why", "Say why a topic of a peer does not arrive, and what to do."),
     "doctor": ("rmpa.cli.doctor", "Check this machine: network, clock, rights, ROS environment."),

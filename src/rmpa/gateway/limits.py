@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.core.sizes import MIB
+from rmpa.core.sizes import KIB, MIB
 
 KEY_MAX: Final = 2048
 """Characters of a key expression or a liveliness token that another site or a ROS 2 node sent. Longer ones are not
@@ -57,6 +57,27 @@ LATCH_LOOKS_AT_ONCE: Final = 2
 """Publishers that are asked that at once: each opens a route in the mesh for a moment."""
 VALUE_HEADER_MAX: Final = 1 * MIB
 """Bytes of the header of another site's last value: most of it is the definition of its type."""
+SITES_REMEMBERED_MAX: Final = 256
+"""Sites that are remembered as unreachable; those that left first are forgotten first."""
+SITE_REPORT_SOURCES_MAX: Final = 5000
+"""Topics and services of one site in ``rmpa site info``: some 2 MB of JSON."""
+VALUE_PORTION: Final = 256 * KIB
+"""Bytes of a last value in one message to a module that asks for it: 20 ms on a 100 Mbit/s link."""
+VALUE_READING_IDLE: Final = 60.0
+"""Seconds for which a last value that is read in portions is kept without another question for it."""
+SITE_ASK_TIMEOUT: Final = 5.0
+"""Seconds for a question to another site's gateway."""
+SITE_PARAMS_AT_ONCE: Final = 256
+"""Questions of other sites about parameters that are answered at once, and parameters of other sites that modules
+here may follow."""
+SITE_PARAM_BYTES_MAX: Final = 64 * MIB
+"""Bytes of one question or answer about parameters between gateways: some of the largest values."""
+SITE_PARAM_TRANSFERS_MAX: Final = 64
+"""Modules of other sites whose parameters are read or written in portions at once."""
+SITE_FOLLOW_INTERVAL: Final = 1.0
+"""Seconds between questions for followed parameters of other sites: one question for each module."""
+SITE_PARAM_TIMEOUT: Final = 20.0
+"""Seconds for a question about a parameter to another site: less than the module that asks waits for this gateway."""
 LAST_VALUES_RETRY_MAX: Final = 30.0
 """Seconds between attempts to write to a disk that takes nothing."""
 SITE_NAME_MAX: Final = 63

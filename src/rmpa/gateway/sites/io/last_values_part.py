@@ -105,6 +105,8 @@ class SiteLastValues:
 
     def withdraw(self, entry: SiteExport) -> None:
         """End listening; the value stays."""
+        if entry.source.kind is not SourceKind.TOPIC:
+            return
         key = _key(entry.source)
         watched = self._watched.pop(key, None)
         if watched is not None and watched.tap is not None:
