@@ -133,6 +133,9 @@ HELD_MESSAGES_MAX: Final = 1000
 """Messages that wait at the receiver for the publisher's header; above it the oldest is dropped, and counted."""
 HELD_BYTES: Final = 64 * 1024 * 1024
 """Bytes that wait likewise; one message always fits."""
+LATCHED_NODES_MAX: Final = 64
+"""Nodes that publish one latched topic of another site, and of which no node here wants one, whose last message is
+kept."""
 DEMAND_LINGER: Final = 1.0
 """Seconds for which a topic of another site stays subscribed after its last subscriber left, as in the mesh."""
 LIMIT_BURST: Final = 0.5

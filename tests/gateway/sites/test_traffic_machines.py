@@ -52,6 +52,21 @@ def test_a_loss_at_the_end_is_seen_once_the_exporter_tells_its_number() -> None:
     assert counter.lost == 2
 
 
+def test_what_is_lost_before_the_first_message_counts_from_what_the_exporter_had_sent() -> None:
+    counter = SequenceCounter()
+    counter.announced(7, 10)
+    assert counter.lost == 0
+    counter.announced(7, 12)
+    assert counter.lost == 2
+    counter.take(7, 14)
+    assert counter.lost == 3
+    counter.restart()
+    counter.announced(7, 20)
+    assert counter.take(7, 19), "it was on its way while the exporter answered"
+    assert counter.take(7, 20)
+    assert counter.lost == 3
+
+
 @given(st.lists(st.booleans(), min_size=1), st.integers(0, 5))
 def test_everything_that_is_sent_is_received_or_counted(kept: list[bool], first: int) -> None:
     counter = SequenceCounter()

@@ -13,6 +13,7 @@ class SequenceCounter:
         self._run: int | None = None
         self._last = 0
         self._announced = 0
+        self._expects_first = False
         self._gaps = 0
         self.received = 0
         """Messages that were new."""
@@ -37,24 +38,28 @@ class SequenceCounter:
         if run != self._run:
             self._settle()
             self._run, self._announced = run, sequence
+        elif self._expects_first:
+            self._gaps += max(0, sequence - self._last - 1)
         elif sequence <= self._last:
             self.old += 1
             return False
         else:
             self._gaps += sequence - self._last - 1
-        self._last = sequence
+        self._last, self._expects_first = sequence, False
         self.received += 1
         return True
 
     def announced(self, run: int, sequence: int) -> None:
-        """The exporter says how many messages it has sent; without a message of this run it means nothing."""
-        if run == self._run:
+        """The exporter says how many messages it has sent; if nothing has come yet, what it sends later is expected."""
+        if self._run is None:
+            self._run, self._last, self._announced, self._expects_first = run, sequence, sequence, True
+        elif run == self._run:
             self._announced = max(self._announced, sequence)
 
     def restart(self) -> None:
         """Nothing is subscribed any more: the next message begins anew, without a loss."""
         self._settle()
-        self._run, self._last, self._announced = None, 0, 0
+        self._run, self._last, self._announced, self._expects_first = None, 0, 0, False
 
     def _settle(self) -> None:
         self._gaps = self.lost

@@ -180,6 +180,7 @@ class ExportedTopic:
             self._stop_lingering()
             if self._tap is None:
                 self._tap = self._graph.tap(self.entry.source, self._on_message, self._on_described, self._on_lost)
+                self._judge()
         elif self._tap is not None and self._linger is None:
             # A subscriber that is lost with its link is no different from one that has left. While the publisher
             # stays connected its messages are numbered, so that the subscriber counts them as lost when it is back.
@@ -234,7 +235,8 @@ class ExportedTopic:
             timer.cancel()
             self._answer(query)
         self._queries.clear()
-        self._judge()
+        if self._tap is not None:
+            self._judge()
 
     def _on_lost(self, reason: str) -> None:
         self._problem = reason

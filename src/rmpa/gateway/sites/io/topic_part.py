@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from rmpa.core.clock import Clock
     from rmpa.core.contract import Contracts
     from rmpa.gateway.neighbour import OwnGraph
+    from rmpa.gateway.sites.attachment import SiteAttachment
     from rmpa.gateway.sites.io.exported_topic import OnValue
     from rmpa.gateway.sites.keys import SiteModule
     from rmpa.gateway.sites.part import SiteExport, SiteImport
@@ -34,6 +35,8 @@ class _Subscription:
     declared: Declared
     topics: dict[str, ImportedTopic] = field(default_factory=dict)
     """By node."""
+    latched: dict[str, tuple[bytes, SiteAttachment]] = field(default_factory=dict)
+    """The last latched message of nodes that are not wanted: they were told once, and would not be again."""
 
 
 class SiteTopics:
@@ -77,7 +80,7 @@ class SiteTopics:
         self._reader = AttachmentReader()
         self._check_timer: asyncio.TimerHandle | None = None
         self.counters = Counters()
-        """``site.message.malformed``, ``site.message.looped``, ``site.message.unknown_node``."""
+        """``site.message.malformed``, ``site.message.looped``, ``site.message.unwanted_node``."""
 
     # --- SitePart -------------------------------------------------------------------------------------------------
 
@@ -170,6 +173,9 @@ class SiteTopics:
                 subscription = self._subscriptions[key] = _Subscription(declared)
             subscription.topics[announced.node] = topic
             self._check_later()
+            known = subscription.latched.pop(announced.node, None)
+            if known is not None:
+                topic.take(*known)
         elif subscription is not None:
             subscription.topics.pop(announced.node)
             if not subscription.topics:
@@ -186,11 +192,16 @@ class SiteTopics:
             self.counters.add("site.message.looped")
             return
         subscription = self._subscriptions.get(key)
-        topic = subscription.topics.get(attachment.node) if subscription is not None else None
-        if topic is None:
-            self.counters.add("site.message.unknown_node")
+        if subscription is None:
             return
-        topic.take(sample.payload, attachment)
+        topic = subscription.topics.get(attachment.node)
+        if topic is not None:
+            topic.take(sample.payload, attachment)
+            return
+        self.counters.add("site.message.unwanted_node")
+        known = subscription.latched
+        if attachment.latched and (attachment.node in known or len(known) < limits.LATCHED_NODES_MAX):
+            known[attachment.node] = sample.payload, attachment
 
     def _check_later(self) -> None:
         if self._check_timer is None and self._subscriptions:
