@@ -30,6 +30,10 @@ def make_neighbours(graph: OwnGraph, session: ZenohSession, settings: Settings) 
     """
     neighbours: dict[str, Neighbour] = {}
     gateway = settings.gateway
+    if gateway.site:
+        from rmpa.gateway.sites.io.joining import make_site_neighbour  # noqa: PLC0415 - as long as it takes
+
+        neighbours["sites"] = make_site_neighbour(graph, session, settings)
     if gateway.ros2.enabled:
         from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour  # noqa: PLC0415 - it reads all types of ROS
         from rmpa.gateway.ros2.io.services import Ros2Services  # noqa: PLC0415 - likewise
