@@ -35,6 +35,7 @@ def test_a_file_says_it_all(tmp_path: Path) -> None:
         listen = ["tcp/0.0.0.0:7448#iface=eth0"]
         router = true
         insecure = true
+        uplink = "1 Mbit/s"
         ros1_bridge = true
         ros1_bridge_namespace = "hall_2"
         store = "/var/lib/last.db"
@@ -64,6 +65,7 @@ def test_a_file_says_it_all(tmp_path: Path) -> None:
         ("tcp/0.0.0.0:7448#iface=eth0",),
         True,
         True,
+        125_000,
         True,
         "hall_2",
         "/var/lib/last.db",

@@ -8,7 +8,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config import limits
-from rmpa.config.quantities import BYTES_A_SECOND, RATE
+from rmpa.config.quantities import BYTES_A_SECOND, RATE, read_bytes_a_second
 from rmpa.config.schema import setting, table
 from rmpa.config.values import (
     BOOL,
@@ -218,6 +218,10 @@ GATEWAY_RULES: Final = ValueType(_read_rules, {"type": "array", "items": table_s
 # --- settings -------------------------------------------------------------------------------------------------------
 
 
+_UPLINK: Final = ValueType(lambda raw: None if raw is None else read_bytes_a_second(raw), BYTES_A_SECOND.json_schema)
+"""Bytes a second, or ``None`` as the default has it."""
+
+
 @dataclass(frozen=True, slots=True)
 class Ros2Settings:
     """The table ``[gateway.ros2]``."""
@@ -303,6 +307,16 @@ class GatewaySettings:
         env="RMPA_GATEWAY_INSECURE",
         option="--insecure/--no-insecure",
         command=_COMMAND,
+    )
+    uplink: int | None = setting(
+        None,
+        _UPLINK,
+        "What the line to the other sites carries, bytes a second: a command then does not wait behind seconds of "
+        "images in the kernel's buffer.",
+        env="RMPA_GATEWAY_UPLINK",
+        option="--uplink",
+        command=_COMMAND,
+        shown_default="unlimited",
     )
     ros1_bridge: bool = setting(
         False,

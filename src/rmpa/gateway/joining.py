@@ -31,7 +31,7 @@ def make_neighbours(graph: OwnGraph, session: ZenohSession, settings: Settings) 
     neighbours: dict[str, Neighbour] = {}
     gateway = settings.gateway
     if gateway.site:
-        from rmpa.gateway.sites.io.joining import make_site_neighbour  # noqa: PLC0415 - as long as it takes
+        from rmpa.gateway.sites.io.joining import make_site_neighbour  # noqa: PLC0415 - not every gateway needs it
 
         neighbours["sites"] = make_site_neighbour(graph, session, settings)
     if gateway.ros2.enabled:

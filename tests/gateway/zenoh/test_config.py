@@ -54,6 +54,20 @@ def test_loopback_needs_no_certificate(endpoint: str) -> None:
     assert gateway_config(GatewaySettings(connect=(endpoint,)), None).certificates is None
 
 
+@pytest.mark.parametrize(
+    ("uplink", "buffer", "batch"), [(125_000, 15_625, 7812), (1000, 4096, 2048), (100_000_000, 12_500_000, 65_535)]
+)
+def test_a_thin_line_gets_small_buffers_below_the_priorities(uplink: int, buffer: int, batch: int) -> None:
+    config = gateway_config(GatewaySettings(connect=("tls/10.0.0.1:7447",), uplink=uplink), FILES)
+    entries = config.entries()
+    assert entries["transport/link/tcp/so_sndbuf"] == entries["transport/link/tls/so_sndbuf"] == buffer
+    assert entries["transport/link/tx/batch_size"] == batch
+    tls = entries["transport/link/tls"]
+    assert isinstance(tls, dict)
+    assert tls["enable_mtls"] is True
+    assert list(entries).index("transport/link/tls") < list(entries).index("transport/link/tls/so_sndbuf")
+
+
 def test_insecure_lets_everything_connect() -> None:
     settings = GatewaySettings(connect=("tcp/10.0.0.1:7447",), insecure=True)
     assert "transport/link/tls" not in gateway_config(settings, None).entries()

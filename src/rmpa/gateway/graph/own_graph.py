@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.gateway.graph.mesh_sources import SourceKey
     from rmpa.ros.master.effects import GraphChange
+    from rmpa.ros.node.in_process import InProcessConnection
     from rmpa.ros.node.subscription import PublisherConnection
     from rmpa.ros.wire.services import ServiceDescription
     from rmpa.ros.wire.tcpros import Buffer, TopicDescription
@@ -122,6 +123,7 @@ class AgentGraph(Part):
             source,
             TAP_NODE,
             self._node.next_number,
+            self._bridge.proxy_nodes.publication,
             on_message=on_message,
             on_described=on_described,
             on_lost=on_lost,
@@ -317,7 +319,7 @@ class AgentGraph(Part):
         for tap in tuple(self._taps.get(topic, ())):
             tap.follow(publishers.get(tap.source.proxy, ""))
 
-    def _connections(self) -> list[PublisherConnection]:
+    def _connections(self) -> list[PublisherConnection | InProcessConnection]:
         taps = [tap for taps in self._taps.values() for tap in taps]
         return [tap.connection for tap in taps if tap.connection is not None]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from rmpa.ros.node.in_process import InProcessConnection
 from rmpa.ros.node.subscription import PublisherConnection
 from rmpa.ros.wire.tcpros import LENGTH, TopicDescription
 
@@ -11,6 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.gateway.neighbour import MeshSource
+    from rmpa.ros.node.publication import Publication
     from rmpa.ros.wire.tcpros import Header
 
 _PREFIX = LENGTH.size
@@ -22,7 +24,8 @@ class TopicTap:
     Args:
         source: The topic.
         caller_id: The subscribing node.
-        number: The connection's number within that node.
+        number: Returns the connection's number within that node.
+        find: ``(node, slave API, topic)``: the topic of a proxy of this process; ``None`` for other publishers.
         on_message: ``(body)``.
         on_described: ``(description)``.
         on_lost: ``(reason)``.
@@ -34,6 +37,7 @@ class TopicTap:
         source: MeshSource,
         caller_id: str,
         number: Callable[[], int],
+        find: Callable[[str, str, str], Publication | None],
         *,
         on_message: Callable[[memoryview], None],
         on_described: Callable[[TopicDescription], None],
@@ -43,11 +47,12 @@ class TopicTap:
         self.source = source
         self._caller_id = caller_id
         self._number = number
+        self._find = find
         self._on_message = on_message
         self._on_described = on_described
         self._on_lost = on_lost
         self._on_closed = on_closed
-        self.connection: PublisherConnection | None = None
+        self.connection: PublisherConnection | InProcessConnection | None = None
         """The connection to the publisher; ``None`` while its address is not known."""
         self._description: TopicDescription | None = None
         self._closed = False
@@ -76,18 +81,34 @@ class TopicTap:
             self._connect(uri)
 
     def _connect(self, uri: str) -> None:
-        on_message = self._on_message
-        self.connection = PublisherConnection(
-            self.source.here,
-            uri,
-            self._caller_id,
-            on_message=lambda framed: on_message(framed[_PREFIX:]),
-            on_header=self._described,
-            on_refused=lambda text: self._on_lost(f"its publisher refuses: {text}"),
-            on_lost=self._on_lost,
-            number=self._number(),
-        )
+        on_message, here, proxy = self._on_message, self.source.here, self.source.proxy
+        if self._find(proxy, uri, here) is not None:
+            self.connection = InProcessConnection(
+                here,
+                uri,
+                self._caller_id,
+                lambda: self._find(proxy, uri, here),
+                on_message=lambda framed: on_message(framed[_PREFIX:]),
+                on_header=self._described,
+                on_refused=self._refused,
+                on_lost=self._on_lost,
+                number=self._number(),
+            )
+        else:
+            self.connection = PublisherConnection(
+                here,
+                uri,
+                self._caller_id,
+                on_message=lambda framed: on_message(framed[_PREFIX:]),
+                on_header=self._described,
+                on_refused=self._refused,
+                on_lost=self._on_lost,
+                number=self._number(),
+            )
         self.connection.start()
+
+    def _refused(self, text: str) -> None:
+        self._on_lost(f"its publisher refuses: {text}")
 
     def _described(self, fields: Header) -> None:
         self._description = TopicDescription.from_header(fields)

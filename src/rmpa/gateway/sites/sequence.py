@@ -50,7 +50,7 @@ class SequenceCounter:
         return True
 
     def announced(self, run: int, sequence: int) -> None:
-        """The exporter says how many messages it has sent; if nothing has come yet, what it sends later is expected."""
+        """The exporter says how many messages it has sent; if none has come yet, what it sends later is expected."""
         if self._run is None:
             self._run, self._last, self._announced, self._expects_first = run, sequence, sequence, True
         elif run == self._run:

@@ -71,6 +71,7 @@ class ZenohConfig:
         certificates: For encrypted endpoints; ``None``: there are none.
         access_control: Zenoh's table of who may do what; ``None``: everything.
         lease: Seconds without a sign of life after which a transport is dead.
+        uplink: Bytes a second that the line carries; ``None``: it is not known, and Linux sizes the buffers.
     """
 
     mode: ZenohMode = ZenohMode.CLIENT
@@ -79,6 +80,7 @@ class ZenohConfig:
     certificates: MeshCertificates | None = None
     access_control: Mapping[str, object] | None = None
     lease: float = limits.LEASE
+    uplink: int | None = None
 
     def entries(self) -> dict[str, object]:
         """The entries of Zenoh's configuration that differ from its defaults, as JSON values by their path."""
@@ -100,6 +102,11 @@ class ZenohConfig:
         }
         if self.certificates is not None:
             entries["transport/link/tls"] = self.certificates.entries()
+        if self.uplink is not None:
+            buffer = max(limits.SEND_BUFFER_MIN, round(self.uplink * limits.SEND_BUFFER))
+            batch = min(limits.BATCH_MAX, max(limits.BATCH_MIN, round(self.uplink * limits.BATCH)))
+            entries |= {f"transport/link/{kind}/so_sndbuf": buffer for kind in ("tcp", "tls")}
+            entries["transport/link/tx/batch_size"] = batch
         if self.access_control is not None:
             entries["access_control"] = self.access_control
         return entries
@@ -121,7 +128,7 @@ def gateway_config(settings: GatewaySettings, certificates: MeshCertificates | N
         if problem and not settings.insecure:
             raise StartError(f"zenoh {endpoint}", *problem)
     mode = ZenohMode.ROUTER if settings.router else ZenohMode.PEER if settings.listen else ZenohMode.CLIENT
-    return ZenohConfig(mode, settings.connect, settings.listen, certificates)
+    return ZenohConfig(mode, settings.connect, settings.listen, certificates, uplink=settings.uplink)
 
 
 def zenohd_entries(config: ZenohConfig) -> dict[str, object]:

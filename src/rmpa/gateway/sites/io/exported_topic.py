@@ -14,16 +14,12 @@ from rmpa.gateway.sites.topic_qos import qos_of
 from rmpa.gateway.sites.traffic import SiteTraffic
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from rmpa.core.clock import Clock
     from rmpa.core.contract import Contract
     from rmpa.gateway.neighbour import OwnGraph, Tap
     from rmpa.gateway.sites.part import SiteExport
     from rmpa.gateway.zenoh_api import ZenohPublisher, ZenohQuery, ZenohSession
     from rmpa.ros.wire.tcpros import TopicDescription
-
-    OnValue = Callable[[SiteExport, TopicDescription, bytes | memoryview, int], None]
 
 
 class ExportedTopic:
@@ -38,7 +34,6 @@ class ExportedTopic:
         session: The Zenoh session.
         contract: The topic's contract.
         clock: Both clocks.
-        on_value: Called with each message: entry, description, body, wall clock in nanoseconds.
     """
 
     def __init__(
@@ -48,14 +43,12 @@ class ExportedTopic:
         session: ZenohSession,
         contract: Contract,
         clock: Clock,
-        on_value: OnValue | None = None,
     ) -> None:
         self.entry = entry
         self._graph = graph
         self._session = session
         self._contract = contract
         self._clock = clock
-        self._on_value = on_value
         self._run = max(1, clock.wall_ns())
         self._sequence = 0
         self._limits = TopicLimits(entry.rate, entry.size)
@@ -242,8 +235,7 @@ class ExportedTopic:
         self._problem = reason
 
     def _on_message(self, body: memoryview) -> None:
-        description = self.description
-        if self._writer is None or description is None:
+        if self._writer is None:
             return
         size = len(body)
         message: bytes | memoryview = body
@@ -253,8 +245,6 @@ class ExportedTopic:
             if repeated:
                 return  # the publisher was connected anew, and gave its last message again
             self._latched = message
-        if self._on_value is not None:
-            self._on_value(self.entry, description, message, self._clock.wall_ns())
         if self._limits and not self._limits.admit(self._clock.now(), size):
             self._limit(message)
             return

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from rmpa.core.contract import Contracts
     from rmpa.gateway.neighbour import OwnGraph
     from rmpa.gateway.sites.attachment import SiteAttachment
-    from rmpa.gateway.sites.io.exported_topic import OnValue
     from rmpa.gateway.sites.keys import SiteModule
     from rmpa.gateway.sites.part import SiteExport, SiteImport
     from rmpa.gateway.sites.rules import CrossingRules
@@ -49,7 +48,6 @@ class SiteTopics:
         rules: Tell which site may have which topic.
         contracts: The contracts of topics, which become Zenoh's QoS.
         clock: Both clocks.
-        on_value: Called with each message that goes out: entry, description, body, wall clock in nanoseconds.
     """
 
     name = "topics"
@@ -62,7 +60,6 @@ class SiteTopics:
         rules: CrossingRules,
         contracts: Contracts,
         clock: Clock,
-        on_value: OnValue | None = None,
     ) -> None:
         self._site = site
         self._graph = graph
@@ -70,7 +67,6 @@ class SiteTopics:
         self._rules = rules
         self._contracts = contracts
         self._clock = clock
-        self._on_value = on_value
         self._exported: dict[tuple[str, str], dict[str, ExportedTopic]] = {}
         """By module and topic, then by node."""
         self._imported: dict[tuple[str, str, str, str], ImportedTopic] = {}
@@ -91,9 +87,7 @@ class SiteTopics:
         self.withdraw(entry)
         contract = self._contracts.of(entry.source.here, entry.announced.type)
         nodes = self._exported.setdefault((entry.source.module, entry.source.name), {})
-        nodes[entry.source.node] = ExportedTopic(
-            entry, self._graph, self._session, contract, self._clock, self._on_value
-        )
+        nodes[entry.source.node] = ExportedTopic(entry, self._graph, self._session, contract, self._clock)
 
     def withdraw(self, entry: SiteExport) -> None:
         """Undeclare it."""
