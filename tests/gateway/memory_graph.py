@@ -27,6 +27,7 @@ class MemoryTap:
     source: MeshSource
     on_message: Callable[[memoryview], None]
     description: TopicDescription | None
+    listener: str = ""
 
     def close(self) -> None:
         self.graph.taps = [tap for tap in self.graph.taps if tap is not self]
@@ -139,10 +140,12 @@ class MemoryGraph:
         on_message: Callable[[memoryview], None],
         on_described: Callable[[TopicDescription], None],
         on_lost: Callable[[str], None],
+        *,
+        listener: str = "",
     ) -> MemoryTap:
         del on_lost
         description = self._publishers[_key(source)]
-        tap = MemoryTap(self, source, on_message, description)
+        tap = MemoryTap(self, source, on_message, description, listener)
         self.taps.append(tap)
         on_described(description)
         return tap

@@ -13,7 +13,7 @@ show it. A module that is linked to the origin, or reaches it by a better relay,
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
@@ -29,6 +29,15 @@ if TYPE_CHECKING:
 
 Place = tuple[str, str]
 """A topic and the proxy that publishes it, by their local names."""
+
+
+OUTSIDE_GUID: Final = "0.0.0.0:0#1"
+"""The GUID of all origins outside the mesh: it is well-formed, but no module can have this address."""
+
+
+def is_outside(origin: Origin) -> bool:
+    """Whether an origin is not a module of this mesh, but what a gateway of it reaches."""
+    return origin.guid == OUTSIDE_GUID
 
 
 def service_place(service: str, node: str) -> Place:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 from rmpa.agent import Agent
 from rmpa.agent.process import run_process, serve
 from rmpa.core.backoff import Backoff
-from rmpa.core.errors import StartError
+from rmpa.core.errors import RmpaError, StartError
 from rmpa.gateway import limits
 from rmpa.gateway.graph.own_graph import AgentGraph
 from rmpa.gateway.joining import make_neighbours, open_gateway_session
@@ -119,7 +119,7 @@ class Gateway:
             self._opening.cancel()
             await asyncio.wait([self._opening])
         if self._rejoining is not None:
-            await self._rejoining
+            await asyncio.wait([self._rejoining])
         await self._close_neighbours()
         if self.session is not None:
             await self.session.close()
@@ -147,7 +147,7 @@ class Gateway:
             self._changed = False
             await self._close_neighbours()
             self.graph.unwatch()
-            self._join(self.session)
+            self._try_to_join(self.session)
 
     def report(self) -> dict[str, object]:
         """What the gateway joins, as JSON values: the reply to the operation ``gateway``."""
@@ -191,7 +191,15 @@ class Gateway:
             except StartError as error:
                 self._failed(error)
             else:
-                self._join(session)
+                self._try_to_join(session)
+
+    def _try_to_join(self, session: OwnedSession) -> None:
+        """Makes the neighbours while the gateway runs: what is wrong with them is told, and ends nothing else."""
+        try:
+            self._join(session)
+        except RmpaError as error:
+            self._problem = str(error)
+            _log.error("! %s", error)
 
 
 def _rules(settings: Settings) -> tuple[object, ...]:

@@ -35,10 +35,11 @@ def make_neighbours(graph: OwnGraph, session: ZenohSession, settings: Settings) 
 
         neighbours["sites"] = make_site_neighbour(graph, session, settings)
     if gateway.ros2.enabled:
+        from rmpa.gateway.ros2.io.actions import Ros2Actions  # noqa: PLC0415 - likewise
         from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour  # noqa: PLC0415 - it reads all types of ROS
         from rmpa.gateway.ros2.io.services import Ros2Services  # noqa: PLC0415 - likewise
         from rmpa.gateway.ros2.io.topics import Ros2Topics  # noqa: PLC0415 - likewise
 
-        parts = (Ros2Services(), Ros2Topics())
+        parts = (Ros2Actions(), Ros2Services(), Ros2Topics())
         neighbours["ros2"] = Ros2Neighbour(graph, session, gateway, parts, settings.make_contracts())
     return neighbours

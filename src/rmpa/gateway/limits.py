@@ -159,6 +159,13 @@ ROS2_CALLS_MAX: Final = 64
 """Calls of one service that are under way at one time, each way; the next one gets an error."""
 ROS2_DESCRIBE_AGAIN: Final = (0.5, 30.0)
 """Seconds until a service that could not be asked for its type is asked again: at first, and at most; it doubles."""
+ROS2_LINGER: Final = 5.0
+"""Seconds for which a topic of ROS 2 that is wanted stays subscribed after a publisher came or went: messages of a
+publisher that restarts are held until nodes have subscribed to it anew, which takes a module some 0.1 s."""
+ROS2_EARLY_MESSAGES: Final = 1000
+"""Messages of one topic of ROS 2 that are held so; the oldest are dropped, and counted as unheard."""
+ROS2_EARLY_BYTES: Final = 16 * 1024 * 1024
+"""Bytes of these."""
 ROS2_PUBLISHERS_MAX: Final = 1000
 """Publishers of one topic of ROS 2 whose sequence numbers are followed; the one silent for longest is forgotten."""
 ROS2_SERVICE_WAIT: Final = 3.0
@@ -168,3 +175,22 @@ OPEN_RETRY_FIRST: Final = 0.5
 """Seconds until a session is opened again, at first, whose router did not answer."""
 OPEN_RETRY_MAX: Final = 5.0
 """The longest time in seconds between two attempts to open a session."""
+ROS2_GOALS_MAX: Final = 1000
+"""Goals of one action that are known at one time, each way; the next one is rejected."""
+ROS2_GOAL_KEPT: Final = 5.0
+"""Seconds for which a goal that has ended stays in the status of ROS 1; actionlib's ``status_list_timeout``."""
+ROS2_RESULT_KEPT: Final = 60.0
+"""Seconds for which a client of ROS 2 may ask for the result of a goal that has ended; rcl's default is 10."""
+ROS2_STATUS_PERIOD: Final = 0.2
+"""Seconds between two messages of an action's status in ROS 1; actionlib's ``status_frequency`` is 5 Hz, and its
+clients count a server as lost after 5 s without one."""
+ROS2_ACCEPT_TIMEOUT: Final = 10.0
+"""Seconds for an action server of ROS 1 to show a goal in its status; then the goal counts as not accepted."""
+ROS2_ACTIONS_MAX: Final = 500
+"""Actions that are joined, each way; the others are reported."""
+ROS2_GOAL_TIMEOUT: Final = 86_400.0
+"""Seconds of one goal of an action at a server of ROS 2: a day. A server that dies ends its goals at once."""
+ROS2_LAST_RESULTS: Final = 1.0
+"""Seconds for which an action's topics stay in ROS 1's graph once its server is gone: its last results leave."""
+ROS2_ACTION_READY: Final = 5.0
+"""Seconds for an action server of ROS 1 to connect to the gateway's topics; then a goal is refused."""

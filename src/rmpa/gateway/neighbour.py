@@ -137,6 +137,8 @@ class OwnGraph(Protocol):
         on_message: Callable[[memoryview], None],
         on_described: Callable[[TopicDescription], None],
         on_lost: Callable[[str], None],
+        *,
+        listener: str = "",
     ) -> Tap:
         """Subscribe to a local topic.
 
@@ -145,6 +147,8 @@ class OwnGraph(Protocol):
             on_message: ``(body)``: without its length; the view is valid during the call only.
             on_described: The publisher's header, at each connection, before its first message.
             on_lost: ``(reason)``: the connection ended or was refused; it is tried again while the source is there.
+            listener: The node that the publisher sees; by default one of the gateway. Clients of actions want the one
+                that publishes the status.
         """
 
     async def describe(self, source: MeshSource) -> ServiceDescription:

@@ -67,6 +67,8 @@ class SiteGraph(MemoryGraph):
         on_message: Callable[[memoryview], None],
         on_described: Callable[[TopicDescription], None],
         on_lost: Callable[[str], None],
+        *,
+        listener: str = "",
     ) -> MemoryTap:
         tap = LateTap(self, source, on_message, None, on_described)
         asyncio.get_running_loop().call_soon(self._describe, tap, on_described)

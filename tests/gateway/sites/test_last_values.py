@@ -53,7 +53,9 @@ class TapGraph:
         self.asked: set[str] = set()
         self.changed = asyncio.Event()
 
-    def tap(self, source: MeshSource, on_message: Any, on_described: Any, on_lost: Any) -> _Tap:
+    def tap(
+        self, source: MeshSource, on_message: Any, on_described: Any, on_lost: Any, *, listener: str = ""
+    ) -> _Tap:
         del on_lost
         key = source.name, source.node
         assert key not in self.taps

@@ -41,6 +41,7 @@ class ProxiedService:
         serve: Awaited with each request for its response.
         describe: Awaited for the service's type.
         timeout: Seconds for a call.
+        taken: Returns which module has a service of this name; empty if there is none.
         on_closed: Called once it is closed.
     """
 
@@ -56,6 +57,7 @@ class ProxiedService:
         serve: Callable[[bytes], Awaitable[bytes]],
         describe: Callable[[], Awaitable[ServiceDescription]],
         timeout: float,
+        taken: Callable[[], str],
         on_closed: Callable[[], None],
     ) -> None:
         self.source = source
@@ -65,6 +67,7 @@ class ProxiedService:
         self._relay = relay
         self._proxies = proxies
         self._serve = serve
+        self._taken = taken
         self._on_closed = on_closed
         self._offered = Source(service_place(source.name, "")[0], proxies.name(origin.node))
         self._key = f"service {source.name}"
@@ -103,6 +106,12 @@ class ProxiedService:
         """Register it if the core has lost it, or if its name has become free."""
         node = self._node
         if node is not None and services.get(self.source.name, {}).get(node.name) != node.service_uri:
+            self._register()
+
+    def make_room(self) -> None:
+        """Leave the name to a module's service, until that one has gone."""
+        if self._node is not None and self._taken():
+            self._unregister(self._node)
             self._register()
 
     def close(self) -> None:
@@ -146,7 +155,7 @@ class ProxiedService:
         if node is None:
             return
         other = next((one for one in self._core.state().services.get(self.source.name, {}) if one != node.name), "")
-        if other:
+        if other := other or self._taken():
             self._refused = f"{other} has a service of this name here"
             return
         code, status, _ = self._core.call("registerService", node.name, self.source.name, node.service_uri, node.uri)
@@ -154,9 +163,12 @@ class ProxiedService:
         if self._refused:
             _log.error("! %s of %s: %s", self.source.name, node.name, self._refused)
 
+    def _unregister(self, node: SlaveNode) -> None:
+        self._core.call("unregisterService", node.name, self.source.name, node.service_uri)
+
     def _left(self, node: SlaveNode) -> None:
         self._node = None
-        self._core.call("unregisterService", node.name, self.source.name, node.service_uri)
+        self._unregister(node)
         node.remove_service(self.source.name)
         self._relay.gone(self._number, self._offered)
 

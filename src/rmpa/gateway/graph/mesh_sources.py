@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 from rmpa.bridge.messages import is_crossing_name, is_crossing_type
 from rmpa.bridge.policy import Policy, is_own
-from rmpa.bridge.relay import service_place
+from rmpa.bridge.relay import is_outside, service_place
 from rmpa.bridge.topics.io.local_sources import LocalSources
-from rmpa.gateway.graph.origins import is_foreign
 from rmpa.gateway.neighbour import MeshSource, SourceKind
 from rmpa.ros.master.effects import RegistrationKind
 from rmpa.runtime.event_loop import yielding_to_data
@@ -139,7 +138,7 @@ class MeshSources:
                 )
         for proxy, local in self._local.relayed(topic).items():
             shown = self._relay.source((topic, proxy))
-            if local.origin is None or shown is None or is_foreign(local.origin):
+            if local.origin is None or shown is None or is_outside(local.origin):
                 continue
             if self._may_cross(topic, local.type, local.origin.node):
                 origin, wire = local.origin, shown[1].topic
@@ -160,7 +159,7 @@ class MeshSources:
                     )
                 continue
             origin, shown = (self._relay.origin(place := service_place(service, node)), self._relay.source(place))
-            if origin is None or shown is None or is_foreign(origin):
+            if origin is None or shown is None or is_outside(origin):
                 continue
             if is_crossing_name(service) and self._services.rules.judge(service, origin.node).allowed:
                 remote = self._services.imports.get(shown[0], service)

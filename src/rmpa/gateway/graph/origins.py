@@ -6,13 +6,12 @@ import hashlib
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.messages import Origin
+from rmpa.bridge.relay import OUTSIDE_GUID
 from rmpa.core import limits as core_limits
 
 if TYPE_CHECKING:
     from rmpa.gateway.neighbour import ForeignSource
 
-NEIGHBOUR_GUID: Final = "0.0.0.0:0#1"
-"""The GUID of each site: its form is that of a GUID, but no module can have this address."""
 _INSTANCE_LABEL: Final = b"rmpa site 1"
 
 
@@ -29,9 +28,4 @@ def foreign_node(source: ForeignSource) -> str:
 
 def foreign_origin(source: ForeignSource) -> Origin:
     """The origin of a neighbour's source; its path is empty."""
-    return Origin(source.site, NEIGHBOUR_GUID, site_instance(source.site), foreign_node(source))
-
-
-def is_foreign(origin: Origin) -> bool:
-    """Whether a relayed source is one that a gateway of this mesh has from a neighbour."""
-    return origin.guid == NEIGHBOUR_GUID
+    return Origin(source.site, OUTSIDE_GUID, site_instance(source.site), foreign_node(source))

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.messages import is_crossing_name, is_crossing_type
 from rmpa.bridge.policy import OWN_NODE
+from rmpa.bridge.relay import is_outside
 from rmpa.bridge.services.exports import LocalService
 from rmpa.bridge.services.io.connection_pool import ServicePool
 from rmpa.bridge.session.part import Part
@@ -81,6 +82,7 @@ class AgentGraph(Part):
         self._bridge = agent.bridge
         self._sources = MeshSources(agent, settings)
         self._sources.watch(self._source_changed)
+        agent.services.make_room = self._make_room
         self.reloaded: Callable[[Settings], None] = lambda _: None
         """Called with other rules, after the graph has taken them."""
         self._taps: dict[str, set[TopicTap]] = {}
@@ -117,11 +119,13 @@ class AgentGraph(Part):
         on_message: Callable[[memoryview], None],
         on_described: Callable[[TopicDescription], None],
         on_lost: Callable[[str], None],
+        *,
+        listener: str = "",
     ) -> TopicTap:
         """Subscribe to a local topic; see ``neighbour.OwnGraph.tap``."""
         tap = TopicTap(
             source,
-            TAP_NODE,
+            listener or TAP_NODE,
             self._node.next_number,
             self._bridge.proxy_nodes.publication,
             on_message=on_message,
@@ -194,6 +198,7 @@ class AgentGraph(Part):
             serve=serve,
             describe=describe,
             timeout=self._agent.services.rules.timeout(source.name),
+            taken=lambda: self._module_with(source.name),
             on_closed=lambda: self._hidden(site, key, shown),
         )
         self._show(site, key, shown)
@@ -323,12 +328,26 @@ class AgentGraph(Part):
         taps = [tap for taps in self._taps.values() for tap in taps]
         return [tap.connection for tap in taps if tap.connection is not None]
 
+    def _module_with(self, service: str) -> str:
+        """The module of this mesh that has a service of this name; empty if there is none."""
+        found = self._agent.services.imports.shown(service)
+        if found is None or (found[1].origin is not None and is_outside(found[1].origin)):
+            return ""
+        return self._agent.services.imports.peer_name(found[0])
+
+    def _make_room(self, name: str) -> None:
+        for shown in self._services_of(name):
+            shown.make_room()
+
     def _retry_service(self, name: str) -> None:
         services = self._core.state().services
-        for site in self._sites.values():
-            for (_, service, _), (shown, *_) in list(site.shown.items()):
-                if service == name and isinstance(shown, ProxiedService):
-                    shown.reconcile(services)
+        for shown in self._services_of(name):
+            shown.reconcile(services)
+
+    def _services_of(self, name: str) -> list[ProxiedService]:
+        """The foreign services of a name, of each site the one that is in the graph."""
+        firsts = (same[0] for site in self._sites.values() for key, same in site.shown.items() if key[1] == name)
+        return [shown for shown in firsts if isinstance(shown, ProxiedService)]
 
     def _source_changed(self, source: MeshSource, there: bool) -> None:
         if not there and source.kind is SourceKind.SERVICE:

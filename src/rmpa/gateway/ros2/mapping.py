@@ -21,10 +21,13 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _FIELD_KEYS: Final = ("fields_1_to_2", "request_fields_1_to_2", "response_fields_1_to_2")
+_ACTION_KEYS: Final = ("goal_fields_1_to_2", "result_fields_1_to_2", "feedback_fields_1_to_2")
+"""ros1_bridge has no actions; these keys are made as its others are."""
 _KEYS: Final = frozenset(
     (
         *_FIELD_KEYS,
-        *(f"ros{version}_{kind}_name" for version in (1, 2) for kind in ("package", "message", "service")),
+        *_ACTION_KEYS,
+        *(f"ros{version}_{kind}_name" for version in (1, 2) for kind in ("package", "message", "service", "action")),
         "enable_foreign_mappings",
     )
 )
@@ -66,6 +69,31 @@ class TypePair:
     response: FieldPaths | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class ActionRule:
+    """A type of ROS 2 for an action of ROS 1.
+
+    Args:
+        name: ``package/action/Name``.
+        goal: The fields of the goal by path, if a rule lists them; ``None``: by name.
+        result: Likewise of the result.
+        feedback: Likewise of the feedback.
+    """
+
+    name: str
+    goal: FieldPaths | None = None
+    result: FieldPaths | None = None
+    feedback: FieldPaths | None = None
+
+    @property
+    def has_fields(self) -> bool:
+        """Whether it lists fields."""
+        return (self.goal, self.result, self.feedback) != (None, None, None)
+
+
+_USUAL_ACTIONS: Final = {"actionlib_tutorials/Fibonacci": "example_interfaces/action/Fibonacci"}
+
+
 @dataclass(slots=True)
 class TypeMapping:
     """The rules of all mapping files; a later file's rule replaces an earlier one of the same type."""
@@ -73,6 +101,7 @@ class TypeMapping:
     _messages: dict[str, TypePair] = field(default_factory=dict)
     _services: dict[str, TypePair] = field(default_factory=dict)
     _packages: dict[str, list[str]] = field(default_factory=dict)
+    _actions: dict[str, ActionRule] = field(default_factory=dict)
 
     def read(self, path: Path) -> None:
         """Take in a mapping file.
@@ -82,7 +111,7 @@ class TypeMapping:
         """
         try:
             rules = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
             raise ConfigError("gateway.ros2.mapping", f"cannot be read: {error}", path=path) from error
         if not isinstance(rules, list):
             raise ConfigError("gateway.ros2.mapping", "is not a list of rules", "as ros1_bridge has them", path=path)
@@ -111,6 +140,23 @@ class TypeMapping:
         if (found := self._services.get(name)) is not None:
             return found
         return TypePair(_USUAL.get(name) or next(iter(self._candidates(name, "srv"))))
+
+    def action(self, name: str) -> ActionRule:
+        """The ROS 2 type of an action type, ``package/Name`` of ROS 1; without a rule the one of the same name."""
+        if (found := self._actions.get(name)) is not None:
+            return found
+        package, _, base = name.partition("/")
+        packages = (*self._packages.get(package, ()), package)
+        return ActionRule(_USUAL_ACTIONS.get(name) or f"{packages[0]}/action/{base}")
+
+    def ros1_action(self, name: str) -> str:
+        """The ROS 1 type of an action type, ``package/action/Name`` of ROS 2; the same name without a rule."""
+        package, _, rest = name.partition("/")
+        base = rest.partition("/")[2]
+        ruled = [ros1 for ros1, rule in self._actions.items() if rule.name == name]
+        usual = [ros1 for ros1, ros2 in _USUAL_ACTIONS.items() if ros2 == name]
+        packages = [f"{ros1}/{base}" for ros1, all_of in self._packages.items() if package in all_of]
+        return next(iter((*ruled, *usual, *packages, f"{package}/{base}")))
 
     def has_service_rule(self, name: str) -> bool:
         """Whether a mapping file has a rule for a service type of ROS 1 or its package."""
@@ -164,22 +210,43 @@ class TypeMapping:
                 return f"needs both ros1_{kind}_name and ros2_{kind}_name, or none of them"
             if name1 is not None:
                 return self._add_type(into, f"{package1}/{name1}", f"{package2}/{kind[:1]}", str(name2), rule)
-        if any(key in rule for key in _FIELD_KEYS):
-            return "maps fields, but names no message or service"
+        name1, name2 = names.get("ros1_action_name"), names.get("ros2_action_name")
+        if (name1 is None) != (name2 is None):
+            return "needs both ros1_action_name and ros2_action_name, or none of them"
+        if name1 is not None:
+            return self._add_action(f"{package1}/{name1}", package2, str(name2), rule)
+        if any(key in rule for key in (*_FIELD_KEYS, *_ACTION_KEYS)):
+            return "maps fields, but names no message, service or action"
         self._packages.setdefault(package1, []).append(package2)
         return ""
+
+    def _add_action(self, ros1: str, package: str, base: str, rule: dict[str, Any]) -> str:
+        if not is_type_name(ros1) or not is_type_name(f"{package}/{base}"):
+            return f"maps {ros1!r} to {package}/{base}: not a name of a type"
+        paths, problem = _paths(rule, _ACTION_KEYS)
+        if not problem:
+            self._actions[ros1] = ActionRule(f"{package}/action/{base}", *paths)
+        return problem
 
     def _add_type(self, into: dict[str, TypePair], ros1: str, head: str, base: str, rule: dict[str, Any]) -> str:
         package, _, kind = head.partition("/")
         if not is_type_name(ros1) or not is_type_name(f"{package}/{base}"):
             return f"maps {ros1!r} to {package}/{base}: not a name of a type"
-        paths: list[FieldPaths | None] = []
-        for key in _FIELD_KEYS:
-            fields = rule.get(key)
-            if fields is not None and not (
-                isinstance(fields, dict) and all(isinstance(each, str) for pair in fields.items() for each in pair)
-            ):
-                return f"has no mapping of fields to fields as {key}"
-            paths.append(fields)
+        paths, problem = _paths(rule, _FIELD_KEYS)
+        if problem:
+            return problem
         into[ros1] = TypePair(f"{package}/{'msg' if kind == 'm' else 'srv'}/{base}", *paths)
         return ""
+
+
+def _paths(rule: dict[str, Any], keys: Iterable[str]) -> tuple[list[FieldPaths | None], str]:
+    """The mappings of fields under each of the keys, and what is wrong with one."""
+    paths: list[FieldPaths | None] = []
+    for key in keys:
+        fields = rule.get(key)
+        if fields is not None and not (
+            isinstance(fields, dict) and all(isinstance(each, str) for pair in fields.items() for each in pair)
+        ):
+            return [], f"has no mapping of fields to fields as {key}"
+        paths.append(fields)
+    return paths, ""

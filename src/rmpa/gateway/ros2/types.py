@@ -142,6 +142,10 @@ class Ros2Types:
         if name not in self:
             self.store.register({name: ([], fields or [_EMPTY_FIELD])})
 
+    def define_as(self, name: str, specification: Specification) -> None:
+        """Take in a type of ROS 2 with the fields of one of ROS 1; one that is known stays as it is."""
+        self.define(name, _fields(specification.fields))
+
     def define_service(self, name: str, request: Fields, response: Fields) -> None:
         """Take in a service type.
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
-LEASE: Final = 1.0
-"""Seconds without a sign of life after which a Zenoh transport counts as dead: a frozen site is seen within 1.5 s.
+LEASE: Final = 1.2
+"""Seconds without a sign of life after which a Zenoh transport counts as dead: so a frozen site is seen within 1.5 s.
 Zenoh sends a keep-alive four times in that time, and any data counts too."""
 BLOCK_MAX: Final = 5.0
 """Seconds that a put of a reliable publisher may wait for a transport before Zenoh closes that transport. It is
@@ -45,6 +45,10 @@ DRAIN_MESSAGES: Final = 256
 """Messages that the event loop takes before it looks at its other work: at most a millisecond or so."""
 DRAIN_BYTES: Final = 8 * 1024 * 1024
 """Bytes that the event loop takes before it looks at its other work."""
+BUSY_PERIOD: Final = 0.001
+"""Seconds between two looks at what arrived while much arrives; the delay that a message may have then."""
+BUSY_MESSAGES: Final = 8
+"""Messages in ``BUSY_PERIOD`` from which on the loop is not woken for each: 8,000 a second."""
 FLUSH_MAX: Final = 1.0
 """Seconds that a publisher which is closed may still send what waits."""
 CLOSE_MAX: Final = 3.0

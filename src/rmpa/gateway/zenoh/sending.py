@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections import deque
 from typing import TYPE_CHECKING, Final, Protocol
 
@@ -207,7 +208,11 @@ class SendingLane:
         return not self._thread.is_alive()
 
     def _run(self) -> None:
+        window_end, in_window = 0.0, 0
         while True:
+            if in_window >= limits.BUSY_MESSAGES and not self._ready:
+                # The loop need not wake this thread, nor wait for the interpreter's lock, for each message.
+                time.sleep(limits.BUSY_PERIOD / 2)
             with self.changed:
                 while not self._ready and not self._stopped:
                     self.changed.wait()
@@ -217,6 +222,10 @@ class SendingLane:
                 turn = publisher.take_turn()
             for payload, attachment in turn:
                 publisher.one_sent(self._put(publisher, payload, attachment))
+            now = time.monotonic()
+            if now >= window_end:
+                window_end, in_window = now + limits.BUSY_PERIOD, 0
+            in_window += len(turn)
             del turn
             with self.changed:
                 publisher.end_turn()

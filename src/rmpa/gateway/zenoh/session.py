@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import StartError
 from rmpa.gateway.zenoh import limits
-from rmpa.gateway.zenoh.arrivals import ArrivalQueue, Arrivals
+from rmpa.gateway.zenoh.arrivals import ArrivalQueue, Arrivals, keep_thread_state
 from rmpa.gateway.zenoh.queries import ArrivedQuery, PendingGet, content
 from rmpa.gateway.zenoh.sending import QueuedPublisher, SendingLane
 from rmpa.gateway.zenoh.worker import SerialWorker
@@ -235,7 +235,7 @@ class OpenSession:
             try:
                 self._session.get(
                     selector,
-                    zenoh.handlers.Callback(pending.add, pending.finish, indirect=False),
+                    self._direct(pending.add, pending.finish),
                     target=zenoh.QueryTarget.ALL_COMPLETE if all_complete else zenoh.QueryTarget.BEST_MATCHING,
                     consolidation=zenoh.ConsolidationMode.NONE,
                     congestion_control=zenoh.CongestionControl.BLOCK,
@@ -293,9 +293,17 @@ class OpenSession:
             if not thread.join(limits.CLOSE_MAX):
                 _log.warning("zenoh: a thread of the session did not end within %g s", limits.CLOSE_MAX)
 
-    def _direct(self, callback: Callable[[Any], None]) -> Any:
-        """A callback that Zenoh calls in its own thread; by default it starts a thread for each one."""
-        return self._zenoh.handlers.Callback(callback, indirect=False)
+    def _direct(self, callback: Callable[[Any], None], ended: Callable[[], None] | None = None) -> Any:
+        """A callback that Zenoh calls in its own thread.
+
+        By default it starts a thread for each one, with an unbounded queue in front of it.
+        """
+
+        def called(arrived: Any) -> None:
+            keep_thread_state()
+            callback(arrived)
+
+        return self._zenoh.handlers.Callback(called, ended, indirect=False)
 
     def _call_loop(self, function: Callable[[], None]) -> None:
         with contextlib.suppress(RuntimeError):  # the loop was closed before the session

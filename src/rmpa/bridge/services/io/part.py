@@ -55,7 +55,7 @@ from rmpa.ros.wire.tcpros import printable
 from rmpa.runtime.event_loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from rmpa.bridge.messages import Message
     from rmpa.bridge.relay import Relay
@@ -141,6 +141,8 @@ class Services(Part):
         """The outbound plan; read by snapshots too."""
         self.imports = ServiceImports(rules, self._limit_settings, gate)
         """The inbound plan; read by snapshots too."""
+        self.make_room: Callable[[str], None] = lambda _: None
+        """Called with a service whose name a node has already: a gateway's node of another site leaves it."""
         self._budgets: dict[int, Budgets] = {}
         self._shown: dict[tuple[int, str], ShownService] = {}
         self._callers: dict[tuple[int, int], ShownService] = {}
@@ -426,12 +428,16 @@ class Services(Part):
         return shown.proxy.service_uri if shown is not None and shown.proxy is not None else ""
 
     def _register(self, shown: ShownService, proxy: SlaveNode) -> None:
-        providers = self._core.state().services.get(shown.service, {})
-        if any(node != proxy.name for node in providers):
+        if self._is_taken(shown, proxy):
+            self.make_room(shown.service)
+        if self._is_taken(shown, proxy):
             return  # another node was first: the scan hides this service, or did so already
         code, status, _ = self._core.call("registerService", proxy.name, shown.service, proxy.service_uri, proxy.uri)
         if code != 1:
             _log.error("! the local core does not take %s of %s: %s", shown.service, proxy.name, status)
+
+    def _is_taken(self, shown: ShownService, proxy: SlaveNode) -> bool:
+        return any(node != proxy.name for node in self._core.state().services.get(shown.service, {}))
 
     def _withdraw(self, action: Withdraw) -> None:
         self._relay.gone(action.peer, Source(f"service {action.service}", action.node))
