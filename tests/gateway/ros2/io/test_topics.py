@@ -107,7 +107,9 @@ async def test_a_type_without_a_pair_is_told_with_what_to_write() -> None:
         (text,) = bed.problems.values()
         assert "count, text" in text
         assert "fields_1_to_2" in text
-        assert bed.rows("out")[0]["problem"] == text
+        (way,) = await bed.neighbour.ways("/odd")
+        assert not way.flows
+        assert way.stages[-1].text == text
         assert bed.own(EntityKind.PUBLISHER) == []
         bed.graph.remove(source)
         assert bed.problems == {}
@@ -124,6 +126,11 @@ async def test_a_subscription_with_another_hash_or_type_is_told() -> None:
         assert "definitions differ" in bed.problems["/chatter of /older"]
         assert "Humble" in bed.problems["/chatter of /humble"]
         assert "std_msgs/msg/Int32" in bed.problems["/chatter of /other"]
+        (way,) = await bed.neighbour.ways("/chatter")
+        assert (way.peer, way.to, way.node) == ("arm", "ros2", "/talker")
+        heard = next(stage for stage in way.stages if stage.name == "heard")
+        assert "/older" in heard.text
+        assert "/humble" in heard.text
         for each in ends:
             each.close()
 
@@ -272,6 +279,10 @@ async def test_losses_are_counted_by_the_numbers() -> None:
         await eventually(lambda: bed.rows("in")[0]["unconverted"])
         (row,) = bed.rows("in")
         assert (row["received"], row["lost"], row["unconverted"]) == (2, 3, 1)
+        (way,) = await bed.neighbour.ways("/chatter", "ros2")
+        assert way.flows
+        assert "3 were lost" in way.stages[-1].text
+        assert await bed.neighbour.ways("/chatter", "warehouse") == []
         assert len(bed.problems) == 1
 
 
@@ -426,6 +437,9 @@ async def test_rules_decide_what_crosses_and_its_name() -> None:
         refused = bed.neighbour.report()["topics_refused"]
         assert isinstance(refused, dict)
         assert "gateway.rule 1" in refused["/secret of /bot"]
+        ways = await bed.neighbour.ways("/secret")
+        assert {(way.peer, way.to) for way in ways} == {("ros2", "gate"), ("gate", "ros2")}
+        assert not any(way.flows for way in ways)
 
 
 async def test_a_rate_limit_is_kept_and_counted() -> None:
