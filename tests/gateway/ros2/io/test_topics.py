@@ -17,6 +17,7 @@ from rmpa.gateway.zenoh_api import ZenohQos
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_zenoh import MemoryQuery, eventually
 from tests.gateway.ros2.io.ros2_bed import STRING, string, topic_bed
+from tests.gateway.ros2.type_descriptions import response
 
 if TYPE_CHECKING:
     from rmpa.gateway.zenoh_api import ZenohSample
@@ -328,34 +329,7 @@ async def test_a_transient_local_publisher_that_comes_later_has_its_history_aske
 
 def describe(types: Ros2Types, name: str, query: MemoryQuery) -> None:
     """What a ROS 2 node answers when it is asked for its type."""
-    from rmpa.gateway.ros2.type_description import _RESPONSE, _store
-
-    store = _store()
-    made = store.types
-    ids = {"float64": 11, "string": 17, "int32": 6, "uint8": 3}
-
-    def kind(desc: Any) -> Any:
-        number, capacity, nested, inner = 0, 0, "", desc
-        if int(desc[0]) > 2:
-            number, capacity = (48, desc[1][1]) if int(desc[0]) == 3 else (144, 0)
-            inner = desc[1][0]
-        if int(inner[0]) == 2:
-            number, nested = number + 1, inner[1]
-        else:
-            number += ids[inner[1][0]]
-        return made["type_description_interfaces/msg/FieldType"](number, capacity, 0, nested)
-
-    def one(each: str) -> Any:
-        fields = [
-            made["type_description_interfaces/msg/Field"](key, kind(desc), "")
-            for key, desc in types.store.fielddefs[each][1]
-        ]
-        return made["type_description_interfaces/msg/IndividualTypeDescription"](each, fields)
-
-    inner = [str(desc[1]) for _, desc in types.store.fielddefs[name][1] if int(desc[0]) == 2]
-    described = made["type_description_interfaces/msg/TypeDescription"](one(name), [one(each) for each in inner])
-    response = made[_RESPONSE](True, "", described, [], [])
-    query.reply(query.key, bytes(store.serialize_cdr(response, _RESPONSE)), query.attachment)
+    query.reply(query.key, response(types, name), query.attachment)
     query.finish()
 
 
