@@ -147,8 +147,9 @@ BEST_EFFORT_BYTES: Final = 8 * 1024 * 1024
 fits, and a burst of 1,000 small ones."""
 RELIABLE_BYTES: Final = 64 * 1024 * 1024
 """Bytes of one reliable topic that wait for a slow link, as in a lane of the mesh."""
-LARGE_MESSAGE: Final = 64 * 1024
-"""Bytes from which on a topic's messages yield to those of others, if its contract has no priority."""
+LARGE_MESSAGE: Final = 8 * 1024
+"""Bytes from which on a topic's messages yield to those of others, if its contract has no priority: on a line of
+1 Mbit/s one such message takes 65 ms, for which all others of its priority wait."""
 IDLE_CHECK: Final = 1.0
 """Seconds without a message after which a receiver asks for the last sequence number: losses at the end of a burst
 leave no gap."""

@@ -174,7 +174,7 @@ def find_agents(environ: Mapping[str, str]) -> list[FoundAgent]:
 
 
 def choose_agent(environ: Mapping[str, str], name: str | None = None) -> FoundAgent:
-    """The named agent; else that of RMPA_AGENT, the only one, the one at ROS_MASTER_URI, or the only no gateway.
+    """The named agent; else that of RMPA_AGENT, the only one, that of ROS_MASTER_URI, the only one but gateways.
 
     Raises:
         UnreachableError: No agent runs, or none of that name.
