@@ -65,6 +65,8 @@ VALUE_PORTION: Final = 256 * KIB
 """Bytes of a last value in one message to a module that asks for it: 20 ms on a 100 Mbit/s link."""
 VALUE_READING_IDLE: Final = 60.0
 """Seconds for which a last value that is read in portions is kept without another question for it."""
+SITE_ACTIONS_MAX: Final = 1024
+"""Connections under the names of other sites' action servers: two for each pair of a client and a server."""
 SITE_ASK_TIMEOUT: Final = 5.0
 """Seconds for a question to another site's gateway."""
 SITE_PARAMS_AT_ONCE: Final = 256
@@ -145,11 +147,14 @@ BEST_EFFORT_BYTES: Final = 8 * 1024 * 1024
 fits, and a burst of 1,000 small ones."""
 RELIABLE_BYTES: Final = 64 * 1024 * 1024
 """Bytes of one reliable topic that wait for a slow link, as in a lane of the mesh."""
-LARGE_MESSAGE: Final = 64 * 1024
-"""Bytes from which on a topic's messages yield to those of others, if its contract has no priority."""
+LARGE_MESSAGE: Final = 8 * 1024
+"""Bytes from which on a topic's messages yield to those of others, if its contract has no priority: on a line of
+1 Mbit/s one such message takes 65 ms, for which all others of its priority wait."""
 IDLE_CHECK: Final = 1.0
 """Seconds without a message after which a receiver asks for the last sequence number: losses at the end of a burst
 leave no gap."""
+IDLE_CHECK_MAX: Final = 60.0
+"""Seconds between two such questions at most: the pause doubles while no message comes."""
 LATENCIES_KEPT: Final = 512
 """Latencies of one topic from which the report's percentiles are computed."""
 ROS2_CALL_TIMEOUT: Final = 600.0
