@@ -153,6 +153,8 @@ LARGE_MESSAGE: Final = 8 * 1024
 IDLE_CHECK: Final = 1.0
 """Seconds without a message after which a receiver asks for the last sequence number: losses at the end of a burst
 leave no gap."""
+IDLE_CHECK_MAX: Final = 60.0
+"""Seconds between two such questions at most: the pause doubles while no message comes."""
 LATENCIES_KEPT: Final = 512
 """Latencies of one topic from which the report's percentiles are computed."""
 ROS2_CALL_TIMEOUT: Final = 600.0
