@@ -120,11 +120,11 @@ def _snapshot() -> Snapshot:
 
 def _states_away(snapshot: Snapshot, away: Mapping[str, str]) -> dict[str, str]:
     """The modules of other sites whose messages come here: they are linked, by gateways."""
-    sources = [(r.peer, r.node) for t in snapshot.topics for r in t.routes if r.direction == "in"]
+    nodes = [route.node for topic in snapshot.topics for route in topic.routes if route.state == "open"]
     return {
         name: "linked"
         for name, site in away.items()
-        if any(peer == site and node.startswith(f"/{name}/") for peer, node in sources)
+        if any(node.startswith(f"/rmpa/{site}/{name}/") for node in nodes)
     }
 
 

@@ -63,11 +63,17 @@ def test_the_robot_in_the_field_is_driven_from_the_office(tidy: dict[str, str]) 
         assert "base is killed" in command(tidy, "kill", "base")
         wait_for_view(
             demo,
-            lambda view: states(view)["base"] == "gone" and view["topics"]["/velocity_order"]["rate"] > 0,
+            lambda view: (
+                bool(view["restarts"])
+                and states(view)["base"] == "gone"
+                and view["topics"]["/velocity_order"]["rate"] > 0
+            ),
             "base gone, velocity beside it there",
         )
         command(tidy, "start", "base")
-        wait_for_view(demo, all_there, "base back")
+        wait_for_view(
+            demo, lambda view: all_there(view) and any(r["back_after"] for r in view["restarts"]), "base back"
+        )
         assert demo.interrupt() == 0, demo.output
     assert_gone(processes, ports)
     (restart,) = summary_of(demo)["restarts"]
@@ -86,5 +92,6 @@ def test_each_site_goes_on_alone_and_they_meet_again(tidy: dict[str, str], part:
         )
         assert apart["topics"]["/command_information"]["rate"] > 0, "the office goes on"
         command(tidy, "start", part)
-        wait_for_view(demo, all_there, "both sites again")
+        seconds = apart["seconds"]
+        wait_for_view(demo, lambda view: view["seconds"] > seconds + 1 and all_there(view), "both sites again")
         assert demo.interrupt() == 0, demo.output

@@ -27,7 +27,7 @@ class MemoryTap:
     source: MeshSource
     on_message: Callable[[memoryview], None]
     description: TopicDescription | None
-    listener: str = ""
+    listener: str = field(default="", kw_only=True)
 
     def close(self) -> None:
         self.graph.taps = [tap for tap in self.graph.taps if tap is not self]
@@ -145,7 +145,7 @@ class MemoryGraph:
     ) -> MemoryTap:
         del on_lost
         description = self._publishers[_key(source)]
-        tap = MemoryTap(self, source, on_message, description, listener)
+        tap = MemoryTap(self, source, on_message, description, listener=listener)
         self.taps.append(tap)
         on_described(description)
         return tap

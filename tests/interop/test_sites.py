@@ -110,6 +110,11 @@ def test_an_action_runs_at_the_other_site(joined: JoinedModules) -> None:
         done = client.wait_event("done", LONG, since=since)
         assert (done["state"], done["result"]) == ("SUCCEEDED", 10)
         assert len(client.events("feedback", since=since)) == 10
+        since = client.mark_events()
+        client.tell("send 100000")
+        client.wait_event("feedback", LONG, since=since)
+        client.tell("cancel")
+        assert client.wait_event("done", LONG, since=since)["state"] == "PREEMPTED"
 
 
 def test_nothing_crosses_without_a_subscriber(joined: JoinedModules) -> None:
@@ -141,9 +146,12 @@ def test_a_burst_loses_nothing_uncounted(joined: JoinedModules) -> None:
 
 def test_a_command_is_not_late_beside_images_on_a_thin_link(joined: JoinedModules) -> None:
     """1 Mbit/s: images take what is left, and the command is never behind more than one of their pieces."""
-    uplink = joined.warehouse.network.nat
+    uplink, gateway = joined.warehouse.network.nat, joined.warehouse.gateway
     with ExitStack() as stack:
         start = stack.enter_context
+        gateway.terminate()
+        gateway.flags = [*gateway.flags, "--uplink", "1 Mbit/s"]
+        gateway.restart()
         command = start(joined.base.ros.roscpp("recorder", topic="/command", commands=True))
         images = start(joined.base.ros.roscpp("listener", topic="/image"))
         pilot = start(joined.arm.ros.roscpp("talker", topic="/command", rate=20, size=64))
@@ -159,7 +167,10 @@ def test_a_command_is_not_late_beside_images_on_a_thin_link(joined: JoinedModule
         report = command.events("report")[-1]
         assert (report["gaps"], report["doubled"]) == (0, 0)
         late = sorted(row.age for row in recorded(command, joined.net.router.home))
-        assert late[len(late) // 2] < 0.5, f"half of the commands came later than {late[len(late) // 2]} s"
+        assert late[len(late) // 2] < 0.7, f"half of the commands came later than {late[len(late) // 2]} s"
+        gateway.terminate()
+        gateway.flags = gateway.flags[:-2]
+        gateway.restart()
 
 
 def test_a_killed_module_is_gone_at_the_other_site_at_once_and_comes_back(joined: JoinedModules) -> None:

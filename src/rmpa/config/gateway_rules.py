@@ -72,6 +72,7 @@ class CrossingRule:
             with a slash.
         rate: Messages a second of each topic that goes out; ``None``: no limit. Others are dropped, and counted.
         size: Bytes a second of each topic that goes out; ``None``: no limit.
+        keep: Whether the gateway keeps the last value of each topic of this site, also if it is not latched.
     """
 
     names: tuple[str, ...] = ("/**",)
@@ -81,6 +82,7 @@ class CrossingRule:
     name: str = "{name}"
     rate: float | None = None
     size: int | None = None
+    keep: bool = False
 
 
 # --- values ---------------------------------------------------------------------------------------------------------
@@ -181,6 +183,7 @@ _KEYS: Final = (
     RuleKey("name", _TEMPLATE, "The name here of what comes in; {site}, {module} and {name} are replaced."),
     RuleKey("rate", RATE, "Messages a second of each topic that goes out; others are dropped, and counted."),
     RuleKey("size", BYTES_A_SECOND, "Bytes a second of each topic that goes out; others are dropped, and counted."),
+    RuleKey("keep", BOOL, "Keep the last value of each topic of this site, also of those that are not latched."),
 )
 _EXAMPLE: Final = 'one has names = ["/camera/**"] and rate = 2, or crossing = "none"'
 _SELECTORS: Final = {"names", "sites", "modules"}

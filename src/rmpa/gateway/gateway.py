@@ -61,7 +61,7 @@ class Gateway:
         load: Callable[[], Loaded] | None = None,
         *,
         open_session: Callable[[Settings], Awaitable[OwnedSession]],
-        make_neighbours: Callable[[AgentGraph, ZenohSession, Settings], Mapping[str, Neighbour]],
+        make_neighbours: Callable[[AgentGraph, OwnedSession, Settings], Mapping[str, Neighbour]],
     ) -> None:
         self._settings = replace(settings, relay=True)
         self._open_session = open_session

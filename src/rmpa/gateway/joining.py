@@ -9,8 +9,8 @@ from rmpa.gateway.zenoh.trust import open_trusted_session
 if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.gateway.gateway import OwnedSession
-    from rmpa.gateway.neighbour import Neighbour, OwnGraph
-    from rmpa.gateway.zenoh_api import ZenohSession
+    from rmpa.gateway.graph.own_graph import AgentGraph
+    from rmpa.gateway.neighbour import Neighbour
 
 
 async def open_gateway_session(settings: Settings) -> OwnedSession:
@@ -22,7 +22,7 @@ async def open_gateway_session(settings: Settings) -> OwnedSession:
     return await open_trusted_session(settings)
 
 
-def make_neighbours(graph: OwnGraph, session: ZenohSession, settings: Settings) -> dict[str, Neighbour]:
+def make_neighbours(graph: AgentGraph, session: OwnedSession, settings: Settings) -> dict[str, Neighbour]:
     """Make the neighbours that the settings ask for, by their names; they are not started.
 
     Raises:
@@ -33,7 +33,7 @@ def make_neighbours(graph: OwnGraph, session: ZenohSession, settings: Settings) 
     if gateway.site:
         from rmpa.gateway.sites.io.joining import make_site_neighbour  # noqa: PLC0415 - not every gateway needs it
 
-        neighbours["sites"] = make_site_neighbour(graph, session, settings)
+        neighbours["sites"] = make_site_neighbour(graph, session, settings, graph.agent)
     if gateway.ros2.enabled:
         from rmpa.gateway.ros2.io.actions import Ros2Actions  # noqa: PLC0415 - likewise
         from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour  # noqa: PLC0415 - it reads all types of ROS

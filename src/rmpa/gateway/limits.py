@@ -65,6 +65,8 @@ VALUE_PORTION: Final = 256 * KIB
 """Bytes of a last value in one message to a module that asks for it: 20 ms on a 100 Mbit/s link."""
 VALUE_READING_IDLE: Final = 60.0
 """Seconds for which a last value that is read in portions is kept without another question for it."""
+SITE_ACTIONS_MAX: Final = 1024
+"""Connections under the names of other sites' action servers: two for each pair of a client and a server."""
 SITE_ASK_TIMEOUT: Final = 5.0
 """Seconds for a question to another site's gateway."""
 SITE_PARAMS_AT_ONCE: Final = 256
@@ -145,11 +147,14 @@ BEST_EFFORT_BYTES: Final = 8 * 1024 * 1024
 fits, and a burst of 1,000 small ones."""
 RELIABLE_BYTES: Final = 64 * 1024 * 1024
 """Bytes of one reliable topic that wait for a slow link, as in a lane of the mesh."""
-LARGE_MESSAGE: Final = 64 * 1024
-"""Bytes from which on a topic's messages yield to those of others, if its contract has no priority."""
+LARGE_MESSAGE: Final = 8 * 1024
+"""Bytes from which on a topic's messages yield to those of others, if its contract has no priority: on a line of
+1 Mbit/s one such message takes 65 ms, for which all others of its priority wait."""
 IDLE_CHECK: Final = 1.0
 """Seconds without a message after which a receiver asks for the last sequence number: losses at the end of a burst
 leave no gap."""
+IDLE_CHECK_MAX: Final = 60.0
+"""Seconds between two such questions at most: the pause doubles while no message comes."""
 LATENCIES_KEPT: Final = 512
 """Latencies of one topic from which the report's percentiles are computed."""
 ROS2_CALL_TIMEOUT: Final = 600.0
@@ -159,6 +164,13 @@ ROS2_CALLS_MAX: Final = 64
 """Calls of one service that are under way at one time, each way; the next one gets an error."""
 ROS2_DESCRIBE_AGAIN: Final = (0.5, 30.0)
 """Seconds until a service that could not be asked for its type is asked again: at first, and at most; it doubles."""
+ROS2_LINGER: Final = 5.0
+"""Seconds for which a topic of ROS 2 that is wanted stays subscribed after a publisher came or went: messages of a
+publisher that restarts are held until nodes have subscribed to it anew, which takes a module some 0.1 s."""
+ROS2_EARLY_MESSAGES: Final = 1000
+"""Messages of one topic of ROS 2 that are held so; the oldest are dropped, and counted as unheard."""
+ROS2_EARLY_BYTES: Final = 16 * 1024 * 1024
+"""Bytes of these."""
 ROS2_PUBLISHERS_MAX: Final = 1000
 """Publishers of one topic of ROS 2 whose sequence numbers are followed; the one silent for longest is forgotten."""
 ROS2_SERVICE_WAIT: Final = 3.0

@@ -100,6 +100,11 @@ class AgentGraph(Part):
     # --- neighbour.OwnGraph -----------------------------------------------------------------------------------
 
     @property
+    def agent(self) -> Agent:
+        """The gateway's agent."""
+        return self._agent
+
+    @property
     def name(self) -> str:
         """The gateway's name among its peers."""
         return self._name
@@ -139,6 +144,18 @@ class AgentGraph(Part):
             self._register_subscriber(source.here)
         tap.follow(self._core.publishers(source.here).get(source.proxy, ""))
         return tap
+
+    def attend(self, source: MeshSource, listener: ForeignSource) -> TopicTap:
+        """Listen under the name that a foreign node has here, and drop what comes.
+
+        Publishers of actions accept a server by the name of its connections; see ``bridge.topics.audience``.
+
+        Args:
+            source: The topic.
+            listener: A source of the node that listens to it.
+        """
+        _, (_, _, name) = self._place(listener)
+        return self.tap(source, lambda _: None, lambda _: None, lambda _: None, listener=name)
 
     async def describe(self, source: MeshSource) -> ServiceDescription:
         """Ask a local service for its type."""

@@ -5,15 +5,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rmpa.gateway import limits
+from rmpa.gateway.sites.part import PassivePart
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.gateway.sites.keys import SiteModule
-    from rmpa.gateway.sites.part import SiteExport, SiteImport
 
 
-class SiteHistory:
+class SiteHistory(PassivePart):
     """Remembers since when sites are there or away: a ``SitePart``.
 
     Args:
@@ -48,24 +48,6 @@ class SiteHistory:
         while len(self._since) > limits.SITES_REMEMBERED_MAX and self.away:
             del self._since[min(self.away, key=self._since.__getitem__)]
 
-    def export(self, entry: SiteExport) -> None:
-        """Nothing."""
-
-    def withdraw(self, entry: SiteExport) -> None:
-        """Nothing."""
-
-    def show(self, entry: SiteImport) -> None:
-        """Nothing."""
-
-    def renew(self, old: SiteImport, new: SiteImport) -> None:
-        """Nothing."""
-
-    def hide(self, entry: SiteImport) -> None:
-        """Nothing."""
-
     def report(self) -> dict[str, object]:
         """The sites that are away, with the seconds since they left."""
         return {site: self.since_ago(site) for site in self.away}
-
-    async def close(self) -> None:
-        """Nothing."""

@@ -72,3 +72,34 @@ class SitePart(Protocol):
 
     async def close(self) -> None:
         """End it: everything was withdrawn and hidden before."""
+
+
+class PassivePart:
+    """A ``SitePart`` that ignores everything; parts override what they need."""
+
+    name = ""
+
+    def export(self, entry: SiteExport) -> None:
+        """Ignore a source of this site."""
+
+    def withdraw(self, entry: SiteExport) -> None:
+        """Ignore that it goes."""
+
+    def show(self, entry: SiteImport) -> None:
+        """Ignore a source of another site."""
+
+    def renew(self, old: SiteImport, new: SiteImport) -> None:
+        """Ignore that it is of another run."""
+
+    def hide(self, entry: SiteImport) -> None:
+        """Ignore that it goes."""
+
+    def module_changed(self, module: SiteModule, there: bool) -> None:
+        """Ignore a module."""
+
+    def report(self) -> dict[str, object]:
+        """Nothing."""
+        return {}
+
+    async def close(self) -> None:
+        """Nothing is to be closed."""

@@ -84,6 +84,10 @@ class CrossingRules:
                 return "" if rule.crossing in _OUT else f"{_named(number, rule)} lets it not go out to {site}"
         return ""
 
+    def kept(self, module: str, name: str) -> bool:
+        """Whether the first rule that fits a topic of this site has its last value kept."""
+        return next((rule.keep for _, rule in self._fitting(module, name)), False)
+
     def incoming(
         self, kind: SourceKind, site: str, module: str, name: str, type_name: str, node: str
     ) -> CrossingDecision:

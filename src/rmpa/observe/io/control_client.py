@@ -174,8 +174,7 @@ def find_agents(environ: Mapping[str, str]) -> list[FoundAgent]:
 
 
 def choose_agent(environ: Mapping[str, str], name: str | None = None) -> FoundAgent:
-    """The named agent; else that of RMPA_AGENT, the only running one, the one whose core is ROS_MASTER_URI, or the only
-    one that is no gateway.
+    """The named agent; else that of RMPA_AGENT, the only one, that of ROS_MASTER_URI, the only one but gateways.
 
     Raises:
         UnreachableError: No agent runs, or none of that name.

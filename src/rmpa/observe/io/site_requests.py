@@ -27,7 +27,7 @@ BODY: Final = "site.last.body"
 PARAM: Final = "site.param"
 """A request about parameters (``bridge.params.transfer``) to a module: ``{site, module, what, args}``."""
 WHY: Final = "site.why"
-"""The request for the ways of a topic or a service through gateways: ``{name, site, module, service}``."""
+"""The request for the ways of a topic or a service through gateways: ``{name, site, module, asker, service}``."""
 _ALL: Final = (REPORT, WHY)
 """Those that every gateway answers for itself."""
 QUESTIONS: Final = (REPORT, INFO, LAST, BODY, PARAM, WHY)
@@ -81,7 +81,9 @@ class SiteRequests:
         if self._gateway is not None:
             return [await self._gateway.answer(what, args)]
         sessions = list(self._linked())
-        found = await asyncio.gather(*(self._ask(session, what, args) for session in sessions))
+        # Twice the time: the gateway itself asks the other site for so long.
+        wait = 2 * limits.ASK_TIMEOUT
+        found = await asyncio.gather(*(self._ask(session, what, args, wait) for session in sessions))
         return [value for value, error in found if error is None]
 
     async def one(self, what: str, args: dict[str, Any]) -> Any:
@@ -97,7 +99,7 @@ class SiteRequests:
         sessions = sorted(self._linked(), key=lambda each: str(each.link.guid) != self._liked.get(site))
         problem: RmpaError | None = None
         for session in sessions:
-            value, error = await self._ask(session, what, args)
+            value, error = await self._ask(session, what, args, limits.PARAM_ASK_TIMEOUT)
             if error is None:
                 self._liked[site] = str(session.link.guid)
                 return value
@@ -112,9 +114,11 @@ class SiteRequests:
             "gateway", "any linked peer", "start one with `rmpa gateway`; `rmpa peer list` shows who is linked"
         )
 
-    async def _ask(self, session: PeerSession, what: str, args: dict[str, Any]) -> tuple[Any, RmpaError | None]:
+    async def _ask(
+        self, session: PeerSession, what: str, args: dict[str, Any], wait: float
+    ) -> tuple[Any, RmpaError | None]:
         try:
-            return await self._rpc.request(session, what, args, limits.PARAM_ASK_TIMEOUT), None
+            return await self._rpc.request(session, what, args, wait), None
         except RmpaError as error:
             return None, error
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from rmpa.config.gateway_rules import Crossing, CrossingRule, Ros2Settings
 from rmpa.core.contract import ContractRule, Contracts, History, Reliability
 from rmpa.gateway.ros2.attachment import Ros2Attachment
+from rmpa.gateway.ros2.conversion import Conversion
 from rmpa.gateway.ros2.io.own_nodes import gid_of
 from rmpa.gateway.ros2.qos import Ros2Durability, Ros2History, Ros2Qos, Ros2Reliability
 from rmpa.gateway.ros2.tokens import NO_HASH, EntityKind
@@ -49,7 +50,8 @@ async def test_a_topic_of_a_module_is_a_publisher_of_ros2() -> None:
         attached = [Ros2Attachment.parse(each.attachment) for each in heard]
         assert [each.sequence for each in attached] == [1, 2]
         assert {each.gid for each in attached} == {gid_of(endpoint.token())}
-        ends[0].close()
+        for each in ends:
+            each.close()
         await eventually(lambda: not bed.graph.taps)
         bed.graph.remove(source)
         assert bed.own(EntityKind.PUBLISHER) == []
@@ -64,7 +66,8 @@ async def test_a_late_node_of_ros2_gets_the_latched_message() -> None:
         bed.graph.send(source, string("old"))
         bed.graph.send(source, string("new"))
         await eventually(lambda: len(early) == 2)
-        ends[0].close()
+        for each in ends:
+            each.close()
         late: list[ZenohSample] = []
         bed.subscribe("/map", late, qos=LATCHED)
         await eventually(lambda: late)
@@ -178,6 +181,45 @@ async def test_a_topic_of_ros2_is_a_source_of_its_node() -> None:
         assert bed.own(EntityKind.SUBSCRIPTION) == []
         talker.close()
         await eventually(lambda: bed.topic("/chatter") is None)
+
+
+async def test_a_publisher_that_restarts_loses_nothing_while_nodes_subscribe_anew() -> None:
+    async with topic_bed() as bed:
+        talker = bed.publisher("/chatter")
+        await eventually(lambda: bed.topic("/chatter"))
+        topic = bed.topic("/chatter")
+        assert topic is not None
+        topic.on_demand(True)
+        await eventually(lambda: talker.wanted)
+        talker.close()
+        await eventually(lambda: bed.topic("/chatter") is None)
+        again = bed.publisher("/chatter")
+        for number in range(60):
+            again.say(f"{number}")
+        await eventually(lambda: bed.topic("/chatter"))
+        topic = bed.topic("/chatter")
+        assert topic is not None
+        again.say("60")
+        topic.on_demand(True)
+        await eventually(lambda: len(topic.messages) == 61)
+        assert topic.messages == [string(f"{number}") for number in range(61)]
+
+
+async def test_a_header_is_numbered_as_its_publisher_numbers_its_messages() -> None:
+    kind, name = MessageType("geometry_msgs/PointStamped"), "geometry_msgs/msg/PointStamped"
+    async with topic_bed() as bed:
+        talker = bed.publisher("/point", type_name=name)
+        await eventually(lambda: bed.topic("/point"))
+        topic = bed.topic("/point")
+        assert topic is not None
+        topic.on_demand(True)
+        await eventually(lambda: talker.wanted)
+        conversion = Conversion(kind, name, bed.types)
+        for x in (1.0, 2.0):
+            talker.put(conversion.to_ros2(kind.serialize(kind.make({"point": {"x": x}}))), skip=1)
+        await eventually(lambda: len(topic.messages) == 2)
+        got: list[Any] = [kind.deserialize(each) for each in topic.messages]
+        assert [(each.header.seq, each.point.x) for each in got] == [(2, 1.0), (4, 2.0)]
 
 
 async def test_each_node_has_its_own_messages() -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.ros2.io.offered_service import OfferedService
-from rmpa.gateway.ros2.io.shown_service import ShownService
+from rmpa.gateway.ros2.io.shown_service import ShownRos2Service
 from rmpa.gateway.ros2.service_pair import ros2_without_use
 from rmpa.gateway.ros2.tokens import EntityKind
 
@@ -23,7 +23,7 @@ class Ros2Services:
     def __init__(self) -> None:
         self._context: Ros2Context | None = None
         self._offered: dict[str, list[OfferedService]] = {}
-        self._shown: dict[str, ShownService] = {}
+        self._shown: dict[str, ShownRos2Service] = {}
         self._counts: Counter[str] = Counter()
 
     def start(self, context: Ros2Context) -> None:
@@ -92,7 +92,7 @@ class Ros2Services:
         context = self._context
         if context is None or (here := context.crossing.name_here(endpoint.name)) is None:
             return
-        self._shown[endpoint.name] = shown = ShownService(context, endpoint, here, self._counts)
+        self._shown[endpoint.name] = shown = ShownRos2Service(context, endpoint, here, self._counts)
         shown.start()
 
     def _replace(self, gone: Ros2Endpoint) -> None:

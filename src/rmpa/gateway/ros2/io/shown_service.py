@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.services import ServiceDescription
 
 
-class ShownService:
+class ShownRos2Service:
     """Shows one service of ROS 2 to the nodes here, and passes on their calls.
 
     Args:

@@ -57,6 +57,7 @@ class Ros2TopicExport:
         self._limit = TopicLimits(decision.rate, decision.size)
         self._latching = False
         self._tap: Tap | None = None
+        self._opening = False
         self._publisher: ZenohPublisher | None = None
         self._endpoint: OwnEndpoint | None = None
         self._conversion: Conversion | None = None
@@ -125,7 +126,7 @@ class Ros2TopicExport:
     # --- in ROS 2's graph ----------------------------------------------------------------------------------------
 
     def _declare(self, type_name: str, type_hash: str) -> None:
-        """Declare the publisher before its token, so that it is ready once it is seen."""
+        """Declare it, or declare it anew with another type or QoS; messages that wait are sent before."""
         context, source = self._context, self.source
         contract = context.contracts.of(source.name, source.type)
         qos = ros2_qos(context.contracts, source.name, source.type, latching=self._latching)
@@ -159,7 +160,8 @@ class Ros2TopicExport:
             publisher.close()
 
     def _matching(self, *, there: bool) -> None:
-        if self._closed:
+        """Zenoh's matching tells of demand, not the tokens of subscriptions: what is sent before it is lost."""
+        if self._closed or self._endpoint is None:
             return
         self._wanted = there
         if there:
@@ -176,8 +178,10 @@ class Ros2TopicExport:
         return self._was_wanted and self._endpoint is not None and self._endpoint.endpoint.qos.latched
 
     def _open_tap(self) -> None:
-        if self._tap is None:
+        if self._tap is None and not self._opening:
+            self._opening = True
             self._tap = self._context.graph.tap(self.source, self._message, self._described, self._lost)
+            self._opening = False
 
     def _close_tap(self) -> None:
         tap, self._tap = self._tap, None

@@ -44,6 +44,7 @@ class Ros2Topics:
         self._context: Ros2Context | None = None
         self._pairs: Ros2Pairs | None = None
         self._exports: dict[tuple[str, str], Ros2TopicExport] = {}
+        self._exports_named: dict[str, dict[tuple[str, str], Ros2TopicExport]] = {}
         self._imports: dict[str, Ros2TopicImport] = {}
         self._refused: dict[str, str] = {}
         self._service_appeared = asyncio.Event()
@@ -61,6 +62,7 @@ class Ros2Topics:
         for imported in self._imports.values():
             imported.close()
         self._exports.clear()
+        self._exports_named.clear()
         self._imports.clear()
 
     def report(self) -> dict[str, object]:
@@ -79,6 +81,9 @@ class Ros2Topics:
             return False
         key = source.here, source.proxy
         if (old := self._exports.pop(key, None)) is not None:
+            self._exports_named[source.here].pop(key, None)
+            if not self._exports_named[source.here]:
+                del self._exports_named[source.here]
             old.close()
         refused = f"{source.here} of {source.proxy}"
         self._refused.pop(refused, None)
@@ -91,6 +96,7 @@ class Ros2Topics:
             self._refuse(refused, decision.why)
         else:
             export = self._exports[key] = Ros2TopicExport(context, pairs, source, decision, self._declared)
+            self._exports_named.setdefault(source.here, {})[key] = export
             export.start()
         return True
 
@@ -115,12 +121,10 @@ class Ros2Topics:
             self._service_appeared = asyncio.Event()
         if endpoint.kind not in _TOPIC_ENDS or self._context is None:
             return False
-        if there:
-            for export in self._exports.values():
-                if export.source.here == endpoint.name:
-                    self._compare(export, endpoint)
-        else:
+        if not there:
             self._context.say(f"{endpoint.name} of {endpoint.node.name}", "")
+        for export in self._exports_named.get(endpoint.name, {}).values() if there else ():
+            self._compare(export, endpoint)
         if endpoint.kind is EntityKind.PUBLISHER and not _hidden(endpoint.name):
             (self._publisher_there if there else self._publisher_gone)(endpoint)
         return True
@@ -137,7 +141,9 @@ class Ros2Topics:
             if not decision.allowed:
                 self._refuse(f"{endpoint.name} of {endpoint.node.name}", decision.why)
                 return
-            imported = self._imports[key] = Ros2TopicImport(context, endpoint, ros1_type, decision)
+            imported = self._imports[key] = Ros2TopicImport(
+                context, endpoint, ros1_type, decision, lambda: self._drop_unused(key)
+            )
             imported.add(endpoint)
             self._find_conversion(imported, endpoint)
         else:
@@ -148,9 +154,14 @@ class Ros2Topics:
         key = endpoint.key()
         if (imported := self._imports.get(key)) is not None:
             imported.remove(endpoint)
-            if not imported.publishers:
-                del self._imports[key]
-                imported.close()
+            self._drop_unused(key)
+
+    def _drop_unused(self, key: str) -> None:
+        """A topic without publishers goes; one that was wanted stays for a while, as its publisher may restart."""
+        imported = self._imports.get(key)
+        if imported is not None and not imported.publishers and not imported.lingers:
+            del self._imports[key]
+            imported.close()
 
     def _find_conversion(self, imported: Ros2TopicImport, endpoint: Ros2Endpoint) -> None:
         context, pairs = self._context, self._pairs

@@ -23,14 +23,14 @@ from rmpa.gateway.sites.last_values import (
     parse_value_key,
     value_key,
 )
+from rmpa.gateway.sites.part import PassivePart
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
 
     from rmpa.gateway.neighbour import MeshSource, OwnGraph, Tap
     from rmpa.gateway.sites.io.last_value_store import LastValueStore
-    from rmpa.gateway.sites.keys import SiteModule
-    from rmpa.gateway.sites.part import SiteExport, SiteImport
+    from rmpa.gateway.sites.part import SiteExport
     from rmpa.gateway.zenoh_api import Declared, ZenohQuery, ZenohSession
     from rmpa.ros.wire.tcpros import TopicDescription
 
@@ -48,7 +48,7 @@ class _Watched:
     described: asyncio.Event | None = None
 
 
-class SiteLastValues:
+class SiteLastValues(PassivePart):
     """Last values of this site: a ``SitePart``.
 
     Latched topics and descriptors of Smart Resources are kept, and what a rule names.
@@ -113,18 +113,6 @@ class SiteLastValues:
             watched.tap.close()
         if (task := self._looking.pop(key, None)) is not None:
             task.cancel()
-
-    def show(self, entry: SiteImport) -> None:
-        """Nothing: a site keeps its own values."""
-
-    def renew(self, old: SiteImport, new: SiteImport) -> None:
-        """Nothing."""
-
-    def hide(self, entry: SiteImport) -> None:
-        """Nothing."""
-
-    def module_changed(self, module: SiteModule, there: bool) -> None:
-        """Nothing: values outlive their modules."""
 
     def report(self) -> dict[str, object]:
         """What is kept, as JSON values."""

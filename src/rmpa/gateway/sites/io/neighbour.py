@@ -64,6 +64,10 @@ class SiteNeighbour:
         self._timer = MachineTimer(self._next_timer, self._handle_timer)
         self._closed = False
 
+    def add(self, part: SitePart) -> None:
+        """Add a part that needs this neighbour, before ``start()``."""
+        self._parts = (*self._parts, part)
+
     @property
     def leads(self) -> bool:
         """Whether this gateway is the one of its site that exports and imports."""

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from rmpa.gateway.sites.part import PassivePart
+
 if TYPE_CHECKING:
     from rmpa.gateway.sites.io.param_exports import SiteParamExports
     from rmpa.gateway.sites.io.param_imports import SiteParamImports
     from rmpa.gateway.sites.keys import SiteModule
-    from rmpa.gateway.sites.part import SiteExport, SiteImport
 
 
-class SiteParams:
+class SiteParams(PassivePart):
     """Parameters between sites: a ``SitePart``.
 
     Args:
@@ -27,21 +28,6 @@ class SiteParams:
         self._exports = exports
         self._imports = imports
         imports.start()
-
-    def export(self, entry: SiteExport) -> None:
-        """Nothing: a module's parameters are there as long as it is."""
-
-    def withdraw(self, entry: SiteExport) -> None:
-        """Nothing."""
-
-    def show(self, entry: SiteImport) -> None:
-        """Nothing."""
-
-    def renew(self, old: SiteImport, new: SiteImport) -> None:
-        """Nothing."""
-
-    def hide(self, entry: SiteImport) -> None:
-        """Nothing."""
 
     def module_changed(self, module: SiteModule, there: bool) -> None:
         """Answer for a module of this site while it is there."""

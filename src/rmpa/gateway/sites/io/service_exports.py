@@ -108,6 +108,7 @@ class SiteServiceExports:
         return [
             {
                 "module": entry.source.module,
+                "node": entry.source.node,
                 "name": entry.source.name,
                 "type": entry.description.type if entry.description is not None else entry.source.type,
                 "calls": entry.calls,

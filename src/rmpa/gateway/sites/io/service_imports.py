@@ -105,6 +105,7 @@ class SiteServiceImports:
             {
                 "site": entry.source.module.site,
                 "module": entry.source.module.name,
+                "node": entry.source.node,
                 "name": entry.source.name,
                 "here": entry.foreign.name,
                 "type": entry.description.type if entry.description is not None else entry.source.type,

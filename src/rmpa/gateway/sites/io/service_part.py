@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.sites.io.service_exports import SiteServiceExports
 from rmpa.gateway.sites.io.service_imports import SiteServiceImports
+from rmpa.gateway.sites.part import PassivePart
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.gateway.neighbour import MeshSource, OwnGraph
-    from rmpa.gateway.sites.keys import SiteModule
     from rmpa.gateway.sites.part import SiteExport, SiteImport
     from rmpa.gateway.zenoh_api import ZenohSession
 
 
-class SiteServices:
+class SiteServices(PassivePart):
     """Services between sites: a ``SitePart``.
 
     Args:
@@ -70,9 +70,6 @@ class SiteServices:
         """Take it out of the graph; calls under way end with an error."""
         if entry.source.kind is SourceKind.SERVICE:
             self._imports.hide(entry.source)
-
-    def module_changed(self, module: SiteModule, there: bool) -> None:
-        """Nothing: the sources of a module come and go by themselves."""
 
     def report(self) -> dict[str, object]:
         """The services that go out and come in, with their calls."""

@@ -13,6 +13,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.sites.attachment import SiteAttachment
 from rmpa.gateway.sites.last_values import HEADER, ValueHeader, value_key
+from rmpa.gateway.sites.part import PassivePart
 from rmpa.gateway.sites.services import NO_MD5
 from rmpa.observe.io.site_requests import BODY, INFO, LAST, PARAM, REPORT, WHY
 from rmpa.observe.sites import LastValueInfo, SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport, ValuePortion
@@ -24,9 +25,9 @@ if TYPE_CHECKING:
     from rmpa.gateway.sites.exports import SiteExports
     from rmpa.gateway.sites.history import SiteHistory
     from rmpa.gateway.sites.imports import SiteImports
+    from rmpa.gateway.sites.io.site_why import SiteWhy
     from rmpa.gateway.sites.keys import SiteGateway, SiteModule
     from rmpa.gateway.zenoh_api import ZenohReply, ZenohSession
-    from rmpa.observe.why.diagnosis import Diagnosis
 
 _KINDS: Final = {SourceKind.TOPIC: "topic", SourceKind.SERVICE: "service"}
 
@@ -46,8 +47,8 @@ class Sites(Protocol):
         """Of its parts, among others."""
 
 
-class SiteAnswers:
-    """A ``SiteAnswerer``.
+class SiteAnswers(PassivePart):
+    """A ``SiteAnswerer``, and a ``SitePart`` to be closed.
 
     Args:
         gateway: This gateway's name.
@@ -57,9 +58,11 @@ class SiteAnswers:
         history: Since when sites are there or away.
         endpoints: The Zenoh endpoints that the session is connected to.
         ask_param: Asks a module of another site about a parameter: site, module, question, arguments.
-        why: The ways of a topic or a service through this gateway: name, site, module, whether a service.
+        why: Tells the ways of a topic or a service through this gateway; closed here.
         stamp: The wall clock, nanoseconds since 1970.
     """
+
+    name = "answers"
 
     def __init__(
         self,
@@ -70,7 +73,7 @@ class SiteAnswers:
         history: SiteHistory,
         endpoints: Callable[[], tuple[str, ...]],
         ask_param: Callable[[str, str, str, dict[str, Any]], Awaitable[object]],
-        why: Callable[[str, str, str, bool], Awaitable[list[Diagnosis]]],
+        why: SiteWhy,
         stamp: Callable[[], int],
     ) -> None:
         self._gateway = gateway
@@ -85,8 +88,9 @@ class SiteAnswers:
         self._readings: dict[tuple[str, str, str, str], bytes] = {}
         self._forgetting: asyncio.TimerHandle | None = None
 
-    def close(self) -> None:
-        """Forget what is being read."""
+    async def close(self) -> None:
+        """Forget what is being read, and answer other gateways no more."""
+        self._why.close()
         self._readings.clear()
         if self._forgetting is not None:
             self._forgetting.cancel()
@@ -96,8 +100,8 @@ class SiteAnswers:
         if what == REPORT:
             return self._report(self._site_names(), sources=False)
         if what == WHY:
-            name, site, module = (str(args.get(key) or "") for key in ("name", "site", "module"))
-            return await self._why(name, site, module, args.get("service") is True)
+            name, site, module, asker = (str(args.get(key) or "") for key in ("name", "site", "module", "asker"))
+            return await self._why.ways(name, site, module, asker, service=args.get("service") is True)
         site = str(args.get("site", ""))
         if what == INFO:
             known = self._site_names()
