@@ -42,4 +42,8 @@ def make_neighbours(graph: AgentGraph, session: OwnedSession, settings: Settings
 
         parts = (Ros2Actions(), Ros2Services(), Ros2Topics())
         neighbours["ros2"] = Ros2Neighbour(graph, session, gateway, parts, settings.make_contracts())
+    if gateway.ros1_bridge:
+        from rmpa.gateway.ros1_bridge.io.joining import make_ros1_bridge_neighbour  # noqa: PLC0415 - likewise
+
+        neighbours["ros1_bridge"] = make_ros1_bridge_neighbour(graph, session, settings)
     return neighbours
