@@ -95,6 +95,7 @@ INTERNAL: Final = {
     "CSR_MAX",
     "DENY_MAX",
     "DOCUMENT_MAX",
+    "IDLE_CHECK_MAX",
     "ISSUED_MAX",
     "JOIN_ANSWER_MAX",
     "JOIN_REQUEST_MAX",

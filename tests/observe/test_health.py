@@ -95,7 +95,7 @@ def test_file_descriptors(near: bool, problem: str, expected: DiagnosticLevel, t
 @pytest.mark.parametrize(
     ("changes", "expected", "text"),
     [
-        ({"state": "idle", "rate": None}, DiagnosticLevel.OK, "nobody here listens"),
+        ({"state": "idle", "rate": None}, DiagnosticLevel.OK, "no node here subscribes"),
         ({"rate": None, "age": None}, DiagnosticLevel.OK, "open"),
         ({"rate": None, "age": 90.0}, DiagnosticLevel.OK, "open, last message 90 s ago"),
         ({"latency": None}, DiagnosticLevel.OK, "10.0 Hz"),

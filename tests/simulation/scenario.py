@@ -196,4 +196,4 @@ class Scenario:
 
 
 def _names(identities: tuple[Identity, ...]) -> str:
-    return ", ".join(f"{i.name}#{i.guid.incarnation}" for i in identities) or "nobody"
+    return ", ".join(f"{i.name}#{i.guid.incarnation}" for i in identities) or "no client"

@@ -335,7 +335,7 @@ class SimListener:
 def connect(
     network: Network, process: Process, host: str, to: Address, on_done: Callable[[SimSocket | None], None]
 ) -> None:
-    """Connect; ``on_done(None)`` if nobody listens there, nothing at all while parted or walled off."""
+    """Connect; ``on_done(None)`` if no process listens there, nothing at all while parted or walled off."""
     world = network.world
 
     def arrive() -> None:

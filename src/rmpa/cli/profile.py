@@ -127,7 +127,7 @@ def explain(resource: str | None, options: GraphOptions) -> None:
 
 def _print_explained(one: SeenResource, decision: dict[str, Any]) -> None:
     runs, chosen = str(decision.get("profile", "")), str(decision.get("chosen", ""))
-    clients = ", ".join(map(str, decision.get("clients", ()))) or "nobody"
+    clients = ", ".join(map(str, decision.get("clients", ()))) or "no client"
     print_line(f"{one}: profile {runs or 'none'}" + (", chosen by hand" if chosen else ""))
     print_line(f"asked by {clients}")
     for conflict in decision.get("conflicts", ()):

@@ -136,7 +136,7 @@ def type_(topic: str, options: GraphOptions) -> None:
     graph.require_topic(wanted.name)
     kind = graph.types.get(wanted.name)
     if kind is None:
-        raise RmpaError(f"nobody has told the type of {wanted.name} yet: its publisher does")
+        raise RmpaError(f"the type of {wanted.name} is not known yet: its publisher tells it")
     if options.as_json:
         print_json({"name": wanted.name, "type": kind})
     else:

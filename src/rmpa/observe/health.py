@@ -273,7 +273,7 @@ def _directly(one: SubscriberTransport) -> str:
 
 def _relayed(route: RouteInfo) -> str:
     if route.state == "idle":
-        return "nobody here listens"
+        return "no node here subscribes"
     if route.rate is None:
         return f"{route.state}, last message {route.age:.3g} s ago" if route.age is not None else route.state
     latency = f", {route.latency.p50 * 1e3:.2f} ms" if route.latency is not None else ""

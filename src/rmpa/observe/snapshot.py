@@ -316,7 +316,7 @@ class SubscriberTransport(msgspec.Struct, kw_only=True, frozen=True):
         text: That as text, ready to read.
         missed: Messages that were seen to pass while it was moved between transports.
         stuck: Why its direct connection cannot be ended although it has to be relayed; empty: nothing is wrong.
-        connected: Whether its direct connection stands, by the node and the kernel; ``None``: nobody looked.
+        connected: Whether its direct connection stands, by the node and the kernel; ``None``: not looked at.
         figures: Of its direct connection, while somebody looks; see ``unmeasured``.
         unmeasured: Why the node tells no figures although somebody looks, ready to read.
         silent: Whether the node that was asked for them did not answer.

@@ -61,7 +61,7 @@ class LogWriter:
                 self._write()
             if self.lost:
                 lost, self.lost = self.lost, 0
-                _log.warning("! %d log lines were lost: whoever reads the log has stopped for a while", lost)
+                _log.warning("! %d log lines were lost: the reader of the log has stopped for a while", lost)
 
     def _write(self) -> None:
         lines = [self._waiting.popleft() for _ in range(min(len(self._waiting), limits.LOG_BATCH))]

@@ -33,3 +33,14 @@ def test_a_shorter_one_is_refused(length: int) -> None:
 def test_each_is_read_back(sequence: int, stamp: int, gid: bytes) -> None:
     made = Ros2Attachment(sequence, stamp, gid)
     assert Ros2Attachment.parse(memoryview(made.serialize())) == made
+
+
+def test_the_older_form_with_names_is_read() -> None:
+    raw = (
+        b"\x0fsequence_number" + (7).to_bytes(8, "little") + b"\x10source_timestamp" + (9).to_bytes(8, "little")
+        + b"\x0asource_gid" + b"\x10" + bytes(range(16))
+    )  # fmt: skip
+    assert Ros2Attachment.parse(raw) == Ros2Attachment(7, 9, bytes(range(16)))
+    for end in range(16, len(raw)):
+        with pytest.raises(RemoteProtocolError):
+            Ros2Attachment.parse(raw[:end])

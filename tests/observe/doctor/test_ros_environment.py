@@ -38,7 +38,7 @@ def test_a_clean_shell() -> None:
         ("http://10.0.0.1:11311", CheckLevel.OK, "is the core of base"),
         ("http://robot2:11311", CheckLevel.FAIL, "is another machine (10.0.0.2)"),
         ("http://10.0.0.7:11311", CheckLevel.FAIL, "is another machine"),
-        ("http://nobody:11311", CheckLevel.FAIL, "nobody knows the name nobody"),
+        ("http://nobody:11311", CheckLevel.FAIL, "the name nobody cannot be resolved"),
         (
             "http://localhost:11312",
             CheckLevel.WARN,
@@ -82,7 +82,7 @@ def test_ros_master_uri_of_a_roscore_that_the_agent_uses() -> None:
         ("ROS_HOSTNAME", "base.local", CheckLevel.OK, "is this machine"),
         ("ROS_HOSTNAME", "localhost", CheckLevel.OK, "is this machine"),
         ("ROS_HOSTNAME", "robot2", CheckLevel.FAIL, "is not an address of this machine"),
-        ("ROS_HOSTNAME", "nobody", CheckLevel.FAIL, "nobody knows the name nobody"),
+        ("ROS_HOSTNAME", "nobody", CheckLevel.FAIL, "the name nobody cannot be resolved"),
         ("ROS_HOSTNAME", "http://base:11311", CheckLevel.FAIL, "is a URI"),
     ],
 )

@@ -43,9 +43,9 @@ def test_alarm_text_and_values() -> None:
 def test_health_reports_the_worst() -> None:
     assert health(loop(), [], []) == (DiagnosticLevel.OK, "profile fast")
     assert health(loop(), [], ["task a stuck"]) == (DiagnosticLevel.WARN, "task a stuck")
-    assert health(loop(), ["nobody publishes /b"], ["c"]) == (DiagnosticLevel.STALE, "nobody publishes /b; c")
+    assert health(loop(), ["no node publishes /b"], ["c"]) == (DiagnosticLevel.STALE, "no node publishes /b; c")
     assert health(loop(runs=False), [], ["c"]) == (DiagnosticLevel.ERROR, "no profile runs; c")
-    level, text = health(loop(rate=90.0), ["nobody publishes /b"], [])
+    level, text = health(loop(rate=90.0), ["no node publishes /b"], [])
     assert (level, text) == (
         DiagnosticLevel.ERROR, "non-adaptable: no profile gives rate as asked; fast is the best there is",
     )  # fmt: skip

@@ -68,7 +68,7 @@ async def test_a_resource_lives_and_says_what_it_lacks(core: RosCore) -> None:
     async with Node("watcher", master_uri=core.uri) as node:
         diagnostics = await node.subscribe("/diagnostics", "diagnostic_msgs/DiagnosticArray")
         said = await node.subscribe("/echo/said", "std_msgs/String")
-        assert await health(diagnostics, STALE) == "nobody publishes /orders"
+        assert await health(diagnostics, STALE) == "no node publishes /orders"
         orders = await node.advertise("/orders", "std_msgs/String")
         await orders.wait_for_subscriber()
         assert await health(diagnostics, OK) == "profile plain"
@@ -87,7 +87,7 @@ async def test_a_resource_lives_and_says_what_it_lacks(core: RosCore) -> None:
         orders.publish(orders.make({"data": "fail"}))  # and again
         assert "it is inactive" in await health(diagnostics, WARN)
         await orders.close()
-        assert "nobody publishes /orders" in await health(diagnostics, STALE)
+        assert "no node publishes /orders" in await health(diagnostics, STALE)
     await member.close()
     assert events == ["configure", *("activate", "deactivate") * 2, "finalize"]
     assert core.state().nodes.keys() <= {"/rosout"}

@@ -118,6 +118,11 @@ def test_arrays_have_the_tags_of_the_specification(kind: str, tag: int, code: st
     assert _json(codec, raw) == {"a": [1, 2, 3]}
 
 
+def _one_nan(value: float) -> float:
+    """CBOR's half-precision NaN has no room for the other bits that a NaN may have."""
+    return math.nan if math.isnan(value) else value
+
+
 _SCALARS: dict[str, st.SearchStrategy[Any]] = {
     "bool": st.booleans(),
     "int8": st.integers(-128, 127),
@@ -128,8 +133,8 @@ _SCALARS: dict[str, st.SearchStrategy[Any]] = {
     "uint32": st.integers(0, 2**32 - 1),
     "int64": st.integers(-(2**63), 2**63 - 1),
     "uint64": st.integers(0, 2**64 - 1),
-    "float32": st.floats(width=32, allow_infinity=False),
-    "float64": st.floats(allow_infinity=False),
+    "float32": st.floats(width=32, allow_infinity=False).map(_one_nan),
+    "float64": st.floats(allow_infinity=False).map(_one_nan),
     "string": st.text(st.characters(exclude_categories=["Cs"])),
     "time": st.fixed_dictionaries({"secs": st.integers(0, 2**32 - 1), "nsecs": st.integers(0, 2**32 - 1)}),
     "duration": st.fixed_dictionaries({"secs": st.integers(-(2**31), 2**31 - 1), "nsecs": st.just(-5)}),

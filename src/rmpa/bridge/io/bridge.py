@@ -163,7 +163,7 @@ class Bridge:
             return
         message = decode(payload)
         if not any(part.message(session, message) for part in self._parts):
-            raise RemoteProtocolError(f"a message of kind {type(message).__name__} that nobody here takes")
+            raise RemoteProtocolError(f"a message of kind {type(message).__name__} that no part here takes")
 
     def _sender(self, peer: int, route: int) -> RouteSender | None:
         return self.topics.outbound.sender(peer, route)

@@ -530,7 +530,7 @@ class ServiceImports:
             return []
         return self._end(peer, message.route, message.reason)
 
-    def release(self, peer: int, service: str, reason: str = "nobody calls it") -> list[ImportAction]:
+    def release(self, peer: int, service: str, reason: str = "no node calls it") -> list[ImportAction]:
         """Close the route of a service that is not needed now; the next call opens it again."""
         remote = self.get(peer, service)
         return self._release(peer, remote, reason) if remote is not None else []

@@ -33,7 +33,7 @@ _BASES: Final = {
     11: "float64",
     13: "uint8",
     15: "bool",
-    16: "octet",
+    16: "byte",
     17: "string",
     21: "string",
 }

@@ -15,15 +15,16 @@ if TYPE_CHECKING:
 def qos_of(contract: Contract, *, latching: bool = False, large: bool = False) -> ZenohQos:
     """The QoS of one topic's publisher.
 
-    All block: a thread waits for Zenoh, and what exceeds the queue before it is dropped there and counted. What Zenoh
-    itself drops is counted nowhere, and would be noticed by a gap only when a later message comes.
+    A thread waits for Zenoh; what exceeds the queue before it is dropped there and counted. None has the congestion
+    control ``BLOCK``: it ends the link behind which a message waits for seconds, as each large one does on a thin
+    link. With ``DROP`` a message waits likewise (``zenoh.limits.DROP_WAIT``), and the link stays; the receiver counts
+    what is lost there by its number.
 
     Args:
         contract: The topic's.
         latching: Whether a late subscriber gets the last message.
         large: Whether its messages are large: they yield to others unless the contract has a priority.
     """
-    reliable = contract.reliability is Reliability.RELIABLE
     if contract.priority is Priority.HIGH:
         priority = ZenohPriority.REAL_TIME
     elif contract.priority is Priority.LOW or large:
@@ -31,10 +32,10 @@ def qos_of(contract: Contract, *, latching: bool = False, large: bool = False) -
     else:
         priority = ZenohPriority.DATA
     return ZenohQos(
-        reliable=reliable,
-        block=True,
+        reliable=True,
+        block=False,
         priority=priority,
         messages=contract.depth,
-        bytes=limits.RELIABLE_BYTES if reliable else limits.BEST_EFFORT_BYTES,
+        bytes=limits.RELIABLE_BYTES if contract.reliability is Reliability.RELIABLE else limits.BEST_EFFORT_BYTES,
         cache=1 if latching else 0,
     )

@@ -97,6 +97,10 @@ class ZenohConfig:
             "scouting/multicast/enabled": False,
             "transport/link/tx/lease": round(self.lease * 1000),
             "transport/link/tx/queue/congestion_control/block/wait_before_close": round(limits.BLOCK_MAX * 1e6),
+            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": round(limits.DROP_WAIT * 1e6),
+            "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": round(
+                limits.DROP_WAIT_MAX * 1e6
+            ),
             "transport/shared_memory/enabled": False,
             "timestamping/enabled": True,
         }

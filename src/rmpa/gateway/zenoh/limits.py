@@ -8,8 +8,14 @@ LEASE: Final = 1.2
 """Seconds without a sign of life after which a Zenoh transport counts as dead: so a frozen site is seen within 1.5 s.
 Zenoh sends a keep-alive four times in that time, and any data counts too."""
 BLOCK_MAX: Final = 5.0
-"""Seconds that a put of a reliable publisher may wait for a transport before Zenoh closes that transport. It is
-Zenoh's own value: a thin link must have the time for one batch. The lease notices a frozen other side before."""
+"""Seconds that a query or a declaration may wait for a transport before Zenoh closes it: Zenoh's own value."""
+DROP_WAIT: Final = 1.0
+"""Seconds that a message, or each fragment of it, waits for room in a transport before Zenoh drops the message: the
+time for one batch of Zenoh (64 KB) at half a megabit a second. Zenoh's own value, 1 ms, loses what is large on every
+slow link. A put that blocks instead would end the link: Zenoh closes a transport behind which one message, with all
+its fragments, waits for longer than ``BLOCK_MAX``, and does not notice a dead one before."""
+DROP_WAIT_MAX: Final = 300.0
+"""Seconds that all fragments of a message may wait together: 32 MB at 1 Mbit/s."""
 SEND_BUFFER: Final = 0.125
 """Seconds of the line's rate that the kernel's buffer of a connection holds, which counts them twice. In that buffer
 there are no priorities: on 1 Mbit/s with images a command waited 2.7 s with Linux's own size, 0.3 s with this one,

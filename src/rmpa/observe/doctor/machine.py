@@ -93,7 +93,7 @@ def judge_rights(rights: KernelRights) -> list[Check]:
             "unlimited' in /etc/security/limits.d/rmpa.conf (docs/realtime.md)"
         )
         level = WARN if rights.wanted else OK
-        asked = "" if rights.wanted else "; nobody asks for it (rmpa up --realtime)"
+        asked = "" if rights.wanted else "; not asked for (rmpa up --realtime)"
         found = [Check("realtime", level, "; ".join(missing) + asked, remedy if rights.wanted else "")]
     if rights.files is None:
         return found

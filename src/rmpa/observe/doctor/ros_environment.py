@@ -110,7 +110,7 @@ def _master(shell: RosShell) -> list[Check]:
         text = f"{said} does not answer, and is the roscore that `rmpa up` should use"
         return [_check(variable, WARN, text, "start it: roscore")]
     if host != "localhost" and not addresses:
-        text = f"{said}: nobody knows the name {host}, so nodes of this shell find no master"
+        text = f"{said}: the name {host} cannot be resolved, so nodes of this shell find no master"
         return [_check(variable, FAIL, text, export)]
     if host != "localhost" and not _is_here(shell, addresses):
         text = (
@@ -126,7 +126,7 @@ def _master(shell: RosShell) -> list[Check]:
     if shell.answers:
         text = f"{said} answers, but no agent of ours runs here"
         return [_check(variable, WARN, text, "end that roscore before `rmpa up`, or let it be the agent's")]
-    return [_check(variable, OK, f"{said}: nobody is there yet; `rmpa up` will be")]
+    return [_check(variable, OK, f"{said}: no master answers there yet; `rmpa up` will be there")]
 
 
 def _own_name(shell: RosShell) -> list[Check]:
@@ -146,7 +146,7 @@ def _own_name(shell: RosShell) -> list[Check]:
         return [*found, _check(variable, FAIL, f"{value} is no IPv4 address", loopback)]
     addresses = _addresses(shell, value)
     if value != "localhost" and not addresses:
-        text = f"nobody knows the name {value}: other nodes of this machine cannot reach those of this shell"
+        text = f"the name {value} cannot be resolved: other nodes of this machine cannot reach those of this shell"
         return [*found, _check(variable, FAIL, text, loopback)]
     if value != "localhost" and not _is_here(shell, addresses):
         have = ", ".join(sorted(shell.addresses))
@@ -162,7 +162,7 @@ def _host_name(shell: RosShell, remedy: str) -> Check:
     if name == "localhost":
         return _check("host name", OK, "nodes are reached by this machine's address")
     if not addresses:
-        text = f"nodes tell others to reach them at {name}, and nobody knows that name"
+        text = f"nodes tell others to reach them at {name}, and that name cannot be resolved"
         return _check("host name", FAIL, text, f"put '127.0.1.1 {name}' into /etc/hosts, or {remedy}")
     if not _is_here(shell, addresses):
         text = f"nodes tell others to reach them at {name}, which is said to be {addresses[0]}: not this machine"

@@ -100,7 +100,7 @@ class DirectSampler:
         self._sampled = asyncio.Event()
 
     def __getitem__(self, flow: DirectFlow) -> DirectSample:
-        """What is known of a flow; nothing if nobody has looked."""
+        """What is known of a flow; nothing if it was not looked at."""
         return self._samples.get(flow) or DirectSample()
 
     @property

@@ -385,7 +385,7 @@ def _open_route(route: RouteInfo, report: PublisherReport | None, peer: str) -> 
                 f"is that node stopped or stuck? on {peer}: rosnode ping {route.node}",
             )
         return Check("route", FAIL, text, "ask again in a moment; if it stays so, see the log there")
-    problem = route.problem or "nobody has asked for it yet"
+    problem = route.problem or "no node has asked for it yet"
     remedy = f"it is tried again by itself; on {peer}: rosnode info {route.node}"
     return Check("route", FAIL, f"{route.state}: {problem}", remedy)
 
@@ -473,7 +473,7 @@ def _reading(ends: BothEnds, later: BothEnds | None, node: str) -> Check:
     stuck = [reader for reader in after if reader.waiting and before.get(reader.number, reader).waiting]
     slow = [reader for reader in after if reader.dropped]
     names = ", ".join(f"{reader.node} ({reader.waiting} B wait, {reader.dropped} dropped)" for reader in stuck)
-    remedy = "its callbacks are too slow, or it is stopped; nobody else waits for it"
+    remedy = "its callbacks are too slow, or it is stopped; no other subscriber waits for it"
     if stuck and len(stuck) == len(after):
         return Check("reader", FAIL, f"{names} does not read", remedy)
     if stuck:

@@ -155,7 +155,7 @@ class ResourceNode:
     def problems(self) -> tuple[list[str], list[str]]:
         """Problems apart from the quality, as texts: first what is missing, second what does not work."""
         missing = [
-            f"nobody publishes {name}"
+            f"no node publishes {name}"
             for name, item in self.resource.inputs.items()
             if item.required and not self.runtime.publishers_of(item)
         ]

@@ -152,7 +152,7 @@ class Liveness:
         except ConnectionRefusedError:
             await asyncio.sleep(limits.NODE_RECHECK_DELAY)
             if await refuses(api) and self._nodes().get(node) == api:
-                _log.warning("= node %s at %s is dead: nobody listens there", node, api)
+                _log.warning("= node %s at %s is dead: no process listens there", node, api)
                 self._on_dead(node, api)
             return
         except OutOfDescriptors:

@@ -41,7 +41,7 @@ class _ProbeResult(enum.Enum):
     """The result of a probe of the address of restored nodes."""
 
     UP = "it is still that node"
-    GONE = "nobody listens there"
+    GONE = "no process listens there"
     OTHER = "another node is there"
     SILENT = "it does not answer"
 

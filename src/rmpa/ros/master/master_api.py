@@ -219,7 +219,7 @@ class MasterApi:
     def _lookup_service(self, caller_id: str, service: str) -> RosReply:
         uri = self.registrations.service_uri(service)
         if uri is None:
-            return RosReply(ERROR, f"nobody provides {service}", "")
+            return RosReply(ERROR, f"no provider of {service}", "")
         if self.service_lookup is not None:
             uri = self.service_lookup(service, uri, caller_id, self.registrations.node_api(caller_id) or "") or uri
         return RosReply(SUCCESS, f"the provider of {service}", uri)

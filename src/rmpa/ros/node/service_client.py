@@ -259,7 +259,7 @@ class ServiceConnection:
                 self._header.set_result(fields)
             return consumed, wanted
         if self._done is None:
-            raise RemoteProtocolError(f"the server of {self.service} sent {len(data)} bytes that nobody asked for")
+            raise RemoteProtocolError(f"the server of {self.service} sent {len(data)} bytes that were not asked for")
         if self._body is not None:
             return self._grow(self._body, data, 0)
         head = parse_reply_head(data)

@@ -308,7 +308,7 @@ class MonitorSession:
         return min((due for due in dues if due is not None), default=None)
 
     def handle_timer(self, now: float) -> Iterator[Output]:
-        """Send what is due, and stop a robot that nobody commands any more."""
+        """Send what is due, and stop a robot that no client commands any more."""
         self._looked = now
         if self._driven and now >= self._drive_until:
             yield from self._stop()

@@ -17,6 +17,7 @@ from rmpa.gateway.zenoh_api import ZenohQos
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_zenoh import MemoryQuery, eventually
 from tests.gateway.ros2.io.ros2_bed import STRING, string, topic_bed
+from tests.gateway.ros2.type_descriptions import response
 
 if TYPE_CHECKING:
     from rmpa.gateway.zenoh_api import ZenohSample
@@ -107,7 +108,9 @@ async def test_a_type_without_a_pair_is_told_with_what_to_write() -> None:
         (text,) = bed.problems.values()
         assert "count, text" in text
         assert "fields_1_to_2" in text
-        assert bed.rows("out")[0]["problem"] == text
+        (way,) = await bed.neighbour.ways("/odd")
+        assert not way.flows
+        assert way.stages[-1].text == text
         assert bed.own(EntityKind.PUBLISHER) == []
         bed.graph.remove(source)
         assert bed.problems == {}
@@ -124,6 +127,11 @@ async def test_a_subscription_with_another_hash_or_type_is_told() -> None:
         assert "definitions differ" in bed.problems["/chatter of /older"]
         assert "Humble" in bed.problems["/chatter of /humble"]
         assert "std_msgs/msg/Int32" in bed.problems["/chatter of /other"]
+        (way,) = await bed.neighbour.ways("/chatter")
+        assert (way.peer, way.to, way.node) == ("arm", "ros2", "/talker")
+        heard = next(stage for stage in way.stages if stage.name == "heard")
+        assert "/older" in heard.text
+        assert "/humble" in heard.text
         for each in ends:
             each.close()
 
@@ -272,6 +280,10 @@ async def test_losses_are_counted_by_the_numbers() -> None:
         await eventually(lambda: bed.rows("in")[0]["unconverted"])
         (row,) = bed.rows("in")
         assert (row["received"], row["lost"], row["unconverted"]) == (2, 3, 1)
+        (way,) = await bed.neighbour.ways("/chatter", "ros2")
+        assert way.flows
+        assert "3 were lost" in way.stages[-1].text
+        assert await bed.neighbour.ways("/chatter", "warehouse") == []
         assert len(bed.problems) == 1
 
 
@@ -317,34 +329,7 @@ async def test_a_transient_local_publisher_that_comes_later_has_its_history_aske
 
 def describe(types: Ros2Types, name: str, query: MemoryQuery) -> None:
     """What a ROS 2 node answers when it is asked for its type."""
-    from rmpa.gateway.ros2.type_description import _RESPONSE, _store
-
-    store = _store()
-    made = store.types
-    ids = {"float64": 11, "string": 17, "int32": 6, "uint8": 3}
-
-    def kind(desc: Any) -> Any:
-        number, capacity, nested, inner = 0, 0, "", desc
-        if int(desc[0]) > 2:
-            number, capacity = (48, desc[1][1]) if int(desc[0]) == 3 else (144, 0)
-            inner = desc[1][0]
-        if int(inner[0]) == 2:
-            number, nested = number + 1, inner[1]
-        else:
-            number += ids[inner[1][0]]
-        return made["type_description_interfaces/msg/FieldType"](number, capacity, 0, nested)
-
-    def one(each: str) -> Any:
-        fields = [
-            made["type_description_interfaces/msg/Field"](key, kind(desc), "")
-            for key, desc in types.store.fielddefs[each][1]
-        ]
-        return made["type_description_interfaces/msg/IndividualTypeDescription"](each, fields)
-
-    inner = [str(desc[1]) for _, desc in types.store.fielddefs[name][1] if int(desc[0]) == 2]
-    described = made["type_description_interfaces/msg/TypeDescription"](one(name), [one(each) for each in inner])
-    response = made[_RESPONSE](True, "", described, [], [])
-    query.reply(query.key, bytes(store.serialize_cdr(response, _RESPONSE)), query.attachment)
+    query.reply(query.key, response(types, name), query.attachment)
     query.finish()
 
 
@@ -426,6 +411,9 @@ async def test_rules_decide_what_crosses_and_its_name() -> None:
         refused = bed.neighbour.report()["topics_refused"]
         assert isinstance(refused, dict)
         assert "gateway.rule 1" in refused["/secret of /bot"]
+        ways = await bed.neighbour.ways("/secret")
+        assert {(way.peer, way.to) for way in ways} == {("ros2", "gate"), ("gate", "ros2")}
+        assert not any(way.flows for way in ways)
 
 
 async def test_a_rate_limit_is_kept_and_counted() -> None:

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.contract import Contracts
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.attachment import GID_BYTES
-from rmpa.gateway.ros2.crossing import Ros2Crossing
+from rmpa.gateway.ros2.crossing import SITE, Ros2Crossing
 from rmpa.gateway.ros2.graph import Ros2Graph
 from rmpa.gateway.ros2.io.own_nodes import OwnRos2Nodes
 from rmpa.gateway.ros2.io.part import Ros2Context
 from rmpa.gateway.ros2.mapping import TypeMapping
 from rmpa.gateway.ros2.tokens import Ros2Endpoint, graph_key
 from rmpa.gateway.ros2.types import WITHOUT_HASH, Ros2Types
+from rmpa.gateway.ros2.why import topic_ways
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Sequence
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.neighbour import MeshSource, OwnGraph
     from rmpa.gateway.ros2.io.part import Ros2Part
     from rmpa.gateway.zenoh_api import Declared, ZenohSession
+    from rmpa.observe.why.diagnosis import Diagnosis
 
 _log: Final = logging.getLogger(__name__)
 _GID_BYTES_BEFORE: Final = 24
@@ -111,6 +113,24 @@ class Ros2Neighbour:
         for part in self._parts:
             shown |= part.report()
         return shown
+
+    async def ways(
+        self, name: str, site: str = "", module: str = "", asker: str = "", *, service: bool = False
+    ) -> list[Diagnosis]:
+        """The ways of a topic between ROS 2 and the modules, for ``rmpa why``.
+
+        Args:
+            name: The topic, by its name in the graph of who asks.
+            site: From this site alone: ``ros2``; empty for all.
+            module: From this module alone; empty for all. ROS 2 has none.
+            asker: The module that asks.
+            service: Whether a service is meant.
+        """
+        del asker
+        if service or site not in ("", SITE):
+            return []
+        ways = topic_ways(self.report(), name, self.context.graph.name, here_only=site == SITE)
+        return [way for way in ways if module in ("", way.peer)]
 
     def _token(self, key: str, alive: bool) -> None:
         if self._closed:

@@ -14,6 +14,7 @@ from rmpa.gateway.sites.keys import ROOT
 from rmpa.gateway.sites.sequence import SequenceCounter
 from rmpa.gateway.sites.topic_header import REFUSED, TopicHeader
 from rmpa.gateway.sites.traffic import SiteTraffic
+from rmpa.gateway.zenoh_api import ZenohPriority
 from rmpa.ros.wire.tcpros import printable
 
 if TYPE_CHECKING:
@@ -69,8 +70,8 @@ class ImportedTopic:
         self._latencies = SampleRing(limits.LATENCIES_KEPT)
         self._clock_offset: float | None = None
         self._clock_error = float("inf")
-        self._last_at = float("-inf")
-        self._unchecked = False
+        self._check_at = float("inf")
+        self._check_pause = limits.IDLE_CHECK
         self._run = 0
         self._last_latched: bytes | None = None
         self._held_dropped = self._mismatched = self._dropped = 0
@@ -93,8 +94,7 @@ class ImportedTopic:
         """Take a message of this publisher."""
         if not self._sequence.take(attachment.run, attachment.sequence):
             return
-        self._last_at = self._clock.now()
-        self._unchecked = True
+        self._check_soon()
         self._traffic.add(len(payload))
         self._latencies.add((self._clock.wall_ns() - attachment.stamp) / 1e9)
         if attachment.latched:
@@ -117,10 +117,14 @@ class ImportedTopic:
             self._ask()
 
     def check(self, now: float) -> None:
-        """Ask for the last sequence number if no message has come for a while: a loss at the end leaves no gap."""
-        idle = now - self._last_at >= limits.IDLE_CHECK
-        if self.wanted and self._unchecked and idle and self._task is None:
-            self._unchecked = False
+        """Ask for the last sequence number if no message has come for a while: a loss at the end leaves no gap.
+
+        It is asked again after twice the time, as long as no message comes, at most
+        ``limits.IDLE_CHECK_MAX`` later.
+        """
+        if self.wanted and now >= self._check_at and self._task is None:
+            self._check_pause = min(self._check_pause * 2, limits.IDLE_CHECK_MAX)
+            self._check_at = now + self._check_pause
             self._ask()
 
     def report(self) -> dict[str, object]:
@@ -179,6 +183,7 @@ class ImportedTopic:
         elif not self.wanted:
             self.wanted = True
             self._on_demand(self, True)
+            self._check_soon()
             self._ask()
 
     def _stop_lingering(self) -> None:
@@ -224,7 +229,9 @@ class ImportedTopic:
         key = f"{ROOT}/{announced.module.site}/{announced.module.name}/d/t{announced.name}"
         before = self._clock.wall_ns()
         replies = await self._session.get(
-            f"{key}?node={announced.node};site={self._site}", timeout=limits.HEADER_TIMEOUT
+            f"{key}?node={announced.node};site={self._site}",
+            timeout=limits.HEADER_TIMEOUT,
+            priority=ZenohPriority.INTERACTIVE_HIGH,
         )
         after = self._clock.wall_ns()
         if not replies:
@@ -252,7 +259,7 @@ class ImportedTopic:
         self._problem = ""
         self._sequence.announced(header.run, header.sequence - header.waiting)
         if header.waiting:
-            self._unchecked = True
+            self._check_soon()
         described, self._description = self._description, header.description
         if header.description != described:
             self._topic.describe(header.description)
@@ -273,6 +280,10 @@ class ImportedTopic:
         if self._description is not None:
             self._problem = f"its messages have the md5 sum {md5}, its header {self._description.md5sum}"
         self._ask()
+
+    def _check_soon(self) -> None:
+        self._check_pause = limits.IDLE_CHECK
+        self._check_at = self._clock.now() + limits.IDLE_CHECK
 
     # --- clocks ---------------------------------------------------------------------------------------------------
 

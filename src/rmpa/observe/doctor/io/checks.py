@@ -154,7 +154,7 @@ def _routes(given: DoctorInput) -> Iterable[Check]:
     for seed, addresses in known.items():
         targets |= {address: f"{address} (seed {seed})" for address in addresses[:1]}
     found = {text: network.probe_route(host) for host, text in targets.items()}
-    return judge_routes(found | {f"seed {name}": "nobody knows this name" for name in names if not known[name]})
+    return judge_routes(found | {f"seed {name}": "the name cannot be resolved" for name in names if not known[name]})
 
 
 def _ports(given: DoctorInput) -> Iterable[Check]:

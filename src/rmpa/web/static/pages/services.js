@@ -5,7 +5,7 @@ import { count, seconds } from "../format.js";
 import { entries, section } from "../state.js";
 import { Facts, Failure, Gone, Link, ModuleLink, NodeLink, Page, Panel, Question, Table, Why, memo, nodeKey } from "../parts.js";
 
-const STATES = { home: "stays in its module", hidden: "hidden here", idle: "nobody calls it", open: "in use" };
+const STATES = { home: "stays in its module", hidden: "hidden here", idle: "no node calls it", open: "in use" };
 
 const Row = memo(({ name, service, own }) => html`<tr><th scope="row"><${Link} page="service" name=${name}>${service.name}<//>${service.problem && html`<div class="muted">${service.problem}</div>`}</th>
   <td><${ModuleLink} name=${service.module || own} /></td><td><${NodeLink} name=${nodeKey(service.module, service.node)}>${service.node}<//></td><td>${service.type || html`<span class="muted">not asked yet</span>`}</td><td>${STATES[service.state] || service.state}</td><td class="number">${count(service.calls || 0)}</td><td class="number">${count(service.failed || 0)}</td></tr>`);
