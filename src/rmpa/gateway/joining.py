@@ -36,10 +36,14 @@ def make_neighbours(graph: AgentGraph, session: OwnedSession, settings: Settings
         neighbours["sites"] = make_site_neighbour(graph, session, settings, graph.agent)
     if gateway.ros2.enabled:
         from rmpa.gateway.ros2.io.actions import Ros2Actions  # noqa: PLC0415 - likewise
+        from rmpa.gateway.ros2.io.answers import Ros2Answers  # noqa: PLC0415 - likewise
         from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour  # noqa: PLC0415 - it reads all types of ROS
         from rmpa.gateway.ros2.io.services import Ros2Services  # noqa: PLC0415 - likewise
         from rmpa.gateway.ros2.io.topics import Ros2Topics  # noqa: PLC0415 - likewise
 
         parts = (Ros2Actions(), Ros2Services(), Ros2Topics())
-        neighbours["ros2"] = Ros2Neighbour(graph, session, gateway, parts, settings.make_contracts())
+        neighbours["ros2"] = ros2 = Ros2Neighbour(graph, session, gateway, parts, settings.make_contracts())
+        requests = graph.agent.sites
+        sites = requests.answerer if gateway.site else None
+        requests.serve(Ros2Answers(settings.name, ros2, lambda: session.endpoints, sites))
     return neighbours
