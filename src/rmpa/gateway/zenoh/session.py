@@ -241,7 +241,7 @@ class OpenSession:
                     congestion_control=zenoh.CongestionControl.BLOCK,
                     timeout=timeout,
                     priority=getattr(zenoh.Priority, priority.name),
-                    payload=body or None,
+                    payload=body,
                     attachment=attachment or None,
                     cancellation_token=cancellation,
                 )
