@@ -35,15 +35,11 @@ def make_neighbours(graph: AgentGraph, session: OwnedSession, settings: Settings
 
         neighbours["sites"] = make_site_neighbour(graph, session, settings, graph.agent)
     if gateway.ros2.enabled:
-        from rmpa.gateway.ros2.io.actions import Ros2Actions  # noqa: PLC0415 - likewise
-        from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour  # noqa: PLC0415 - it reads all types of ROS
-        from rmpa.gateway.ros2.io.services import Ros2Services  # noqa: PLC0415 - likewise
-        from rmpa.gateway.ros2.io.topics import Ros2Topics  # noqa: PLC0415 - likewise
+        from rmpa.gateway.ros2.io.joining import make_ros2_neighbour  # noqa: PLC0415 - it reads all types of ROS
 
-        parts = (Ros2Actions(), Ros2Services(), Ros2Topics())
-        neighbours["ros2"] = Ros2Neighbour(graph, session, gateway, parts, settings.make_contracts())
+        neighbours["ros2"] = make_ros2_neighbour(graph, session, settings)
     if gateway.ros1_bridge:
         from rmpa.gateway.ros1_bridge.io.joining import make_ros1_bridge_neighbour  # noqa: PLC0415 - likewise
 
-        neighbours["ros1_bridge"] = make_ros1_bridge_neighbour(graph, session, settings)
+        neighbours["ros1_bridge"] = make_ros1_bridge_neighbour(graph, session, settings, graph.agent)
     return neighbours
