@@ -164,6 +164,12 @@ def test_ros1_lists_and_hears_a_ros2_talker(hall: Hall, ros2: OtherEnd) -> None:
     for number in range(2):
         with hall.robot.ros.rospy("listener", topic="/from2", type="String", name=f"l_{number}") as listener:
             hears_all(listener, ros2, f"turn{number}")
+            code, text = hall.robot.agent.rmpa("why", "ros2:/from2")
+            assert code == 0, text
+            assert "std_msgs/msg/String of ROS 2 is std_msgs/String here" in text
+    code, text = hall.robot.agent.rmpa("site", "info", "ros2")
+    assert code == 0, text
+    assert "/from2" in text
 
 
 @needs_sdk

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from rmpa.core.errors import UnreachableError
-from rmpa.gateway import limits
 from rmpa.gateway.zenoh.trust import open_trusted_session
 
 if TYPE_CHECKING:
@@ -37,24 +35,11 @@ def make_neighbours(graph: AgentGraph, session: OwnedSession, settings: Settings
 
         neighbours["sites"] = make_site_neighbour(graph, session, settings, graph.agent)
     if gateway.ros2.enabled:
-        from rmpa.gateway.ros2.io.actions import Ros2Actions  # noqa: PLC0415 - likewise
-        from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour  # noqa: PLC0415 - it reads all types of ROS
-        from rmpa.gateway.ros2.io.params import Ros2Params  # noqa: PLC0415 - likewise
-        from rmpa.gateway.ros2.io.services import Ros2Services  # noqa: PLC0415 - likewise
-        from rmpa.gateway.ros2.io.topics import Ros2Topics  # noqa: PLC0415 - likewise
+        from rmpa.gateway.ros2.io.joining import make_ros2_neighbour  # noqa: PLC0415 - it reads all types of ROS
 
-        agent = graph.agent
-
-        async def ask_module(module: str, what: str, args: dict[str, Any]) -> object:
-            for peer in agent.bridge.sessions.linked():
-                if peer.link.name == module:
-                    return await agent.bridge.rpc.request(peer, what, args, limits.ROS2_PARAM_TIMEOUT)
-            raise UnreachableError("module", repr(module), "it is not linked to this gateway")
-
-        parts = (Ros2Params(ask_module, agent.params), Ros2Actions(), Ros2Services(), Ros2Topics())
-        neighbours["ros2"] = Ros2Neighbour(graph, session, gateway, parts, settings.make_contracts())
+        neighbours["ros2"] = make_ros2_neighbour(graph, session, settings)
     if gateway.ros1_bridge:
         from rmpa.gateway.ros1_bridge.io.joining import make_ros1_bridge_neighbour  # noqa: PLC0415 - likewise
 
-        neighbours["ros1_bridge"] = make_ros1_bridge_neighbour(graph, session, settings)
+        neighbours["ros1_bridge"] = make_ros1_bridge_neighbour(graph, session, settings, graph.agent)
     return neighbours

@@ -60,6 +60,11 @@ class SiteRequests:
         self._liked: dict[str, str] = {}
         """The gateway that answered for a site, by its GUID."""
 
+    @property
+    def answerer(self) -> SiteAnswerer | None:
+        """What answers as a gateway; ``None``: this agent is none."""
+        return self._gateway
+
     def serve(self, gateway: SiteAnswerer) -> None:
         """Answer as a gateway from now on."""
         self._gateway = gateway
