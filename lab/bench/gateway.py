@@ -257,6 +257,7 @@ def _faults(run: _Run) -> None:
         for _ in range(run.plan.faults):
             for what, times in taken.items():
                 _wait(watcher, "there", proxy)
+                time.sleep(_SETTLE)  # the core has stored the talker, which does not register anew
                 since = watcher.mark_events()
                 begun = time.monotonic_ns()
                 if what == "module killed":

@@ -41,5 +41,5 @@ def make_neighbours(graph: AgentGraph, session: OwnedSession, settings: Settings
     if gateway.ros1_bridge:
         from rmpa.gateway.ros1_bridge.io.joining import make_ros1_bridge_neighbour  # noqa: PLC0415 - likewise
 
-        neighbours["ros1_bridge"] = make_ros1_bridge_neighbour(graph, session, settings)
+        neighbours["ros1_bridge"] = make_ros1_bridge_neighbour(graph, session, settings, graph.agent)
     return neighbours

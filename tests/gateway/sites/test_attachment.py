@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import pytest
 from hypothesis import given
@@ -69,6 +69,8 @@ def test_the_run_is_read_back_and_a_reader_knows_each_source_again() -> None:
     first = replace(ATTACHMENT, run=2**63 - 1)
     second = replace(first, sequence=8, node="/other", latched=False)
     reader = AttachmentReader()
-    for _ in range(2):
-        assert [reader.read(each.serialize()) for each in (first, second)] == [first, second]
+    for each in (first, second, first, second):
+        sequence, stamp, source = reader.read(each.serialize())
+        assert (sequence, stamp) == (each.sequence, each.stamp)
+        assert SiteAttachment(sequence, stamp, *astuple(source)) == each
     assert first.serialize() == GOLDEN + (2**63 - 1).to_bytes(8, "little")

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from rmpa.bridge.permission_gate import PermissionGate
 from rmpa.bridge.policy import Policy, PolicyDecision
 from rmpa.config.gateway_rules import Crossing, CrossingRule
+from rmpa.config.permission_rules import Access, PermissionRule
 from rmpa.config.policy import PolicySettings
+from rmpa.config.settings import TrustSettings
+from rmpa.core.counters import Counters
 from rmpa.gateway.neighbour import SourceKind
+from rmpa.gateway.site_permissions import SitePermissions
 from rmpa.gateway.sites.rules import CrossingDecision, CrossingRules
+from rmpa.trust.permissions import Permissions
 
 T = SourceKind.TOPIC
 
@@ -84,3 +90,20 @@ def test_the_gateways_policy_stands_above_the_rules() -> None:
     assert not out(rules, "/rosout").allowed
     assert into(rules, "/secret/plan").name == "/cloud/secret/plan"
     assert not into(CrossingRules((), judge), "/secret/plan").allowed
+
+
+def test_permissions_stand_above_the_rules_and_what_they_refuse_is_counted() -> None:
+    counters = Counters()
+    trust = TrustSettings(
+        rules=(PermissionRule(("cloud",), names={"publish": ("/scan",), "call": ("/stop",), "param": ("/arm/**",)}),)
+    )
+    rules = CrossingRules(permissions=SitePermissions(PermissionGate(Permissions(trust), counters)))
+    assert into(rules, "/scan").allowed
+    refused = into(rules, "/cmd_vel")
+    assert (refused.allowed, refused.why) == (False, "no [[permission]] lets cloud publish /cmd_vel")
+    assert not into(rules, "/scan", site="elsewhere").allowed
+    assert rules.refusal("cloud", "arm", "/stop", Access.CALL) == ""
+    assert "do not let cloud call /off" in rules.refusal("cloud", "arm", "/off", Access.CALL)
+    assert rules.refusal("cloud", "arm", "/arm/speed", Access.PARAM) == ""
+    assert rules.refusal("", "arm", "/arm/speed", Access.PARAM), "a program that names no site"
+    assert (counters["permission.publish"], counters["permission.call"], counters["permission.param"]) == (2, 1, 1)

@@ -32,8 +32,11 @@ VERSION: Final = 1
 _LATCHED: Final = 1
 _HEAD: Final = struct.Struct("<BBQq16s")
 _RUN: Final = struct.Struct("<Q")
-_TAILS_KEPT: Final = 64
-"""Ends of attachments that a reader remembers: those of one source are all the same."""
+_NUMBERS: Final = struct.Struct("<Qq")
+_COMMON: Final = 18
+"""From here on, and before the numbers, all attachments of one source are the same."""
+_SOURCES_KEPT: Final = 256
+"""Sources that a reader remembers; then it begins anew."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +73,8 @@ class SiteAttachment:
         Raises:
             RemoteProtocolError: It is shorter than it says, of another version, or has a name that is none in ROS.
         """
-        return AttachmentReader().read(data)
+        sequence, stamp, source = AttachmentReader().read(bytes(data))
+        return cls(sequence, stamp, source.md5, source.node, source.path, source.latched, source.run)
 
 
 class AttachmentWriter:
@@ -95,14 +99,28 @@ class AttachmentWriter:
         return _HEAD.pack(VERSION, self._flags, sequence, stamp, self._md5) + self._tail
 
 
+@dataclass(frozen=True, slots=True)
+class MessageSource:
+    """What the attachments of one source have in common; the fields are those of ``SiteAttachment``."""
+
+    md5: str
+    node: str
+    path: tuple[str, ...]
+    latched: bool
+    run: int
+
+
 class AttachmentReader:
     """Reads the attachments of sources; what is the same in all of one source's is read once."""
 
     def __init__(self) -> None:
-        self._tails: dict[bytes, tuple[str, tuple[str, ...], int]] = {}
+        self._known: dict[bytes, MessageSource] = {}
 
-    def read(self, data: Buffer) -> SiteAttachment:
+    def read(self, data: bytes) -> tuple[int, int, MessageSource]:
         """Read an attachment; bytes behind the run are ignored, so that later versions may add to it.
+
+        Returns:
+            The sequence, the stamp, and the source.
 
         Raises:
             RemoteProtocolError: It is shorter than it says, of another version, or has a name that is none in ROS.
@@ -111,20 +129,23 @@ class AttachmentReader:
             raise RemoteProtocolError(
                 f"an attachment of a site has {len(data)} bytes; the least are {_HEAD.size + 2}"
             )
-        version, flags, sequence, stamp, md5 = _HEAD.unpack_from(data)
-        if version != VERSION:
-            raise RemoteProtocolError(
-                f"an attachment of a site is of version {version}; this gateway reads {VERSION}"
-            )
-        tail = bytes(data[_HEAD.size :])
-        known = self._tails.get(tail)
-        if known is None:
-            known = _read_tail(tail)
-            if len(self._tails) >= _TAILS_KEPT:
-                self._tails.clear()
-            self._tails[tail] = known
-        node, path, run = known
-        return SiteAttachment(sequence, stamp, md5.hex(), node, path, bool(flags & _LATCHED), run)
+        common = data[:2] + data[_COMMON:]
+        source = self._known.get(common)
+        if source is None:
+            source = _read_source(data)
+            if len(self._known) >= _SOURCES_KEPT:
+                self._known.clear()
+            self._known[common] = source
+        sequence, stamp = _NUMBERS.unpack_from(data, 2)
+        return sequence, stamp, source
+
+
+def _read_source(data: bytes) -> MessageSource:
+    version, flags, _, _, md5 = _HEAD.unpack_from(data)
+    if version != VERSION:
+        raise RemoteProtocolError(f"an attachment of a site is of version {version}; this gateway reads {VERSION}")
+    node, path, run = _read_tail(data[_HEAD.size :])
+    return MessageSource(md5.hex(), node, path, bool(flags & _LATCHED), run)
 
 
 def _read_tail(tail: bytes) -> tuple[str, tuple[str, ...], int]:

@@ -6,14 +6,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config.gateway_rules import Crossing
+from rmpa.config.permission_rules import Access
 from rmpa.core.names import is_global_name, matches
+from rmpa.gateway.neighbour import SourceKind
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from rmpa.bridge.policy import PolicyDecision
     from rmpa.config.gateway_rules import CrossingRule
-    from rmpa.gateway.neighbour import SourceKind
+    from rmpa.gateway.site_permissions import SitePermissions
 
     Judge = Callable[[SourceKind, str, str, str], PolicyDecision]
 
@@ -49,11 +51,19 @@ class CrossingRules:
         rules: In the order of the file.
         judge: The gateway's own policy, ``(kind, name, type, node)``, which must let a source cross too: by its name
             in its module if it goes out, by its name here if it comes in. ``None``: it lets everything cross.
+        permissions: ``[[permission]]``, which must let other sites do it too; what they refuse is counted. ``None``:
+            trust is off.
     """
 
-    def __init__(self, rules: Sequence[CrossingRule] = (), judge: Judge | None = None) -> None:
+    def __init__(
+        self,
+        rules: Sequence[CrossingRule] = (),
+        judge: Judge | None = None,
+        permissions: SitePermissions | None = None,
+    ) -> None:
         self._rules = tuple(rules)
         self._judge = judge
+        self._permissions = permissions
 
     def outgoing(self, kind: SourceKind, module: str, name: str, type_name: str, node: str) -> CrossingDecision:
         """Decide whether a source of this site is offered, which all sites see that Zenoh's rules of access let.
@@ -77,12 +87,21 @@ class CrossingRules:
                 return CrossingDecision(False, f"{_named(number, rule)} lets it not go out")
         return decision
 
-    def refusal(self, site: str, module: str, name: str) -> str:
-        """Why another site may not have a source of this one; empty if it may."""
+    def refusal(self, site: str, module: str, name: str, access: Access = Access.SUBSCRIBE) -> str:
+        """Why another site may not have a source or parameter of this one; empty if it may.
+
+        Args:
+            site: The other site; empty for a program that names none.
+            module: The module that has it.
+            name: Its name in its module.
+            access: What the other site would do with it.
+        """
         for number, rule in self._fitting(module, name):
             if any(matches(glob, site) for glob in rule.sites):
-                return "" if rule.crossing in _OUT else f"{_named(number, rule)} lets it not go out to {site}"
-        return ""
+                if rule.crossing not in _OUT:
+                    return f"{_named(number, rule)} lets it not go out to {site}"
+                break
+        return "" if self._permissions is None else self._permissions.why_not(access, site, "", name)
 
     def kept(self, module: str, name: str) -> bool:
         """Whether the first rule that fits a topic of this site has its last value kept."""
@@ -113,7 +132,12 @@ class CrossingRules:
         if not is_global_name(here):
             return CrossingDecision(False, f"{why} names it {here!r}, which is no global name of ROS")
         decision = self._policy(kind, here, type_name, node)
-        return CrossingDecision(True, why, here) if decision.allowed else decision
+        if not decision.allowed:
+            return decision
+        access = Access.PUBLISH if kind is SourceKind.TOPIC else Access.SERVE
+        if self._permissions is not None and not self._permissions.admits(access, site, module, here):
+            return CrossingDecision(False, self._permissions.judge(access, site, module, here).rule)
+        return CrossingDecision(True, why, here)
 
     def _fitting(self, module: str, name: str) -> Iterator[tuple[int, CrossingRule]]:
         for number, rule in enumerate(self._rules, 1):

@@ -7,6 +7,7 @@ import logging
 import re
 from typing import TYPE_CHECKING, Final
 
+from rmpa.config.permission_rules import Access
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
 from rmpa.gateway.ros1_bridge.io.announcer import OWN_DISCOVERY, BridgeAnnouncer
@@ -109,7 +110,10 @@ class Ros1BridgeNeighbour:
             self._refused.pop(("out", source.here), None)
             return
         decision = self._rules.outgoing(source.kind, source.module, source.name, source.type, source.node)
-        refusal = self._rules.refusal(SITE, source.module, source.name) if decision.allowed else decision.why
+        access = Access.SUBSCRIBE if source.kind is SourceKind.TOPIC else Access.CALL
+        refusal = decision.why
+        if decision.allowed:
+            refusal = self._rules.refusal(SITE, source.module, source.name, access)
         if refusal:
             self._refused["out", source.here] = refusal
             return

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from rmpa.core.clock import Clock
     from rmpa.gateway.neighbour import OwnGraph
-    from rmpa.gateway.sites.attachment import SiteAttachment
+    from rmpa.gateway.sites.attachment import MessageSource
     from rmpa.gateway.sites.part import SiteImport
     from rmpa.gateway.zenoh_api import ZenohSession
     from rmpa.ros.wire.tcpros import TopicDescription
@@ -72,6 +72,7 @@ class ImportedTopic:
         self._clock_error = float("inf")
         self._check_at = float("inf")
         self._check_pause = limits.IDLE_CHECK
+        self._fresh = False
         self._run = 0
         self._last_latched: bytes | None = None
         self._held_dropped = self._mismatched = self._dropped = 0
@@ -90,20 +91,20 @@ class ImportedTopic:
         """Why its messages do not come, or are not understood; empty for nothing."""
         return self._problem or self._topic.problem
 
-    def take(self, payload: bytes, attachment: SiteAttachment) -> None:
-        """Take a message of this publisher."""
-        if not self._sequence.take(attachment.run, attachment.sequence):
+    def take(self, payload: bytes, sequence: int, stamp: int, source: MessageSource) -> None:
+        """Take a message of this publisher, with what its attachment says."""
+        if not self._sequence.take(source.run, sequence):
             return
-        self._check_soon()
+        self._fresh = True
         self._traffic.add(len(payload))
-        self._latencies.add((self._clock.wall_ns() - attachment.stamp) / 1e9)
-        if attachment.latched:
-            renewed, self._run = attachment.run != self._run, attachment.run
+        self._latencies.add((self._clock.wall_ns() - stamp) / 1e9)
+        if source.latched:
+            renewed, self._run = source.run != self._run, source.run
             if renewed and payload == self._last_latched:
                 return  # another gateway of that site has taken over, and had it from the publisher again
             self._last_latched = payload
-        if self._description is None or attachment.md5 != self._description.md5sum:
-            self._hold(payload, attachment.md5)
+        if self._description is None or source.md5 != self._description.md5sum:
+            self._hold(payload, source.md5)
         else:
             self._dropped += self._topic.publish(payload)
 
@@ -122,7 +123,10 @@ class ImportedTopic:
         It is asked again after twice the time, as long as no message comes, at most
         ``limits.IDLE_CHECK_MAX`` later.
         """
-        if self.wanted and now >= self._check_at and self._task is None:
+        if self._fresh:
+            self._fresh = False
+            self._check_soon()
+        elif self.wanted and now >= self._check_at and self._task is None:
             self._check_pause = min(self._check_pause * 2, limits.IDLE_CHECK_MAX)
             self._check_at = now + self._check_pause
             self._ask()

@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Any
 from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.services.rules import ServiceRules
+from rmpa.config.permission_rules import Access
 from rmpa.core.errors import UnreachableError
 from rmpa.gateway import limits
 from rmpa.gateway.graph.own_graph import AgentGraph
 from rmpa.gateway.neighbour import SourceKind
+from rmpa.gateway.site_permissions import SitePermissions
 from rmpa.gateway.sites.history import SiteHistory
 from rmpa.gateway.sites.io.action_part import SiteActions
 from rmpa.gateway.sites.io.last_value_store import LastValueStore
@@ -60,17 +62,17 @@ def make_site_neighbour(
         return policy.judge(name, type_name, node)
 
     gateway, clock = settings.gateway, SystemClock()
-    rules = CrossingRules(gateway.rules, judge)
+    permissions = None if agent is None else SitePermissions(agent.bridge.gate)
+    rules = CrossingRules(gateway.rules, judge, permissions)
 
     def refusal(site: str, module: str, name: str) -> str:
         return rules.refusal(site, module, name)
 
     def why_not(site: str, source: MeshSource) -> str:
-        return refusal(site, source.module, source.name)
+        return rules.refusal(site, source.module, source.name, Access.CALL)
 
     history = SiteHistory(clock.now)
     parts: list[SitePart] = [
-        history,
         SiteLastValues(
             gateway.site, session, graph, LastValueStore(_store_file(settings)), rules.kept, refusal, clock.wall_ns
         ),
@@ -79,6 +81,7 @@ def make_site_neighbour(
     ]
     own = SiteGateway(gateway.site, gateway.rank, secrets.token_hex(16))
     neighbour = SiteNeighbour(graph, session, own, rules, parts)
+    neighbour.on_sites = history.seen
     if isinstance(graph, AgentGraph):
         neighbour.add(SiteActions(graph.attend))
     if agent is not None:
@@ -102,11 +105,17 @@ def _add_questions(
         for peer in agent.bridge.sessions.linked():
             if peer.link.name == module:
                 return await agent.bridge.rpc.request(peer, what, args, limits.SITE_PARAM_TIMEOUT)
-        raise UnreachableError("module", f"{module!r} of site {own.site}", "it is not linked to its gateway")
+        where = f"site {own.site} as {module!r}"
+        raise UnreachableError("module", where, "`rmpa peer list` there shows which are linked to its gateway")
 
-    exports = SiteParamExports(own.site, session, ask_module, rules.refusal)
+    def may_not(site: str, module: str, parameter: str) -> str:
+        return rules.refusal(site, module, parameter, Access.PARAM)
+
+    exports = SiteParamExports(own.site, session, ask_module, may_not)
     imports = SiteParamImports(own.site, session, clock.wall_ns, agent.params, lambda: neighbour.catalogue.sites)
-    neighbour.add(SiteParams(own.site, exports, imports))
+    params = SiteParams(exports, imports)
+    neighbour.add(params)
+    neighbour.on_leads = params.lead
     why = SiteWhy(own.site, name, session, neighbour, history, rules)
     answers = SiteAnswers(
         name, own, session, neighbour, history, lambda: session.endpoints, imports.ask, why, clock.wall_ns

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rmpa.core.clock import Clock
     from rmpa.core.contract import Contracts
     from rmpa.gateway.neighbour import OwnGraph
-    from rmpa.gateway.sites.attachment import SiteAttachment
+    from rmpa.gateway.sites.attachment import MessageSource
     from rmpa.gateway.sites.keys import SiteModule
     from rmpa.gateway.sites.part import SiteExport, SiteImport
     from rmpa.gateway.sites.rules import CrossingRules
@@ -34,7 +34,7 @@ class _Subscription:
     declared: Declared
     topics: dict[str, ImportedTopic] = field(default_factory=dict)
     """By node."""
-    latched: dict[str, tuple[bytes, SiteAttachment]] = field(default_factory=dict)
+    latched: dict[str, tuple[bytes, int, int, MessageSource]] = field(default_factory=dict)
     """The last latched message of nodes that are not wanted: they were told once, and would not be again."""
 
 
@@ -178,24 +178,24 @@ class SiteTopics:
 
     def _on_sample(self, key: str, sample: ZenohSample) -> None:
         try:
-            attachment = self._reader.read(sample.attachment)
+            sequence, stamp, source = self._reader.read(sample.attachment)
         except RemoteProtocolError:
             self.counters.add("site.message.malformed")
             return
-        if self._site in attachment.path:
+        if self._site in source.path:
             self.counters.add("site.message.looped")
             return
         subscription = self._subscriptions.get(key)
         if subscription is None:
             return
-        topic = subscription.topics.get(attachment.node)
+        topic = subscription.topics.get(source.node)
         if topic is not None:
-            topic.take(sample.payload, attachment)
+            topic.take(sample.payload, sequence, stamp, source)
             return
         self.counters.add("site.message.unwanted_node")
         known = subscription.latched
-        if attachment.latched and (attachment.node in known or len(known) < limits.LATCHED_NODES_MAX):
-            known[attachment.node] = sample.payload, attachment
+        if source.latched and (source.node in known or len(known) < limits.LATCHED_NODES_MAX):
+            known[source.node] = sample.payload, sequence, stamp, source
 
     def _check_later(self) -> None:
         if self._check_timer is None and self._subscriptions:
