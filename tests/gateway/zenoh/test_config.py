@@ -80,4 +80,4 @@ def test_the_file_for_zenohd_has_the_same_entries_nested() -> None:
     transport = nested["transport"]
     assert isinstance(transport, dict)
     assert transport["link"]["tls"]["listen_certificate"] == "module.crt"
-    assert transport["link"]["tx"]["lease"] == 1200
+    assert transport["link"]["tx"]["lease"] == 1000
