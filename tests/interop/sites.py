@@ -45,9 +45,9 @@ class JoinedModules:
         return traffic["rx_bytes"] + traffic["tx_bytes"]
 
 
-def join(lab: Lab, home: Path, shell: Callable[[Host], Ros], stack: ExitStack) -> JoinedModules:
-    """Start all; return when each module's agent is linked with its gateway."""
-    net = JoinedSites(lab, home, stack, MODULES)
+def join(lab: Lab, home: Path, shell: Callable[[Host], Ros], stack: ExitStack, config: str = "") -> JoinedModules:
+    """Start all, the gateways with this ``rmpa.toml``; return when each module's agent is linked with its gateway."""
+    net = JoinedSites(lab, home, stack, MODULES, config=config)
     made = [Module(site.module.host, site.module, shell(site.module.host)) for site in net.sites]
     for site in net.sites:
         site.module.wait_peer(site.gateway.name)

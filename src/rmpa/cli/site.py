@@ -12,7 +12,7 @@ import msgspec
 from rmpa.cli.options import agent_option, json_option
 from rmpa.cli.output import Column, duration, print_json, print_line, print_table, printable, size, warn
 from rmpa.config.values import did_you_mean
-from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
+from rmpa.core.errors import ConfigError, PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.core.names import is_legal_name
 from rmpa.observe import limits
 from rmpa.observe.io.control_client import ControlClient, choose_agent
@@ -45,7 +45,10 @@ def _connect(agent: str | None, name: str | None) -> ControlClient:
 
 
 def _ask(client: ControlClient, what: str, kind: type[_T], **args: object) -> _T:
-    value: object = client.call("site", object, what=what, args=args)
+    try:
+        value: object = client.call("site", object, what=what, args=args)
+    except PeerRefused as error:
+        raise RmpaError(error.reason) from None  # the agent only passes on what a gateway says
     try:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError as error:

@@ -128,7 +128,7 @@ class ValuePortion(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         size: Bytes of the whole message.
-        data: These bytes of it, in base64.
+        data: These bytes of it.
     """
 
     size: int

@@ -16,7 +16,6 @@ from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, Unreac
 from rmpa.gateway.sites.io.param_exports import SiteParamExports
 from rmpa.gateway.sites.io.param_imports import SiteParamImports
 from rmpa.gateway.sites.io.param_part import SiteParams
-from rmpa.gateway.sites.keys import SiteModule
 from rmpa.gateway.sites.params import (
     ParamAnswer,
     ParamQuestion,
@@ -33,8 +32,6 @@ from tests.gateway.sites.loopback_session import LoopbackSession
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
-
-ARM = SiteModule("warehouse", "arm", "0" * 32)
 
 
 class ArmParams:
@@ -95,8 +92,8 @@ class ParamSites:
         self.sites = ["warehouse"]
         self.exports = SiteParamExports("warehouse", cast("Any", self.session), self.arm.ask, self._why_not)
         self.imports = SiteParamImports("office", cast("Any", self.session), lambda: 1, self.own, lambda: self.sites)
-        self.part = SiteParams("warehouse", self.exports, self.imports)
-        self.part.module_changed(ARM, there=True)
+        self.part = SiteParams(self.exports, self.imports)
+        self.part.lead(leads=True)
 
     def _why_not(self, site: str, module: str, name: str) -> str:
         return f"a rule keeps {name} of {module} from {site}" if name in self.denied else ""
@@ -175,8 +172,8 @@ async def test_a_program_reads_and_sets_them_as_json(sites: ParamSites) -> None:
     assert "names several" in reply.payload.decode()
 
 
-async def test_a_module_that_left_is_answered_for_no_more(sites: ParamSites) -> None:
-    sites.part.module_changed(ARM, there=False)
+async def test_a_gateway_that_stands_by_does_not_answer(sites: ParamSites) -> None:
+    sites.part.lead(leads=False)
     with pytest.raises(UnreachableError, match="site warehouse for its module arm"):
         await sites.get("/speed")
 

@@ -38,6 +38,7 @@ class Ros2Graph:
         self._nodes: dict[str, Ros2Node] = {}
         self._endpoints: dict[str, Ros2Endpoint] = {}
         self._by_name: dict[str, dict[str, Ros2Endpoint]] = {}
+        self._rivals: dict[str, Ros2Node] = {}
         self.ignored: Counter[str] = Counter()
         """Tokens that were ignored, by reason."""
 
@@ -53,6 +54,35 @@ class Ros2Graph:
     def at(self, name: str, *kinds: EntityKind) -> Iterator[Ros2Endpoint]:
         """The endpoints of a topic or service, of the given kinds, in the order in which they appeared."""
         return (each for each in self._by_name.get(name, {}).values() if each.kind in kinds)
+
+    def rival(self, key: str, *, alive: bool) -> str:
+        """Take in that another gateway's node appeared or disappeared.
+
+        Returns:
+            The node's name; empty if the token is no such one.
+        """
+        if not alive:
+            gone = self._rivals.pop(key, None)
+            return "" if gone is None else gone.name
+        try:
+            node = parse_token(key)
+        except RemoteProtocolError:
+            return ""
+        if not isinstance(node, Ros2Node) or node.zid == self._own_zid or node.domain != self._domain:
+            return ""
+        if not node.name.startswith(OWN_NAMESPACE) or len(self._rivals) >= limits.ROS2_NODES_MAX:
+            return ""
+        self._rivals[key] = node
+        return node.name
+
+    def led_by(self, node: str) -> str:
+        """The Zenoh session of another gateway that shows a module's node; empty if this gateway is to show it.
+
+        Two gateways of one mesh would show each node twice, and each message would come twice. Of those that show a
+        node the one with the least session id goes on.
+        """
+        shown = (each.zid for each in self._rivals.values() if each.name == node)
+        return min((zid for zid in shown if _order(zid) < _order(self._own_zid)), key=_order, default="")
 
     def change(self, key: str, *, alive: bool) -> Ros2Node | Ros2Endpoint | None:
         """Take in that a token appeared or disappeared.
@@ -108,6 +138,13 @@ class Ros2Graph:
         if not others:
             del self._by_name[endpoint.name]
         return endpoint
+
+
+def _order(zid: str) -> int:
+    try:
+        return int(zid, 16)
+    except ValueError:
+        return 1 << 128  # no session of Zenoh's: it never leads
 
 
 def valid_name(name: str) -> bool:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from rmpa.ros.wire.tcpros import Buffer
 
-_RULES: Final = "change [[gateway.rule]] in the rmpa.toml of the gateway of {}, and restart it"
+_RULES: Final = "change [[gateway.rule]] in the rmpa.toml of the gateway of {}, and run rmpa reload there"
 
 
 class WhyQuestion(msgspec.Struct, kw_only=True, frozen=True):

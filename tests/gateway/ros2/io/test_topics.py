@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from rmpa.config.gateway_rules import Crossing, CrossingRule, Ros2Settings
+from rmpa.config.gateway_rules import Crossing, CrossingRule, GatewaySettings, Ros2Settings
 from rmpa.core.contract import ContractRule, Contracts, History, Reliability
 from rmpa.gateway.ros2.attachment import Ros2Attachment
 from rmpa.gateway.ros2.conversion import Conversion
+from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour
 from rmpa.gateway.ros2.io.own_nodes import gid_of
+from rmpa.gateway.ros2.io.topics import Ros2Topics
 from rmpa.gateway.ros2.qos import Ros2Durability, Ros2History, Ros2Qos, Ros2Reliability
 from rmpa.gateway.ros2.tokens import NO_HASH, EntityKind
 from rmpa.gateway.ros2.type_description import SERVICE_TYPE
@@ -16,7 +18,7 @@ from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.gateway.zenoh_api import ZenohQos
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_zenoh import MemoryQuery, eventually
-from tests.gateway.ros2.io.ros2_bed import STRING, string, topic_bed
+from tests.gateway.ros2.io.ros2_bed import STRING, find_none, string, topic_bed
 from tests.gateway.ros2.type_descriptions import response
 
 if TYPE_CHECKING:
@@ -451,3 +453,30 @@ async def test_hostile_tokens_are_ignored_and_counted() -> None:
         assert isinstance(ignored, dict)
         assert sum(ignored.values()) == len(hostile)
         assert ignored["other gateway"] == 1
+
+
+async def test_of_two_gateways_of_one_mesh_one_shows_a_node_and_the_other_takes_over() -> None:
+    async with topic_bed() as bed:
+        gateways = [Ros2Neighbour(bed.graph, bed.network.session(), GatewaySettings(), [Ros2Topics(find_none)])]
+        gateways[0].start()
+        source = bed.graph.publisher("/chatter", STRING)
+        await eventually(lambda: len(bed.own(EntityKind.PUBLISHER)) == 1)
+        (first,) = bed.own(EntityKind.PUBLISHER)
+        assert first.node.zid == bed.neighbour.context.session.zid
+        assert gateways[0].report()["standing_by"] == {"/rmpa/arm/talker": first.node.zid}
+        heard: list[ZenohSample] = []
+        bed.subscribe("/chatter", heard)
+        await eventually(lambda: bed.graph.taps)
+        assert bed.graph.send(source, string("once")) == 1
+        other = bed.graph.publisher("/second", STRING)
+        await eventually(lambda: len(bed.own(EntityKind.PUBLISHER)) == 2)
+        await bed.neighbour.close()
+        await eventually(lambda: len(bed.own(EntityKind.PUBLISHER)) == 2)
+        await eventually(lambda: bed.graph.taps)
+        assert {each.node.zid for each in bed.own(EntityKind.PUBLISHER)} == {gateways[0].context.session.zid}
+        bed.graph.send(source, string("twice"))
+        await eventually(lambda: len(heard) == 2)
+        for each in (source, other):
+            bed.graph.remove(each)
+        assert gateways[0].report()["standing_by"] == {}
+        await gateways[0].close()

@@ -61,6 +61,8 @@ class Ros2Neighbour:
             mapping.read(Path(path))
         self._tasks: set[asyncio.Task[None]] = set()
         self._problems: dict[str, str] = {}
+        self._sources: dict[str, set[MeshSource]] = {}
+        self._standing_by: dict[str, str] = {}
         size = _GID_BYTES_BEFORE if ros2.distribution in WITHOUT_HASH else GID_BYTES
         self.context: Final = Ros2Context(
             graph,
@@ -107,6 +109,7 @@ class Ros2Neighbour:
             "nodes": sorted(context.ros2.nodes),
             "endpoints": len(context.ros2),
             "own_nodes": context.nodes.names,
+            "standing_by": dict(self._standing_by),
             "ignored_tokens": dict(context.ros2.ignored),
             "problems": dict(self._problems),
         }
@@ -135,14 +138,49 @@ class Ros2Neighbour:
     def _token(self, key: str, alive: bool) -> None:
         if self._closed:
             return
+        if rival := self.context.ros2.rival(key, alive=alive):
+            self._judge_again(rival)
         entity = self.context.ros2.change(key, alive=alive)
         if isinstance(entity, Ros2Endpoint):
             _log.debug("%s %s", "+" if alive else "-", entity.token())
             any(part.endpoint(entity, there=alive) for part in self._parts)
 
     def _mesh_source(self, source: MeshSource, there: bool) -> None:
-        if not self._closed:
-            any(part.mesh_source(source, there=there) for part in self._parts)
+        if self._closed:
+            return
+        sources = self._sources.setdefault(source.proxy, set())
+        (sources.add if there else sources.discard)(source)
+        if not sources:
+            del self._sources[source.proxy]
+        if source.proxy in self._standing_by:
+            if not sources:
+                self._lead(source.proxy)
+        elif there and (leader := self.context.ros2.led_by(source.proxy)):
+            self._stand_by(source.proxy, leader)
+        else:
+            self._offer(source, there=there)
+
+    def _offer(self, source: MeshSource, *, there: bool) -> None:
+        any(part.mesh_source(source, there=there) for part in self._parts)
+
+    def _judge_again(self, node: str) -> None:
+        """Another gateway shows a node of a module, or does not any more: only one of them may."""
+        leader = self.context.ros2.led_by(node)
+        if leader and node in self._sources and node not in self._standing_by:
+            self._stand_by(node, leader)
+            for source in tuple(self._sources[node]):
+                self._offer(source, there=False)
+        elif not leader and node in self._standing_by:
+            self._lead(node)
+            for source in tuple(self._sources.get(node, ())):
+                self._offer(source, there=True)
+
+    def _stand_by(self, node: str, leader: str) -> None:
+        self._standing_by[node] = leader
+        _log.info("= the gateway with session %s shows %s in ROS 2; this one stands by", leader, node)
+
+    def _lead(self, node: str) -> None:
+        del self._standing_by[node]
 
     def _spawn(self, work: Coroutine[None, None, None]) -> None:
         task = asyncio.get_running_loop().create_task(work)

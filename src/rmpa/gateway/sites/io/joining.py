@@ -73,7 +73,6 @@ def make_site_neighbour(
 
     history = SiteHistory(clock.now)
     parts: list[SitePart] = [
-        history,
         SiteLastValues(
             gateway.site, session, graph, LastValueStore(_store_file(settings)), rules.kept, refusal, clock.wall_ns
         ),
@@ -82,6 +81,7 @@ def make_site_neighbour(
     ]
     own = SiteGateway(gateway.site, gateway.rank, secrets.token_hex(16))
     neighbour = SiteNeighbour(graph, session, own, rules, parts)
+    neighbour.on_sites = history.seen
     if isinstance(graph, AgentGraph):
         neighbour.add(SiteActions(graph.attend))
     if agent is not None:
@@ -105,14 +105,17 @@ def _add_questions(
         for peer in agent.bridge.sessions.linked():
             if peer.link.name == module:
                 return await agent.bridge.rpc.request(peer, what, args, limits.SITE_PARAM_TIMEOUT)
-        raise UnreachableError("module", f"{module!r} of site {own.site}", "it is not linked to its gateway")
+        where = f"site {own.site} as {module!r}"
+        raise UnreachableError("module", where, "`rmpa peer list` there shows which are linked to its gateway")
 
     def may_not(site: str, module: str, parameter: str) -> str:
         return rules.refusal(site, module, parameter, Access.PARAM)
 
     exports = SiteParamExports(own.site, session, ask_module, may_not)
     imports = SiteParamImports(own.site, session, clock.wall_ns, agent.params, lambda: neighbour.catalogue.sites)
-    neighbour.add(SiteParams(own.site, exports, imports))
+    params = SiteParams(exports, imports)
+    neighbour.add(params)
+    neighbour.on_leads = params.lead
     why = SiteWhy(own.site, name, session, neighbour, history, rules)
     answers = SiteAnswers(
         name, own, session, neighbour, history, lambda: session.endpoints, imports.ask, why, clock.wall_ns

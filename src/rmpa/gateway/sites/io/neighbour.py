@@ -18,7 +18,7 @@ from rmpa.gateway.sites.report import refusals_report, sites_report
 from rmpa.runtime.machine_timer import MachineTimer
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from rmpa.gateway.neighbour import MeshSource, OwnGraph
     from rmpa.gateway.sites.part import SiteExport, SitePart
@@ -57,6 +57,10 @@ class SiteNeighbour:
         """What this site offers."""
         self.imports = SiteImports(rules)
         """What is shown of the other sites."""
+        self.on_sites: Callable[[tuple[str, ...]], None] = lambda _: None
+        """Called with the names of the other sites, after each change of what they have."""
+        self.on_leads: Callable[[bool], None] = lambda _: None
+        """Called when this gateway begins to lead its site, and when it ends."""
         self._leader: Leader | None = None
         self._active = False
         self._tokens: dict[str, Declared] = {}
@@ -173,6 +177,7 @@ class SiteNeighbour:
             _log.info("= another gateway of site %s leads now", self._own.site)
             self._rest()
         self._act()
+        self.on_sites(self.catalogue.sites)
         self._timer.arm()
 
     def _act(self) -> None:
@@ -202,6 +207,7 @@ class SiteNeighbour:
         _log.info("= this gateway leads site %s", self._own.site)
         self._act()
         self._active = True
+        self.on_leads(True)
         for module in self.exports.modules:
             self._own_module(module, there=True)
         for entry in self.exports.entries:
@@ -228,6 +234,7 @@ class SiteNeighbour:
         for module in self.exports.modules:
             self._own_module(module, there=False)
         self._active = False
+        self.on_leads(False)
 
     def _export(self, entry: SiteExport) -> None:
         for part in self._parts:

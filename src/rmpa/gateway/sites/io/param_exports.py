@@ -57,49 +57,44 @@ class SiteParamExports:
         self._session = session
         self._ask = ask
         self._why_not = why_not
-        self._queryables: dict[str, Declared] = {}
+        self._queryable: Declared | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self.asked = 0
         """Questions that came."""
         self.refused = 0
         """Questions that got an error."""
 
-    def export(self, module: str) -> None:
-        """Answer for a module."""
-        if module not in self._queryables:
-            key = f"{ROOT}/{self._site}/{module}/p/**"
-            self._queryables[module] = self._session.queryable(key, lambda query: self._take(module, query))
-
-    def withdraw(self, module: str) -> None:
-        """End that."""
-        declared = self._queryables.pop(module, None)
-        if declared is not None:
-            declared.close()
+    def lead(self, leads: bool) -> None:
+        """Answer while this gateway leads its site."""
+        if leads and self._queryable is None:
+            self._queryable = self._session.queryable(f"{ROOT}/{self._site}/*/p/**", self._take)
+        elif not leads and self._queryable is not None:
+            self._queryable.close()
+            self._queryable = None
 
     async def close(self) -> None:
-        """Withdraw all; questions under way get an error."""
-        for module in list(self._queryables):
-            self.withdraw(module)
+        """Answer no more; questions under way get an error."""
+        self.lead(leads=False)
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     # --- inside ---------------------------------------------------------------------------------------------------
 
-    def _take(self, module: str, query: ZenohQuery) -> None:
+    def _take(self, query: ZenohQuery) -> None:
         self.asked += 1
         if len(self._tasks) >= limits.SITE_PARAMS_AT_ONCE:
             self.refused += 1
             query.reply_error("too many questions about parameters at once; try again later")
             return
-        task = asyncio.get_running_loop().create_task(self._answer(module, query), name=f"parameter of {module}")
+        task = asyncio.get_running_loop().create_task(self._answer(query), name="parameter for a site")
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _answer(self, module: str, query: ZenohQuery) -> None:
+    async def _answer(self, query: ZenohQuery) -> None:
         try:
             site = SiteAttachment.parse(query.attachment).path[-1] if query.attachment else ""
-            _, name = parse_param_key(query.key)
+            module, name = parse_param_key(query.key)
             if name == GATEWAYS:
                 reply = (await self._for_gateway(site, module, ParamQuestion.parse(query.payload))).serialize()
             elif query.payload:
@@ -117,7 +112,7 @@ class SiteParamExports:
             query.reply_error(f"the gateway of site {self._site} ends")
             raise
         except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! a question about a parameter of %s failed", module)
+            _log.exception("! a question about a parameter failed")
             self._fail(query, f"the gateway of site {self._site} failed at the parameter; its log says why")
 
     def _fail(self, query: ZenohQuery, text: str) -> None:

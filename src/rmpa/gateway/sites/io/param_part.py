@@ -9,30 +9,26 @@ from rmpa.gateway.sites.part import PassivePart
 if TYPE_CHECKING:
     from rmpa.gateway.sites.io.param_exports import SiteParamExports
     from rmpa.gateway.sites.io.param_imports import SiteParamImports
-    from rmpa.gateway.sites.keys import SiteModule
 
 
 class SiteParams(PassivePart):
     """Parameters between sites: a ``SitePart``.
 
     Args:
-        site: This site's name.
         exports: Answers for the modules of this site.
         imports: Asks other sites; it is started here.
     """
 
     name = "params"
 
-    def __init__(self, site: str, exports: SiteParamExports, imports: SiteParamImports) -> None:
-        self._site = site
+    def __init__(self, exports: SiteParamExports, imports: SiteParamImports) -> None:
         self._exports = exports
         self._imports = imports
         imports.start()
 
-    def module_changed(self, module: SiteModule, there: bool) -> None:
-        """Answer for a module of this site while it is there."""
-        if module.site == self._site:
-            (self._exports.export if there else self._exports.withdraw)(module.name)
+    def lead(self, leads: bool) -> None:
+        """Answer for the modules of this site while this gateway leads it."""
+        self._exports.lead(leads)
 
     def report(self) -> dict[str, object]:
         """Questions of other sites, and what is followed from them."""

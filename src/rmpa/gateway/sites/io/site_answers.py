@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import base64
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
@@ -134,9 +133,7 @@ class SiteAnswers(PassivePart):
             return
         ago = self._history.since_ago(site)
         if ago is not None:
-            raise UnreachableError(
-                f"gateway of site {site}", f"its keys since {ago:.0f} s", "`rmpa site list` shows all"
-            )
+            raise RmpaError(f"site {site} is unreachable since {ago:.0f} s; `rmpa site list` shows all")
         known = ", ".join(self._sites.catalogue.sites) or "none"
         raise UnreachableError(f"site {site!r}", "any Zenoh router that this gateway reaches", f"known are: {known}")
 
@@ -270,7 +267,7 @@ class SiteAnswers(PassivePart):
         if offset + len(portion) >= len(body):
             self._readings.pop(key, None)
         self._forget_later()
-        return ValuePortion(size=len(body), data=base64.b64encode(portion))
+        return ValuePortion(size=len(body), data=portion)
 
     async def _body(self, site: str, module: str, topic: str, node: str) -> bytes:
         newest: tuple[int, bytes] | None = None
