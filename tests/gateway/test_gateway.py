@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.config.gateway_rules import Crossing, CrossingRule, GatewaySettings
+from rmpa.config.settings import TrustSettings
 from rmpa.core.errors import StartError
+from rmpa.gateway import limits
 from rmpa.gateway.gateway import Gateway
 from rmpa.observe.io.control_client import ControlClient
 from tests.agent.conftest import pytest_asyncio_loop_factories
@@ -37,6 +39,7 @@ class OpenedSession(MemorySession):
         super().__init__(MemoryZenoh(), "1")
         self.events = events
         self.endpoints: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+        self.stale = False
 
     async def close(self) -> None:  # type: ignore[override] # a real one ends threads
         self.events.append("session closed")
@@ -65,6 +68,7 @@ class Bed:
     def __init__(self, settings: Settings, gateway: GatewaySettings, failures: int = 0) -> None:
         self.events: list[str] = []
         self.failures = failures
+        self.sessions: list[OpenedSession] = []
         self.rules: list[tuple[CrossingRule, ...]] = []
         """Of each time that the neighbours were made."""
         self.settings = replace(settings, gateway=gateway)
@@ -74,7 +78,8 @@ class Bed:
         if self.failures:
             self.failures -= 1
             raise StartError("zenoh", "no router answers")
-        return OpenedSession(self.events)
+        self.sessions.append(OpenedSession(self.events))
+        return self.sessions[-1]
 
     def _make(self, graph: AgentGraph, _session: ZenohSession, settings: Settings) -> Mapping[str, Neighbour]:
         self.rules.append(settings.gateway.rules)
@@ -122,6 +127,32 @@ async def test_other_rules_make_the_neighbours_anew(settings: Callable[..., Sett
         assert bed.events == ["started in g", "closed", "started in g"]
         assert bed.rules == [(), rules]
     assert bed.events[3:] == ["closed", "session closed"]
+
+
+async def test_a_session_whose_certificate_was_renewed_is_opened_anew_with_its_neighbours(
+    settings: Callable[..., Settings], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "CERTIFICATE_LOOK_PERIOD", 0.05)
+    monkeypatch.setattr(limits, "OPEN_RETRY_FIRST", 0.05)
+    bed = Bed(settings("g"), CONNECT)
+    async with started(bed) as gateway:
+        bed.sessions[0].stale = True
+        await until(lambda: len(bed.events) == 4)
+        assert bed.events == ["started in g", "closed", "session closed", "started in g"]
+        assert gateway.session is bed.sessions[1]
+    assert bed.events[4:] == ["closed", "session closed"]
+
+
+async def test_other_permissions_open_a_session_that_listens_anew(
+    settings: Callable[..., Settings], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "OPEN_RETRY_FIRST", 0.05)
+    listens = GatewaySettings(router=True, listen=("tcp/127.0.0.1:7447",))
+    bed = Bed(settings("g"), listens)
+    async with started(bed) as gateway:
+        gateway.agent.apply_settings(replace(bed.settings, trust=TrustSettings(default="allow")))
+        await until(lambda: len(bed.sessions) == 2 and gateway.session is bed.sessions[1])
+        assert bed.events == ["started in g", "closed", "session closed", "started in g"]
 
 
 async def test_a_router_that_comes_later_is_joined_then(settings: Callable[..., Settings]) -> None:

@@ -39,6 +39,10 @@ class OwnedSession(ZenohSession, Protocol):
     def endpoints(self) -> tuple[str, ...]:
         """The endpoints of the other side of each link that is up now."""
 
+    @property
+    def stale(self) -> bool:
+        """Whether it has to be opened anew for others to connect to it: its certificate was renewed."""
+
     async def close(self) -> None:
         """Close it and end its threads."""
 
@@ -79,7 +83,8 @@ class Gateway:
         self._opening: asyncio.Task[None] | None = None
         self.graph.reloaded = self._reloaded
         self._rejoining: asyncio.Task[None] | None = None
-        self._changed = False
+        self._changed = self._reopen = False
+        self._looking: asyncio.Task[None] | None = None
 
     async def start(self) -> None:
         """Start the agent and the neighbours; where only ``connect`` is set, a router may come later.
@@ -112,14 +117,18 @@ class Gateway:
             self._opening = asyncio.get_running_loop().create_task(self._open_later(), name="open the zenoh session")
         else:
             self._join(session)
+        self._looking = asyncio.get_running_loop().create_task(self._look(), name="look whether the session is stale")
 
     async def close(self) -> None:
         """Take everything back: the neighbours first, the agent last."""
+        if self._looking is not None:
+            self._looking.cancel()
+            await asyncio.wait([self._looking])
+        if self._rejoining is not None:
+            await asyncio.wait([self._rejoining])
         if self._opening is not None:
             self._opening.cancel()
             await asyncio.wait([self._opening])
-        if self._rejoining is not None:
-            await asyncio.wait([self._rejoining])
         await self._close_neighbours()
         if self.session is not None:
             await self.session.close()
@@ -137,17 +146,37 @@ class Gateway:
     def _reloaded(self, settings: Settings) -> None:
         """Have other rules hold: the neighbours are made anew, and what crosses pauses for a moment."""
         before, self._settings = self._settings, replace(settings, relay=True)
-        if _rules(before) != _rules(settings):
-            self._changed = True
-            if self._rejoining is None or self._rejoining.done():
-                self._rejoining = asyncio.get_running_loop().create_task(self._rejoin(), name="take other rules")
+        if settings.gateway.listen and before.trust != settings.trust:
+            self._reopen = True  # Zenoh reads its table of access once
+        if self._reopen or _rules(before) != _rules(settings):
+            self._begin_rejoin()
+
+    def _begin_rejoin(self) -> None:
+        self._changed = True
+        if self._rejoining is None or self._rejoining.done():
+            self._rejoining = asyncio.get_running_loop().create_task(self._rejoin(), name="take other rules")
 
     async def _rejoin(self) -> None:
         while self._changed and self.session is not None:
             self._changed = False
             await self._close_neighbours()
             self.graph.unwatch()
-            self._try_to_join(self.session)
+            if not self._reopen:
+                self._try_to_join(self.session)
+                continue
+            self._reopen = False
+            session, self.session = self.session, None
+            await session.close()
+            _log.info("= the zenoh session is opened anew: its certificate or the permissions have changed")
+            self._opening = asyncio.get_running_loop().create_task(self._open_later(), name="open the zenoh session")
+
+    async def _look(self) -> None:
+        """Opens the session anew where it listens and its certificate was renewed: Zenoh reads that once."""
+        while True:
+            await asyncio.sleep(limits.CERTIFICATE_LOOK_PERIOD)
+            if self.session is not None and self.session.stale:
+                self._reopen = True
+                self._begin_rejoin()
 
     def report(self) -> dict[str, object]:
         """What the gateway joins, as JSON values: the reply to the operation ``gateway``."""

@@ -176,6 +176,8 @@ ROS2_PUBLISHERS_MAX: Final = 1000
 ROS2_SERVICE_WAIT: Final = 3.0
 """Seconds in which a ROS 2 node's get_type_description may appear after its first publisher, and in which it answers:
 a node declares one after the other."""
+CERTIFICATE_LOOK_PERIOD: Final = 60.0
+"""Seconds between two looks whether the certificate of a session that listens was renewed; it is each 3.5 days."""
 OPEN_RETRY_FIRST: Final = 0.5
 """Seconds until a session is opened again, at first, whose router did not answer."""
 OPEN_RETRY_MAX: Final = 5.0

@@ -6,6 +6,7 @@ import pytest
 
 from rmpa.config.gateway_rules import GatewaySettings
 from rmpa.core.errors import StartError
+from rmpa.gateway.zenoh import limits
 from rmpa.gateway.zenoh.config import MeshCertificates, ZenohMode, gateway_config, zenohd_entries
 
 FILES = MeshCertificates("ca.crt", "module.crt", "module.key")
@@ -80,4 +81,4 @@ def test_the_file_for_zenohd_has_the_same_entries_nested() -> None:
     transport = nested["transport"]
     assert isinstance(transport, dict)
     assert transport["link"]["tls"]["listen_certificate"] == "module.crt"
-    assert transport["link"]["tx"]["lease"] == 1200
+    assert transport["link"]["tx"]["lease"] == round(limits.LEASE * 1000)

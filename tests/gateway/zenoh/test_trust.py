@@ -172,6 +172,14 @@ async def test_a_program_without_a_certificate_of_the_mesh_is_not_let_in(fleet: 
         await opened.close()
 
 
+async def test_a_renewed_certificate_makes_a_listening_session_stale_and_a_connecting_one_not(fleet: Fleet) -> None:
+    router, a = await fleet.router(default="allow"), await fleet.gateway("a")
+    before = (router.stale, a.stale)
+    fleet.mesh.save("fleet", time.time())
+    fleet.mesh.save("a", time.time())
+    assert (before, (router.stale, a.stale)) == ((False, False), (True, False))
+
+
 async def test_the_file_for_zenohd_opens_a_router_that_enforces_the_same(fleet: Fleet, tmp_path: Path) -> None:
     gateway = GatewaySettings(listen=(fleet.endpoint,))
     trust = TrustSettings(rules=(allow("a", publish="/scan"), allow("b", subscribe="/**")))

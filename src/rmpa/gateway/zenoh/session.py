@@ -11,6 +11,7 @@ import asyncio
 import contextlib
 import json
 import logging
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import StartError
@@ -90,9 +91,12 @@ class OpenSession:
         library: The module ``zenoh``.
         session: Zenoh's session.
         loop: The event loop in which all callbacks are called.
+        listens_with: The file of the certificate that it listens with; ``None``: it does not, or has none.
     """
 
-    def __init__(self, library: Any, session: Any, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(
+        self, library: Any, session: Any, loop: asyncio.AbstractEventLoop, listens_with: Path | None = None
+    ) -> None:
         self._zenoh = library
         self._session = session
         self._loop = loop
@@ -103,6 +107,8 @@ class OpenSession:
         self._lanes: dict[ZenohPriority, SendingLane] = {}
         self._publishers: set[QueuedPublisher] = set()
         self._kept: set[Declaration] = set()
+        self._certificate = listens_with
+        self._stamp = _stamp(listens_with)
         self._closing = False
         self._closed = False
         self._flushed = asyncio.Event()
@@ -111,6 +117,14 @@ class OpenSession:
     def endpoints(self) -> tuple[str, ...]:
         """The endpoints of the other side of each link that is up now, such as ``tcp/192.0.2.1:7447``."""
         return () if self._closed else tuple(str(link.dst) for link in self._session.info.links())
+
+    @property
+    def stale(self) -> bool:
+        """Whether it has to be opened anew for others to connect to it: its certificate was renewed.
+
+        Zenoh reads the certificate of a listener once, and that of a connection each time.
+        """
+        return _stamp(self._certificate) != self._stamp
 
     def publisher(self, key: str, qos: ZenohQos, on_matching: Callable[[bool], None]) -> QueuedPublisher:
         """Declare a publisher; ``on_matching(there)`` tells whether there is a subscriber, also at the beginning."""
@@ -373,7 +387,18 @@ async def open_session(config: ZenohConfig) -> OpenSession:
         session = await in_thread(lambda: zenoh.open(settings), "zenoh open")
     except zenoh.ZError as error:
         raise _start_error(config, _reason(error)) from None
-    return OpenSession(zenoh, session, asyncio.get_running_loop())
+    files = config.certificates if config.listen else None
+    certificate = Path(files.certificate) if files is not None else None
+    return OpenSession(zenoh, session, asyncio.get_running_loop(), certificate)
+
+
+def _stamp(file: Path | None) -> tuple[int, int] | None:
+    """What changes when a file is replaced; ``None`` for none, and for one that cannot be seen."""
+    try:
+        info = file.stat() if file is not None else None
+    except OSError:
+        return None
+    return (info.st_ino, info.st_mtime_ns) if info is not None else None
 
 
 def _reason(error: Exception) -> str:

@@ -120,22 +120,30 @@ class NodeParams:
                 await self._store(event.node, parameter.name, None)
 
     async def _read(self, node: str) -> None:
-        try:
+        """Read all parameters of a node; one that declares its services one by one may not answer at first."""
+        again, longest = limits.ROS2_DESCRIBE_AGAIN
+        async with self._lock:
+            await self._tree.provide(ROOT + node, None)  # of a node of this name that was here before
+        while node in self._nodes and node not in self._read_nodes:
+            try:
+                await self._read_once(node)
+            except RmpaError as error:
+                self._context.say(f"parameters of {node}", str(error))
+                await asyncio.sleep(again)
+                again = min(again * 2, longest)
+
+    async def _read_once(self, node: str) -> None:
+        answer = await self._call(node, "list_parameters", prefixes=[], depth=0)
+        names = [str(name) for name in answer.result.names][: limits.ROS2_PARAMS_MAX]
+        for first in range(0, len(names), _PORTION):
+            asked = names[first : first + _PORTION]
+            answer = await self._call(node, "get_parameters", names=asked)
             async with self._lock:
-                await self._tree.provide(ROOT + node, None)  # of a node of this name that was here before
-            answer = await self._call(node, "list_parameters", prefixes=[], depth=0)
-            names = [str(name) for name in answer.result.names][: limits.ROS2_PARAMS_MAX]
-            for first in range(0, len(names), _PORTION):
-                asked = names[first : first + _PORTION]
-                answer = await self._call(node, "get_parameters", names=asked)
-                async with self._lock:
-                    for name, value in zip(asked, answer.values, strict=False):
-                        await self._store(node, name, self._types.plain(value))
-        except RmpaError as error:
-            self._context.say(f"parameters of {node}", str(error))
-        else:
-            if node in self._nodes:
-                self._read_nodes.add(node)
+                for name, value in zip(asked, answer.values, strict=False):
+                    await self._store(node, name, self._types.plain(value))
+        if node in self._nodes:
+            self._read_nodes.add(node)
+            self._context.say(f"parameters of {node}", "")
 
     async def _store(self, node: str, name: str, value: XmlRpcValue) -> None:
         known = self._nodes.get(node)
