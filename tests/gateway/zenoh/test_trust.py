@@ -122,6 +122,32 @@ async def test_the_rules_of_permission_hold_in_a_router(fleet: Fleet) -> None:
     assert matching["c"] == [False]
 
 
+async def test_headers_and_parameters_are_answered_for_the_names_that_are_permitted(fleet: Fleet) -> None:
+    await fleet.router(
+        allow("a", publish="/scan /secret/**"), allow("b", subscribe="/scan", param="/arm/**"), allow("c", call="/x")
+    )
+    a, b, c = await fleet.gateway("a"), await fleet.gateway("b"), await fleet.gateway("c")
+
+    def answer(query: ZenohQuery) -> None:
+        query.reply(query.key, b"told")
+        query.finish()
+
+    for what in ("arm/d/t", "arm/d/m", "*/v", "*/p"):
+        a.queryable(f"rmpa/1/home/{what}/**", answer)
+    a.queryable("rmpa/1/home/-gateway/why", answer)
+
+    async def told(session: OpenSession, what: str) -> bool:
+        return bool(await session.get(f"rmpa/1/home/{what}", b"", timeout=2.0))
+
+    allowed = ("arm/d/t/scan", "arm/d/m/00", "arm/v/scan", "arm/p/arm/speed", "arm/p/-", "-gateway/why")
+    async with asyncio.timeout(30):
+        for what in allowed:
+            while not await told(b, what):
+                await asyncio.sleep(0.02)
+    assert not any([await told(b, what) for what in ("arm/d/t/secret/key", "arm/v/secret/key", "arm/p/other")])
+    assert [what for what in allowed if await told(c, what)] == ["arm/d/m/00", "-gateway/why"]
+
+
 async def test_the_cache_of_a_latched_topic_crosses_where_it_is_permitted(fleet: Fleet) -> None:
     await fleet.router(allow("a", publish="/scan"), allow("b", subscribe="/scan"))
     a, b, c = await fleet.gateway("a"), await fleet.gateway("b"), await fleet.gateway("c")
