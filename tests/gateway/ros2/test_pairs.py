@@ -89,3 +89,8 @@ def test_a_rule_to_a_type_that_is_not_known_says_what_to_do(tmp_path: Path) -> N
     mapping.read(rules)
     with pytest.raises(NoConversion, match="get_type_description"):
         pairs(mapping).ros2_type("a_msgs/A")
+
+
+def test_a_definition_that_ros2_cannot_have_is_no_pair() -> None:
+    with pytest.raises(NoConversion, match="no form in ROS 2"):
+        pairs().learn(MessageType.learn("arm_msgs/Odd", "float64 fooBar\nfloat64 foo_bar"))

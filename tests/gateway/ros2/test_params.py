@@ -55,6 +55,10 @@ def test_what_the_other_side_has_no_type_for() -> None:
     value = TYPES.value(0)
     object.__setattr__(value, "integer_value", 2**40)
     assert TYPES.plain(value) == float(2**40), "ROS 1's integers have 32 bits"
+    many = TYPES.value([1, 2])
+    many.integer_array_value[0] = 2**40
+    assert TYPES.plain(many) == [float(2**40), 2.0]
+    assert isinstance(TYPES.plain(many), list)
     with pytest.raises(RemoteProtocolError):
         TYPES.read("rcl_interfaces/srv/GetParameters_Request", b"\0\1\0\0\xff\xff\xff\xff")
 

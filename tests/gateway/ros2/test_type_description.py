@@ -72,6 +72,7 @@ HOSTILE = {
         "a/msg/B": [("y", 49, 2000, 0, "a/msg/C")],
         "a/msg/C": [("z", 6, 0, 0, "")],
     },
+    "two fields of one name": {WHEELS: [("x", 6, 0, 0, ""), ("x", 17, 0, 0, "")]},
     "wide characters": {WHEELS: [("x", 18, 0, 0, "")]},
     "no such type": {WHEELS: [("x", 47, 0, 0, "")]},
     "a long name": {WHEELS: [("x" * 300, 6, 0, 0, "")]},

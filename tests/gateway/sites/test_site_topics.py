@@ -9,6 +9,7 @@ import pytest
 from rmpa.config.gateway_rules import Crossing, CrossingRule
 from rmpa.core.contract import ContractRule
 from rmpa.gateway import limits
+from rmpa.gateway.zenoh.sending import QueuedPublisher
 from tests.gateway.sites.site_bed import MD5, SiteBed, described, site_bed
 from tests.gateway.zenoh_bed import until
 
@@ -131,6 +132,20 @@ async def test_what_the_queue_drops_is_counted_at_both_ends() -> None:
 
         await until(lambda: len(topic.messages) + lost() == 2001 and dropped() == lost(), 30)
         assert dropped() > 0
+
+
+async def test_a_loss_at_the_end_is_counted_although_no_message_follows(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with site_bed() as bed:
+        yard, hall = await bed.pair()
+        source = yard.graph.add("/burst", described())
+        topic = await hall.subscribed("/burst")
+        await until(lambda: yard.graph.send(source, b"first"))
+        await until(lambda: topic.messages)
+        monkeypatch.setattr(QueuedPublisher, "put", lambda _publisher, _payload, _attachment: 0)
+        for _ in range(3):
+            yard.graph.send(source, b"swallowed by the network")
+        await until(lambda: hall.topics("in")[0]["lost"] == 3)
+        assert hall.topics("in")[0]["messages"] == 1
 
 
 async def test_a_rule_limits_the_rate_at_the_near_end_and_counts() -> None:

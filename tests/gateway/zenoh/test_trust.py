@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.config.gateway_rules import GatewaySettings
-from rmpa.config.permission_rules import Effect, PermissionRule
 from rmpa.config.settings import Settings, TrustSettings
 from rmpa.core.errors import StartError
 from rmpa.gateway.zenoh.config import ZenohConfig
 from rmpa.gateway.zenoh.session import open_session
 from rmpa.gateway.zenoh.trust import open_trusted_session, zenohd_config
 from rmpa.gateway.zenoh_api import ZenohQos
-from tests.gateway.zenoh_bed import free_port, until
+from tests.gateway.zenoh_bed import until
+from tests.gateway.zenoh_fleet import Fleet, allow, deny
 from tests.trust.io.member_files import SecuredMesh
 
 if TYPE_CHECKING:
@@ -33,43 +33,6 @@ zenoh = pytest.importorskip("zenoh")
 
 SCAN = "rmpa/1/home/arm/t/sensor_msgs%LaserScan/scan"
 SECRET = "rmpa/1/home/arm/t/std_msgs%String/secret/key"
-
-
-def allow(*modules: str, **names: str) -> PermissionRule:
-    return PermissionRule(modules, names={key: tuple(globs.split()) for key, globs in names.items()})
-
-
-def deny(*modules: str, **names: str) -> PermissionRule:
-    return replace(allow(*modules, **names), effect=Effect.DENY)
-
-
-class Fleet:
-    """A router with a certificate and rules, and gateways that connect to it."""
-
-    def __init__(self, folder: Path) -> None:
-        self.mesh = SecuredMesh(folder)
-        self.endpoint = f"tls/127.0.0.1:{free_port()}"
-        self._opened: list[OpenSession] = []
-
-    def settings(self, name: str, gateway: GatewaySettings, trust: TrustSettings | None = None) -> Settings:
-        self.mesh.save(name, time.time())
-        return Settings(name=name, state_dir=str(self.mesh.folder), gateway=gateway, trust=trust or TrustSettings())
-
-    async def router(self, *rules: PermissionRule, default: str = "deny") -> OpenSession:
-        gateway = GatewaySettings(listen=(self.endpoint,), router=True)
-        return await self.open(self.settings("fleet", gateway, TrustSettings(default=default, rules=rules)))
-
-    async def open(self, settings: Settings) -> OpenSession:
-        opened = await open_trusted_session(settings)
-        self._opened.append(opened)
-        return opened
-
-    async def gateway(self, name: str) -> OpenSession:
-        return await self.open(self.settings(name, GatewaySettings(connect=(self.endpoint,))))
-
-    async def close(self) -> None:
-        for opened in reversed(self._opened):
-            await opened.close()
 
 
 @pytest.fixture
@@ -120,6 +83,32 @@ async def test_the_rules_of_permission_hold_in_a_router(fleet: Fleet) -> None:
     assert got == {"b": [b"scan"], "b secret": [], "c": []}
     assert matching["a secret"] == [False]
     assert matching["c"] == [False]
+
+
+async def test_headers_and_parameters_are_answered_for_the_names_that_are_permitted(fleet: Fleet) -> None:
+    await fleet.router(
+        allow("a", publish="/scan /secret/**"), allow("b", subscribe="/scan", param="/arm/**"), allow("c", call="/x")
+    )
+    a, b, c = await fleet.gateway("a"), await fleet.gateway("b"), await fleet.gateway("c")
+
+    def answer(query: ZenohQuery) -> None:
+        query.reply(query.key, b"told")
+        query.finish()
+
+    for what in ("arm/d/t", "arm/d/m", "*/v", "*/p"):
+        a.queryable(f"rmpa/1/home/{what}/**", answer)
+    a.queryable("rmpa/1/home/-gateway/why", answer)
+
+    async def told(session: OpenSession, what: str) -> bool:
+        return bool(await session.get(f"rmpa/1/home/{what}", b"", timeout=2.0))
+
+    allowed = ("arm/d/t/scan", "arm/d/m/00", "arm/v/scan", "arm/p/arm/speed", "arm/p/-", "-gateway/why")
+    async with asyncio.timeout(30):
+        for what in allowed:
+            while not await told(b, what):
+                await asyncio.sleep(0.02)
+    assert not any([await told(b, what) for what in ("arm/d/t/secret/key", "arm/v/secret/key", "arm/p/other")])
+    assert [what for what in allowed if await told(c, what)] == ["arm/d/m/00", "-gateway/why"]
 
 
 async def test_the_cache_of_a_latched_topic_crosses_where_it_is_permitted(fleet: Fleet) -> None:

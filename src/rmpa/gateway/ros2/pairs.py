@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from rosbags.typesys.base import TypesysError
+
 from rmpa.core.errors import RmpaError
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.conversion import Conversion, NoConversion
@@ -68,9 +70,12 @@ class Ros2Pairs:
             self._ros1[kind.name] = kind
         if (known := self.ros2_type(kind.name)) is not None:
             return known
-        self._types.learn(kind.specifications)
         name = ros2_name(kind.name)
-        return name, self._types.type_hash(name)
+        try:
+            self._types.learn(kind.specifications)
+            return name, self._types.type_hash(name)
+        except (KeyError, TypesysError) as error:
+            raise NoConversion(f"{kind.name} has no form in ROS 2: {error}") from error
 
     def outgoing(self, kind: MessageType) -> Conversion:
         """The conversion of a ROS 1 type, by the pair that ``learn`` finds.
@@ -137,10 +142,10 @@ class Ros2Pairs:
             raise NoConversion(f"{limits.ROS2_TYPES_MAX} types of ROS 2 were learnt already; {name} is not")
         if name not in fields:
             raise NoConversion(f"the node that has {name} described other types")
-        variant = self._types.variant(fields)
         try:
+            variant = self._types.variant(fields)
             hashed = variant.type_hash(name)
-        except (KeyError, RecursionError) as error:
+        except (KeyError, RecursionError, TypesysError) as error:
             raise NoConversion(f"the description of {name} is not complete: {error}") from error
         if hashed != type_hash:
             raise NoConversion(f"the description of {name} has the type hash {hashed}, its publisher {type_hash}")
@@ -157,10 +162,13 @@ class Ros2Pairs:
             if ros1 is None or ros2_name(ros1.name) != name:
                 return None
             variant = self._types.variant({})
-            variant.learn(ros1.specifications)
-            if variant.type_hash(name) != type_hash:
+            try:
+                variant.learn(ros1.specifications)
+                if variant.type_hash(name) != type_hash:
+                    return None
+                self._types.learn(ros1.specifications)
+            except (KeyError, TypesysError):
                 return None
-            self._types.learn(ros1.specifications)
         return self._types if self._types.type_hash(name) == type_hash else None
 
     def _make_incoming(self, name: str, types: Ros2Types) -> Conversion:

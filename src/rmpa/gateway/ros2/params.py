@@ -161,16 +161,13 @@ class ParamTypes:
         found = getattr(value, name)
         if name == "byte_array_value":
             return bytes(found)
-        if name.endswith("_array_value"):
-            return [_small(each) for each in (found.tolist() if hasattr(found, "tolist") else found)]
-        return _small(found)
-
-
-def _small(value: Any) -> XmlRpcValue:
-    if isinstance(value, int) and not isinstance(value, bool) and not -_INT_MAX <= value < _INT_MAX:
-        return float(value)
-    made: XmlRpcValue = value
-    return made
+        values: list[Any] = found if not hasattr(found, "tolist") else found.tolist()
+        if not name.endswith("_array_value"):
+            values = [found]
+        if name.startswith("integer") and not all(-_INT_MAX <= each < _INT_MAX for each in values):
+            values = [float(each) for each in values]
+        made: XmlRpcValue = values if name.endswith("_array_value") else values[0]
+        return made
 
 
 def _typed(value: XmlRpcValue) -> tuple[int, Any]:

@@ -87,6 +87,9 @@ def _fields(described: Any) -> list[tuple[str, Any]]:
     for field in described.fields:
         if len(field.name) > limits.ROS2_NAME_MAX or _FIELD_NAME.fullmatch(field.name) is None:
             raise RemoteProtocolError(f"{field.name[:80]!r} is not the name of a field of ROS 2")
+    names = [field.name for field in described.fields]
+    if len(set(names)) < len(names):
+        raise RemoteProtocolError(f"{described.type_name} has two fields of one name")
     return [(field.name, _desc(field.type)) for field in described.fields]
 
 

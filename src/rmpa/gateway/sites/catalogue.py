@@ -144,9 +144,9 @@ class SiteCatalogue:
         if isinstance(item, SiteGateway):
             self._gateway(site, item, now, alive=alive)
         elif alive:
-            self._came(site, item)
+            self._came(site, item, key)
         else:
-            self._went(site, item, now)
+            self._went(site, item, key, now)
         self._forget_if_empty(name)
 
     def next_timer(self) -> float | None:
@@ -179,8 +179,7 @@ class SiteCatalogue:
             if (item.module.site if isinstance(item, SiteSource) else item.site) == gateway.site:
                 self._ending.set(key, site.interrupted_until)
 
-    def _came(self, site: _Site, item: SiteModule | SiteSource) -> None:
-        key = item.token()
+    def _came(self, site: _Site, item: SiteModule | SiteSource, key: str) -> None:
         if self._by_token.pop(key, None) is not None:
             self._ending.set(key, None)
             self._tell(CatalogueChange.RENEWED, item)
@@ -210,7 +209,7 @@ class SiteCatalogue:
         if known is not None:
             self._tell(CatalogueChange.FOUND, item)
 
-    def _went(self, site: _Site, item: SiteModule | SiteSource, now: float) -> None:
+    def _went(self, site: _Site, item: SiteModule | SiteSource, key: str, now: float) -> None:
         if isinstance(item, SiteSource) and item in site.orphans.get(item.module, ()):
             site.orphans[item.module].discard(item)
             site.sources -= 1
@@ -218,7 +217,6 @@ class SiteCatalogue:
                 del site.orphans[item.module]
             return
         there = item in site.modules if isinstance(item, SiteModule) else item in site.modules.get(item.module, ())
-        key = item.token()
         if there and key not in self._by_token:
             self._by_token[key] = item
             self._ending.set(key, max(now + limits.SITE_SETTLE, site.interrupted_until))

@@ -30,10 +30,12 @@ _MODULE: Final = "rmpa/1/*/*"
 _TOPIC: Final = (f"{_MODULE}/t/*/{{}}", f"{_MODULE}/t/*/{{}}/@adv/**", f"{_MODULE}/d/t/{{}}", f"{_MODULE}/v/{{}}")
 _SERVICE: Final = (f"{_MODULE}/s/*/{{}}",)
 _PARAM: Final = (f"{_MODULE}/p/{{}}",)
+_ASKED_BY_GATEWAYS: Final = f"{_MODULE}/p/-"
 _IN: Final = "ingress"
 _OUT: Final = "egress"
 _ASKS: Final = {_IN: ("query",), _OUT: ("declare_queryable", "reply")}
 _ANSWERS: Final = {_IN: ("declare_queryable", "reply"), _OUT: ("query",)}
+_OFFERS: Final = {_IN: ("declare_queryable",), _OUT: ("declare_queryable",)}
 _TOKENS: Final = ("liveliness_token", "liveliness_query", "declare_liveliness_subscriber")
 _EVERYTHING: Final = ("put", "delete", "declare_subscriber", "query", "reply", "declare_queryable", *_TOKENS)
 _FLOWS: Final[dict[Access, tuple[tuple[str, ...], dict[str, tuple[str, ...]]]]] = {
@@ -113,7 +115,7 @@ class _Table:
         return AccessTable(entries, tuple(self._notes))
 
     def _base(self) -> None:
-        """What each member needs: presence, definitions, and to answer for its own parameters."""
+        """What each member needs: presence, definitions, and to offer answers; names are judged in queries."""
         both = {_IN: _TOKENS, _OUT: _TOKENS}
         asked = dict.fromkeys((_IN, _OUT), ("query", "reply", "declare_queryable"))
         everything = dict.fromkeys(
@@ -122,6 +124,8 @@ class _Table:
         rules = [
             *self._rule("presence", Effect.ALLOW, ("rmpa/1/**",), both),
             *self._rule("definitions", Effect.ALLOW, (f"{_MODULE}/d/m/*",), asked),
+            *self._rule("questions of gateways", Effect.ALLOW, ("rmpa/1/*/-gateway/why",), asked),
+            *self._rule("answers", Effect.ALLOW, tuple(f"{_MODULE}/{each}/**" for each in "dvp"), _OFFERS),
             *self._rule("own parameters", Effect.ALLOW, (f"{_MODULE}/p/**",), _ANSWERS),
         ]
         if self._foreign:
@@ -143,6 +147,8 @@ class _Table:
                         for key in self._keys(number, rule, glob)
                     )
                 )
+                if access is Access.PARAM and rule.effect is Effect.ALLOW and keys:
+                    keys += (_ASKED_BY_GATEWAYS,)  # the name is in the question, and its gateway judges it
                 label = f"permission {number}: {access}" + (f" of {name[0]}" if name and len(name) == 1 else "")
                 rules += self._rule(label, rule.effect, keys, found[1])
             if rules:

@@ -8,7 +8,7 @@ from collections import deque
 from typing import TYPE_CHECKING
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.stats import SampleRing
+from rmpa.core.stats import SampleRing, SampleSummary
 from rmpa.gateway import limits
 from rmpa.gateway.sites.keys import ROOT
 from rmpa.gateway.sites.sequence import SequenceCounter
@@ -67,7 +67,8 @@ class ImportedTopic:
         self._held: deque[tuple[bytes, str]] = deque()
         self._sequence = SequenceCounter()
         self._traffic = SiteTraffic(clock.now())
-        self._latencies = SampleRing(limits.LATENCIES_KEPT)
+        # Made with the first message: most topics of a large site are never subscribed to.
+        self._latencies: SampleRing | None = None
         self._clock_offset: float | None = None
         self._clock_error = float("inf")
         self._check_at = float("inf")
@@ -97,6 +98,8 @@ class ImportedTopic:
             return
         self._fresh = True
         self._traffic.add(len(payload))
+        if self._latencies is None:
+            self._latencies = SampleRing(limits.LATENCIES_KEPT)
         self._latencies.add((self._clock.wall_ns() - stamp) / 1e9)
         if source.latched:
             renewed, self._run = source.run != self._run, source.run
@@ -136,7 +139,7 @@ class ImportedTopic:
         self._traffic.read(self._clock.now())
         source, announced, traffic, header = self.entry.source, self.entry.announced, self._traffic, self._header
         offset = self._clock_offset or 0.0
-        delays = self._latencies.summary()
+        delays = SampleSummary.of(self._latencies or ())
         return {
             "site": source.site,
             "module": source.module,

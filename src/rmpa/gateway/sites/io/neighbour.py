@@ -12,7 +12,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.sites.catalogue import CatalogueChange, SiteCatalogue
 from rmpa.gateway.sites.exports import SiteExports
 from rmpa.gateway.sites.imports import SiteImports
-from rmpa.gateway.sites.keys import SiteGateway, SiteModule, parse_token, tokens_key
+from rmpa.gateway.sites.keys import GATEWAY, SiteGateway, SiteModule, parse_token, tokens_key
 from rmpa.gateway.sites.leader import Leader
 from rmpa.gateway.sites.report import refusals_report, sites_report
 from rmpa.runtime.machine_timer import MachineTimer
@@ -130,6 +130,8 @@ class SiteNeighbour:
         self._after(now)
 
     def _judge_leader(self, key: str, *, alive: bool, now: float) -> None:
+        if f"/{GATEWAY}/" not in key:
+            return
         try:
             item = parse_token(key)
         except RemoteProtocolError:
