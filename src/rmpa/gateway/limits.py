@@ -173,6 +173,8 @@ ROS2_EARLY_BYTES: Final = 16 * 1024 * 1024
 """Bytes of these."""
 ROS2_PUBLISHERS_MAX: Final = 1000
 """Publishers of one topic of ROS 2 whose sequence numbers are followed; the one silent for longest is forgotten."""
+ROS2_ASKS_MAX: Final = 200
+"""ROS 2 nodes that are asked for types at one time; any program can declare tokens of types that are not known."""
 ROS2_SERVICE_WAIT: Final = 3.0
 """Seconds in which a ROS 2 node's get_type_description may appear after its first publisher, and in which it answers:
 a node declares one after the other."""

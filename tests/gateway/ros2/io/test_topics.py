@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from rmpa.config.gateway_rules import Crossing, CrossingRule, GatewaySettings, Ros2Settings
 from rmpa.core.contract import ContractRule, Contracts, History, Reliability
+from rmpa.gateway import limits
 from rmpa.gateway.ros2.attachment import Ros2Attachment
 from rmpa.gateway.ros2.conversion import Conversion
 from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour
@@ -22,6 +23,8 @@ from tests.gateway.ros2.io.ros2_bed import STRING, find_none, string, topic_bed
 from tests.gateway.ros2.type_descriptions import response
 
 if TYPE_CHECKING:
+    import pytest
+
     from rmpa.gateway.zenoh_api import ZenohSample
 
 LATCHED = Ros2Qos(durability=Ros2Durability.TRANSIENT_LOCAL, depth=1)
@@ -381,8 +384,6 @@ async def test_a_false_description_is_not_believed() -> None:
 
 
 async def test_a_type_that_no_one_describes_is_told_with_what_to_do() -> None:
-    from rmpa.gateway import limits
-
     async with topic_bed() as bed:
         bed.publisher("/wheels", node="/base", type_name="base_msgs/msg/Wheels", type_hash="RIHS01_" + "2" * 64)
         bed.publisher("/chatter", node="/old", type_hash="RIHS01_" + "2" * 64)
@@ -391,6 +392,31 @@ async def test_a_type_that_no_one_describes_is_told_with_what_to_do() -> None:
         assert "start_type_description_service" in texts[1]
         assert "gateway.ros2.distribution" in texts[0] + texts[1]
         assert all(row["problem"] for row in bed.rows("in"))
+
+
+async def test_a_type_that_is_learnt_later_makes_the_topic_known() -> None:
+    theirs = Ros2Types("jazzy")
+    theirs.learn(CUSTOM.specifications)
+    type_hash = theirs.type_hash("arm_msgs/msg/Grip")
+    async with topic_bed() as bed:
+        bed.publisher("/grip_state", type_name="arm_msgs/msg/Grip", type_hash=type_hash)
+        await eventually(lambda: bed.topic("/grip_state"))
+        topic = bed.topic("/grip_state")
+        assert topic is not None
+        assert topic.description is None
+        bed.graph.publisher("/grip", CUSTOM)
+        await eventually(lambda: topic.description)
+        assert topic.description == CUSTOM.describe()
+
+
+async def test_no_more_nodes_are_asked_at_one_time_than_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "ROS2_ASKS_MAX", 3)
+    monkeypatch.setattr(limits, "ROS2_SERVICE_WAIT", 60.0)
+    async with topic_bed() as bed:
+        for number in range(5):
+            bed.publisher(f"/t{number}", type_name=f"odd_msgs/msg/T{number}", type_hash="RIHS01_" + "3" * 64)
+        await eventually(lambda: len(bed.problems) == 2)
+        assert all("asked for types already" in text for text in bed.problems.values())
 
 
 # --- rules, and what is not believed --------------------------------------------------------------------------------

@@ -107,6 +107,11 @@ class Ros2TopicImport:
         return len(self._gids)
 
     @property
+    def converts(self) -> bool:
+        """Whether the conversion of its type was found."""
+        return self._conversion is not None
+
+    @property
     def lingers(self) -> bool:
         """Whether it stays subscribed although none wants it now: a publisher came or went a moment ago."""
         return self._timer is not None

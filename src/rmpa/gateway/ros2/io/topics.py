@@ -49,6 +49,7 @@ class Ros2Topics:
         self._refused: dict[str, str] = {}
         self._service_appeared = asyncio.Event()
         self._asked = 0
+        self._asking = 0
 
     def start(self, context: Ros2Context) -> None:
         """Begin."""
@@ -105,6 +106,19 @@ class Ros2Topics:
         if self._context is not None:
             for other in list(self._context.ros2.at(export.source.here, *_TOPIC_ENDS)):
                 self._compare(export, other)
+            self._retry_imports()
+
+    def _retry_imports(self) -> None:
+        """A type was learnt: topics of ROS 2 whose fields were not known may have it."""
+        for imported in self._imports.values() if self._pairs is not None else ():
+            if imported.converts or self._pairs is None:
+                continue
+            try:
+                found = self._pairs.incoming(imported.type, imported.type_hash)
+            except NoConversion:
+                continue
+            if found is not None:
+                imported.converted(found, "")
 
     def _compare(self, export: Ros2TopicExport, other: Ros2Endpoint) -> None:
         if self._context is not None and export.endpoint is not None:
@@ -148,6 +162,8 @@ class Ros2Topics:
             self._find_conversion(imported, endpoint)
         else:
             imported.add(endpoint)
+            if imported.problem:  # this node may be able to describe the type
+                self._find_conversion(imported, endpoint)
 
     def _publisher_gone(self, endpoint: Ros2Endpoint) -> None:
         self._refused.pop(f"{endpoint.name} of {endpoint.node.name}", None)
@@ -174,7 +190,10 @@ class Ros2Topics:
             return
         if conversion is not None:
             imported.converted(conversion, "")
+        elif self._asking >= limits.ROS2_ASKS_MAX:
+            imported.converted(None, f"{self._asking} ROS 2 nodes are asked for types already; this one is not")
         else:
+            self._asking += 1
             context.spawn(self._ask_type(imported, endpoint))
 
     async def _ask_type(self, imported: Ros2TopicImport, endpoint: Ros2Endpoint) -> None:
@@ -186,8 +205,11 @@ class Ros2Topics:
             pairs.described(endpoint.type, endpoint.type_hash, await self._describe(context, endpoint))
             imported.converted(pairs.incoming(endpoint.type, endpoint.type_hash), "")
         except (NoConversion, RemoteProtocolError) as error:
-            imported.converted(None, str(error))
+            if not imported.converts:
+                imported.converted(None, str(error))
             return
+        finally:
+            self._asking -= 1
         for export in self._exports.values():
             export.retry()
 
