@@ -147,7 +147,7 @@ class Agent:
         self.snapshots = SnapshotBuilder(settings, sources)
         self._nodes = NodeRequests(settings, self.core, self.bridge.rpc, self.bridge.gate)
         AgentRequests(self.bridge.rpc, self.snapshots)
-        self.sites = SiteRequests(self.bridge.rpc, self.bridge.sessions.linked)
+        self.sites = SiteRequests(self.bridge.rpc, self.bridge.sessions.linked, self.bridge.gate)
         """Answers questions about other sites; a gateway answers them itself."""
         self._why = WhyService(settings, self.core, self.bridge, self.services, self.snapshots, self.sites)
         self.operations = ControlOperations(

@@ -157,6 +157,21 @@ async def test_parts_are_passed_on_while_they_come() -> None:
     assert bed.parts.sizes == [len(whole), len(whole)]
 
 
+async def test_what_may_be_sent_on_is_not_overwritten_by_the_next_message() -> None:
+    bed = Bed(parts=True)
+    views: list[memoryview] = []
+    keeping = InProcessConnection(
+        "/chatter", "http://127.0.0.1:1/", "/a", lambda: bed.there, on_message=views.append, on_parts=bed.parts
+    )
+    keeping.start()
+    await asyncio.sleep(0)
+    for text in ("first", "other"):
+        small = framed(text)
+        bed.publication.begin(len(small))
+        bed.publication.extend(small)
+    assert [bytes(view) for view in views] == [framed("first"), framed("other")]
+
+
 async def test_an_aborted_message_does_not_end_the_connection() -> None:
     for parts in (False, True):
         bed = Bed(parts=parts)

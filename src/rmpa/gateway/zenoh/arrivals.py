@@ -16,6 +16,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from rmpa.gateway.zenoh import limits
+from rmpa.runtime.stream import collected_sends
 
 if TYPE_CHECKING:
     import asyncio
@@ -194,8 +195,9 @@ class Arrivals:
                 queue = self._ready.popleft()
                 taken, taken_bytes = self._take_turn(queue, min(messages, limits.TURN_MESSAGES))
                 queue.reschedule()
-            for item in taken:
-                queue.deliver(item)
+            with collected_sends():  # one system call for what goes to one peer
+                for item in taken:
+                    queue.deliver(item)
             messages -= len(taken)
             size -= taken_bytes
         return limits.DRAIN_MESSAGES - messages

@@ -7,8 +7,12 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from rmpa.bridge import limits
+from rmpa.bridge.params import transfer
+from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.session.peer_rpc import UNKNOWN_QUESTION
+from rmpa.config.permission_rules import Access
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
+from rmpa.trust.permissions import refusal
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
@@ -51,9 +55,13 @@ class SiteRequests:
     Args:
         rpc: Carries requests between the modules.
         linked: Returns the sessions of the peers that are linked now.
+        gate: Decides which peers may read and set parameters of other sites by this gateway, and read last values.
     """
 
-    def __init__(self, rpc: PeerRpc, linked: Callable[[], Iterable[PeerSession]]) -> None:
+    def __init__(
+        self, rpc: PeerRpc, linked: Callable[[], Iterable[PeerSession]], gate: PermissionGate = OPEN_GATE
+    ) -> None:
+        self._gate = gate
         self._rpc = rpc
         self._linked = linked
         self._gateway: SiteAnswerer | None = None
@@ -69,7 +77,7 @@ class SiteRequests:
         """Answer as a gateway from now on."""
         self._gateway = gateway
         for what in QUESTIONS:
-            self._rpc.on_request(what, partial(_answer, gateway, what))
+            self._rpc.on_request(what, partial(self._answer_peer, gateway, what))
 
     async def answer(self, args: dict[str, Any]) -> Any:
         """The operation ``site``: ``what`` (one of ``QUESTIONS``) and its ``args``.
@@ -119,6 +127,17 @@ class SiteRequests:
             "gateway", "any linked peer", "start one with `rmpa gateway`; `rmpa peer list` shows who is linked"
         )
 
+    def _answer_peer(
+        self, gateway: SiteAnswerer, what: str, asker: PeerSession, args: dict[str, Any]
+    ) -> Awaitable[object]:
+        """Answer a linked module, which another site takes for this one's gateway: so it is judged here."""
+        if self._gate.on:
+            access, name = _needs(what, args)
+            peer = asker.link.name
+            if name and not self._gate.admits(access, peer, name):
+                raise PeerRefused(str(args.get("site", "")), refusal(access, peer, name))
+        return gateway.answer(what, args)
+
     async def _ask(
         self, session: PeerSession, what: str, args: dict[str, Any], wait: float
     ) -> tuple[Any, RmpaError | None]:
@@ -128,8 +147,14 @@ class SiteRequests:
             return None, error
 
 
-def _answer(gateway: SiteAnswerer, what: str, _asker: PeerSession, args: dict[str, Any]) -> Awaitable[object]:
-    return gateway.answer(what, args)
+def _needs(what: str, args: dict[str, Any]) -> tuple[Access, str]:
+    """What a module must be allowed for a question, and for which name; empty: nothing."""
+    if what in (LAST, BODY):
+        return Access.SUBSCRIBE, str(args.get("topic", ""))
+    inner = args.get("args")
+    if what != PARAM or not isinstance(inner, dict) or args.get("what") in (transfer.MORE, transfer.PUT):
+        return Access.PARAM, ""  # portions: the question that begins or ends with them names the parameter
+    return Access.PARAM, str(inner.get("key", "")) or "/"
 
 
 def _is_no_gateway(error: RmpaError) -> bool:

@@ -259,7 +259,8 @@ class InProcessConnection:
         self._in_parts = self._parts is not None and size > core_limits.CUT_THROUGH_BYTES
         if self._parts is not None and self._in_parts:
             self._parts.begin(size)
-        elif len(self._buffer) < size:
+        elif len(self._buffer) < size or self._parts is not None:
+            # One that takes parts may send the message on: then it is read until the end of the present read.
             self._buffer = memoryview(bytearray(size))
 
     def part(self, part: Buffer) -> None:
