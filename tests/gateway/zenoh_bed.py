@@ -7,11 +7,15 @@ import contextlib
 import socket
 from typing import TYPE_CHECKING
 
+import pytest
+
 from rmpa.gateway.zenoh.config import ZenohConfig, ZenohMode
 from rmpa.gateway.zenoh.session import OpenSession, open_session
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
+
+pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")
 
 
 def free_port() -> int:
