@@ -167,7 +167,7 @@ class InProcessConnection:
         self._on_refused = on_refused
         self._on_lost = on_lost
         self._buffer = memoryview(bytearray())
-        """Where a message that comes in parts is assembled; kept for the next one unless it is large: new memory is slow."""
+        """Where a message that comes in parts is assembled; kept for the next one, unless it is very large."""
         self._filled = self._size = 0
         self._in_parts = False
         self._backoff = Backoff(limits.TCPROS_RETRY_FIRST, limits.TCPROS_RETRY_MAX, random.random)
