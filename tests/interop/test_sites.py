@@ -185,11 +185,17 @@ def test_a_command_is_not_late_beside_images_on_a_thin_link(joined: JoinedModule
         images = start(joined.base.ros.roscpp("listener", topic="/image"))
         pilot = start(joined.arm.ros.roscpp("talker", topic="/command", rate=20, size=64))
         flows(command, 5)
-        start(joined.arm.ros.roscpp("talker", topic="/image", rate=20, size=50_000, source=2))
+        camera = start(joined.arm.ros.roscpp("talker", topic="/image", rate=20, size=50_000, source=2))
         uplink.shape("1mbit", cable=1)
         try:
             flows(images, 3, LONG)
             flows(command, 100, LONG)
+            camera.end()
+            burst = start(joined.base.ros.roscpp("listener", topic="/thin_burst"))
+            teller = start(joined.arm.ros.rospy("teller", topic="/thin_burst", commands=True, wait=1))
+            teller.wait_event("connected", LONG)
+            teller.tell("1000 300 0")
+            whole(burst.wait_event("report", LONG, where=lambda e: e["last"] == 300), 300)
         finally:
             uplink.unshape(cable=1)
         pilot.end()

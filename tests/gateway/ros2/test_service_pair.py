@@ -8,7 +8,7 @@ import pytest
 
 from rmpa.gateway.ros2.conversion import NoConversion
 from rmpa.gateway.ros2.mapping import TypeMapping, TypePair
-from rmpa.gateway.ros2.service_pair import ServicePair, ros1_without_use, ros2_without_use
+from rmpa.gateway.ros2.service_pair import ServicePair, ros1_without_use, ros2_without_use, type_by_name
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.ros.types.service_types import ServiceType, known_services
 
@@ -82,6 +82,8 @@ def test_services_that_the_other_side_cannot_use_are_left_out_with_a_reason() ->
     assert "loggers" in ros1_without_use("roscpp/SetLoggerLevel")
     assert ros1_without_use("roscpp/SetLoggerLevel", ruled=True) == ""
     assert ros1_without_use("std_srvs/Trigger") == ""
+    assert "loggers" in ros1_without_use(type_by_name("/talker/get_loggers")), "it need not be asked for its type"
+    assert ros1_without_use(type_by_name("/talker/stop")) == ""
     assert "parameters" in ros2_without_use("/talker/get_parameters", "rcl_interfaces/srv/GetParameters")
     assert "action" in ros2_without_use("/fib/_action/send_goal", "example_interfaces/action/Fibonacci_SendGoal")
     assert ros2_without_use("/reset", "std_srvs/srv/Trigger") == ""

@@ -31,6 +31,14 @@ _ROS2_WITHOUT_USE: Final = {
 _ACTION_PART: Final = "/_action/"
 
 
+_LOGGER_NAMES: Final = {"get_loggers": "roscpp/GetLoggers", "set_logger_level": "roscpp/SetLoggerLevel"}
+
+
+def type_by_name(name: str) -> str:
+    """The type of a service that each node of rospy and roscpp has, by its name; empty for others."""
+    return _LOGGER_NAMES.get(name.rpartition("/")[2], "")
+
+
 def ros1_without_use(service_type: str, *, ruled: bool = False) -> str:
     """Why ROS 2 has no use of a service of ROS 1; empty if it has.
 

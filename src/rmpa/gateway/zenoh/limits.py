@@ -10,11 +10,12 @@ site is gone within 1.5 s (measured: 1.2 s with a lease of 0.8 s, 1.6 s with one
 four times in that time, from a thread of its own, and any data counts too."""
 BLOCK_MAX: Final = 5.0
 """Seconds that a query or a declaration may wait for a transport before Zenoh closes it: Zenoh's own value."""
-DROP_WAIT: Final = 1.0
-"""Seconds that a message, or each fragment of it, waits for room in a transport before Zenoh drops the message: the
-time for one batch of Zenoh (64 KB) at half a megabit a second. Zenoh's own value, 1 ms, loses what is large on every
-slow link. A put that blocks instead would end the link: Zenoh closes a transport behind which one message, with all
-its fragments, waits for longer than ``BLOCK_MAX``, and does not notice a dead one before."""
+DROP_WAIT: Final = 10.0
+"""Seconds that a message, or each fragment of it, waits for room in a transport before Zenoh drops the message and,
+at once, those behind it. One batch of Zenoh (64 KB) takes a line of 1 Mbit/s half a second, and longer where packets
+are lost: with 1 s here a burst of 1,000 messages lost most of them, with 10 s none. Zenoh's own value, 1 ms, loses
+what is large on every slow link. A dead transport ends by its lease. A put that blocks instead would end the link:
+Zenoh closes a transport behind which one message, with all its fragments, waits for longer than ``BLOCK_MAX``."""
 DROP_WAIT_MAX: Final = 300.0
 """Seconds that all fragments of a message may wait together: 32 MB at 1 Mbit/s."""
 SEND_BUFFER: Final = 0.125

@@ -75,12 +75,12 @@ class PendingGet:
         self._replies: list[ZenohReply] = []
 
     def add(self, reply: Any) -> None:
-        """Take one answer. Zenoh's own answer for a time-out is left out: it comes from no queryable."""
+        """Take one answer. Zenoh's own for a time-out, here or in a router on the way, is left out."""
         sample = reply.ok
         if sample is not None:
             answer = ZenohReply(str(sample.key_expr), content(sample.payload), content(sample.attachment), ok=True)
-        elif reply.replier_id is None:
-            return
+        elif reply.replier_id is None or not reply.replier_id.eid:
+            return  # no queryable has the entity id 0
         else:
             answer = ZenohReply("", content(reply.err.payload), b"", ok=False)
         with self._lock:

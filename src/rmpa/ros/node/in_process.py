@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core import limits as core_limits
 from rmpa.core.backoff import Backoff
 from rmpa.core.outbox import QueuedMessage
+from rmpa.core.sizes import MIB
 from rmpa.ros import limits
 from rmpa.ros.wire.slave_api import INBOUND, BusConnection
 from rmpa.ros.wire.tcpros import ANY, subscriber_header
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.tcpros import Buffer, Header
 
 _INFO: Final = "in this process"
+_KEPT_BUFFER: Final = 4 * MIB
 
 
 def _ignore(*_: object) -> None:
@@ -165,7 +167,7 @@ class InProcessConnection:
         self._on_refused = on_refused
         self._on_lost = on_lost
         self._buffer = memoryview(bytearray())
-        """Where a message that comes in parts is assembled; kept for the next one, since new memory is slow."""
+        """Where a message that comes in parts is assembled; kept for the next one, unless it is very large."""
         self._filled = self._size = 0
         self._in_parts = False
         self._backoff = Backoff(limits.TCPROS_RETRY_FIRST, limits.TCPROS_RETRY_MAX, random.random)
@@ -277,6 +279,8 @@ class InProcessConnection:
         self._buffer[before : self._filled] = part
         if self._filled == size:
             self._on_message(self._buffer[:size])
+            if len(self._buffer) > _KEPT_BUFFER:
+                self._buffer = memoryview(bytearray())
 
     def abort(self) -> None:
         """Drop the message in progress: its rest will not come."""

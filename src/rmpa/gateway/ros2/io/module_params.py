@@ -14,7 +14,7 @@ from rmpa.gateway.ros2.attachment import Ros2Attachment
 from rmpa.gateway.ros2.graph import OWN_NAMESPACE
 from rmpa.gateway.ros2.params import SERVICES, ParamTypes, key_of, listed, name_in_ros2
 from rmpa.gateway.ros2.qos import Ros2Qos
-from rmpa.gateway.ros2.tokens import EntityKind
+from rmpa.gateway.ros2.tokens import EntityKind, data_key
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Generator, Sequence
@@ -50,9 +50,10 @@ class ModuleParams:
         for service in SERVICES:
             kind, type_hash = types.service(service)
             name = f"{node}/{service}"
+            key = data_key(context.settings.ros2.domain, name, kind, type_hash)
+            queryable = context.session.queryable(key, self._taker(service, kind))
             endpoint = context.nodes.declare(node, EntityKind.SERVICE, name, kind, type_hash, Ros2Qos())
-            take = self._taker(service, kind)
-            self._declared += (endpoint, context.session.queryable(endpoint.endpoint.key(), take))
+            self._declared += (queryable, endpoint)
 
     def close(self) -> None:
         """Take the services back."""

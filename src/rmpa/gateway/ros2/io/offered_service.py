@@ -12,8 +12,8 @@ from rmpa.gateway import limits
 from rmpa.gateway.ros2.attachment import Ros2Attachment
 from rmpa.gateway.ros2.graph import valid_name
 from rmpa.gateway.ros2.qos import Ros2Qos
-from rmpa.gateway.ros2.service_pair import ServicePair, ros1_without_use
-from rmpa.gateway.ros2.tokens import EntityKind
+from rmpa.gateway.ros2.service_pair import ServicePair, ros1_without_use, type_by_name
+from rmpa.gateway.ros2.tokens import EntityKind, data_key
 from rmpa.ros.types.find import find_service_type
 
 if TYPE_CHECKING:
@@ -82,18 +82,22 @@ class OfferedService:
             again = min(again * 2, longest)
         return None
 
+    def _without_use(self, service_type: str) -> bool:
+        reason = ros1_without_use(service_type, ruled=self._context.mapping.has_service_rule(service_type))
+        if reason:
+            self._counts["without_use"] += 1
+            _log.debug("%s is not offered to ROS 2: %s", self.source.here, reason)
+        return bool(reason)
+
     async def _offer(self) -> None:
+        if self._without_use(type_by_name(self.source.name)):
+            return  # not even asked for its type: each node has two of these
         description = await self._describe()
-        if description is None or self._closed:
+        if description is None or self._closed or self._without_use(description.type):
             return
         try:
-            mapping = self._context.mapping
-            if reason := ros1_without_use(description.type, ruled=mapping.has_service_rule(description.type)):
-                self._counts["without_use"] += 1
-                _log.debug("%s is not offered to ROS 2: %s", self.source.here, reason)
-                return
             kind = await asyncio.to_thread(find_service_type, description.type, description.md5sum)
-            self._pair = ServicePair(kind, mapping.service(kind.name), self._context.types)
+            self._pair = ServicePair(kind, self._context.mapping.service(kind.name), self._context.types)
         except RmpaError as error:
             self._say(f"ROS 2 does not see this service: {error}")
             return
@@ -105,11 +109,13 @@ class OfferedService:
             self._say("ROS 2 does not allow this name; a rule with another name lets the service cross")
             return
         self._say("")
-        nodes = self._context.nodes
-        self._endpoint = nodes.declare(
-            self.source.proxy, EntityKind.SERVICE, self.source.here, pair.ros2, pair.type_hash, Ros2Qos()
+        context, name = self._context, self.source.here
+        key = data_key(context.settings.ros2.domain, name, pair.ros2, pair.type_hash)
+        # Before its token: a client may call as soon as it sees that.
+        self._queryable = context.session.queryable(key, self._query)
+        self._endpoint = context.nodes.declare(
+            self.source.proxy, EntityKind.SERVICE, name, pair.ros2, pair.type_hash, Ros2Qos()
         )
-        self._queryable = self._context.session.queryable(self._endpoint.endpoint.key(), self._query)
 
     def _say(self, text: str) -> None:
         self._context.say(self.source.here, text)

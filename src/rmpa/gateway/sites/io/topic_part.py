@@ -91,9 +91,11 @@ class SiteTopics:
 
     def withdraw(self, entry: SiteExport) -> None:
         """Undeclare it."""
+        if entry.source.kind is not SourceKind.TOPIC:
+            return  # a service of a node may have the name of its topic
         key = (entry.source.module, entry.source.name)
         topic = self._exported.get(key, {}).pop(entry.source.node, None)
-        if topic is not None and entry.source.kind is SourceKind.TOPIC:
+        if topic is not None:
             topic.close()
             if not self._exported[key]:
                 del self._exported[key]

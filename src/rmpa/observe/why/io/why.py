@@ -101,10 +101,17 @@ class WhyService:
         if not isinstance(name, str) or not is_global_name(name):
             raise ConfigError("name", f"{name!r} is not a topic, nor a service", "write /name, or PEER:/name")
         wanted = str(peer) if peer is not None else None
-        ways = await self._through_gateways(name, wanted, service=args.get("service") is True)
-        if ways and wanted is not None and "/" in wanted:
+        service = args.get("service") is True
+        if (
+            wanted is not None
+            and "/" in wanted
+            and (ways := await self._through_gateways(name, wanted, service=service))
+        ):
             return ways
-        found = await self._in_the_mesh(name, wanted, service=args.get("service") is True)
+        # At once: a peer whose agent hangs holds up both.
+        found, ways = await asyncio.gather(
+            self._in_the_mesh(name, wanted, service=service), self._through_gateways(name, wanted, service=service)
+        )
         if any(diagnosis.peer != self._name for diagnosis in ways):
             # "No peer publishes it" is not the answer where another site does, or would.
             found = tuple(diagnosis for diagnosis in found if diagnosis.node or diagnosis.flows)
