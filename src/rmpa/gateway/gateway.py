@@ -7,7 +7,7 @@ import contextlib
 import logging
 import random
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 from rmpa.agent import Agent
 from rmpa.agent.process import run_process, serve
@@ -16,7 +16,6 @@ from rmpa.core.errors import RmpaError, StartError
 from rmpa.gateway import limits
 from rmpa.gateway.graph.own_graph import AgentGraph
 from rmpa.gateway.joining import make_neighbours, open_gateway_session
-from rmpa.gateway.zenoh_api import ZenohSession
 from rmpa.observe.control import GATEWAY_ROLE, ROLE
 
 if TYPE_CHECKING:
@@ -25,26 +24,12 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.config.sources import Loaded
     from rmpa.gateway.neighbour import Neighbour
+    from rmpa.gateway.zenoh_api import OwnedSession
     from rmpa.runtime.realtime import SchedulingRequest
 
 _log = logging.getLogger(__name__)
 REPORT: Final = "gateway"
 """The operation of the control socket that returns ``Gateway.report``."""
-
-
-class OwnedSession(ZenohSession, Protocol):
-    """An open session, for its owner."""
-
-    @property
-    def endpoints(self) -> tuple[str, ...]:
-        """The endpoints of the other side of each link that is up now."""
-
-    @property
-    def stale(self) -> bool:
-        """Whether it has to be opened anew for others to connect to it: its certificate was renewed."""
-
-    async def close(self) -> None:
-        """Close it and end its threads."""
 
 
 class Gateway:

@@ -8,9 +8,9 @@ from rmpa.gateway.zenoh.trust import open_trusted_session
 
 if TYPE_CHECKING:
     from rmpa.config.settings import Settings
-    from rmpa.gateway.gateway import OwnedSession
     from rmpa.gateway.graph.own_graph import AgentGraph
     from rmpa.gateway.neighbour import Neighbour
+    from rmpa.gateway.zenoh_api import OwnedSession
 
 
 async def open_gateway_session(settings: Settings) -> OwnedSession:

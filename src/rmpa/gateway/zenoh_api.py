@@ -158,3 +158,18 @@ class ZenohSession(Protocol):
         priority: ZenohPriority = ZenohPriority.DATA,
     ) -> list[ZenohReply]:
         """Ask; wait for all answers, or for ``timeout`` seconds. ``all_complete``: ask every complete queryable."""
+
+
+class OwnedSession(ZenohSession, Protocol):
+    """An open session, for its owner."""
+
+    @property
+    def endpoints(self) -> tuple[str, ...]:
+        """The endpoints of the other side of each link that is up now."""
+
+    @property
+    def stale(self) -> bool:
+        """Whether it has to be opened anew for others to connect to it: its certificate was renewed."""
+
+    async def close(self) -> None:
+        """Close it and end its threads."""

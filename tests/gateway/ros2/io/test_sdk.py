@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 pytest.importorskip("zenoh_ros2_sdk")
 
+pytestmark = pytest.mark.timeout(180)
+
 GRIP = MessageType.learn("arm_msgs/Grip", "float64 width\nstring[] fingers")
 
 

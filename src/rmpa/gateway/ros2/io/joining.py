@@ -15,8 +15,8 @@ from rmpa.gateway.ros2.io.topics import Ros2Topics
 
 if TYPE_CHECKING:
     from rmpa.config.settings import Settings
-    from rmpa.gateway.gateway import OwnedSession
     from rmpa.gateway.graph.own_graph import AgentGraph
+    from rmpa.gateway.zenoh_api import OwnedSession
 
 
 def make_ros2_neighbour(graph: AgentGraph, session: OwnedSession, settings: Settings) -> Ros2Neighbour:

@@ -37,9 +37,9 @@ if TYPE_CHECKING:
     from rmpa.agent import Agent
     from rmpa.bridge.policy import PolicyDecision
     from rmpa.config.settings import Settings
-    from rmpa.gateway.gateway import OwnedSession
     from rmpa.gateway.neighbour import MeshSource, OwnGraph
     from rmpa.gateway.sites.part import SitePart
+    from rmpa.gateway.zenoh_api import OwnedSession
 
 
 def make_site_neighbour(
