@@ -73,14 +73,16 @@ def states(view: dict[str, Any]) -> dict[str, str]:
     return {name: module["state"] for name, module in view["modules"].items()}
 
 
-def wait_for_view(demo: Process, holds: Callable[[dict[str, Any]], bool], what: str) -> dict[str, Any]:
-    """Wait until one of the last views is as wanted."""
+def wait_for_view(
+    demo: Process, holds: Callable[[dict[str, Any]], bool], what: str, within: float = 30.0
+) -> dict[str, Any]:
+    """Wait until one of the last views is as wanted, at most so many seconds."""
 
     def look() -> list[dict[str, Any]]:
         assert demo.returncode is None, f"the demo ended with {demo.returncode}\n{demo.output}"
         return [view for view in views(demo)[-2:] if holds(view)]
 
-    return eventually(look, 30, what=what)[0]
+    return eventually(look, within, what=what)[0]
 
 
 def flows(view: dict[str, Any]) -> bool:
