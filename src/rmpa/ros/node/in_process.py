@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import random
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.core import limits as core_limits
 from rmpa.core.backoff import Backoff
@@ -21,7 +21,6 @@ from rmpa.ros.wire.tcpros import ANY, subscriber_header
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from rmpa.ros.node.publication import Publication
     from rmpa.ros.node.subscription import PartsTaker
     from rmpa.ros.wire.tcpros import Buffer, Header
 
@@ -114,6 +113,13 @@ class InProcessSubscriber:
             self._owner.closed_by(self)
 
 
+class AttachTarget(Protocol):
+    """What takes a subscriber over: a ``Publication``."""
+
+    def attach(self, connection: InProcessSubscriber, /) -> None:
+        """Serve it, hold it, or refuse it."""
+
+
 class InProcessConnection:
     """Subscribes to a publication of this process; ``PublisherConnection`` does it for another process.
 
@@ -141,7 +147,7 @@ class InProcessConnection:
         topic: str,
         uri: str,
         caller_id: str,
-        find: Callable[[], Publication | None],
+        find: Callable[[], AttachTarget | None],
         *,
         on_message: Callable[[memoryview], None],
         on_parts: PartsTaker | None = None,

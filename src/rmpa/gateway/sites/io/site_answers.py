@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.core.identity import peer_name_problem
@@ -20,30 +20,13 @@ from rmpa.observe.sites import LastValueInfo, SiteInfo, SiteModuleInfo, SiteSour
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from rmpa.gateway.sites.catalogue import SiteCatalogue
-    from rmpa.gateway.sites.exports import SiteExports
     from rmpa.gateway.sites.history import SiteHistory
-    from rmpa.gateway.sites.imports import SiteImports
     from rmpa.gateway.sites.io.site_why import SiteWhy
     from rmpa.gateway.sites.keys import SiteGateway, SiteModule
+    from rmpa.gateway.sites.known_sites import Sites
     from rmpa.gateway.zenoh_api import ZenohReply, ZenohSession
 
 _KINDS: Final = {SourceKind.TOPIC: "topic", SourceKind.SERVICE: "service"}
-
-
-class Sites(Protocol):
-    """What is known of sites: ``SiteNeighbour``."""
-
-    catalogue: SiteCatalogue
-    exports: SiteExports
-    imports: SiteImports
-
-    @property
-    def leads(self) -> bool:
-        """Whether this gateway leads its site."""
-
-    def report(self) -> dict[str, object]:
-        """Of its parts, among others."""
 
 
 class SiteAnswers(PassivePart):

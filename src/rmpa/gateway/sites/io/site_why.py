@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
     from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.sites.history import SiteHistory
-    from rmpa.gateway.sites.io.site_answers import Sites
     from rmpa.gateway.sites.keys import SiteSource
+    from rmpa.gateway.sites.known_sites import Sites
     from rmpa.gateway.sites.rules import CrossingRules
     from rmpa.gateway.zenoh_api import Declared, ZenohQuery, ZenohSession
 
