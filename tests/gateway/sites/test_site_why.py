@@ -14,7 +14,7 @@ from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.sites.history import SiteHistory
 from rmpa.gateway.sites.io.site_answers import SiteAnswers
 from rmpa.gateway.sites.io.site_why import SiteWhy
-from rmpa.gateway.sites.keys import SiteGateway
+from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource
 from rmpa.gateway.sites.rules import CrossingRules
 from rmpa.gateway.sites.why import (
     SourceHere,
@@ -65,6 +65,7 @@ async def asked(bed: SiteBed, name: str, rules: tuple[CrossingRule, ...] = ()) -
     site = await bed.site(name, rules=rules)
     history = SiteHistory(time.monotonic)
     site.neighbour.on_sites = history.seen
+    site.neighbour.on_site_source = lambda source, there: history.source(source, there=there)
     why = SiteWhy(name, f"{name}_gateway", site.session, site.neighbour, history, CrossingRules(rules))
     params: list[tuple[str, str, str]] = []
 
@@ -98,8 +99,10 @@ async def test_the_way_of_a_topic_is_told_from_both_gateways() -> None:
         source = yard.site.graph.add("/chatter", TEXT)
         await until(lambda: hall.site.shows("/chatter"))
         (way,) = await hall.why("/chatter")
-        assert (way.flows, way.node, way.peer, way.to) == (True, "/talker", "yard/arm", "site hall")
-        assert levels(way)["demand here"] == levels(way)["demand there"] == "warn"
+        assert (way.flows, way.node, way.peer, way.to) == (False, "/talker", "yard/arm", "site hall")
+        assert (levels(way)["demand there"], levels(way)["demand here"]) == ("warn", "fail")
+        (leaving,) = await yard.why("/chatter", asker="arm")
+        assert levels(leaving)["demand there"] == "fail"
         await hall.site.subscribed("/chatter")
         await until(lambda: any(topic["wanted"] for topic in yard.site.topics("out")))
         yard.site.graph.send(source, b"hello")
@@ -158,6 +161,10 @@ async def test_a_site_that_left_is_unreachable_since_then_and_one_that_never_was
         (way,) = await hall.why("/chatter", "yard")
         assert way.failed is not None
         assert way.failed.text.startswith("site yard is unreachable since")
+        (unnamed,) = await hall.why("/chatter")  # the question of a user who does not know whose it was
+        assert unnamed.failed is not None
+        assert unnamed.failed.text.startswith("site yard is unreachable since")
+        assert await hall.why("/other") == []
         assert await hall.why("/chatter", "joystick") == []  # a peer's name
         (moon,) = await hall.why("/chatter", "moon", "arm")
         assert moon.failed is not None
@@ -225,6 +232,26 @@ def test_history() -> None:
     history.seen(["hall"])
     assert history.away == ("yard",)
     assert (history.since_ago("yard"), history.since_ago("hall"), history.since_ago("moon")) == (2.0, 7.0, None)
+
+
+def test_what_a_site_had_is_remembered_while_it_is_away() -> None:
+    now = 0.0
+    history = SiteHistory(lambda: now)
+    arm = SiteModule("yard", "arm", "0" * 32)
+    scan, old, last = (SiteSource(arm, SourceKind.TOPIC, "a/B", "/n", name) for name in ("/scan", "/old", "/last"))
+    for source in (scan, old, last):
+        history.source(source, there=True)
+    history.seen(["yard"])
+    assert history.had("/scan") == (), "it is there"
+    history.source(old, there=False)
+    now = 9.0
+    history.source(last, there=False)  # withdrawn by a gateway that ends
+    history.seen([])
+    assert [history.had(name) for name in ("/scan", "/last", "/old")] == [(("yard", "arm"),), (("yard", "arm"),), ()]
+    history.source(last, there=True)
+    history.seen(["yard"])
+    history.seen([])
+    assert [history.had(name) for name in ("/scan", "/last")] == [(), (("yard", "arm"),)]
 
 
 def test_a_question_that_is_none_is_refused() -> None:

@@ -17,7 +17,7 @@ from rmpa.core.names import is_global_name
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.sites.keys import GATEWAY, ROOT
-from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check
+from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check, CheckLevel
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.tcpros import Buffer
 
 _RULES: Final = "change [[gateway.rule]] in the rmpa.toml of the gateway of {}, and run rmpa reload there"
+_NO_DEMAND: Final = "that is no fault; to try it: rmpa topic echo"
 
 
 class WhyQuestion(msgspec.Struct, kw_only=True, frozen=True):
@@ -197,12 +198,17 @@ def there_stages(site: str, module: str, name: str, found: SourceThere | None, r
     return [*stages, *sent_stages(site, found)]
 
 
-def sent_stages(site: str, found: SourceThere) -> list[Check]:
-    """The stages of a topic behind its rule at the exporting gateway."""
+def sent_stages(site: str, found: SourceThere, no_demand: CheckLevel = WARN) -> list[Check]:
+    """The stages of a topic behind its rule at the exporting gateway.
+
+    Args:
+        site: Its site.
+        found: What it knows.
+        no_demand: What it means that no other site subscribes: by itself nothing, if the reason is at the other site.
+    """
     if not found.wanted:
-        return [
-            Check("demand there", WARN, f"no other site subscribes, as the gateway of {site} hears: nothing is sent")
-        ]
+        text = f"no other site subscribes, as the gateway of {site} hears: nothing is sent"
+        return [Check("demand there", no_demand, text, _NO_DEMAND)]
     stages = [Check("demand there", OK, "another site subscribes")]
     lost = []
     if found.dropped:
@@ -235,7 +241,8 @@ def here_stages(own: str, found: SourceHere) -> list[Check]:
         calls, failed = int(report.get("calls", 0)), int(report.get("failed", 0))
         return [*stages, Check("calls", OK, f"{calls} calls from here, {failed} failed")]
     if not report.get("wanted"):
-        return [*stages, Check("demand here", WARN, "no node of this site subscribes: it crosses once one does")]
+        text = "no node of this site subscribes: it crosses once one does"
+        return [*stages, Check("demand here", FAIL, text, _NO_DEMAND)]
     return [*stages, Check("demand here", OK, "a node of this site subscribes"), _arrived(report)]
 
 

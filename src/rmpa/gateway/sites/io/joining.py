@@ -82,6 +82,7 @@ def make_site_neighbour(
     own = SiteGateway(gateway.site, gateway.rank, secrets.token_hex(16))
     neighbour = SiteNeighbour(graph, session, own, rules, parts)
     neighbour.on_sites = history.seen
+    neighbour.on_site_source = lambda source, there: history.source(source, there=there)
     if isinstance(graph, AgentGraph):
         neighbour.add(SiteActions(graph.attend))
     if agent is not None:

@@ -12,7 +12,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.sites.catalogue import CatalogueChange, SiteCatalogue
 from rmpa.gateway.sites.exports import SiteExports
 from rmpa.gateway.sites.imports import SiteImports
-from rmpa.gateway.sites.keys import GATEWAY, SiteGateway, SiteModule, parse_token, tokens_key
+from rmpa.gateway.sites.keys import GATEWAY, SiteGateway, SiteModule, SiteSource, parse_token, tokens_key
 from rmpa.gateway.sites.leader import Leader
 from rmpa.gateway.sites.report import refusals_report, sites_report
 from rmpa.runtime.machine_timer import MachineTimer
@@ -59,10 +59,13 @@ class SiteNeighbour:
         """What is shown of the other sites."""
         self.on_sites: Callable[[tuple[str, ...]], None] = lambda _: None
         """Called with the names of the other sites, after each change of what they have."""
+        self.on_site_source: Callable[[SiteSource, bool], None] = lambda _source, _there: None
+        """Called when another site announces or withdraws a source; not for those that go together with the site."""
         self.on_leads: Callable[[bool], None] = lambda _: None
         """Called when this gateway begins to lead its site, and when it ends."""
         self._leader: Leader | None = None
         self._active = False
+        self._sites: frozenset[str] = frozenset()
         self._tokens: dict[str, Declared] = {}
         self._declared: list[Declared] = []
         self._timer = MachineTimer(self._next_timer, self._handle_timer)
@@ -166,10 +169,13 @@ class SiteNeighbour:
                     self._module_changed(item, there=event.change is CatalogueChange.FOUND)
             elif event.change is CatalogueChange.FOUND:
                 self.imports.found(item)
+                self.on_site_source(item, True)
             elif event.change is CatalogueChange.RENEWED:
                 self.imports.renewed(item)
             else:
                 self.imports.gone(item)
+                if item.module.site in self.catalogue.sites:
+                    self.on_site_source(item, False)
         leads = self._leader is not None and self._leader.leads
         if leads and not self._active:
             self._lead()
@@ -177,8 +183,18 @@ class SiteNeighbour:
             _log.info("= another gateway of site %s leads now", self._own.site)
             self._rest()
         self._act()
+        self._tell_sites()
         self.on_sites(self.catalogue.sites)
         self._timer.arm()
+
+    def _tell_sites(self) -> None:
+        """Log which sites have come, and which have gone."""
+        there = frozenset(self.catalogue.sites)
+        for site in sorted(there - self._sites):
+            _log.info("= site %s is joined", site)
+        for site in sorted(self._sites - there):
+            _log.warning("! site %s is unreachable: its gateway has ended, or the way to it; `rmpa site list`", site)
+        self._sites = there
 
     def _act(self) -> None:
         """Do what the plans say, or forget it while another gateway leads."""

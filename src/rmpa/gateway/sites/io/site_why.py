@@ -91,6 +91,9 @@ class SiteWhy:
         if site and not ways:
             ways.append(await self._no_way(name, site, module, service=service))
         if not site:
+            for away, had in self._history.had(name):
+                ways.append(await self._no_way(name, away, had, service=service))
+        if not site:
             ways += self._leaving(name, asker if asker != self._gateway else "", service=service)
         return ways
 
@@ -186,7 +189,7 @@ class SiteWhy:
             else:
                 stages.append(Check("rule here", OK, there.rule))
                 if there.kind == SourceKind.TOPIC.value:
-                    stages += sent_stages(self._site, there)
+                    stages += sent_stages(self._site, there, no_demand=FAIL)
             yield Diagnosis.of(
                 until_failure(stages),
                 kind=_KINDS[source.kind],

@@ -213,7 +213,7 @@ class WhyService:
             text, remedy = "no peer is linked that it could go to", "`rmpa peer list` tells of the peers"
             return Diagnosis.of((Check("peer", FAIL, text, remedy),), name=topic, peer=here, to="")
         state = self._core.state()
-        similar = await asyncio.to_thread(did_you_mean, topic, {*state.publishers, *state.subscribers})
+        similar = await asyncio.to_thread(did_you_mean, topic, {*state.publishers, *state.subscribers} - {topic})
         if awaited := self._topics.awaited(topic):
             text = f"{', '.join(awaited)} published {topic} before this agent was restarted, and does not answer"
             remedy = "it is asked again by itself; is that program stopped or stuck? Else start it again"
