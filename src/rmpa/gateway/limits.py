@@ -155,6 +155,11 @@ IDLE_CHECK: Final = 1.0
 leave no gap."""
 IDLE_CHECK_MAX: Final = 60.0
 """Seconds between two such questions at most: the pause doubles while no message comes."""
+RESUMED_WITHIN: Final = 10.0
+"""Seconds after a topic of another site is back within which a subscriber counts as the one from before: what was
+lost meanwhile is counted. roscpp's and rospy's nodes are back within two."""
+INTERRUPTED_TOPICS_MAX: Final = 1024
+"""Topics whose counts are kept while their site is away; of more, the oldest begin anew."""
 LATENCIES_KEPT: Final = 512
 """Latencies of one topic from which the report's percentiles are computed."""
 ROS2_CALL_TIMEOUT: Final = 600.0

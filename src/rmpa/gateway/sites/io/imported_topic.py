@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import deque
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rmpa.core.errors import RemoteProtocolError
@@ -30,6 +31,19 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True, slots=True)
+class InterruptedTopic:
+    """What is kept of a topic that went while nodes subscribed, so that what is lost meanwhile is counted.
+
+    Args:
+        sequence: Its counts of messages and losses.
+        traffic: Its traffic.
+    """
+
+    sequence: SequenceCounter
+    traffic: SiteTraffic
+
+
 class ImportedTopic:
     """Shows one publisher of another site, and publishes its messages while nodes subscribe.
 
@@ -43,6 +57,7 @@ class ImportedTopic:
         session: The Zenoh session.
         clock: Both clocks.
         on_demand: ``(topic, wanted)``: its key is to be subscribed to, or no longer.
+        interrupted: What ``close`` returned before, if the same topic was there and went.
     """
 
     def __init__(
@@ -53,6 +68,7 @@ class ImportedTopic:
         session: ZenohSession,
         clock: Clock,
         on_demand: Callable[[ImportedTopic, bool], None],
+        interrupted: InterruptedTopic | None = None,
     ) -> None:
         self.entry = entry
         self._site = site
@@ -65,8 +81,9 @@ class ImportedTopic:
         self._header: TopicHeader | None = None
         self._problem = ""
         self._held: deque[tuple[bytes, str]] = deque()
-        self._sequence = SequenceCounter()
-        self._traffic = SiteTraffic(clock.now())
+        self._sequence = SequenceCounter() if interrupted is None else interrupted.sequence
+        self._traffic = SiteTraffic(clock.now()) if interrupted is None else interrupted.traffic
+        self._resumes_until = 0.0 if interrupted is None else clock.now() + limits.RESUMED_WITHIN
         # Made with the first message: most topics of a large site are never subscribed to.
         self._latencies: SampleRing | None = None
         self._clock_offset: float | None = None
@@ -168,15 +185,20 @@ class ImportedTopic:
             "problem": self.problem,
         }
 
-    def close(self) -> None:
-        """Take it out of the graph."""
+    def close(self) -> InterruptedTopic | None:
+        """Take it out of the graph; what it returns is for the same topic once it is back."""
         self._closed = True
+        interrupted = None
+        if self.wanted and self._linger is None:
+            interrupted = InterruptedTopic(self._sequence, self._traffic)
+            self._sequence = SequenceCounter()
         self._stop_lingering()
         if self._task is not None:
             self._task.cancel()
             self._task = None
         self._detach()
         self._topic.close()
+        return interrupted
 
     # --- demand ---------------------------------------------------------------------------------------------------
 
@@ -189,6 +211,9 @@ class ImportedTopic:
                 self._linger = asyncio.get_running_loop().call_later(limits.DEMAND_LINGER, self._detach)
         elif not self.wanted:
             self.wanted = True
+            if self._clock.now() > self._resumes_until:
+                self._sequence.restart()
+            self._resumes_until = 0.0
             self._on_demand(self, True)
             self._check_soon()
             self._ask()

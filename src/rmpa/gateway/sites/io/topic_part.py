@@ -12,7 +12,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.sites.attachment import AttachmentReader
 from rmpa.gateway.sites.io.exported_topic import ExportedTopic
-from rmpa.gateway.sites.io.imported_topic import ImportedTopic
+from rmpa.gateway.sites.io.imported_topic import ImportedTopic, InterruptedTopic
 from rmpa.gateway.sites.keys import ROOT
 from rmpa.gateway.sites.topic_header import REFUSED
 
@@ -71,6 +71,8 @@ class SiteTopics:
         """By module and topic, then by node."""
         self._imported: dict[tuple[str, str, str, str], ImportedTopic] = {}
         """By site, module, node and name there."""
+        self._interrupted: dict[tuple[str, str, str, str], InterruptedTopic] = {}
+        """Likewise: those that went while nodes subscribed."""
         self._subscriptions: dict[str, _Subscription] = {}
         self._questions: dict[SiteModule, tuple[Declared, Declared]] = {}
         self._reader = AttachmentReader()
@@ -104,8 +106,10 @@ class SiteTopics:
         """Show a publisher of another site."""
         if entry.source.kind is SourceKind.TOPIC:
             self.hide(entry)
-            self._imported[_ident(entry)] = ImportedTopic(
-                entry, self._site, self._graph, self._session, self._clock, self._on_demand
+            ident = _ident(entry)
+            interrupted = self._interrupted.pop(ident, None)
+            self._imported[ident] = ImportedTopic(
+                entry, self._site, self._graph, self._session, self._clock, self._on_demand, interrupted
             )
 
     def renew(self, old: SiteImport, new: SiteImport) -> None:
@@ -119,8 +123,11 @@ class SiteTopics:
         """Take it out of the graph."""
         if entry.source.kind is SourceKind.TOPIC:
             topic = self._imported.pop(_ident(entry), None)
-            if topic is not None:
-                topic.close()
+            interrupted = topic.close() if topic is not None else None
+            if interrupted is not None:
+                self._interrupted[_ident(entry)] = interrupted
+                if len(self._interrupted) > limits.INTERRUPTED_TOPICS_MAX:
+                    del self._interrupted[next(iter(self._interrupted))]
 
     def module_changed(self, module: SiteModule, there: bool) -> None:
         """Answer questions for headers and definitions of a module of this site."""
