@@ -221,7 +221,9 @@ GATEWAY_RULES: Final = ValueType(_read_rules, {"type": "array", "items": table_s
 # --- settings -------------------------------------------------------------------------------------------------------
 
 
-_UPLINK: Final = ValueType(lambda raw: None if raw is None else read_bytes_a_second(raw), BYTES_A_SECOND.json_schema)
+_UPLINK: Final = ValueType(
+    lambda raw: None if raw is None else read_bytes_a_second(raw), BYTES_A_SECOND.json_schema, "RATE"
+)
 """Bytes a second, or ``None`` as the default has it."""
 
 
