@@ -346,7 +346,9 @@ def test_wrong_flags_are_refused_plainly(tidy: dict[str, str], flags: list[str],
 
 def test_the_readme_s_commands(tidy: dict[str, str]) -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    commands = list(dict.fromkeys(re.findall(r"^\$ make (demo(?:-kill|-start)?\b(?!-)[^#\n]*?) *(?:#.*)?$", readme, re.MULTILINE)))
+    commands = list(
+        dict.fromkeys(re.findall(r"^\$ make (demo(?:-kill|-start)?\b(?!-)[^#\n]*?) *(?:#.*)?$", readme, re.MULTILINE))
+    )
     assert commands == ["demo", "demo-kill MODULE=base", "demo-start MODULE=base"]
     # The environment that `make` would build first is the one that these tests run in.
     make = ["make", "-C", str(ROOT), "-o", ".venv/.installed", f"BIN={Path(sys.executable).parent}"]

@@ -19,6 +19,7 @@ from rmpa.gateway.zenoh import limits
 from rmpa.gateway.zenoh.arrivals import ArrivalQueue, Arrivals, keep_thread_state
 from rmpa.gateway.zenoh.queries import ArrivedQuery, PendingGet, content
 from rmpa.gateway.zenoh.sending import QueuedPublisher, SendingLane
+from rmpa.gateway.zenoh.socket_tuning import SocketTuning
 from rmpa.gateway.zenoh.worker import SerialWorker
 from rmpa.gateway.zenoh_api import ZenohPriority, ZenohSample
 from rmpa.runtime.threads import in_thread
@@ -112,11 +113,18 @@ class OpenSession:
         self._closing = False
         self._closed = False
         self._flushed = asyncio.Event()
+        self._tuning = SocketTuning()
+        self._looking: asyncio.TimerHandle | None = None
+        self._look_at_links()
 
     @property
     def endpoints(self) -> tuple[str, ...]:
         """The endpoints of the other side of each link that is up now, such as ``tcp/192.0.2.1:7447``."""
         return () if self._closed else tuple(str(link.dst) for link in self._session.info.links())
+
+    def _look_at_links(self) -> None:
+        self._tuning.look(self.endpoints)
+        self._looking = self._loop.call_later(limits.LOOK_AT_LINKS, self._look_at_links)
 
     @property
     def stale(self) -> bool:
@@ -278,6 +286,8 @@ class OpenSession:
         if self._closing:
             return
         self._closing = True
+        if self._looking is not None:
+            self._looking.cancel()
         if not self._publishers:
             self._flushed.set()
         for publisher in tuple(self._publishers):
