@@ -167,7 +167,7 @@ def test_why_names_the_hop_and_the_rule(joined: JoinedModules) -> None:
         told.wait_event("up")
         spy.wait_event("up")
         joined.base.wait_topic("/told")
-        output = does(base, "why", "warehouse/arm:/told")
+        output = fails(base, "why", "warehouse/arm:/told")
         assert "/told of /told from warehouse/arm to site yard" in output
         assert "no node of this site subscribes" in output
         output = fails(base, "why", "warehouse/arm:/secret/word")
@@ -184,6 +184,7 @@ def test_a_site_that_is_cut_off_is_told_of_as_unreachable(joined: JoinedModules)
     try:
         eventually(lambda: "unreachable" in base.rmpa("site", "list")[1], LONG, what="unreachable", every=0.5)
         assert "site warehouse is unreachable since" in fails(base, "why", "warehouse/arm:/told")
+        assert "site warehouse is unreachable since" in fails(base, "why", "/told"), "whose it was need not be known"
         assert "site warehouse is unreachable since" in fails(base, "site", "last", "warehouse/arm", "/told")
         fails(base, "site", "info", "warehouse")
     finally:
