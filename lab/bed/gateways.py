@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from lab.bed.agents import RMPA, Agent
+from lab.bed.agents import Agent
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -34,18 +34,9 @@ class GatewayProcess(Agent):
     """One ``rmpa gateway`` and the commands against it; ``flags`` are its options, the rest is as of ``Agent``."""
 
     @property
-    def argv(self) -> list[str]:
-        """The command line on its host."""
-        words = [str(RMPA), "gateway", "--name", self.name, "--log-level", self.log_level]
-        if self.multicast:
-            words += ["--multicast", self.multicast]
-        if not self.host.namespace:
-            words += ["--interface", "lo"]  # tests keep to this machine
-        if self.config:
-            path = self.home / f"{self.name}.toml"
-            path.write_text(self.config, encoding="utf-8")
-            words += ["--config", str(path)]
-        return self.host.command([*self.prefix, *words, *self.flags])
+    def command(self) -> list[str]:
+        """The command of rmpa that it runs; a gateway's core has any free port."""
+        return ["gateway"]
 
 
 @dataclass(frozen=True, slots=True)

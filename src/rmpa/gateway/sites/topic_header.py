@@ -6,7 +6,7 @@ r"""The answer of a gateway to the question for a publisher's header (``…/d/t/
      "definition": "string data\n", "node": "/talker", "run": 17, "sequence": 42, "waiting": 0, "dropped": 0,
      "limited": 0, "time": 1700000000000000000}
 
-The question's parameters are ``node`` (one publisher of several; without it any) and ``site`` (of the one who asks).
+The question's parameters are ``node`` (one publisher of several; without it any) and ``site`` (the site that asks).
 """
 
 from __future__ import annotations

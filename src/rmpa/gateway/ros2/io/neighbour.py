@@ -123,7 +123,7 @@ class Ros2Neighbour:
         """The ways of a topic between ROS 2 and the modules, for ``rmpa why``.
 
         Args:
-            name: The topic, by its name in the graph of who asks.
+            name: The topic, by its name at the module that asks.
             site: From this site alone: ``ros2``; empty for all.
             module: From this module alone; empty for all. ROS 2 has none.
             asker: The module that asks.

@@ -77,7 +77,7 @@ class SiteWhy:
         """The ways of a name to here from other sites, and from a module of this site to others.
 
         Args:
-            name: A topic or service, by its name in the graph of who asks.
+            name: A topic or service, by its name at the module that asks.
             site: From this site alone; empty for all.
             module: From this module of it alone; empty for all.
             asker: The module that asks, whose own sources are told of too; empty for this gateway.
