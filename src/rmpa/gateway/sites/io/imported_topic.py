@@ -133,7 +133,12 @@ class ImportedTopic:
         if entry.announced.module != self.entry.announced.module:
             self._topic.forget_latched()
             self._last_latched = None
+        moved = self.wanted and entry.announced.key() != self.entry.announced.key()
+        if moved:
+            self._on_demand(self, False)
         self.entry = entry
+        if moved:
+            self._on_demand(self, True)
         if self.wanted:
             self._ask()
 
