@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := venv
-.PHONY: venv demo demo-kill demo-start test test-bare tests style format types imports reference fuzz soak soak-web bench experiment wheel ros chromium clients clean
+.PHONY: venv demo demo-sites demo-kill demo-start test test-bare tests style format types imports reference fuzz soak soak-web bench experiment wheel ros chromium clients clean
 
 $(STAMP): pyproject.toml constraints.txt scripts/bootstrap
 	scripts/bootstrap $(PYTHON) $(VENV)
@@ -15,6 +15,9 @@ venv: $(STAMP)  ## build .venv with everything that the commands below need
 
 demo: $(STAMP)  ## the paper's set-up (Fig. 7) on this machine: make demo [SECONDS=30] [JOYSTICK=/dev/input/js0]
 	@$(BIN)/python examples/turtlebot/demo.py $(if $(SECONDS),--seconds $(SECONDS)) $(if $(JOYSTICK),--joystick $(JOYSTICK))
+
+demo-sites: $(STAMP)  ## the same modules at two sites, joined by gateways over a router: make demo-sites [SECONDS=30]
+	@$(BIN)/python examples/turtlebot/demo.py --sites $(if $(SECONDS),--seconds $(SECONDS)) $(if $(JOYSTICK),--joystick $(JOYSTICK))
 
 demo-kill demo-start: $(STAMP)  ## kill -9 a module of the running demo, start it again: make demo-kill MODULE=base
 	@$(BIN)/python examples/turtlebot/demo.py $(@:demo-%=%) $(or $(MODULE),$(error name one: make $@ MODULE=base))

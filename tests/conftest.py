@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 _PROBES: Final = {
     "ros": ros.why_not,
     "netns": namespaces.why_not,
+    "nat": namespaces.why_no_nat,
     "pty": probes.why_no_pty,
     "git": probes.why_no_git,
 }

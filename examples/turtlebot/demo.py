@@ -3,12 +3,14 @@
 make demo [SECONDS=30] [JOYSTICK=/dev/input/js0]      until Ctrl-C, or for so many seconds
 make demo-kill MODULE=base                            kill -9 one module, from a second terminal
 make demo-start MODULE=base                           and start it again
+make demo-sites [SECONDS=30]                          the same modules at two sites, joined by gateways over a router
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import importlib.util
 import json
 import math
 import os
@@ -18,6 +20,7 @@ import sys
 from pathlib import Path
 
 from home import Home, ask, running
+from sites import JOINING, SITES
 from supervisor import MODULES, Refused, Supervisor
 
 
@@ -27,21 +30,25 @@ def main() -> int:
     try:
         if options.command:
             return _command(options.command, options.module, options.demo)
+        if options.sites:
+            _explain_sites(as_json=options.json)
         if options.joystick:
             _check_joystick(options.joystick)
-        return asyncio.run(_run(options.seconds, options.joystick, as_json=options.json, web=options.web))
+        return asyncio.run(_run(options))
     except (Refused, OSError) as error:
         print(f"demo: {error}", file=sys.stderr)
         return 1
 
 
-async def _run(seconds: float | None, joystick: str, *, as_json: bool, web: bool) -> int:
+async def _run(options: argparse.Namespace) -> int:
     home = Home()
     try:
-        supervisor = Supervisor(home, joystick=joystick, as_json=as_json, web=web)
+        supervisor = Supervisor(
+            home, joystick=options.joystick, as_json=options.json, web=options.web, sites=options.sites
+        )
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             asyncio.get_running_loop().add_signal_handler(number, supervisor.stop)
-        await supervisor.run(seconds)
+        await supervisor.run(options.seconds)
     finally:
         home.remove()
     for failure in supervisor.failures:
@@ -63,6 +70,15 @@ def _command(verb: str, module: str, pid: int | None) -> int:
     return 0
 
 
+def _explain_sites(*, as_json: bool) -> None:
+    missing = [name for name in ("zenoh", "xxhash") if importlib.util.find_spec(name) is None]
+    if missing:
+        raise Refused(f"{' and '.join(missing)} not installed: pip install 'rmpa[zenoh]'; `make` does it")
+    if not as_json:
+        places = "; ".join(f"{site}: {', '.join(modules)}" for site, modules in SITES.items())
+        print(f"Two sites that do not see each other, joined by a gateway each and a router. {places}", flush=True)
+
+
 def _check_joystick(device: str) -> None:
     there = ", ".join(sorted(str(path) for path in Path("/dev/input").glob("js*"))) or "no joystick at all"
     try:
@@ -81,11 +97,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--joystick", metavar="DEVICE", default="", help="such as /dev/input/js0 [a recorded drive]")
     parser.add_argument("--json", action="store_true", help="one JSON object a second, and the summary as the last")
     parser.add_argument("--no-web", dest="web", action="store_false", help="without the web page")
+    parser.add_argument("--sites", action="store_true", help="the modules are at two sites, joined by gateways")
     parser.set_defaults(command="")
     commands = parser.add_subparsers(title="from a second terminal", metavar="COMMAND")
     for verb, text in (("kill", "kill -9 a module's agent and node"), ("start", "start a killed module again")):
         command = commands.add_parser(verb, help=text)
-        command.add_argument("module", metavar="MODULE", help=f"one of {', '.join(MODULES)}")
+        names = f"one of {', '.join(MODULES)}; with --sites also {', '.join(JOINING)}"
+        command.add_argument("module", metavar="MODULE", help=names)
         command.add_argument("--demo", type=int, metavar="PID", help="which demo, where several run")
         command.set_defaults(command=verb)
     return parser

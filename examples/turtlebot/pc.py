@@ -25,10 +25,11 @@ from module import arguments, joined, run
 from rate import Rate
 from rmpa.core.errors import RmpaError
 from rmpa.observe.io.control_client import ControlClient, choose_agent
+from sites import SITES
 from watch import HERE, MODULES, TOPICS, PoseView, View, Watch
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
 
     from rmpa.observe.snapshot import Snapshot
     from rmpa.ros import Node, Received
@@ -41,12 +42,13 @@ SWITCH = 2e-4
 """Seconds after which the thread that draws gives way to one that receives; Python's 5 ms would spoil the figures."""
 
 
-async def pc(master_uri: str, screen: Screen, *, events: bool) -> None:
+async def pc(master_uri: str, screen: Screen, *, events: bool, sites: bool) -> None:
     """Subscribe to everything, look at our agent, and show it all until we are cancelled; then the summary."""
-    watch = Watch(time.monotonic())
+    away = {name: site for site, names in SITES.items() for name in names if HERE not in names} if sites else {}
+    watch = Watch(time.monotonic(), away)
     if events:
         _follow(sys.stdin.fileno(), watch, screen, asyncio.current_task())
-    looking = asyncio.create_task(_look(watch))
+    looking = asyncio.create_task(_look(watch, away))
     try:
         with screen:
             async with joined("pc", master_uri, PROFILE, *(about.type for about in TOPICS.values())) as node:
@@ -95,7 +97,7 @@ def _pose(received: Received) -> PoseView:
     )
 
 
-async def _look(watch: Watch) -> None:
+async def _look(watch: Watch, away: Mapping[str, str]) -> None:
     """Ask the own agent for its peers, and for the latency of messages without a header."""
     counted: dict[str, int] = {}
     async for _ in Rate(LOOKS):
@@ -104,7 +106,7 @@ async def _look(watch: Watch) -> None:
             now = time.monotonic()
             # A module that came back has a new GUID; its ghost may still be listed beside it.
             peers = sorted(snapshot.peers, key=lambda peer: peer.state == "linked")
-            watch.peers({peer.name: peer.state for peer in peers}, now)
+            watch.peers({peer.name: peer.state for peer in peers} | _states_away(snapshot, away), now)
             for topic, messages, latency in _measured(snapshot):
                 if counted.get(topic) != messages:  # each message at most once
                     counted[topic] = messages
@@ -114,6 +116,16 @@ async def _look(watch: Watch) -> None:
 def _snapshot() -> Snapshot:
     with ControlClient(choose_agent(os.environ, HERE).path) as agent:
         return agent.snapshot()
+
+
+def _states_away(snapshot: Snapshot, away: Mapping[str, str]) -> dict[str, str]:
+    """The modules of other sites whose messages come here: they are linked, by gateways."""
+    nodes = [route.node for topic in snapshot.topics for route in topic.routes if route.state == "open"]
+    return {
+        name: "linked"
+        for name, site in away.items()
+        if any(node.startswith(f"/rmpa/{site}/{name}/") for node in nodes)
+    }
 
 
 def _measured(snapshot: Snapshot) -> Iterator[tuple[str, int, float]]:
@@ -208,8 +220,9 @@ if __name__ == "__main__":
     parser = arguments(__doc__)
     parser.add_argument("--json", action="store_true", help="one JSON object a second, and the summary as the last")
     parser.add_argument("--events", action="store_true", help="read the supervisor's news on standard input")
+    parser.add_argument("--sites", action="store_true", help="two of the modules are at another site")
     options = parser.parse_args()
     sys.setswitchinterval(SWITCH)
     signal.signal(signal.SIGTTOU, signal.SIG_IGN)  # we are not the terminal's foreground job: the supervisor is
     with contextlib.suppress(BrokenPipeError):
-        run(pc(options.master, Screen(as_json=options.json), events=options.events))
+        run(pc(options.master, Screen(as_json=options.json), events=options.events, sites=options.sites))

@@ -1,6 +1,7 @@
 """Runs the four modules, each with an agent and a core of its own, as children of ours; beside them a web page.
 
 Three are Smart Resources: ``rmpa run`` starts their agents. The pc is an agent (``rmpa up``) and an ordinary node.
+With ``sites`` the modules are at two sites, and gateways and a router run beside them.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import TYPE_CHECKING
 
 from child import Child, adopt
 from ports import free_port
+from sites import JOINING, gateway_options, site_of
 from web_page import NoPage, WebPage
 
 if TYPE_CHECKING:
@@ -67,16 +69,22 @@ class Supervisor:
         joystick: A joystick device for the module joystick, or empty.
         as_json: Whether the pc prints JSON.
         web: Whether there is a web page.
+        sites: Whether the modules are at two sites that only gateways join.
     """
 
-    def __init__(self, home: Home, *, joystick: str = "", as_json: bool = False, web: bool = True) -> None:
+    def __init__(
+        self, home: Home, *, joystick: str = "", as_json: bool = False, web: bool = True, sites: bool = False
+    ) -> None:
         self._web = web
+        self._sites = sites
         self._home = home
         self._joystick = joystick
         self._as_json = as_json
         self._taken: set[int] = set()
-        self._multicast = f"{GROUP}:{free_port(socket.SOCK_DGRAM, self._taken)}"
-        self._modules = {name: Module(name, free_port(socket.SOCK_STREAM, self._taken)) for name in MODULES}
+        self._groups: dict[str, str] = {}
+        names = (*MODULES, *JOINING) if sites else MODULES
+        self._modules = {name: Module(name, free_port(socket.SOCK_STREAM, self._taken)) for name in names}
+        self._router_port = free_port(socket.SOCK_STREAM, self._taken)
         self._untold: list[bytes] | None = []
         self._watching: set[asyncio.Task[None]] = set()
         self._server: asyncio.Server | None = None
@@ -135,7 +143,7 @@ class Supervisor:
         module.started = time.monotonic()
         module.starts += 1
         started: dict[str, object] = {"event": "started", "module": module.name, "at": module.started}
-        if module.name != "pc":
+        if module.name != "pc" and module.name in MODULES:
             self._news(started)
         env = self._environment(module.name)
         for name, argv in self._programs(module):
@@ -149,12 +157,16 @@ class Supervisor:
 
     def _programs(self, module: Module) -> list[tuple[str, list[str]]]:
         options = [
-            *("--core-port", str(module.core_port), "--interface", "lo", "--multicast", self._multicast),
+            *("--core-port", str(module.core_port), "--interface", "lo", "--multicast", self._group(module.name)),
             *("--config", str(self._home.settings)),
         ]
         rmpa, file = rmpa_program(), str(HERE / f"{module.name}.py")
+        if module.name in JOINING:
+            own = ["--name", module.name, *gateway_options(module.name, self._router_port)]
+            return [(module.name, [rmpa, "gateway", *own, *options, "--log-level", "error"])]
         if module.name == "pc":
             node = [sys.executable, file, "--master", f"http://127.0.0.1:{module.core_port}/", "--events"]
+            node += ["--sites"] if self._sites else []
             return [
                 ("agent of pc", [rmpa, "up", "--name", "pc", *options, "--log-level", "error"]),
                 ("node of pc", node + (["--json"] if self._as_json else [])),
@@ -164,6 +176,15 @@ class Supervisor:
         if module.name == "joystick" and self._joystick:
             run += ["--set", f"device={self._joystick}"]
         return [(f"module {module.name}", [*run, "--", *options, "--log-level", "error"])]
+
+    def _group(self, name: str) -> str:
+        """Where the beacons of a module go: one port, or one for each site."""
+        site = site_of(name) if self._sites else ""
+        if self._sites and not site:
+            return "off"
+        if site not in self._groups:
+            self._groups[site] = f"{GROUP}:{free_port(socket.SOCK_DGRAM, self._taken)}"
+        return self._groups[site]
 
     def _follow(self, work: Coroutine[object, object, None], name: str) -> None:
         task = asyncio.create_task(work, name=name)
@@ -233,18 +254,20 @@ class Supervisor:
     async def _do(self, verb: str, name: str) -> str:
         module = self._modules.get(name)
         if module is None:
-            raise Refused(f"no module named {name!r}: there are {', '.join(MODULES)}")
+            raise Refused(f"no module named {name!r}: there are {', '.join(self._modules)}")
         if verb == "kill":
             if not module.runs:
                 raise Refused(f"{name} does not run; `demo.py start {name}` starts it")
             at = time.monotonic()
             pids = ", ".join(str(pid) for child in module.children if child.runs for pid in child.pids())
             # Told first: on a busy machine the pc's agent may see it gone before we have buried it.
-            self._news({"event": "killed", "module": name, "at": at})
+            if name in MODULES:
+                self._news({"event": "killed", "module": name, "at": at})
             await self._kill(module)
             if name == "pc":
                 print("the pc is killed, the others go on; start it: make demo-start MODULE=pc", file=sys.stderr)
-            return f"{name} is killed (kill -9 of its agent and its node, processes {pids})"
+            what = "its agent and its node" if name in MODULES else "its process"
+            return f"{name} is killed (kill -9 of {what}, processes {pids})"
         if verb == "start":
             if module.runs:
                 raise Refused(f"{name} runs already")

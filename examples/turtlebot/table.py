@@ -33,7 +33,8 @@ def ms(seconds: float | None, digits: int = 2) -> str:
 
 def live(view: View, trail: Sequence[tuple[float, float]], *, unicode: bool = True) -> RenderableType:
     """The whole screen."""
-    title = f"RMPA on one machine: four modules, four ROS cores, no master between them   {view.seconds:6.1f} s"
+    where = "at two sites, joined by gateways" if _at_sites(view) else "on one machine"
+    title = f"RMPA {where}: four modules, four ROS cores, no master between them   {view.seconds:6.1f} s"
     side = Table.grid(padding=(0, 2))
     heading = view.pose.heading if view.pose else 0.0
     drawing = Group(_pose(view), *draw(trail, heading, WIDTH, HEIGHT, unicode=unicode))
@@ -44,14 +45,20 @@ def live(view: View, trail: Sequence[tuple[float, float]], *, unicode: bool = Tr
     return Group(*parts)
 
 
+def _at_sites(view: View) -> bool:
+    return any(module.site for module in view.modules.values())
+
+
 def _modules(view: View) -> Table:
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
-    for name in ("module", "state", "for", "first", "profile"):
+    sites = ("site",) if _at_sites(view) else ()
+    for name in ("module", "state", "for", "first", "profile", *sites):
         table.add_column(name, justify="right" if name in {"for", "first"} else "left", no_wrap=True)
     for name, module in view.modules.items():
         state = Text(module.state, style=COLOURS.get(module.state, "bold red"))
         first = NONE if module.first_message is None else f"{module.first_message:.2f} s"
-        table.add_row(name, state, f"{module.since:.0f} s", first, module.profile or NONE)
+        site = (module.site or "here",) if sites else ()
+        table.add_row(name, state, f"{module.since:.0f} s", first, module.profile or NONE, *site)
     for restart in view.restarts[-3:]:
         table.add_row(Text(_restart(restart.module, restart.seen_gone_after, restart.back_after), style="dim"))
     return table
@@ -99,7 +106,10 @@ def _restart(module: str, gone: float | None, back: float | None) -> str:
 
 def line(view: View) -> str:
     """One line, for a file or a pipe."""
-    modules = (f"{name}:{m.state}" + (f"/{m.profile}" if m.profile else "") for name, m in view.modules.items())
+    modules = (
+        f"{name}:{m.state}" + (f"/{m.profile}" if m.profile else "") + (f"@{m.site}" if m.site else "")
+        for name, m in view.modules.items()
+    )
     parts = [f"{view.seconds:5.0f} s ", " ".join(modules)]
     for name, topic in view.topics.items():
         latency = f" {ms(topic.latency.p50)}" if topic.latency else ""

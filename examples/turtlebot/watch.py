@@ -7,8 +7,12 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from rmpa.core.stats import SampleRing, SampleSummary
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 RECENT = 100
 """Samples behind the live figures."""
@@ -72,13 +76,15 @@ class ModuleView:
 
     ``state`` is ``waiting`` (not seen yet), ``here`` (the pc itself), ``linked`` or another word of the pc's agent,
     or ``gone``; ``since`` so many seconds. ``first_message`` came so many seconds after the module's last start.
-    ``profile`` is the System Profile that its resource runs; empty: not known.
+    ``profile`` is the System Profile that its resource runs; empty: not known. ``site`` is the other site that it is
+    at; empty: it is at the pc's.
     """
 
     state: str
     since: float
     first_message: float | None
     profile: str = ""
+    site: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,10 +161,12 @@ class Watch:
 
     Args:
         now: The demo's start.
+        away: The site of each module that is not at the pc's.
     """
 
-    def __init__(self, now: float) -> None:
+    def __init__(self, now: float, away: Mapping[str, str] | None = None) -> None:
         self._start = now
+        self._away = away or {}
         self._flows = {name: _Flow() for name in TOPICS}
         self._modules = {name: _Module(since=now) for name in MODULES}
         self._commands: deque[float] = deque()
@@ -276,7 +284,9 @@ class Watch:
         return View(
             seconds=now - self._start,
             modules={
-                name: ModuleView(module.state, now - module.since, module.first_message, module.profile)
+                name: ModuleView(
+                    module.state, now - module.since, module.first_message, module.profile, self._away.get(name, "")
+                )
                 for name, module in self._modules.items()
             },
             topics={name: self._topic(flow, now, whole=whole) for name, flow in self._flows.items()},

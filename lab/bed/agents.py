@@ -119,10 +119,14 @@ class Agent:
         return {**kept, **places, "PYTHONUNBUFFERED": "1"}
 
     @property
+    def command(self) -> list[str]:
+        """The command of rmpa that it runs, with the options that this command alone has."""
+        return ["up", "--core-port", str(self.core_port)]
+
+    @property
     def argv(self) -> list[str]:
         """The command line on its host."""
-        words = [str(RMPA), "up", "--name", self.name, "--core-port", str(self.core_port)]
-        words += ["--log-level", self.log_level]
+        words = [str(RMPA), *self.command, "--name", self.name, "--log-level", self.log_level]
         if self.multicast:
             words += ["--multicast", self.multicast]
         if not self.host.namespace:

@@ -39,6 +39,11 @@ _PREFIX: Final = "rmpa"
 _PLACES: Final = Path("/run/netns")
 """Where ``ip`` keeps its namespaces (ip-netns(8))."""
 _CLONE_NEWNET: Final = 0x40000000
+_MASQUERADE: Final = """
+table ip nat {{
+    chain out {{ type nat hook postrouting priority 100; policy accept; oifname "{uplink}" masquerade; }}
+    chain past {{ type filter hook forward priority 0; policy accept; iifname "{uplink}" ct state new drop; }}
+}}"""
 _libc = ctypes.CDLL(None, use_errno=True)
 _labs = itertools.count(1)
 
@@ -66,6 +71,21 @@ def why_not() -> str:
     return ""
 
 
+@functools.cache
+def why_no_nat() -> str:
+    """Why ``Lab.nat`` cannot be used here, or an empty string."""
+    if reason := why_not():
+        return reason
+    if shutil.which("nft") is None:
+        return "no nftables here (apt install nftables)"
+    with Lab() as lab:
+        try:
+            lab.nat("nat", 1, 0)
+        except NetworkError as error:
+            return f"this machine's namespaces allow no NAT ({error})"
+    return ""
+
+
 class NetworkError(RmpaError):
     """``ip`` or ``tc`` refused a command."""
 
@@ -79,12 +99,14 @@ class Cable:
         address: Its IPv4 address.
         switch: The namespace of the network's switch.
         port: The switch's end.
+        network: The network's number.
     """
 
     interface: str
     address: str
     switch: str
     port: str
+    network: int
 
 
 @dataclass(slots=True)
@@ -199,10 +221,17 @@ MACHINE: Final = Host("machine")
 
 @dataclass(slots=True)
 class Network:
-    """A switch and the addresses 10.77.``number``.0/24 on it."""
+    """A switch and the addresses 10.77.``subnet``.0/24 on it.
+
+    Args:
+        number: Its number in the lab.
+        switch: The namespace of its switch.
+        subnet: The third byte of its addresses; two networks behind NAT may have the same.
+    """
 
     number: int
     switch: str
+    subnet: int
     _next: int = 1
 
     def plug(self, host: Host, *, octet: int | None = None) -> Cable:
@@ -210,7 +239,7 @@ class Network:
         if octet is None:
             octet, self._next = self._next, self._next + 1
         interface, port = f"eth{len(host.cables)}", f"port{octet}"
-        cable = Cable(interface, f"10.77.{self.number}.{octet}", self.switch, port)
+        cable = Cable(interface, f"10.77.{self.subnet}.{octet}", self.switch, port, self.number)
         # The hardware address is the address's, so that a host that was off comes back as itself.
         hardware = f"02:4d:50:00:{self.number:02x}:{octet:02x}"
         names = ["link", "add", interface, "address", hardware, "netns", host.namespace]
@@ -224,7 +253,7 @@ class Network:
     @property
     def broadcast(self) -> str:
         """Its broadcast address."""
-        return f"10.77.{self.number}.255"
+        return f"10.77.{self.subnet}.255"
 
 
 class Lab:
@@ -241,13 +270,13 @@ class Lab:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def network(self, number: int = 0) -> Network:
-        """Network 10.77.``number``.0/24, made when first asked for."""
+    def network(self, number: int = 0, subnet: int | None = None) -> Network:
+        """Network 10.77.``subnet``.0/24 (default: its number), made when first asked for."""
         if number not in self._networks:
             switch = self._namespace(f"switch{number}")
             _ip("-n", switch, "link", "add", "switch", "type", "bridge", "forward_delay", "0", "mcast_snooping", "0")
             _ip("-n", switch, "link", "set", "switch", "up")
-            self._networks[number] = Network(number, switch)
+            self._networks[number] = Network(number, switch, number if subnet is None else subnet)
         return self._networks[number]
 
     def host(self, name: str, *networks: int) -> Host:
@@ -277,8 +306,7 @@ class Lab:
         host.ip("link", "set", "lo", "up")
         wires, host.cables[:] = list(host.cables), []
         for wire in wires:
-            number, octet = (int(part) for part in wire.address.split(".")[2:])
-            self.network(number).plug(host, octet=octet)
+            self.network(wire.network).plug(host, octet=int(wire.address.rpartition(".")[2]))
 
     def router(self, first: int, second: int, name: str = "router") -> Host:
         """A host that forwards between two networks; tell the hosts there by ``route``. No multicast crosses."""
@@ -288,6 +316,20 @@ class Lab:
             self.network(number).plug(router, octet=254)
         _run(router.command(["sysctl", "-qw", "net.ipv4.ip_forward=1"]))
         return router
+
+    def nat(self, name: str, inside: int, outside: int) -> Host:
+        """A host that forwards from network ``inside`` to ``outside`` and hides the addresses of ``inside`` (NAT).
+
+        Its cable 0 is the inner one, cable 1 the uplink. As with a router at home, hosts inside reach those outside
+        when they are told by ``route``, and nothing from outside can begin a connection inwards. Needs ``nft``.
+        """
+        nat = Host(name, self._namespace(name))
+        nat.ip("link", "set", "lo", "up")
+        self.network(inside).plug(nat, octet=254)
+        uplink = self.network(outside).plug(nat)
+        _run(nat.command(["sysctl", "-qw", "net.ipv4.ip_forward=1"]))
+        _run(nat.command(["nft", _MASQUERADE.format(uplink=uplink.interface)]))
+        return nat
 
     def route(self, host: Host, via: Host) -> None:
         """Make ``via`` the default gateway of ``host``: the router's address on a network they share."""

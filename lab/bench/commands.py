@@ -17,6 +17,7 @@ from lab.bench import (
     bookkeeping,
     crosstraffic,
     decision,
+    gateway,
     idle,
     joining,
     load,
@@ -106,6 +107,13 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
     "decision": Measurement("how long a resource takes to decide", decision.measure, needs=()),
     "trust": Measurement("what TLS on the links costs, and what attacks cost a secured agent", trust.measure),
     "bookkeeping": Measurement("what measuring quality costs, and how soon a resource adapts", bookkeeping.measure),
+    "gateway": Measurement(
+        "sites joined by gateways, beside a bare pair of Zenoh programs",
+        gateway.measure,
+        (why_no_ros, gateway.why_no_sites),
+        parts=gateway.PARTS,
+        only=gateway.measure,
+    ),
     "web": Measurement(
         "rmpa web beside rosbridge_suite's server and foxglove-sdk's",
         web.measure,
@@ -125,7 +133,7 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
     default="",
     metavar="KEYS",
     help="path: these contenders, comma-separated (lab/bench/contenders.py has them); "
-    f"web: of {', '.join(web.PARTS)}.",
+    f"web: of {', '.join(web.PARTS)}; gateway: of {', '.join(gateway.PARTS)}.",
 )
 @click.option(
     "--realtime",

@@ -137,7 +137,7 @@ def direct(client: str, *, nodelay: bool) -> Callable[[Bed], RoundTripPath]:
         shell.master()
         word = "tcpNoDelay" if nodelay else "Nagle"
         key = f"{client}_{'nodelay' if nodelay else 'nagle'}"
-        return _nodes(key, f"{client} direct, {word}", shell, shell, client, nodelay=nodelay)
+        return nodes(key, f"{client} direct, {word}", shell, shell, client, nodelay=nodelay)
 
     return start
 
@@ -145,7 +145,7 @@ def direct(client: str, *, nodelay: bool) -> Callable[[Bed], RoundTripPath]:
 def direct_hosts(bed: Bed) -> RoundTripPath:
     """Roscpp straight from host to host by the same kind of cable as the agents': classic ROS at its best."""
     here, there = bed.classic()
-    return _nodes("roscpp_hosts", "roscpp direct, two hosts", here, there, "roscpp")
+    return nodes("roscpp_hosts", "roscpp direct, two hosts", here, there, "roscpp")
 
 
 def relays(bed: Bed) -> RoundTripPath:
@@ -157,7 +157,7 @@ def relays(bed: Bed) -> RoundTripPath:
         [("/ping", "/ping1"), ("/ping1", "/ping2"), ("/pong", "/pong1"), ("/pong1", "/pong2")], start=1
     ):
         between[f"relay {stage}"] = shell.start(RELAY, source, target, f"__name:=relay{stage}")
-    return _nodes("relays", "roscpp, two C++ relays", shell, shell, "roscpp", between, ask="/ping2", answer="/pong2")
+    return nodes("relays", "roscpp, two C++ relays", shell, shell, "roscpp", between, ask="/ping2", answer="/pong2")
 
 
 def through(
@@ -173,7 +173,7 @@ def through(
         ]
         here, there = (bed.shell(agent.host, agent.core_port) for agent in pair)
         between = {f"agent {number}": agent.process for number, agent in enumerate(pair, 1)}
-        made = _nodes(key, title, here, there, "roscpp", between)
+        made = nodes(key, title, here, there, "roscpp", between)
         made.still, made.transport = [], transport
         made.require_transport()
         return made
@@ -181,7 +181,7 @@ def through(
     return start
 
 
-def _nodes(
+def nodes(
     key: str,
     title: str,
     here: Ros,
@@ -193,6 +193,7 @@ def _nodes(
     ask: str = "/ping",
     answer: str = "/pong",
 ) -> RoundTripPath:
+    """ROS nodes as both ends: ``ping`` in ``here``, ``pong`` in ``there``, and the processes ``between`` by name."""
     pong = there.node(client, "velocity", "__name:=pong", cmd=ask, vel="/pong", nodelay=nodelay)
     start = here.rospy if client == "rospy" else here.roscpp
     ping = start("ping", "__name:=ping", commands=True, topic="/ping", reply=answer, nodelay=nodelay)

@@ -1,8 +1,9 @@
-"""Zenoh between two peers: ``ping_zenoh.py serve PORT | ping PORT [--shared-memory]``; lines of ``roundtrips``.
+"""Zenoh between two ends: ``ping_zenoh.py serve|ping PORT [--shared-memory] [--through]``; lines of ``roundtrips``.
 
 Its best settings for latency: a TCP link named on both sides (no scouting, no gossip), express messages (not
 batched), the highest data priority, a blocking ``recv`` (a callback that wakes the main thread is slower). Such a
-link loses nothing, so there is no time-out. ``--shared-memory`` lets large messages bypass TCP.
+link loses nothing, so there is no time-out. ``--shared-memory`` lets large messages bypass TCP. With ``--through``
+both ends are clients of the router at the endpoint that stands in place of the port.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import zenoh
 
 from node import say
 from roundtrips import measure
+from zenoh_router import settings_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -46,8 +48,8 @@ def publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
     )
 
 
-def serve(endpoint: str, *, shared_memory: bool) -> None:
-    session = zenoh.open(config([endpoint], [], shared_memory=shared_memory))
+def serve(settings: zenoh.Config) -> None:
+    session = zenoh.open(settings)
     back = publisher(session, "bench/pong")
     asked = session.declare_subscriber("bench/ping")
     say("up")
@@ -55,8 +57,8 @@ def serve(endpoint: str, *, shared_memory: bool) -> None:
         back.put(asked.recv().payload)
 
 
-def ping(endpoint: str, *, shared_memory: bool) -> None:
-    session = zenoh.open(config([], [endpoint], shared_memory=shared_memory))
+def ping(settings: zenoh.Config) -> None:
+    session = zenoh.open(settings)
     there = publisher(session, "bench/ping")
     came = session.declare_subscriber("bench/pong")
 
@@ -83,4 +85,9 @@ def ping(endpoint: str, *, shared_memory: bool) -> None:
 if __name__ == "__main__":
     role, port, *flags = sys.argv[1:]
     run = serve if role == "serve" else ping
-    run(f"tcp/127.0.0.1:{port}", shared_memory="--shared-memory" in flags)
+    if "--through" in flags:
+        run(settings_of("client", {"connect/endpoints": [port]}))
+    else:
+        at = [f"tcp/127.0.0.1:{port}"]
+        shared = "--shared-memory" in flags
+        run(config(at, [], shared_memory=shared) if role == "serve" else config([], at, shared_memory=shared))

@@ -44,6 +44,7 @@ ARGS: Final[dict[str, dict[str, Any]]] = {
     "agent": {"peer": "b"},
     "contract": {"topic": "/chatter", "type_name": "std_msgs/String"},
     "node": {"what": "node.list", "peer": "b"},
+    "site": {"what": "site.report", "args": {}},
 }
 
 

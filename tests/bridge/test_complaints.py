@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 ROOT: Final = Path(__file__).parents[2]
-ROWS: Final = tuple(map(str, range(1, 22)))
+ROWS: Final = tuple(map(str, range(1, 29)))
 
 
 def _tests() -> tuple[set[str], dict[str, set[str]]]:

@@ -145,7 +145,7 @@ def test_the_documentation_has_every_key_and_every_default() -> None:
         key: str(
             getattr(Contract(), key.removesuffix("_duration")) or ("unlimited" if key == "max_rate" else "infinite")
         )
-        for key in LISTS["contract"][2:]
+        for key in LISTS["contract",][2:]
     } | {"outage": f"{Contract().outage:g} s"}
     assert {key: value for key, value in written.items() if key in defaults} == defaults
 

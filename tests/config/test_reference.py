@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from click.testing import CliRunner
 
+from rmpa.cli.gateway import gateway
 from rmpa.cli.main import cli
 from rmpa.cli.up import up
 from rmpa.config.reference import SCHEMA_FILE, json_schema, json_value, schema_text, with_settings_tables
@@ -17,6 +18,11 @@ from rmpa.config.sources import load_settings
 from rmpa.core.errors import ConfigError
 from tests.core.example import EXAMPLE, uncommented
 
+if TYPE_CHECKING:
+    import click
+
+NOT_OF_A_GATEWAY = {"--core", "--master", "--fresh", "--web", "--no-web"}
+"""Options of ``rmpa up`` about what a gateway has not: a core of its nodes, a page."""
 DOCS = Path(__file__).parents[2] / "docs"
 
 
@@ -37,7 +43,7 @@ def test_documentation_has_every_setting_and_every_list_of_tables() -> None:
         assert (
             setting.title if setting.is_list_of_tables else f"| `{(setting.key or (setting.env,))[-1]}` |"
         ) in page
-    assert {setting.key[0] for setting in SETTINGS if len(setting.key) > 1} == set(TABLES)
+    assert {".".join(setting.key[:-1]) for setting in SETTINGS if len(setting.key) > 1} == set(TABLES)
 
 
 def test_no_two_settings_share_a_name() -> None:
@@ -53,8 +59,14 @@ def test_every_default_can_be_read_again() -> None:
 
 
 def test_up_has_an_option_for_each_setting_that_declares_one() -> None:
-    options = {name for parameter in up.params for name in (*parameter.opts, *parameter.secondary_opts)}
-    assert options == {"--config"} | {part for s in SETTINGS if s.option for part in s.option.split("/")}
+    of_up = {part for s in SETTINGS if s.option and s.command == "up" for part in s.option.split("/")}
+    of_gateway = {part for s in SETTINGS if s.option and s.command == "gateway" for part in s.option.split("/")}
+    assert _options(up) == {"--config"} | of_up
+    assert _options(gateway) == {"--config"} | of_gateway | of_up - NOT_OF_A_GATEWAY
+
+
+def _options(command: click.Command) -> set[str]:
+    return {name for parameter in command.params for name in (*parameter.opts, *parameter.secondary_opts)}
 
 
 def test_schema_accepts_the_example_file(validate: Any) -> None:
@@ -97,6 +109,15 @@ def test_schema_accepts_the_files_of_the_documentation(validate: Any) -> None:
         "[[service]]\ntimeout = 1",
         "[[param]]\nkey = '/a'",
         "[param]\nkey = '/a'",
+        "[gateway]\nsites = 'a'",
+        "[gateway]\nconnect = ['http://a:1']",
+        "[gateway.ros2]\nenable = true",
+        "[gateway.ros2]\ndistribution = 'jazy'",
+        "[gateway]\nros2 = true",
+        "[gateway]\nrank = 1000",
+        "[[gateway.rule]]\nnames = []",
+        "[gateway.rule]\nrate = 2",
+        "[[gateway.rule]]\ncrossing = 'inn'",
     ],
 )
 def test_schema_refuses_what_the_agent_refuses(validate: Any, tmp_path: Path, text: str) -> None:

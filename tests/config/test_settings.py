@@ -15,12 +15,14 @@ from rmpa.config import limits
 from rmpa.config.file import LISTS, SCHEMAS, parse_config
 from rmpa.config.settings import (
     SETTINGS,
+    GatewaySettings,
     HostPort,
     LaneSettings,
     LimitSettings,
     Multicast,
     PolicySettings,
     RealtimeSettings,
+    Ros2Settings,
     Settings,
     WebSettings,
 )
@@ -83,14 +85,14 @@ def test_the_example_shows_every_key_and_its_commented_lines_load() -> None:
     text = ""
     for name in dict.fromkeys(t for t, _ in kept):
         text += name + "\n" + "\n".join(line for (t, _), line in kept.items() if t == name) + "\n"
-    assert set(parse_config(text.encode(), None)) == set(SCHEMAS) - {(name,) for name in LISTS}
+    assert set(parse_config(text.encode(), None)) == set(SCHEMAS) - set(LISTS)
 
 
 def test_the_examples_lists_of_tables_load_and_show_every_key(load: Load) -> None:
     text = uncommented(EXAMPLE.read_text())
     found = parse_config(text.encode(), None)
     for name, keys in LISTS.items():
-        tables = found[name,]
+        tables = found[name]
         assert isinstance(tables, list)
         assert {key for table in tables for key in table} == set(keys), name
     assert load(text).notes == ()
@@ -188,6 +190,18 @@ def test_every_flag(load: Load) -> None:
         "log_json": True,
         "realtime": True,
         "web": True,
+        "site": "warehouse",
+        "rank": "7",
+        "connect": ("tls/fleet.example:7447", "tcp/[::1]:7448"),
+        "listen": ("tcp/0.0.0.0:7447",),
+        "router": True,
+        "insecure": True,
+        "uplink": "1 Mbit/s",
+        "ros1_bridge": True,
+        "ros2": True,
+        "ros2_domain": "3",
+        "ros2_distribution": "kilted",
+        "ros2_mapping": ("a.yaml",),
     }
     assert set(options) == {setting.option_name for setting in SETTINGS if setting.option}
     settings = load(options=options).settings
@@ -207,6 +221,17 @@ def test_every_flag(load: Load) -> None:
         log_json=True,
         realtime=RealtimeSettings(True),
         web=WebSettings(True),
+        gateway=GatewaySettings(
+            "warehouse",
+            7,
+            ("tls/fleet.example:7447", "tcp/[::1]:7448"),
+            ("tcp/0.0.0.0:7447",),
+            True,
+            True,
+            125_000,
+            True,
+            ros2=Ros2Settings(True, 3, "kilted", ("a.yaml",)),
+        ),
     )
 
 

@@ -10,9 +10,10 @@ from rmpa.bridge.naming import PeerNames
 from rmpa.config import limits
 from rmpa.config.contract_rules import CONTRACT_RULES
 from rmpa.config.file import SCHEMAS, parse_config
+from rmpa.config.gateway_rules import GATEWAY_RULES
 from rmpa.config.param_rules import PARAM_RULES, overlap, untouchable
 from rmpa.config.peer_rules import PEER_RULES
-from rmpa.config.quantities import read_duration, read_rate
+from rmpa.config.quantities import read_bytes_a_second, read_duration, read_rate
 from rmpa.config.settings import SETTINGS
 from rmpa.config.values import BadValue
 from rmpa.core.contract import Contracts
@@ -20,7 +21,12 @@ from rmpa.core.errors import ConfigError
 from rmpa.core.names import is_global_name
 
 _EXAMPLE = Path(__file__).parents[2] / "examples" / "rmpa.toml"
-_READERS = (*(s.type.read for s in SETTINGS if not s.is_list_of_tables), read_duration, read_rate)
+_READERS = (
+    *(s.type.read for s in SETTINGS if not s.is_list_of_tables),
+    read_duration,
+    read_rate,
+    read_bytes_a_second,
+)
 
 SEEDS: list[bytes] = [
     b"".join(line for line in _EXAMPLE.read_bytes().splitlines(keepends=True) if not line.startswith(b"#")),
@@ -48,6 +54,11 @@ SEEDS: list[bytes] = [
     b'[[peer]]\nname = "a"\n[[peer.remap]]\ndirection = "out"\nfrom = "/a"\nto = "/b"\ntypes = ["a/*"]\n',
     b'[[peer]]\nname = "*"\nallow = ["/{peer}/**"]\nremap_out = {"/a" = "/b", "/b" = "/a"}\n',
     b'[[peer]]\nname = "*"\n[peer.remap_in]\n"/**" = "/a/**"\n"/b/**" = "/**"\n',
+    b'[gateway]\nsite = "a"\nconnect = ["tls/a:7447"]\n[gateway.ros2]\nenabled = true\nmapping = ["a.yaml"]\n',
+    b'[[gateway.rule]]\nnames = ["/a/**"]\nsize = "1 Mbit/s"\n[[gateway.rule]]\nname = "/{site}/{module}{name}"\n',
+    b"[gateway]\nros2.domain = 3\nrule = [{crossing = 'in', name = '{name}'}, {sites = ['*'], rate = 0}]\n",
+    b"tcp/[fe80::1%eth0]:7447#iface=eth0",
+    b"1.5 Mbit/s",
     b"100 ms",
     b"86400.000000000 s",
     b"infinite",
@@ -62,6 +73,7 @@ def fuzz(data: bytes) -> None:
         rules = found.pop(("contract",), [])
         _check_follow_rules(found.pop(("param",), []))
         _check_peers(found.pop(("peer",), []))
+        _check_gateway_rules(found.pop(("gateway", "rule"), []))
         if not set(found) <= set(SCHEMAS):
             raise AssertionError(f"unknown keys came through: {set(found) - set(SCHEMAS)}")
         _check_contracts(rules)
@@ -102,6 +114,20 @@ def _check_peers(raw: object) -> None:
             for name in ("/a", "/a/b", "/arm/joints", "/tf", "/robot1/odom"):
                 if not is_global_name(way(name)):
                     raise AssertionError(f"{name} becomes {way(name)!r}")
+
+
+def _check_gateway_rules(raw: object) -> None:
+    """Rules whose names are names of ROS, or a BadValue that says where."""
+    try:
+        rules = GATEWAY_RULES.read(raw)
+    except BadValue as error:
+        if error.at == () and isinstance(raw, list) and len(raw) <= limits.GATEWAY_RULES_MAX:
+            raise AssertionError("a wrong rule, but nothing says which") from error
+        return
+    for rule in rules:
+        name = rule.name.replace("{site}", "s").replace("{module}", "m").replace("{name}", "/a/b")
+        if not is_global_name(name):
+            raise AssertionError(f"{rule.name} makes {name!r}")
 
 
 def _check_contracts(raw: object) -> None:

@@ -14,7 +14,7 @@ import pytest
 from lab.bed import namespaces
 from lab.bed.agents import NotifySocket
 from lab.bed.namespaces import Lab
-from lab.bed.processes import Deadline, Process, eventually, run
+from lab.bed.processes import CommandFailed, Deadline, Process, eventually, run
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -81,6 +81,21 @@ def test_router_joins_two_networks(lab: Lab) -> None:
     lab.route(a, router)
     lab.route(b, router)
     _connect(a, b)
+
+
+@pytest.mark.nat
+def test_two_networks_of_the_same_addresses_reach_out_behind_nat_and_are_not_reached(lab: Lab) -> None:
+    outer = lab.host("outer", 0)
+    lab.network(2, subnet=1)
+    nats = [lab.nat(f"nat{inside}", inside, 0) for inside in (1, 2)]
+    inner = [lab.host(f"inner{inside}", inside) for inside in (1, 2)]
+    assert inner[0].address == inner[1].address
+    for host, nat in zip(inner, nats, strict=True):
+        lab.route(host, nat)
+        assert _connect(host, outer) == nat.cables[1].address
+        outer.ip("route", "replace", host.address, "via", nat.cables[1].address)
+        with pytest.raises(CommandFailed, match=r"timed out|unreachable|No route"):
+            _connect(outer, host, timeout=0.5)
 
 
 @pytest.mark.netns
@@ -207,10 +222,12 @@ def _has(word: str) -> bool:
     return shutil.which(word) is not None
 
 
-def _connect(a: namespaces.Host, b: namespaces.Host) -> None:
-    """Open a TCP connection from one host to the other."""
-    serve = "import socket; s = socket.create_server(('', 7000)); print('ready', flush=True); s.accept()"
-    dial = f"import socket; socket.create_connection(('{b.address}', 7000), 10).close()"
+def _connect(a: namespaces.Host, b: namespaces.Host, timeout: float = 10.0) -> str:
+    """Open a TCP connection from one host to the other; return the address that it comes from there."""
+    serve = "import socket; s = socket.create_server(('', 7000)); print('ready', flush=True); print(s.accept()[1][0])"
+    dial = f"import socket; socket.create_connection(('{b.address}', 7000), {timeout}).close()"
     with Process(b.command(["python3", "-c", serve])) as server:
         server.wait_for("ready")
         run(a.command(["python3", "-c", dial]))
+        server.wait()
+        return server.lines[-1]

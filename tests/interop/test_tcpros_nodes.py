@@ -15,6 +15,7 @@ import pytest
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.http.client import call_api
+from rmpa.ros.node.accepted_connection import AcceptedConnection
 from rmpa.ros.node.node import Node
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
@@ -173,6 +174,7 @@ async def test_trap_9_tcp_nodelay_is_what_the_listener_asks_for(
     ros.node(library, "listener", nodelay=nodelay)
     await asyncio.wait_for(publisher.wait_for_subscriber(), DEADLINE)
     (link,) = publisher.publication._open
+    assert isinstance(link, AcceptedConnection)
     assert link._sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) == nodelay
 
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import URGENT, Outbox
 from rmpa.core.sizes import KIB, MIB
-from rmpa.runtime.stream import Stream
+from rmpa.runtime.stream import Stream, collected_sends
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -294,6 +294,22 @@ async def test_messages_of_one_read_leave_in_one_call(sockets: Sockets) -> None:
     relay.close()
     end.stream.close()
     left.close()
+
+
+async def test_messages_that_are_collected_leave_in_one_call(sockets: Sockets) -> None:
+    target = counted(sockets[0])
+    one, end = End(target), End(sockets[1])
+    with collected_sends():
+        for i in range(50):
+            one.send(b"%d" % i)
+        with collected_sends():
+            one.send(b"inner")
+    one.send(b"after")
+    await until(lambda: len(end.got) == 52)
+    assert end.got == [*(b"%d" % i for i in range(50)), b"inner", b"after"]
+    assert len(target.calls) == 2
+    one.stream.close()
+    end.stream.close()
 
 
 async def test_batches_keep_order_and_bytes_through_full_buffers(sockets: Sockets) -> None:

@@ -19,6 +19,9 @@ def test_fails_at_its_first_run() -> None:
 """
 
 
+_FAILED = "FAILED tests/shaky/test_it.py::test_fails_at_its_first_run - assert not True"
+
+
 def _run(root: Path, **files: str) -> tuple[int, list[str]]:
     """Run a copy of the script over ``tests/NAME/test_it.py`` for each name; return its exit code and its lines."""
     script = root / "scripts" / "run-tests"
@@ -36,8 +39,9 @@ def _run(root: Path, **files: str) -> tuple[int, list[str]]:
 def test_a_part_that_passes_alone_is_named_as_flaky(tmp_path: Path) -> None:
     code, lines = _run(tmp_path, shaky=_FAILS_ONCE, steady="def test_passes() -> None: pass")
     assert code == 0
-    assert "0 of 2 parts failed, 1 flaky" in lines[-2]
-    assert lines[-1] == "flaky: tests/shaky (failed, then passed alone)"
+    at = lines.index("flaky: tests/shaky (failed, then passed alone)")
+    assert "0 of 2 parts failed, 1 flaky" in lines[at - 1]
+    assert lines[at + 1 :] == ["      E       assert not True", f"      {_FAILED}"], "what failed, and why"
 
 
 def test_a_part_that_fails_twice_fails_the_run(tmp_path: Path) -> None:

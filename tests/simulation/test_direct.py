@@ -16,7 +16,7 @@ FACTOR = int(os.environ.get("RMPA_SIMULATION_SEEDS", "1"))
 BLOCK = 50
 
 
-@pytest.mark.parametrize("block", range(5 * FACTOR))
+@pytest.mark.parametrize("block", range(3 * FACTOR))
 def test_each_subscriber_settles_on_the_path_that_the_conditions_ask_for(block: int) -> None:
     for seed in range(block * BLOCK, (block + 1) * BLOCK):
         DirectScenario(seed).play()

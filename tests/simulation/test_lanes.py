@@ -16,7 +16,7 @@ from tests.simulation.point_scenario import TROUBLES, Course, PointScenario
 
 FACTOR = int(os.environ.get("RMPA_SIMULATION_SEEDS", "1"))
 BLOCK = 25
-BLOCKS = [(count, block) for count, blocks in ((2, 5), (3, 2)) for block in range(blocks * FACTOR)]
+BLOCKS = [(count, block) for count, blocks in ((2, 3), (3, 1)) for block in range(blocks * FACTOR)]
 
 
 @pytest.mark.parametrize(("count", "block"), BLOCKS)

@@ -19,13 +19,13 @@ FACTOR = int(os.environ.get("RMPA_SIMULATION_SEEDS", "1"))
 BLOCK = 100
 
 
-@pytest.mark.parametrize("block", range(7 * FACTOR))
+@pytest.mark.parametrize("block", range(4 * FACTOR))
 def test_the_fate_of_every_message_is_known(block: int) -> None:
     for seed in range(block * BLOCK, (block + 1) * BLOCK):
         ReliableScenario(seed).play()
 
 
-@pytest.mark.parametrize("block", range(3 * FACTOR))
+@pytest.mark.parametrize("block", range(2 * FACTOR))
 def test_nothing_is_lost_while_it_fits(block: int) -> None:
     for seed in range(block * BLOCK, (block + 1) * BLOCK):
         scenario = ReliableScenario(seed, Bounds())

@@ -16,13 +16,13 @@ BLOCK = 50
 
 
 @pytest.mark.parametrize("count", [2, 3, 4, 5])
-@pytest.mark.parametrize("block", range(4 * FACTOR))
+@pytest.mark.parametrize("block", range(2 * FACTOR))
 def test_small_networks_agree_after_healing(count: int, block: int) -> None:
     for seed in range(block * BLOCK, (block + 1) * BLOCK):
         Scenario(seed, count).play()
 
 
-@pytest.mark.parametrize("block", range(7 * FACTOR))
+@pytest.mark.parametrize("block", range(4 * FACTOR))
 def test_networks_of_ten_agree_after_healing(block: int) -> None:
     for seed in range(block * 10, (block + 1) * 10):
         Scenario(seed, 10).play()

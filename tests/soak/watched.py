@@ -17,7 +17,7 @@ from collections import Counter, deque
 from pathlib import Path
 from typing import Final
 
-from rmpa.agent import agent
+from rmpa.agent import process
 from rmpa.cli.main import main
 from rmpa.runtime.event_loop import AgentLoop
 
@@ -85,5 +85,5 @@ class WatchedLoop(AgentLoop):
 
 if __name__ == "__main__":
     signal.signal(signal.SIGUSR1, tell)
-    agent.AgentLoop = WatchedLoop  # type: ignore[attr-defined]  # in the way of rmpa.agent.agent.run
+    process.AgentLoop = WatchedLoop  # type: ignore[attr-defined]  # in the way of rmpa.agent.process.run_process
     sys.exit(main())

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import logging
 import os
 import random
-import signal
-import sys
 import time
 from typing import TYPE_CHECKING, Final
 
 from rmpa.agent.core_choice import make_core
 from rmpa.agent.network import Network
 from rmpa.agent.permission_notes import permission_notes
-from rmpa.agent.reload import Reloader, SighupHandler
+from rmpa.agent.process import run_process, serve
+from rmpa.agent.reload import Reloader
 from rmpa.agent.trust import AgentTrust, open_membership
 from rmpa.agent.trust_operations import PlainOperations, TrustOperations
 from rmpa.agent.web_process import WebProcess, web_command, web_environment
@@ -28,8 +26,6 @@ from rmpa.bridge.policy import Policy
 from rmpa.bridge.services.io.part import Services
 from rmpa.bridge.services.rules import ServiceRules
 from rmpa.core.counters import Counters
-from rmpa.core.errors import StartError
-from rmpa.core.open_files import remedy
 from rmpa.observe.io.agent_requests import AgentRequests
 from rmpa.observe.io.control_operations import ControlOperations
 from rmpa.observe.io.control_server import ControlServer
@@ -38,25 +34,23 @@ from rmpa.observe.io.graph_revision import GraphRevisions
 from rmpa.observe.io.peer_clocks import PeerClocks
 from rmpa.observe.io.peer_credentials import control_access
 from rmpa.observe.io.runtime_dir import runtime_dir
+from rmpa.observe.io.site_requests import SiteRequests
 from rmpa.observe.io.snapshot_builder import SnapshotBuilder, SnapshotSources
 from rmpa.observe.why.io.why import WhyService
 from rmpa.ros.node.logger_services import LoggerServices
-from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime import realtime
-from rmpa.runtime.descriptors import is_shortage, raise_file_limit
-from rmpa.runtime.event_loop import AgentLoop
 from rmpa.runtime.garbage_collector import GarbageCollector
-from rmpa.runtime.service_manager import notify_service_manager
 from rmpa.runtime.system_clock import SystemClock
 from rmpa.trust.permissions import Permissions
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 
     from rmpa.config.settings import Settings
     from rmpa.config.sources import Loaded
     from rmpa.core.identity import Identity
+    from rmpa.observe.io.control_server import Handler
     from rmpa.ros.core.api import Core
+    from rmpa.runtime import realtime
 
 _log = logging.getLogger(__name__)
 
@@ -132,6 +126,8 @@ class Agent:
         self.reloader = Reloader(settings, load, self.apply_settings)
         self.reloaded: Callable[[], None] = lambda: None
         """Called when changed settings hold."""
+        self.other_notes: list[Callable[[], Iterable[str]]] = []
+        """What else the snapshot's notes tell: of parts that the agent does not make itself."""
         counters = Counters()
         self._collector = GarbageCollector(self._bytes_carried, counters)
         self._clocks = PeerClocks(self.bridge)
@@ -151,7 +147,9 @@ class Agent:
         self.snapshots = SnapshotBuilder(settings, sources)
         self._nodes = NodeRequests(settings, self.core, self.bridge.rpc, self.bridge.gate)
         AgentRequests(self.bridge.rpc, self.snapshots)
-        self._why = WhyService(settings, self.core, self.bridge, self.services, self.snapshots)
+        self.sites = SiteRequests(self.bridge.rpc, self.bridge.sessions.linked, self.bridge.gate)
+        """Answers questions about other sites; a gateway answers them itself."""
+        self._why = WhyService(settings, self.core, self.bridge, self.services, self.snapshots, self.sites)
         self.operations = ControlOperations(
             settings.name,
             self.bridge,
@@ -162,6 +160,7 @@ class Agent:
             GraphRevisions(self.core, rows=settings.core_mode == "embedded"),
             self._trust_operations(),
             self._nodes,
+            self.sites,
         )
         self._control = ControlServer(
             runtime_dir(os.environ, settings.runtime_dir),
@@ -170,6 +169,10 @@ class Agent:
             counters=counters,
             access=control_access(settings.control_group),
         )
+
+    def add_operations(self, handlers: Mapping[str, Handler]) -> None:
+        """Add operations to the control socket, before ``start()``."""
+        self._control.add(handlers)
 
     async def start(self) -> None:
         """Start every part; the network comes last, so that peers find a complete agent.
@@ -223,6 +226,8 @@ class Agent:
         yield from permission_notes(self._settings, secured=self.bridge.gate.on)
         if self.trust is not None:
             yield from self.trust.notes()
+        for notes in self.other_notes:
+            yield from notes()
 
     def apply_settings(self, settings: Settings) -> None:
         """Take settings that were read again; only those of ``agent.reload.LIVE`` differ."""
@@ -240,27 +245,19 @@ async def _serve(
     cpus: Collection[int] = (),
 ) -> None:
     agent = Agent(settings, requests, load)
-    stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    loop.set_default_executor(realtime.worker_pool())
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stop.set)
-    sighup = SighupHandler(agent.reloader, stop.set)
     web = WebProcess(web_command(settings), random.random, environ=web_environment(settings, os.environ), cpus=cpus)
     agent.reloaded = web.reload
-    await agent.start()
-    sighup.start()
-    if settings.web.enabled:
-        web.start()
-    try:
-        notify_service_manager("READY=1")
-        await stop.wait()
-        notify_service_manager("STOPPING=1")
-        _log.info("= ending")
-    finally:
-        await sighup.close()
+
+    async def start() -> None:
+        await agent.start()
+        if settings.web.enabled:
+            web.start()
+
+    async def close() -> None:
         await web.close()
         await agent.close()
+
+    await serve(start, close, agent.reloader)
 
 
 def run(settings: Settings, load: Callable[[], Loaded] | None = None) -> int:
@@ -273,15 +270,4 @@ def run(settings: Settings, load: Callable[[], Loaded] | None = None) -> int:
     Raises:
         StartError: The agent cannot start on this machine with these settings.
     """
-    raise_file_limit()
-    sys.setswitchinterval(runtime_limits.THREAD_SWITCH)
-    cpus = os.sched_getaffinity(0)  # before the agent takes some for itself
-    requests = realtime.apply(settings.realtime)
-    try:
-        with asyncio.Runner(loop_factory=AgentLoop) as runner:
-            runner.run(_serve(settings, requests, load, cpus))
-    except OSError as error:
-        if is_shortage(error):
-            raise StartError(f"agent {settings.name}", "no file descriptors left", remedy()) from error
-        raise
-    return 0
+    return run_process(settings, lambda requests, cpus: _serve(settings, requests, load, cpus))

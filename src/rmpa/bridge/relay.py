@@ -13,7 +13,7 @@ show it. A module that is linked to the origin, or reaches it by a better relay,
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
@@ -29,6 +29,20 @@ if TYPE_CHECKING:
 
 Place = tuple[str, str]
 """A topic and the proxy that publishes it, by their local names."""
+
+
+OUTSIDE_GUID: Final = "0.0.0.0:0#1"
+"""The GUID of all origins outside the mesh: it is well-formed, but no module can have this address."""
+
+
+def is_outside(origin: Origin) -> bool:
+    """Whether an origin is not a module of this mesh, but what a gateway of it reaches."""
+    return origin.guid == OUTSIDE_GUID
+
+
+def service_place(service: str, node: str) -> Place:
+    """The place of a service, which differs from that of a topic of the same name."""
+    return f"service {service}", node
 
 
 class Relay:
@@ -81,6 +95,11 @@ class Relay:
         """Forget all sources that a peer offered."""
         for owner, source in [key for key in self._places if key[0] == peer]:
             self.gone(owner, source)
+
+    def source(self, place: Place) -> tuple[int, Source] | None:
+        """The peer that offers what is at a place, and its source, by the wire name; ``None`` if it is no proxy's."""
+        shown = self._origins.get(place)
+        return shown[:2] if shown is not None else None
 
     def origin(self, place: Place) -> Origin | None:
         """The origin to offer a proxy's topic with, this relay in its path; ``None`` if it is not relayed."""
@@ -138,6 +157,8 @@ class RelayPaths:
         self._may_relay = may_relay
         self.instance = ""
         """Our own, as 32 hexadecimal digits."""
+        self.reached_here: set[str] = set()
+        """Instances that this module reaches by itself, outside the mesh: a gateway's sites."""
         self._linked: dict[int, LinkedPeer] = {}
         self._origins: dict[str, _Origin] = {}
 
@@ -198,6 +219,8 @@ class RelayPaths:
             return "it is ours, and came back by a relay"
         if self.instance in origin.path:
             return "we passed it on ourselves"
+        if origin.instance in self.reached_here:
+            return f"{origin.name} is reached from here"
         if self._direct(origin):
             return f"{origin.name} has a link of its own"
         best = self._best(origin.instance)

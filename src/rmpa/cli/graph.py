@@ -21,14 +21,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class GraphName:
-    """A topic, service, node or resource as a user names it: ``/cmd``, or ``joystick:/cmd`` for one peer's."""
+    """A topic, service, node or resource as a user names it: ``/cmd``, or ``joystick:/cmd`` for one peer's.
+
+    A module of another site is the peer ``warehouse/arm``.
+    """
 
     name: str
     peer: str | None = None
 
     def matches(self, node: str) -> bool:
         """Whether what this local node (perhaps a proxy) offers is meant."""
-        return self.peer is None or proxied_peer(node) == self.peer
+        if self.peer is None or (proxy := proxied_node(node)) is None:
+            return self.peer is None
+        return proxy[0] == self.peer or ("/" in self.peer and "".join(proxy).startswith(f"{self.peer}/"))
 
     def contains(self, name: str, peers: Iterable[str | None]) -> bool:
         """Whether a name is in this namespace, and from the peer if one is named.

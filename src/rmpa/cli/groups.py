@@ -148,6 +148,22 @@ alarm: Final = _group(
     },
     _RESOURCE,
 )
+site: Final = _group(
+    "See other sites that gateways join, and values of modules that are off.",
+    {
+        "site": {
+            "list": "List this site and the others, and how they are.",
+            "info": "Show the modules of a site and what they offer.",
+            "last": "Print the last value of a topic that a site's gateway keeps, also if its module is off.",
+        }
+    },
+    """\
+\b
+Any module of a site can ask: the gateways that it is linked to answer.
+Parameters of another site's module: `rmpa param get --peer SITE/MODULE /name`.
+Why something does not come from a site: `rmpa why /name`.
+""",
+)
 trust: Final = _group(
     "Secure the mesh: who may join, and what other modules may do here.",
     {

@@ -91,17 +91,28 @@ def ask_peer(master: Master, wanted: GraphName, what: str, kind: type[_T]) -> _T
 
 
 def peers_nodes(master: Master, graph: Graph, peer: str | None) -> list[tuple[str | None, NodeLine]]:
-    """The nodes of all peers, or of one; without an agent, or an answer, only those that have a proxy here.
+    """The nodes of all peers, or of one; of those that no link leads to only those that have a proxy here.
+
+    Modules behind a relay and other sites have no link; without an agent, or an answer, there is none either.
 
     Raises:
-        RmpaError: The peer that was named is not linked.
+        RmpaError: The peer that was named is not linked, and has no proxy here.
     """
+    proxied = [proxied_node(node) for node in graph.nodes]
+    shown = [(one[0], NodeLine(name=one[1])) for one in proxied if one is not None and peer in (None, one[0])]
     if master.agent is None:
-        shown = [proxied_node(node) for node in graph.nodes]
-        return [(one[0], NodeLine(name=one[1])) for one in shown if one is not None and peer in (None, one[0])]
+        return list(shown)
     with ControlClient(master.agent, timeout=limits.CONTROL_HANDLER_TIMEOUT) as client:
-        told = client.call("node", tuple[PeerNodes, ...], what="node.list", peer=peer)
+        try:
+            told = client.call("node", tuple[PeerNodes, ...], what="node.list", peer=peer)
+        except PeerRefused:
+            if peer is None or not shown:
+                raise
+            told = ()
     for one in told:
         if one.problem:
             warn(f"{one.peer} does not tell its nodes, only those that stand here: {one.problem}")
-    return [(one.peer, line) for one in sorted(told, key=lambda one: one.peer) for line in one.nodes]
+    found: list[tuple[str | None, NodeLine]] = [(one.peer, line) for one in told for line in one.nodes]
+    asked = {one.peer for one in told}
+    found += [(name, line) for name, line in shown if name not in asked]
+    return sorted(found, key=lambda one: one[0] or "")

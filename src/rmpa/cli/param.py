@@ -22,7 +22,11 @@ from rmpa.observe.snapshot import FollowedInfo
 if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
-peer_option = click.option("--peer", metavar="PEER", help="The parameters of this peer's module (or its GUID).")
+peer_option = click.option(
+    "--peer",
+    metavar="PEER",
+    help="The parameters of this peer's module (or its GUID); SITE/MODULE: of another site's.",
+)
 
 
 def _json(value: Any) -> Any:

@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from rmpa.bridge.proxy_names import proxied_peer
+from rmpa.bridge.proxy_names import proxied_node, proxied_peer
+from rmpa.bridge.relay import OUTSIDE_GUID
 from rmpa.cli.graph import GraphName, read_graph, read_name
 from rmpa.cli.output import printable
 from rmpa.cli.stream import with_node
+from rmpa.config.gateway_rules import RESERVED_SITES
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.resource.run.descriptor import TOPIC, Descriptor
@@ -40,7 +42,7 @@ class SeenResource:
 
     Args:
         path: The name of its node, below which this module's graph has its topics: ``/sonar``.
-        peer: The peer that it runs at; ``None``: this module.
+        peer: The peer that it runs at, ``site/module`` for a module of another site; ``None``: this module.
         caller: The node that publishes its topics in this graph: its own, or a proxy.
         descriptor: Its published description.
     """
@@ -80,7 +82,7 @@ class ResourceGraph:
             own = [each for each in self.seen if each.peer is None] or list(self.seen)
             return _only(own, "say which resource is meant")
         wanted = read_name(text, "resource")
-        found = [s for s in self.seen if s.path == wanted.name and (wanted.peer is None or s.peer == wanted.peer)]
+        found = [s for s in self.seen if s.path == wanted.name and wanted.matches(s.caller)]
         if not found:
             near = did_you_mean(str(wanted), map(str, self.seen))
             remedy = f"did you mean {printable(near)}?" if near else "`rmpa resource list` shows all"
@@ -160,15 +162,29 @@ def run_with_resources(options: GraphOptions, body: Callable[[ResourceGraph], Aw
 async def with_resources(master: Master, body: Callable[[ResourceGraph], Awaitable[None]]) -> None:
     """Find all resources of a master's graph, and run ``body`` with them."""
     graph = await read_graph(master)
+    sites = await asyncio.to_thread(_sites, master)
 
     async def within(node: Node) -> None:
-        await body(ResourceGraph(node, graph, await find_resources(node, graph)))
+        await body(ResourceGraph(node, graph, await find_resources(node, graph, sites)))
 
     await with_node(master, _NODE, within)
 
 
-async def find_resources(node: Node, graph: Graph) -> tuple[SeenResource, ...]:
-    """All resources that publish a descriptor, this module's first."""
+def _sites(master: Master) -> frozenset[str]:
+    """The names of the other sites that a gateway joins, as the master's agent knows them."""
+    snapshot = master.snapshot(topics=())
+    peers = snapshot.peers if snapshot is not None else ()
+    return frozenset(peer.name for peer in peers if peer.guid == OUTSIDE_GUID) - frozenset(RESERVED_SITES)
+
+
+async def find_resources(node: Node, graph: Graph, sites: frozenset[str] = frozenset()) -> tuple[SeenResource, ...]:
+    """All resources that publish a descriptor, this module's first.
+
+    Args:
+        node: This command's own node.
+        graph: The master's graph.
+        sites: The names of other sites, whose modules are told apart.
+    """
     ending = f"/{TOPIC}"
     topics = {
         topic: set(nodes)
@@ -181,8 +197,16 @@ async def find_resources(node: Node, graph: Graph) -> tuple[SeenResource, ...]:
             descriptor = Descriptor.parse(str(received.message.data))
         except RmpaError:
             continue  # another program's topic of that name
-        found.append(SeenResource(topic.removesuffix(ending), proxied_peer(caller), caller, descriptor))
+        found.append(SeenResource(topic.removesuffix(ending), _peer(caller, sites), caller, descriptor))
     return tuple(sorted(found, key=lambda each: (each.peer or "", each.path)))
+
+
+def _peer(caller: str, sites: frozenset[str]) -> str | None:
+    """The peer whose node a proxy stands for; ``site/module`` if it is of another site."""
+    proxy = proxied_node(caller)
+    if proxy is None or proxy[0] not in sites:
+        return proxy[0] if proxy is not None else None
+    return f"{proxy[0]}/{proxy[1].split('/')[1]}"
 
 
 async def first_messages(

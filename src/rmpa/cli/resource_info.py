@@ -80,7 +80,8 @@ def _print_info(one: SeenResource, about: dict[str, Any]) -> None:
     if said.description:
         _line("Description", said.description)
     if one.peer is not None:
-        _line("Node", f"{said.node} of peer {one.peer}, by its proxy {one.caller}")
+        whose = "module" if "/" in one.peer else "peer"
+        _line("Node", f"{said.node} of {whose} {one.peer}, by its proxy {one.caller}")
     _line("State", about["state"] or "does not answer")
     _line("Profile", about["profile"] or "none runs")
     if said.contexts:

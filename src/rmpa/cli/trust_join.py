@@ -79,7 +79,7 @@ def invite(
 ) -> None:
     """Invite a module, at the authority: print a token that is valid once, and compare the code that both sides show.
 
-    The token goes to standard output, all else to standard error. Whoever has it may join: pass it on as a secret.
+    The token goes to standard output, all else to standard error. It lets its holder join: pass it on as a secret.
     """
     if module and (problem := peer_name_problem(module)):
         raise ConfigError("--module", problem)

@@ -8,17 +8,13 @@ import os
 import socket
 import sys
 from functools import partial
-from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.config.settings import SETTINGS
+from rmpa.cli.setting_options import config_option, setting_options
 from rmpa.config.sources import load_settings
 from rmpa.core.log import configure_logging
 from rmpa.runtime.log_writer import LogWriter
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 _log = logging.getLogger("rmpa.up")
 EPILOG = """\
@@ -39,25 +35,9 @@ Examples:
 """
 
 
-def _setting_options(command: Callable[..., int]) -> Callable[..., int]:
-    """An option for each setting that has one, in the order of their declarations."""
-    for setting in reversed([setting for setting in SETTINGS if setting.option]):
-        default = setting.shown_default or ("" if setting.is_switch or setting.is_list else str(setting.default))
-        shown = setting.help + (" Repeatable." if setting.is_list else "")
-        command = click.option(
-            setting.option,
-            is_flag=setting.is_switch,
-            default=None,
-            multiple=setting.is_list,
-            metavar=None if setting.is_switch else setting.type.metavar,
-            help=f"{shown} [default: {default}]" if default else shown,
-        )(command)
-    return command
-
-
 @click.command(epilog=EPILOG)
-@_setting_options
-@click.option("--config", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]")
+@setting_options("up")
+@config_option
 def up(**options: object) -> int:
     """Run this machine's agent: ROS core, discovery, mesh and bridge."""
     load = partial(load_settings, options, dict(os.environ), host_name=socket.gethostname())

@@ -32,12 +32,14 @@ SCHEMAS: Final[dict[Key, JsonSchema]] = {s.key: s.type.json_schema for s in SETT
 
 Each of ``LISTS`` is one: ``("contract",)`` has the list of all ``[[contract]]``.
 """
-LISTS: Final = {s.key[0]: tuple(s.type.json_schema["items"]["properties"]) for s in SETTINGS if s.is_list_of_tables}
-"""The tables that there may be many of (``[[contract]]``), and the keys that each may have."""
-_TOP: Final = tuple(dict.fromkeys(key[0] for key in SCHEMAS))
-"""The keys and tables of the file itself."""
-_TABLES: Final = {top: [key[1] for key in SCHEMAS if key[0] == top and len(key) > 1] for top in _TOP}
-"""By name: the keys of each table; none for a key that is not a table."""
+LISTS: Final = {s.key: tuple(s.type.json_schema["items"]["properties"]) for s in SETTINGS if s.is_list_of_tables}
+"""The tables that there may be many of (``("contract",)``), and the keys that each may have."""
+_TABLES: Final = {
+    key[:depth]: tuple(dict.fromkeys(other[depth] for other in SCHEMAS if other[:depth] == key[:depth]))
+    for key in SCHEMAS
+    for depth in range(len(key))
+}
+"""The keys and tables of each table; those of the file itself by ``()``."""
 
 
 def parse_config(data: bytes, path: Path | None) -> dict[Key, object]:
@@ -69,9 +71,7 @@ def parse_config(data: bytes, path: Path | None) -> dict[Key, object]:
     for place, value, types in _mistyped(table):
         problem, remedy = _type_mistake(place, value, types)
         raise ConfigError(dotted(place), problem, remedy, path, line_of(text, place))
-    return {
-        key: value_at(table, key) for key in SCHEMAS if key[0] in table and (len(key) == 1 or key[1] in table[key[0]])
-    }
+    return {key: value for key in SCHEMAS if (value := value_at(table, key)) is not None}
 
 
 def _parse_toml(text: str, path: Path | None) -> dict[str, Any]:
@@ -105,24 +105,23 @@ def dotted(place: Place) -> str:
 
 def _unknown(table: dict[str, Any]) -> Iterator[tuple[Place, str]]:
     """Unknown keys, each with what was probably meant."""
-    everywhere = [key for key in SCHEMAS if key[0] not in LISTS]
-    everywhere += [(name, key) for name, keys in LISTS.items() for key in keys]
-    for name, value in table.items():
-        if name not in _TOP:
-            yield (name,), _suggestion(name, (), everywhere, list(_TOP))
-        for place, inside, known in _tables_below(name, value):
-            for key in inside:
-                if key not in known:
-                    yield (*place, key), _suggestion(key, (name,), everywhere, list(known))
+    everywhere = [key for key in SCHEMAS if key not in LISTS]
+    everywhere += [(*name, key) for name, keys in LISTS.items() for key in keys]
+    for place, key_of_table, inside, known in _tables((), table):
+        for key in inside:
+            if key not in known:
+                yield (*place, key), _suggestion(key, key_of_table, everywhere, list(known))
 
 
-def _tables_below(name: str, value: object) -> Iterator[tuple[Place, dict[str, Any], Sequence[str]]]:
-    """The tables below one key of the file, each with its place and the keys that it may have."""
-    if isinstance(value, dict) and (known := _TABLES.get(name)):
-        yield (name,), value, known
-    for index, element in enumerate(value if name in LISTS and isinstance(value, list) else ()):
+def _tables(key: Key, value: object) -> Iterator[tuple[Place, Key, dict[str, Any], Sequence[str]]]:
+    """A key's table and those in it: the place, the key, the table, and the keys that it may have."""
+    if isinstance(value, dict) and (known := _TABLES.get(key)):
+        yield key, key, value, known
+        for name in value:
+            yield from _tables((*key, name), value[name])
+    for index, element in enumerate(value if key in LISTS and isinstance(value, list) else ()):
         if isinstance(element, dict):
-            yield (name, index), element, LISTS[name]
+            yield (*key, index), key, element, LISTS[key]
 
 
 def _suggestion(word: str, table: Key, everywhere: list[Key], here: list[str]) -> str:
@@ -143,19 +142,26 @@ def _suggestion(word: str, table: Key, everywhere: list[Key], here: list[str]) -
 def _home(key: Key) -> str:
     if len(key) == 1:
         return "above the first table"
-    return f"in a [[{key[0]}]]" if key[0] in LISTS else f"in [{key[0]}]"
+    table = ".".join(key[:-1])
+    return f"in a [[{table}]]" if key[:-1] in LISTS else f"in [{table}]"
 
 
 def _mistyped(table: dict[str, Any]) -> Iterator[tuple[Place, object, list[str]]]:
     """Values of a wrong type: place, value, and the types (in JSON Schema's words) that it may have."""
-    for name, value in table.items():
-        if not _TABLES[name]:
-            yield from _mismatches((name,), value, SCHEMAS[(name,)])
+    for place, value in _values((), table):
+        if place not in _TABLES:
+            yield from _mismatches(place, value, SCHEMAS[place])
         elif not isinstance(value, dict):
-            yield (name,), value, ["object"]
-        else:
-            for key, inner in value.items():
-                yield from _mismatches((name, key), inner, SCHEMAS[name, key])
+            yield place, value, ["object"]
+
+
+def _values(key: Key, value: object) -> Iterator[tuple[Key, object]]:
+    """Each value below a key that is not a table of settings; also what stands in the place of such a table."""
+    if key in _TABLES and isinstance(value, dict):
+        for name, inner in value.items():
+            yield from _values((*key, name), inner)
+    else:
+        yield key, value
 
 
 def _mismatches(place: Place, value: object, schema: JsonSchema) -> Iterator[tuple[Place, object, list[str]]]:
@@ -175,7 +181,7 @@ def _mismatches(place: Place, value: object, schema: JsonSchema) -> Iterator[tup
 
 def _type_mistake(place: Place, value: object, types: list[str]) -> tuple[str, str]:
     """The problem and the remedy for a value of a wrong type."""
-    if len(place) == 1 and place[0] in LISTS and isinstance(value, dict):
-        return "one table, where a list of them is expected", f"write [[{place[0]}]], in two brackets"
+    if place in LISTS and isinstance(value, dict):
+        return "one table, where a list of them is expected", f"write [[{dotted(place)}]], in two brackets"
     problem = f"{shown(value)} is not {' or '.join(_TYPES[name][1] for name in types)}"
     return problem, f'did you mean ["{value}"]?' if types == ["array"] and isinstance(value, str) else ""

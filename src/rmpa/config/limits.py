@@ -35,6 +35,14 @@ PERMISSION_RULES_MAX: Final = 4096
 """Tables ``[[permission]]`` in a file; each decision compares a name with all that are about one module."""
 GROUPS_MAX: Final = 256
 """Groups of modules in ``[trust.groups]``: as many as a large network has modules."""
+GATEWAY_RULES_MAX: Final = 1024
+"""Tables ``[[gateway.rule]]`` in a file; each source is compared with them in order."""
+GATEWAY_RANK_MAX: Final = 999
+"""Highest rank of a gateway: it has three digits in its liveliness token."""
+SITE_NAME_MAX: Final = 63
+"""Characters of a site's name, as for a module's name and for a label of DNS."""
+GATEWAY_BYTES_MAX: Final = 100_000_000_000
+"""Highest ``size`` of a ``[[gateway.rule]]`` in bytes a second: more than any network carries."""
 WEB_TOKENS_MAX: Final = 64
 """Tables ``[[web_token]]``: each request is compared with the token of each."""
 BOUND_MAX: Final = 1_000_000

@@ -12,6 +12,19 @@ from rmpa.config.values import BadValue, JsonSchema, ValueType, shown
 _QUANTITY: Final = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)\s*([a-zµ]*)")
 _SECONDS: Final = {"us": 1e6, "µs": 1e6, "ms": 1e3, "s": 1.0, "min": 1 / 60, "h": 1 / 3600}
 """By unit: so many of it are a second. Dividing by these rounds only once, so that ``"100 ms"`` is exactly 0.1."""
+_BYTES: Final = {
+    "b": 1.0,
+    "kb": 1e3,
+    "mb": 1e6,
+    "gb": 1e9,
+    "kib": 1024.0,
+    "mib": 1048576.0,
+    "kbit": 125.0,
+    "mbit": 125e3,
+    "gbit": 125e6,
+}
+"""By unit: so many bytes it is."""
+_FLOW: Final = re.compile(rf"([0-9]{{1,9}}(?:\.[0-9]{{1,9}})?)\s*({'|'.join(_BYTES)})(?:/s)?", re.IGNORECASE)
 _INFINITE: Final = "infinite"
 """ROS 2's own word for a duration without a bound; it lifts the bound that an earlier rule has set."""
 _UNLIMITED: Final = "unlimited"
@@ -84,6 +97,31 @@ def read_rate(raw: object) -> float | None:
     return rate
 
 
+def read_bytes_a_second(raw: object) -> int | None:
+    """Bytes a second as a number, or a text such as ``"100 KB/s"`` or ``"1 Mbit/s"``; ``"unlimited"`` is ``None``.
+
+    Raises:
+        BadValue: It is not such a quantity, or outside of the bounds in ``config.limits``.
+    """
+    example = 'a size is bytes a second as a number, or a text such as "100 KB/s" or "1 Mbit/s"'
+    if isinstance(raw, str):
+        text = raw.strip()
+        if text.lower() == _UNLIMITED:
+            return None
+        match = _FLOW.fullmatch(text)
+        if match is None:
+            raise BadValue(f"{raw!r} is not a number of bytes a second", example)
+        found = float(match[1]) * _BYTES[match[2].lower()]
+    else:
+        found = _number(raw, "a number of bytes a second", example)
+    if found == math.inf:
+        return None
+    if not 1 <= found <= limits.GATEWAY_BYTES_MAX:
+        bounds = f'a size is between 1 and {limits.GATEWAY_BYTES_MAX:,} bytes a second; "{_UNLIMITED}" is none at all'
+        raise BadValue(f"{shown(raw)} is out of range", bounds)
+    return int(found)
+
+
 def _seconds(raw: object, what: str) -> float:
     """A duration in seconds, before its bounds are checked."""
     example = f'{what} is seconds as a number, or a text such as "100 ms"'
@@ -124,3 +162,4 @@ def duration_of(what: str) -> ValueType[float | None]:
 OUTAGE: Final = ValueType(read_outage, _number_or_text(30, "5 min"))
 TIMEOUT: Final = ValueType(read_timeout, _number_or_text(60, "5 min"))
 RATE: Final = ValueType(read_rate, _number_or_text(10, "10 Hz", _UNLIMITED))
+BYTES_A_SECOND: Final = ValueType(read_bytes_a_second, _number_or_text(125_000, "100 KB/s", "1 Mbit/s", _UNLIMITED))

@@ -43,11 +43,10 @@ def json_schema() -> JsonSchema:
         entry = setting.type.json_schema | {"description": _plain(setting.help)}
         if not setting.is_list_of_tables and not setting.shown_default and setting.default != "":
             entry["default"] = json_value(setting.default)
-        if len(setting.key) == 1:
-            properties[setting.key[0]] = entry
-        else:
-            table = properties.setdefault(setting.key[0], _table(setting.key[0]))
-            table["properties"][setting.key[1]] = entry
+        inside = properties
+        for depth, name in enumerate(setting.key[:-1], 1):
+            inside = inside.setdefault(name, _table(".".join(setting.key[:depth])))["properties"]
+        inside[setting.key[-1]] = entry
     return {
         "$schema": "http://json-schema.org/draft-07/schema#",
         "title": "rmpa.toml",
@@ -77,7 +76,7 @@ def settings_tables() -> str:
     """The reference of all settings in Markdown: a heading and a table for each table of the file."""
     parts: list[str] = []
     for name in ("", *TABLES):
-        rows = [s for s in SETTINGS if not s.is_list_of_tables and "".join(s.key[:-1]) == name and s.key]
+        rows = [s for s in SETTINGS if not s.is_list_of_tables and ".".join(s.key[:-1]) == name and s.key]
         title, text = (f"## `[{name}]`", TABLES[name]) if name else ("## Above the first table", "")
         parts += [title, text, _markdown(_setting_rows(rows))]
     for setting in SETTINGS:

@@ -5,7 +5,8 @@
     port: int = setting(0, PORT_OR_ANY, "The mesh's port.", key="mesh.port", env="RMPA_PORT", option="--port")
 
 From this line follow the typed field with its default, the key of ``rmpa.toml`` and the check of its type, the
-environment variable, the option of ``rmpa up``, the row of docs/settings.md and the entry of the JSON Schema.
+environment variable, the option of ``rmpa up`` or ``rmpa gateway``, the row of docs/settings.md and the entry of the
+JSON Schema.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ class _Declaration:
     option: str
     shown_default: str
     live: bool
+    command: str
 
 
 def setting(
@@ -47,6 +49,7 @@ def setting(
     option: str = "",
     shown_default: str = "",
     live: bool = False,
+    command: str = "up",
 ) -> _T:
     """Declare a setting: the right-hand side of a field of a settings dataclass.
 
@@ -56,11 +59,12 @@ def setting(
         help: What it does, in one or two sentences: for ``--help``, the documentation and editors.
         key: Its key in ``rmpa.toml``, with dots; by default the field's name in its table; empty: not in the file.
         env: Its environment variable; empty: none.
-        option: Its option of ``rmpa up`` (``--port``, ``--realtime/--no-realtime``); empty: none.
+        option: Its option of ``command`` (``--port``, ``--realtime/--no-realtime``); empty: none.
         shown_default: What the documentation says instead of the default.
         live: Whether ``rmpa reload`` applies a change; else it needs a restart. True for all of a live table.
+        command: The command of ``rmpa`` that has the option: ``up``, or ``gateway``, which has those of ``up`` too.
     """
-    declared = _Declaration(value_type, help, key, env, option, shown_default, live)
+    declared = _Declaration(value_type, help, key, env, option, shown_default, live, command)
     made: _T = field(default=default, metadata={_SETTING: declared})
     return made
 
@@ -70,7 +74,7 @@ def table(kind: type[_T], name: str, *, live: bool = False) -> _T:
 
     Args:
         kind: The dataclass.
-        name: Its table in ``rmpa.toml``.
+        name: Its table in ``rmpa.toml``, with dots for one in another (``gateway.ros2``).
         live: Whether ``rmpa reload`` applies changes in it.
     """
     made: _T = field(default_factory=kind, metadata={_TABLE: (kind, name, live)})
@@ -91,6 +95,7 @@ class Setting:
         option: Its option, as click declares it; may be empty.
         shown_default: What the documentation says instead of the default; may be empty.
         live: Whether ``rmpa reload`` applies a change.
+        command: The command that has the option.
     """
 
     path: tuple[str, ...]
@@ -102,6 +107,7 @@ class Setting:
     option: str
     shown_default: str
     live: bool
+    command: str
 
     @property
     def name(self) -> str:
@@ -112,7 +118,7 @@ class Setting:
     def title(self) -> str:
         """Its name for users: ``core.port``, ``[[contract]]``, or the variable if it is not in the file."""
         if self.is_list_of_tables:
-            return f"[[{self.key[0]}]]"
+            return f"[[{'.'.join(self.key)}]]"
         return ".".join(self.key) or self.env
 
     @property
@@ -166,5 +172,14 @@ def settings_of(
             dotted = f"{table_name}.{item.name}".removeprefix(".") if it.key is None else it.key
             key = tuple(dotted.split(".")) if dotted else ()
             yield Setting(
-                where, it.type, it.help, item.default, key, it.env, it.option, it.shown_default, live or it.live
+                where,
+                it.type,
+                it.help,
+                item.default,
+                key,
+                it.env,
+                it.option,
+                it.shown_default,
+                live or it.live,
+                it.command,
             )

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.config import limits
 from rmpa.config.contract_rules import CONTRACT_RULES
+from rmpa.config.gateway_rules import CrossingRule, GatewaySettings, Ros2Settings
 from rmpa.config.param_rules import PARAM_RULES, FollowRule
 from rmpa.config.peer_rules import PEER_RULES, PeerRule, Remap
 from rmpa.config.permission_rules import (
@@ -64,7 +65,9 @@ if TYPE_CHECKING:
 __all__ = [
     "SETTINGS",
     "TABLES",
+    "CrossingRule",
     "FollowRule",
+    "GatewaySettings",
     "HostPort",
     "LaneSettings",
     "LimitSettings",
@@ -77,6 +80,7 @@ __all__ = [
     "PolicySettings",
     "RealtimeSettings",
     "Remap",
+    "Ros2Settings",
     "ServiceRule",
     "ServiceSettings",
     "Settings",
@@ -465,6 +469,7 @@ class Settings:
         live=True,
     )
     trust: TrustSettings = table(TrustSettings, "trust")
+    gateway: GatewaySettings = table(GatewaySettings, "gateway")
     relay: bool = setting(
         False,
         BOOL,
@@ -542,8 +547,10 @@ TABLES: Final = {
     "realtime": "What the agent asks the kernel for.",
     "web": "Where the module's state is served over HTTP (docs/web.md).",
     "trust": "What the modules of a secured mesh may do here (docs/design/trust.md).",
+    "gateway": "The other sites that rmpa gateway joins (docs/sites.md); the options are those of rmpa gateway.",
+    "gateway.ros2": "The ROS 2 graph that rmpa gateway joins (docs/ros2.md).",
     "relay": "Whether this module joins networks that are not routed to each other.",
     "control": "Who on this machine may use the agent's control socket, which the commands ask.",
     "log": "What the log says, and how.",
 }
-"""The tables of ``rmpa.toml``, each with its description."""
+"""The tables of ``rmpa.toml``, each with its description; ``gateway.ros2`` is one in another."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from ipaddress import AddressValueError, IPv4Address
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 from urllib.parse import urlsplit
 
 from rmpa.config.contract_rules import contract_warnings
@@ -92,6 +92,9 @@ class Given:
 
 _Layer = dict[str, Given]
 """The raw values of one source, by the setting's name."""
+_Tree = dict[str, Any]
+"""Values by key; those of a table are a dictionary again."""
+_Table = TypeVar("_Table")
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,14 +155,22 @@ def load_settings(
 
 def _assemble(values: Mapping[str, object], path: Path | None) -> Settings:
     """The settings with these values, by name; those in a table (``realtime.cpus``) are set in its dataclass."""
-    settings = Settings(config_file=path)
-    tables: dict[str, dict[str, object]] = {}
+    tree: _Tree = {}
     for name, value in values.items():
-        table, _, key = name.rpartition(".")
-        tables.setdefault(table, {})[key] = value
-    found = tables.pop("", {})
-    found |= {table: replace(getattr(settings, table), **inner) for table, inner in tables.items()}
-    return replace(settings, **found)  # type: ignore[arg-type] # each value is of the type that its setting declares
+        *tables, key = name.split(".")
+        inner = tree
+        for table in tables:
+            inner = inner.setdefault(table, {})
+        inner[key] = value
+    return _with(Settings(config_file=path), tree)
+
+
+def _with(table: _Table, tree: _Tree) -> _Table:
+    """A dataclass of settings with other values; a dictionary among them is one of its tables."""
+    values = {
+        key: _with(getattr(table, key), value) if isinstance(value, dict) else value for key, value in tree.items()
+    }
+    return replace(table, **values)  # type: ignore[type-var] # each is a dataclass, each value of its setting's type
 
 
 def _check_together(settings: Settings, given: _Layer) -> None:

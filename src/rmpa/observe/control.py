@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import msgspec
 
@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from rmpa.core.yielding import Yielder
 
 _T = TypeVar("_T")
+ROLE: Final = "role"
+"""The operation that only an agent with another role than a module's serves; its value names that."""
+GATEWAY_ROLE: Final = "gateway"
+"""The role of the agent in ``rmpa gateway``."""
 
 
 def _parse(line: bytes, type_: type[_T], what: str, most: int) -> _T:

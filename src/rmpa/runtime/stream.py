@@ -1,9 +1,8 @@
 """A connected TCP socket on the data path: one growing read buffer, one ``sendmsg`` a write, a bounded outbox.
 
-asyncio's transports join or copy the bytes that cannot be sent at once, and have no bound with a drop policy. A
-``Stream`` queues them in a ``core.outbox.Outbox``, and needs one system call for each message in each direction. A
-large message can be sent in parts while it is still being received (``open`` and ``extend``). Messages that arrived
-in one read are sent in one write (*corking*, as TCP_CORK does).
+asyncio's transports join or copy what cannot be sent at once, and have no bound with a drop policy. A ``Stream``
+queues it in an ``Outbox``, and needs one system call for each message. A large message can be sent in parts while it
+is received (``open``, ``extend``). Messages of one read are sent in one write (*corking*, as TCP_CORK does).
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import math
 import socket
 import sys
 import termios
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final, cast
 
 from rmpa.core import limits as core_limits
@@ -45,6 +44,20 @@ OnClose = Callable[[Exception | None], None]
 
 _corked: list[Stream] | None = None
 """The streams that collect messages for one write while the bytes of a read are handled; see ``Stream.send``."""
+
+
+@contextlib.contextmanager
+def collected_sends() -> Iterator[None]:
+    """Collect the messages that are sent within, whose parts must not change until the end: one write a stream."""
+    global _corked  # noqa: PLW0603 - one loop, one thread
+    outer, corked = _corked, list[Stream]()
+    _corked = corked
+    try:
+        yield
+    finally:
+        for stream in corked:
+            stream._uncork()  # noqa: SLF001 - of this module
+        _corked = outer
 
 
 class Stream:
@@ -271,8 +284,7 @@ class Stream:
         """
         if self._closed or self._finishing or parcel.dropped:
             return 0
-        view = memoryview(data)
-        dropped = 0
+        view, dropped = memoryview(data), 0
         while len(view) > _PART:
             dropped += self._extend(parcel, view[:_PART])
             view = view[_PART:]
@@ -518,17 +530,14 @@ class Stream:
 
     def _deliver(self) -> None:
         global _corked  # noqa: PLW0603 - one loop, one thread: one read at a time
-        outer = _corked
-        # A few bytes are one or two messages, which are sent at once unless an outer read collects messages.
-        corked: list[Stream] = []
+        outer, corked = _corked, list[Stream]()
+        # A few bytes are one or two messages, sent at once unless an outer read collects.
         _corked = corked if self._filled > _CORK_ABOVE or outer is not None else None
         try:
             consumed, wanted = self._on_bytes(self._view[: self._filled])
-        except RemoteProtocolError as error:
-            self._lost(error)
-            return
         except Exception as error:  # noqa: BLE001 - a callback's top: else the same bytes would be offered for ever
-            _log.error("! a reader of bytes failed; its connection is closed", exc_info=error)
+            if not isinstance(error, RemoteProtocolError):
+                _log.error("! a reader of bytes failed; its connection is closed", exc_info=error)
             self._lost(error)
             return
         finally:

@@ -12,7 +12,7 @@ import pytest
 
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, StartError, UnreachableError
 from rmpa.observe import limits
-from rmpa.observe.control import ControlReply
+from rmpa.observe.control import GATEWAY_ROLE, ROLE, ControlReply
 from rmpa.observe.io.control_client import ControlClient, choose_agent, find_agents, same_core
 from rmpa.observe.io.control_server import ControlServer, Handler
 from rmpa.observe.snapshot import PingReply, Snapshot
@@ -233,6 +233,11 @@ async def test_choosing_an_agent(server: ControlServer, place: Path) -> None:
     assert await choose(RMPA_AGENT="second") == "second"
     assert await choose(ROS_MASTER_URI="http://localhost:11312") == "second"
     await second.close()
+    gateway = ControlServer(place, "gate", {"snapshot": lambda _: moved, ROLE: lambda _: GATEWAY_ROLE})
+    await gateway.start()
+    assert await choose() == "base", "a gateway beside the agent is asked only by its name"
+    assert await choose("gate") == "gate"
+    await gateway.close()
 
 
 def test_no_agent_at_all(place: Path) -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.ros import limits
+from rmpa.ros.node.accepted_connection import AcceptedConnection
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.tcpros_server import TcprosServer
 from rmpa.ros.wire.tcpros import TopicDescription, frame_message
@@ -205,6 +206,7 @@ async def test_a_wildcard_is_never_described(held: Owner) -> None:
 async def test_tcp_nodelay_is_honoured_on_our_socket(known: Owner, asked: str, given: int) -> None:
     link = await known.subscriber(tcp_nodelay=asked)
     (inbound,) = known.publication._open
+    assert isinstance(inbound, AcceptedConnection)
     assert inbound._sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) == given
     link.close()
 
@@ -223,6 +225,7 @@ async def test_junk_from_a_subscriber_is_read_away(known: Owner) -> None:
     for _ in range(40):
         await link.send(b"j" * 100_000)
     (inbound,) = known.publication._open
+    assert isinstance(inbound, AcceptedConnection)
     await until(lambda: inbound.stream.bytes_in > 4_000_000)
     assert len(inbound.stream._buffer) <= 1 << 18
     known.publication.publish_framed(frame_message(b"still here"))
@@ -320,6 +323,7 @@ async def test_what_was_published_can_be_waited_for(known: Owner) -> None:
 async def test_a_machine_that_was_switched_off_is_noticed_by_the_kernel(known: Owner) -> None:
     link = await known.subscriber()
     (inbound,) = known.publication._open
+    assert isinstance(inbound, AcceptedConnection)
     for level, option, value in (
         (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1),
         (socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 60),
@@ -557,7 +561,9 @@ async def test_contract_depth_bounds_each_subscribers_queue() -> None:
     late = await owner.subscriber(callerid="/late", buffer=4096)
     for _ in range(100):
         owner.publication.publish_framed(frame_message(bytes(200_000)))
-    assert all(link.dropped > 50 and link.stream.outbox.pending_entries <= 4 for link in owner.publication._open)
+    links = [link for link in owner.publication._open if isinstance(link, AcceptedConnection)]
+    assert len(links) == 2
+    assert all(link.dropped > 50 and link.stream.outbox.pending_entries <= 4 for link in links)
     owner.publication.bound(10**6)
     assert owner.publication._queue_messages == limits.SUBSCRIBER_QUEUE_MESSAGES
     early.close()

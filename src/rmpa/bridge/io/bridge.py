@@ -105,6 +105,7 @@ class Bridge:
             rng=rng,
             counters=self.counters,
             gate=self.gate,
+            find=self.proxy_nodes.publication,
         )
         self.add(self.topics)
         self._reconciler: asyncio.TimerHandle | None = None

@@ -4,8 +4,9 @@ Sans-I/O, like ``bridge.topics.imports`` for topics. The driver passes in the pe
 local graph, and the services that local nodes want to call; it gets back actions.
 
 A graph has one provider of each service, so one of several is shown: a local one always, else that of the peer with
-the lowest GUID. The others are hidden, with the reason, and one of them is shown when the first one leaves. Each
-service of each peer is in one state of this table::
+the lowest GUID, and one that a gateway reaches outside the mesh only if there is no other. The others are hidden,
+with the reason, and one of them is shown when the first one leaves. Each service of each peer is in one state of this
+table::
 
     idle ──wanted──► opening ──opened──► open
       ▲                 │ closed, 5 s      │ closed, withdrawn, link down, released
@@ -36,7 +37,7 @@ from rmpa.bridge.messages import (
     is_crossing_name,
 )
 from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
-from rmpa.bridge.relay import LinkedPeer, RelayPaths
+from rmpa.bridge.relay import LinkedPeer, RelayPaths, is_outside
 from rmpa.bridge.services.exports import ServiceAbout
 from rmpa.bridge.services.remote_service import TRANSITIONS, RemoteService, ServiceRouteState
 from rmpa.config.permission_rules import Access
@@ -164,6 +165,11 @@ class ServiceImports:
         """A peer's service by its name here; ``None`` if the peer offers none of this name."""
         return self._claims.get(service, {}).get(peer)
 
+    def shown(self, service: str) -> tuple[int, RemoteService] | None:
+        """The peer's service that is in the local graph by this name."""
+        claims = self._claims.get(service, {})
+        return next(((peer, remote) for peer, remote in claims.items() if remote.shown), None)
+
     def peer_name(self, peer: int) -> str:
         """The name of a peer, for texts."""
         found = self._peers.get(peer)
@@ -209,6 +215,14 @@ class ServiceImports:
         Call after ``gone``. A relay may still reach the peer itself, or modules that the peer relayed.
         """
         return self._choose_of(self.ways.unlinked(peer))
+
+    def reached_here(self, instance: str, *, reached: bool) -> list[ImportAction]:
+        """Set whether this module reaches another one outside the mesh; what relays bring of that one is hidden."""
+        if reached:
+            self.ways.reached_here.add(instance)
+        else:
+            self.ways.reached_here.discard(instance)
+        return self._choose_of((instance,))
 
     def _choose_of(self, instances: Collection[str]) -> list[ImportAction]:
         """Choose again among the services of these modules: another path to them may be the best now."""
@@ -408,7 +422,7 @@ class ServiceImports:
         new: tuple[int, RemoteService] | None = None
         left: list[_ServiceImportPeer] = []
         actions: list[ImportAction] = []
-        for number in sorted(claims, key=lambda number: (self._peers[number].rank, number)):
+        for number in sorted(claims, key=lambda number: self._preference(number, claims[number])):
             remote = claims[number]
             nodes = self._peers[number].nodes
             objection = self._objection(service, number, remote)
@@ -432,6 +446,10 @@ class ServiceImports:
             actions.append(Provide(number, service, remote.node))
         # Only now: the services that this chooses could take the place that was found free above.
         return actions + [action for known in left for action in self._next_in(known)]
+
+    def _preference(self, number: int, remote: RemoteService) -> tuple[bool, int, int]:
+        """Sorts the claims to a name: modules of this mesh before what gateways reach, then by GUID."""
+        return remote.origin is not None and is_outside(remote.origin), self._peers[number].rank, number
 
     def _objection(self, service: str, number: int, remote: RemoteService) -> str | None:
         origin = remote.origin

@@ -78,6 +78,10 @@ class PeerSessions:
             session.proxies.names[node] = self._namespaces.relayed_name(origin)
         return session.proxies.name(node)
 
+    def reserved_name(self, origin: Origin) -> str:
+        """The name of the proxy of a node that this module reaches outside the mesh; its namespace stays reserved."""
+        return self._namespaces.relayed_name(origin, reserve=True)
+
     # --- links ---------------------------------------------------------------------------------------------------
 
     def link_up(self, link: PeerLink) -> None:

@@ -22,6 +22,8 @@ class ProxyNamespaces:
         """The module's instance and its namespace, by the session's number."""
         self._relayed: dict[str, str] = {}
         """The namespace of each relayed module, by its instance."""
+        self._reserved: set[str] = set()
+        """The instances whose namespaces are kept while they have no proxy."""
 
     def add(self, peer: int, identity: Identity) -> str:
         """Return the namespace of a peer, which is reserved until ``remove``."""
@@ -34,8 +36,15 @@ class ProxyNamespaces:
         """Release the namespace of a peer that is gone for good."""
         self._linked.pop(peer, None)
 
-    def relayed_name(self, origin: Origin) -> str:
-        """The name of a relayed node's proxy, made by the same rules as for linked modules."""
+    def relayed_name(self, origin: Origin, *, reserve: bool = False) -> str:
+        """The name of a relayed node's proxy, made by the same rules as for linked modules.
+
+        Args:
+            origin: Its module and node.
+            reserve: Whether the namespace is kept for good.
+        """
+        if reserve:
+            self._reserved.add(origin.instance)
         prefix = self._relayed.get(origin.instance)
         if prefix is None:
             module = Identity(Guid.parse(origin.guid), bytes.fromhex(origin.instance), origin.name)
@@ -47,7 +56,7 @@ class ProxyNamespaces:
         self._relayed = {
             instance: prefix
             for instance, prefix in self._relayed.items()
-            if any(name.startswith(f"{prefix}/") for name in names)
+            if instance in self._reserved or any(name.startswith(f"{prefix}/") for name in names)
         }
 
     def _taken(self, instance: str) -> set[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from typing import TYPE_CHECKING, Final
+from weakref import WeakValueDictionary
 
 from rmpa.core.errors import StartError
 from rmpa.ros.environment import is_loopback
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
     from rmpa.core.counters import Counters
     from rmpa.ros.core.api import Core
+    from rmpa.ros.node.publication import Publication
     from rmpa.ros.wire.xmlrpc import RosReply
 
 _log = logging.getLogger(__name__)
@@ -38,6 +40,8 @@ class ProxyNodes:
         self._core = core
         self._counters = counters
         self._listener: SharedListener | None = None
+        self._made: WeakValueDictionary[str, SlaveNode] = WeakValueDictionary()
+        """The last node of each name."""
         self.listening = ""
         """How the proxies listen, as text: at which ports, or why each has two sockets of its own."""
 
@@ -81,7 +85,7 @@ class ProxyNodes:
         if self._listener is None:
             with DESCRIPTORS.open_socket(Use.PROXY, what=f"the proxy {name}"):
                 pass  # only checks that there is room for its sockets, and for connections to them
-        return SlaveNode(
+        node = self._made[name] = SlaveNode(
             name,
             self._core.node_host,
             self._core.uri,
@@ -90,3 +94,15 @@ class ProxyNodes:
             counters=self._counters,
             on_kill=on_kill,
         )
+        return node
+
+    def publication(self, name: str, uri: str, topic: str) -> Publication | None:
+        """The topic of a proxy of this process, for subscribers of this process; ``None`` if there is none.
+
+        Args:
+            name: The proxy.
+            uri: Its slave API, which tells it from an earlier proxy of that name.
+            topic: The topic.
+        """
+        node = self._made.get(name)
+        return node.publication(topic) if node is not None and node.uri == uri else None

@@ -309,6 +309,14 @@ class Imports:
         """Call after ``link_down``: other relays may now bring the peer's sources, and those that it relayed."""
         return self._ways_changed(self.ways.unlinked(peer))
 
+    def reached_here(self, instance: str, *, reached: bool) -> list[Action]:
+        """Set whether this module reaches another one outside the mesh; what relays bring of that one is hidden."""
+        if reached:
+            self.ways.reached_here.add(instance)
+        else:
+            self.ways.reached_here.discard(instance)
+        return self._ways_changed((instance,))
+
     def _ways_changed(self, instances: Collection[str]) -> list[Action]:
         """Judges sources of modules whose path may have changed; shown ones first, so that their names get free."""
         touched = [

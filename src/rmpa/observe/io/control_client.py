@@ -14,7 +14,7 @@ import msgspec
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.core.sizes import KIB
 from rmpa.observe import limits
-from rmpa.observe.control import ControlReply, ControlRequest
+from rmpa.observe.control import GATEWAY_ROLE, ROLE, ControlReply, ControlRequest
 from rmpa.observe.io.runtime_dir import runtime_dir, runtime_dirs
 from rmpa.observe.snapshot import Snapshot
 
@@ -174,7 +174,7 @@ def find_agents(environ: Mapping[str, str]) -> list[FoundAgent]:
 
 
 def choose_agent(environ: Mapping[str, str], name: str | None = None) -> FoundAgent:
-    """The named agent; else that of RMPA_AGENT, the only running one, or the one whose core is ROS_MASTER_URI.
+    """The named agent; else that of RMPA_AGENT, the only one, that of ROS_MASTER_URI, the only one but gateways.
 
     Raises:
         UnreachableError: No agent runs, or none of that name.
@@ -200,7 +200,17 @@ def choose_agent(environ: Mapping[str, str], name: str | None = None) -> FoundAg
         with contextlib.suppress(RmpaError), ControlClient(agent.path) as client:
             if same_core(client.snapshot().agent.core_uri, uri):
                 return agent
+    modules = [agent for agent in agents if not _is_gateway(agent)]
+    if len(modules) == 1:
+        return modules[0]
     raise RmpaError(f"several agents run on this machine: {listed}; name one with --agent NAME or RMPA_AGENT")
+
+
+def _is_gateway(agent: FoundAgent) -> bool:
+    """Whether it is the agent of ``rmpa gateway``; others refuse the question."""
+    with contextlib.suppress(RmpaError), ControlClient(agent.path, timeout=limits.CONTROL_LOOK_TIMEOUT) as client:
+        return client.call(ROLE, str) == GATEWAY_ROLE
+    return False
 
 
 def same_core(one: str, other: str) -> bool:

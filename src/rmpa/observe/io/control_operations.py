@@ -20,8 +20,10 @@ from rmpa.observe import limits
 from rmpa.observe.contract_term import ContractTerm
 from rmpa.observe.graph_changes import GraphRevision
 from rmpa.observe.io.agent_requests import INFO as AGENT_INFO
+from rmpa.observe.io.site_requests import PARAM as SITE_PARAM
 from rmpa.observe.peer_agent import PeerAgent
 from rmpa.observe.reload_reply import ReloadReply
+from rmpa.observe.sites import read_site_module
 from rmpa.observe.snapshot import FollowedInfo, PingReply, Snapshot
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.node_info import NodeLine, PeerNodes
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.observe.io.control_server import Handler
     from rmpa.observe.io.graph_revision import GraphRevisions
+    from rmpa.observe.io.site_requests import SiteRequests
     from rmpa.observe.io.snapshot_builder import SnapshotBuilder
     from rmpa.observe.why.io.why import WhyService
 
@@ -62,6 +65,7 @@ class ControlOperations:
         graph: Counts the changes of the local graph.
         trust: Answers the commands of ``rmpa trust``.
         nodes: Knows the nodes of this module.
+        sites: Answers questions about other sites.
     """
 
     def __init__(
@@ -75,6 +79,7 @@ class ControlOperations:
         graph: GraphRevisions,
         trust: TrustCommands,
         nodes: NodeRequests,
+        sites: SiteRequests,
     ) -> None:
         self._name = name
         self._bridge = bridge
@@ -85,6 +90,7 @@ class ControlOperations:
         self._graph = graph
         self._trust = trust
         self._nodes = nodes
+        self._sites = sites
 
     def handlers(self) -> dict[str, Handler]:
         """The handler of each operation, for ``ControlServer``."""
@@ -127,10 +133,17 @@ class ControlOperations:
         return await self._reload(check=args.get("check") is True)
 
     async def param(self, args: Args) -> Any:
-        """Pass a request about parameters on to a peer: ``peer``, ``what`` and the ``args`` of that request."""
+        """Pass a request about parameters on to a peer: ``peer``, ``what`` and the ``args`` of that request.
+
+        A peer ``site/module`` is a module of another site, which a gateway asks.
+        """
         what, inner = _request(args, PARAM_REQUESTS), args.get("args")
         if not isinstance(inner, dict):
             raise ConfigError("args", f"{inner!r} is no table")
+        if "/" in (peer := str(args.get("peer", ""))):
+            site, module = read_site_module(peer)
+            asked = {"site": site, "module": module, "what": what, "args": inner}
+            return await self._sites.one(SITE_PARAM, asked)
         session = self._session(args.get("peer", ""))
         return await self._bridge.rpc.request(session, what, inner, bridge_limits.PARAM_ASK_TIMEOUT)
 
@@ -194,6 +207,10 @@ class ControlOperations:
     async def trust(self, args: Args) -> object:
         """``what``: the command, with its own arguments."""
         return await self._trust.answer_command(args)
+
+    async def site(self, args: Args) -> Any:
+        """The arguments of ``SiteRequests.answer``."""
+        return await self._sites.answer(args)
 
     def _session(self, name: object) -> PeerSession:
         """The linked peer of a name or GUID.
@@ -265,6 +282,7 @@ OPERATIONS: Final = (
     Operation("trust", ControlOperations.trust, object),  # TrustStatus, or as the command says (trust.status)
     Operation("agent", ControlOperations.agent, PeerAgent),
     Operation("contract", ControlOperations.contract, dict[str, ContractTerm]),
+    Operation("site", ControlOperations.site, object),  # as the questions of observe.io.site_requests say
     Operation("node", ControlOperations.node, object),  # tuple[PeerNodes, ...] for lists, else as REPLIES says
 )
 """All operations of the control socket."""

@@ -71,6 +71,10 @@ class ControlServer:
         self._clients: set[asyncio.Task[None]] = set()
         self.path = place / f"{name}.sock"
 
+    def add(self, handlers: Mapping[str, Handler]) -> None:
+        """Serve more operations, before ``start()``."""
+        self._handlers = {**self._handlers, **handlers}
+
     def lock(self) -> None:
         """Lock the name, before anything else of the agent starts; else ``start()`` does it."""
         if self._lock is None:

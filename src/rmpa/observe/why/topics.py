@@ -14,6 +14,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits as bridge_limits
+from rmpa.bridge.relay import OUTSIDE_GUID
 from rmpa.config import limits as config_limits
 from rmpa.config.permission_rules import Access
 from rmpa.config.values import did_you_mean
@@ -70,7 +71,10 @@ def peer_stages(snapshot: Snapshot, name: str) -> tuple[Check, ...]:
         remedy = "; ".join(filter(None, remedies)) or "give each module a --name and an address of its own"
         return (Check("peer", FAIL, "; ".join(texts), remedy),)
     if peer.state == "relayed":
-        heard = Check("peer", OK, f"{peer.name} is known ({peer.guid})")
+        outside = peer.guid == OUTSIDE_GUID
+        heard = Check(
+            "peer", OK, f"{peer.name} is another site" if outside else f"{peer.name} is known ({peer.guid})"
+        )
         return (heard, Check("link", OK, f"no link of its own; {peer.via} passes on what it publishes"))
     found = Check("peer", OK, f"{peer.name} is known, by {peer.source or 'its link'} ({peer.guid})")
     if peer.state != "linked" or peer.link is None:

@@ -37,7 +37,7 @@ def read_contract(where: str, terms: Mapping[str, object]) -> Contract:
     Raises:
         ConfigError: A key is unknown or a value is invalid; ``where`` begins the error's text.
     """
-    known = [key for key in LISTS["contract"] if key not in ("topics", "types")]
+    known = [key for key in LISTS["contract",] if key not in ("topics", "types")]
     for term in terms:
         if term not in known:
             near = did_you_mean(term, known)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import deque
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from rmpa.ros import limits
 from rmpa.ros.wire.slave_api import OUTBOUND, BusConnection
@@ -21,8 +21,11 @@ if TYPE_CHECKING:
 
     from rmpa.core.outbox import QueuedMessage
     from rmpa.ros.node.accepted_connection import AcceptedConnection
+    from rmpa.ros.node.in_process import InProcessSubscriber
     from rmpa.ros.wire.tcpros import Buffer
     from rmpa.ros.wire.xmlrpc import RosReply
+
+    SubscriberConnection: TypeAlias = AcceptedConnection | InProcessSubscriber
 
 _log = logging.getLogger(__name__)
 
@@ -83,10 +86,10 @@ class Publication:
         """Latched messages that a subscriber has had by another path, by its caller id."""
         self._queue_messages = queue_messages
         self._queue_bytes = queue_bytes
-        self._held: tuple[AcceptedConnection, ...] = ()
-        self._open: tuple[AcceptedConnection, ...] = ()
+        self._held: tuple[SubscriberConnection, ...] = ()
+        self._open: tuple[SubscriberConnection, ...] = ()
         self._latched: deque[bytes] = deque(maxlen=1)
-        self._partial: list[tuple[AcceptedConnection, QueuedMessage]] = []
+        self._partial: list[tuple[SubscriberConnection, QueuedMessage]] = []
         self._whole: bytearray | None = None
         self._size = self._left = 0
         self._dropped_before = 0
@@ -142,7 +145,7 @@ class Publication:
             for connection in (*self._open, *self._held)
         ]
 
-    def attach(self, connection: AcceptedConnection) -> None:
+    def attach(self, connection: SubscriberConnection) -> None:
         """Take over a connection whose header names this topic: serve it, hold it, or refuse it."""
         problem = check_subscriber(connection.fields, self.topic, self.caller_id, self._description)
         if problem is not None:
@@ -174,7 +177,7 @@ class Publication:
         """
         before = self.subscribers
         reply = publisher_header(self.topic, self.caller_id, description)
-        old: tuple[AcceptedConnection, ...] = ()
+        old: tuple[SubscriberConnection, ...] = ()
         if self._reply and self._reply != reply:
             self._latched.clear()
             old, self._open = self._open, ()
@@ -315,7 +318,7 @@ class Publication:
         self._partial = []
         self._whole = None
 
-    def _serve(self, connection: AcceptedConnection) -> None:
+    def _serve(self, connection: SubscriberConnection) -> None:
         _log.debug(
             "> %s: serves subscriber %s at %s", self.topic, printable(connection.caller_id), connection.peer[0]
         )
@@ -328,15 +331,15 @@ class Publication:
             self._open += (connection,)
             self._on_listeners()
 
-    def _refuse(self, connection: AcceptedConnection, text: str) -> None:
+    def _refuse(self, connection: SubscriberConnection, text: str) -> None:
         _log.debug("! %s: refuses subscriber %s: %s", self.topic, printable(connection.caller_id), text)
         connection.refuse(text)
         self._on_mismatch(connection.fields, text)
 
-    def _count_dropped(self, connection: AcceptedConnection) -> None:
+    def _count_dropped(self, connection: SubscriberConnection) -> None:
         self._dropped_before += connection.dropped
 
-    def _gone(self, connection: AcceptedConnection, error: Exception | None) -> None:
+    def _gone(self, connection: SubscriberConnection, error: Exception | None) -> None:
         _log.debug("< %s: subscriber %s is gone (%s)", self.topic, printable(connection.caller_id), error or "closed")
         before = self.subscribers
         self._count_dropped(connection)

@@ -18,6 +18,7 @@ from rmpa.ros.wire.xmlrpc import RosFault
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Sequence
 
+    from rmpa.ros.node.in_process import InProcessConnection
     from rmpa.ros.node.publication import Publication
     from rmpa.ros.node.service_server import ServiceEndpoint
     from rmpa.ros.node.shared_listener import SharedListener
@@ -72,7 +73,7 @@ class SlaveNode:
         on_param_update: Callable[[str, XmlRpcValue], bool] = _not_followed,
         on_publisher_update: Callable[[str, Sequence[str]], None] = _ignore,
         on_kill: Callable[[str, str], Awaitable[RosReply]] | None = None,
-        taps: Callable[[], Iterable[PublisherConnection]] = tuple,
+        taps: Callable[[], Iterable[PublisherConnection | InProcessConnection]] = tuple,
     ) -> None:
         self.name = name
         self.counters = counters if counters is not None else Counters()
@@ -154,6 +155,10 @@ class SlaveNode:
         if publication.topic in self._publications:
             raise ValueError(f"{self.name} publishes {publication.topic} already")
         self._publications[publication.topic] = publication
+
+    def publication(self, topic: str) -> Publication | None:
+        """A topic that is served; ``None`` if it is not."""
+        return self._publications.get(topic)
 
     def remove_publication(self, topic: str) -> None:
         """Stop serving a topic and close its connections; nothing happens if it is not served."""

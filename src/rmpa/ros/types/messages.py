@@ -95,6 +95,11 @@ class MessageType:
         """The fields, in order."""
         return self._specifications[self.name].fields
 
+    @property
+    def specifications(self) -> Mapping[str, Specification]:
+        """The type and all that it embeds, by name."""
+        return self._specifications
+
     def serialize(self, message: object) -> bytes:
         """Serialize a message object, without a length in front.
 

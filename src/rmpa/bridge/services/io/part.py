@@ -27,6 +27,7 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.naming import Names
 from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.policy import Policy, is_own
+from rmpa.bridge.relay import service_place
 from rmpa.bridge.services.exports import ExportAction, LocalService, ServiceAbout, ServiceExports
 from rmpa.bridge.services.imports import (
     EndedService,
@@ -54,7 +55,7 @@ from rmpa.ros.wire.tcpros import printable
 from rmpa.runtime.event_loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from rmpa.bridge.messages import Message
     from rmpa.bridge.relay import Relay
@@ -140,6 +141,8 @@ class Services(Part):
         """The outbound plan; read by snapshots too."""
         self.imports = ServiceImports(rules, self._limit_settings, gate)
         """The inbound plan; read by snapshots too."""
+        self.make_room: Callable[[str], None] = lambda _: None
+        """Called with a service whose name a node has already: a gateway's node of another site leaves it."""
         self._budgets: dict[int, Budgets] = {}
         self._shown: dict[tuple[int, str], ShownService] = {}
         self._callers: dict[tuple[int, int], ShownService] = {}
@@ -191,6 +194,10 @@ class Services(Part):
     def served(self) -> Mapping[str, CallStats]:
         """Counts and latencies of the peers' calls, by service of this module."""
         return self._serving.stats
+
+    def reached_here(self, instance: str, *, reached: bool) -> None:
+        """Set whether this module reaches another one outside the mesh; see ``ServiceImports.reached_here``."""
+        self._act(self.imports.reached_here(instance, reached=reached))
 
     def reload(self, settings: Settings) -> None:
         """Apply other settings."""
@@ -357,7 +364,7 @@ class Services(Part):
     def _to_relay(self, service: str, providers: Mapping[str, str]) -> LocalService | None:
         """The server of a service that is relayed for another module; ``None`` if there is none."""
         for node, uri in providers.items():
-            if (origin := self._relay.origin(_relayed(service, node))) is not None:
+            if (origin := self._relay.origin(service_place(service, node))) is not None:
                 return LocalService(node, uri, origin)
         return None
 
@@ -395,7 +402,7 @@ class Services(Part):
         remote = self.imports.get(action.peer, action.service)
         origin = remote.origin if remote is not None else None
         name = self._sessions.proxy_name(session, action.node, origin)
-        source, place = Source(f"service {action.service}", action.node), _relayed(action.service, name)
+        source, place = Source(f"service {action.service}", action.node), service_place(action.service, name)
         self._relay.pass_on(session.peer, session.link.identity, source, place, origin)
         shown = self._shown[action.peer, action.service] = ShownService(
             action.peer, action.service, action.node, self.imports.peer_name(action.peer)
@@ -425,12 +432,16 @@ class Services(Part):
         return shown.proxy.service_uri if shown is not None and shown.proxy is not None else ""
 
     def _register(self, shown: ShownService, proxy: SlaveNode) -> None:
-        providers = self._core.state().services.get(shown.service, {})
-        if any(node != proxy.name for node in providers):
+        if self._is_taken(shown, proxy):
+            self.make_room(shown.service)
+        if self._is_taken(shown, proxy):
             return  # another node was first: the scan hides this service, or did so already
         code, status, _ = self._core.call("registerService", proxy.name, shown.service, proxy.service_uri, proxy.uri)
         if code != 1:
             _log.error("! the local core does not take %s of %s: %s", shown.service, proxy.name, status)
+
+    def _is_taken(self, shown: ShownService, proxy: SlaveNode) -> bool:
+        return any(node != proxy.name for node in self._core.state().services.get(shown.service, {}))
 
     def _withdraw(self, action: Withdraw) -> None:
         self._relay.gone(action.peer, Source(f"service {action.service}", action.node))
@@ -534,11 +545,6 @@ class Services(Part):
     def _told_of_mismatch(self, session: PeerSession, args: dict[str, Any]) -> None:
         text = printable(str(args.get("text", ""))[: limits.CONTROL_TEXT_MAX])
         self._driver.warn("service.mismatch_remote", session.link.name, f"{session.link.name}: {text}")
-
-
-def _relayed(service: str, node: str) -> tuple[str, str]:
-    """The key of a service in ``Relay``, which also holds topics: a topic may have the same name."""
-    return f"service {service}", node
 
 
 def _description(about: ServiceAbout) -> ServiceDescription:

@@ -15,6 +15,7 @@ from rmpa.bridge.policy import OWN_NODE
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.serial_number import is_later, serial_add
 from rmpa.mesh.resume_table import ResumeTable
+from rmpa.ros.node.in_process import InProcessConnection
 from rmpa.ros.node.subscription import PublisherConnection
 from rmpa.ros.wire.tcpros import TopicDescription as TcprosDescription
 from rmpa.runtime.descriptors import DESCRIPTORS
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.data.io.route_sender import DataLink, RouteSender
     from rmpa.bridge.data.losses import Missed
     from rmpa.ros.core.api import Core
+    from rmpa.ros.node.publication import Publication
     from rmpa.ros.node.slave_node import SlaveNode
 
 _log = logging.getLogger(__name__)
@@ -47,6 +49,8 @@ class LocalSubscriptions:
         on_missed: Called with a source, a peer, the number of messages that it has missed, and the reason.
         on_oversized: Called with a source and its flow when a message that is too long was left out.
         on_malformed: Called with a source and a text when its publisher breaks TCPROS; ``on_lost`` follows.
+        find: ``(node, slave API, topic)``: the topic of a proxy of this process, which is subscribed to without a
+            socket; ``None`` for others.
     """
 
     def __init__(
@@ -61,14 +65,16 @@ class LocalSubscriptions:
         on_missed: Callable[[Source, int, int, str], None],
         on_oversized: Callable[[Source, ExportFlow], None],
         on_malformed: Callable[[Source, str], None],
+        find: Callable[[str, str, str], Publication | None] = lambda *_: None,
     ) -> None:
+        self._find = find
         self._on_malformed = on_malformed
         self._on_oversized = on_oversized
         self._core = core
         self._node = node
         self._on_described = on_described
         self._on_lost = on_lost
-        self._connections: dict[Source, PublisherConnection] = {}
+        self._connections: dict[Source, PublisherConnection | InProcessConnection] = {}
         self._flows: dict[Source, ExportFlow] = {}
         self._senders: dict[tuple[int, int], RouteSender] = {}
         self._parked: ResumeTable[tuple[int, Source]] = ResumeTable()
@@ -88,7 +94,7 @@ class LocalSubscriptions:
         return self._flows
 
     @property
-    def connections(self) -> Iterable[PublisherConnection]:
+    def connections(self) -> Iterable[PublisherConnection | InProcessConnection]:
         """The connections to local publishers."""
         return self._connections.values()
 
@@ -99,9 +105,29 @@ class LocalSubscriptions:
         if sum(s.topic == source.topic for s in self._flows) == 1:
             self._core.call("registerSubscriber", OWN_NODE, source.topic, "*", self._node.uri)
         _log.debug("> subscribe to %s at %s", source, action.uri)
+        connection = self._connections[source] = self._connection(source, action.uri, flow)
+        connection.start()
+
+    def _connection(self, source: Source, uri: str, flow: ExportFlow) -> PublisherConnection | InProcessConnection:
+        """A connection to a publisher, without a socket if it is a proxy of this process."""
+        connection: PublisherConnection | InProcessConnection
+        if self._find(source.node, uri, source.topic) is not None:
+            connection = InProcessConnection(
+                source.topic,
+                uri,
+                OWN_NODE,
+                lambda: self._find(source.node, uri, source.topic),
+                on_message=flow.message,
+                on_parts=flow,
+                on_header=lambda fields: self._header(source, fields),
+                on_refused=lambda text: self._gone(source, connection, f"its publisher refuses: {text}"),
+                on_lost=lambda reason: self._gone(source, connection, reason),
+                number=self._node.next_number(),
+            )
+            return connection
         connection = PublisherConnection(
             source.topic,
-            action.uri,
+            uri,
             OWN_NODE,
             on_message=flow.message,
             on_parts=flow,
@@ -111,8 +137,7 @@ class LocalSubscriptions:
             on_oversized=lambda size: self._left_out(source, flow, size),
             number=self._node.next_number(),
         )
-        self._connections[source] = connection
-        connection.start()
+        return connection
 
     def disconnect(self, source: Source) -> None:
         """Disconnect one publisher, and drop its routes."""
@@ -274,7 +299,7 @@ class LocalSubscriptions:
         flow.left_out(size)
         self._on_oversized(source, flow)
 
-    def _gone(self, source: Source, connection: PublisherConnection, reason: str) -> None:
+    def _gone(self, source: Source, connection: PublisherConnection | InProcessConnection, reason: str) -> None:
         if self._connections.get(source) is not connection:
             return
         self._connections.pop(source).close()

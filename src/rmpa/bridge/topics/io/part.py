@@ -65,6 +65,7 @@ if TYPE_CHECKING:
     from rmpa.core.counters import Counters
     from rmpa.core.identity import Identity
     from rmpa.ros.core.api import Core
+    from rmpa.ros.node.publication import Publication
     from rmpa.ros.node.slave_node import SlaveNode
 
 _log = logging.getLogger(__name__)
@@ -86,6 +87,7 @@ class Topics(Part):
         rng: Uniform numbers in [0, 1) for back-off jitter.
         counters: Counts what happens, by name.
         gate: Decides what each peer may do.
+        find: ``(node, slave API, topic)``: the topic of a proxy of this process; see ``LocalSubscriptions``.
     """
 
     advertisement = "advertise"
@@ -105,6 +107,7 @@ class Topics(Part):
         rng: Callable[[], float],
         counters: Counters,
         gate: PermissionGate = OPEN_GATE,
+        find: Callable[[str, str, str], Publication | None] = lambda *_: None,
     ) -> None:
         self._core = core
         self._sessions = sessions
@@ -127,6 +130,7 @@ class Topics(Part):
             on_malformed=lambda source, text: self._driver.warn(
                 "publisher.malformed", str(source), f"{source}: {text}"
             ),
+            find=find,
         )
         """The subscriptions to local publishers, and the routes to the peers."""
         self.exports = Exports(policy, contracts, names, limit_settings, self.outbound, gate)
@@ -205,6 +209,10 @@ class Topics(Part):
         self._claims_timer.close()
         self._subscribers.close()
         self.outbound.close()
+
+    def reached_here(self, instance: str, *, reached: bool) -> None:
+        """Set whether this module reaches another one outside the mesh; see ``Imports.reached_here``."""
+        self._act(self.imports.reached_here(instance, reached=reached))
 
     def reload(self, settings: Settings) -> None:
         """Takes new settings; sources and routes that they do not change go on untouched."""

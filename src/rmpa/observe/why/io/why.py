@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import msgspec
@@ -14,6 +15,7 @@ from rmpa.core.names import is_global_name
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, Check
 from rmpa.observe.io.agent_requests import INFO as AGENT_INFO
+from rmpa.observe.io.site_requests import WHY as WHY_SITES
 from rmpa.observe.peer_agent import PeerAgent
 from rmpa.observe.why.diagnosis import PERMISSION_THERE, BothEnds, Diagnosis, TopicAtPublisher, without_rules
 from rmpa.observe.why.direct_stages import connected_directly
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.services.io.part import Services
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import Settings
+    from rmpa.observe.io.site_requests import SiteRequests
     from rmpa.observe.io.snapshot_builder import SnapshotBuilder
     from rmpa.observe.snapshot import PeerInfo
     from rmpa.ros.core.api import Core
@@ -53,12 +56,21 @@ class WhyService:
         bridge: Its bridge.
         services: The bridge's part for services.
         snapshots: Its snapshots.
+        sites: Asks gateways for the ways through them.
     """
 
     def __init__(
-        self, settings: Settings, core: Core, bridge: Bridge, services: Services, snapshots: SnapshotBuilder
+        self,
+        settings: Settings,
+        core: Core,
+        bridge: Bridge,
+        services: Services,
+        snapshots: SnapshotBuilder,
+        sites: SiteRequests,
     ) -> None:
         self._core = core
+        self._name = settings.name
+        self._sites = sites
         self._bridge = bridge
         self._snapshots = snapshots
         self._topics = TopicEvidence(settings, core, bridge, snapshots)
@@ -89,17 +101,44 @@ class WhyService:
         if not isinstance(name, str) or not is_global_name(name):
             raise ConfigError("name", f"{name!r} is not a topic, nor a service", "write /name, or PEER:/name")
         wanted = str(peer) if peer is not None else None
-        if args.get("service") is True or self._is_service(name):
+        service = args.get("service") is True
+        if (
+            wanted is not None
+            and "/" in wanted
+            and (ways := await self._through_gateways(name, wanted, service=service))
+        ):
+            return ways
+        # At once: a peer whose agent hangs holds up both.
+        found, ways = await asyncio.gather(
+            self._in_the_mesh(name, wanted, service=service), self._through_gateways(name, wanted, service=service)
+        )
+        if any(diagnosis.peer != self._name for diagnosis in ways):
+            # "No peer publishes it" is not the answer where another site does, or would.
+            found = tuple(diagnosis for diagnosis in found if diagnosis.node or diagnosis.flows)
+        return (*found, *ways)
+
+    async def _through_gateways(self, name: str, peer: str | None, *, service: bool) -> tuple[Diagnosis, ...]:
+        """The ways from other sites and to them: ``peer`` is a site, or a site and a module of it."""
+        site, _, module = (peer or "").partition("/")
+        asked = {"name": name, "site": site, "module": module, "asker": self._name, "service": service}
+        found: list[Diagnosis] = []
+        for answer in await self._sites.all(WHY_SITES, asked):
+            with contextlib.suppress(msgspec.ValidationError):  # of another release
+                found += msgspec.convert(answer, tuple[Diagnosis, ...])
+        return tuple(found)
+
+    async def _in_the_mesh(self, name: str, wanted: str | None, *, service: bool) -> tuple[Diagnosis, ...]:
+        if service or self._is_service(name):
             return await self._service(name, wanted)
         found = await (self._everywhere(name) if wanted is None else self._one(wanted, name))
         failed = found[0].failed
         if failed is not None and failed.name in _NO_PUBLISHER and not found[0].node:
             # No topic has this name anywhere; a service that does not cross may have it.
-            service = await self._service(name, wanted)
-            if any(diagnosis.node for diagnosis in service):
-                return service
+            calls = await self._service(name, wanted)
+            if any(diagnosis.node for diagnosis in calls):
+                return calls
             # Whether there is a topic or a service of this name is not told to those who may not have it.
-            return (*found, *(diagnosis for diagnosis in service if _is_denied(diagnosis)))
+            return (*found, *(diagnosis for diagnosis in calls if _is_denied(diagnosis)))
         return found
 
     async def _module(self, name: str) -> Diagnosis:
@@ -174,7 +213,7 @@ class WhyService:
             text, remedy = "no peer is linked that it could go to", "`rmpa peer list` tells of the peers"
             return Diagnosis.of((Check("peer", FAIL, text, remedy),), name=topic, peer=here, to="")
         state = self._core.state()
-        similar = await asyncio.to_thread(did_you_mean, topic, {*state.publishers, *state.subscribers})
+        similar = await asyncio.to_thread(did_you_mean, topic, {*state.publishers, *state.subscribers} - {topic})
         if awaited := self._topics.awaited(topic):
             text = f"{', '.join(awaited)} published {topic} before this agent was restarted, and does not answer"
             remedy = "it is asked again by itself; is that program stopped or stuck? Else start it again"

@@ -1,4 +1,4 @@
-// All topics, and one of them: who sends it to whom, how fast, how late, what is lost, and what is in it.
+// All topics, and one of them: which node sends it to which, how fast, how late, what is lost, and what is in it.
 
 import { html, useState } from "../vendor/htm-preact.js";
 import { bandwidth, clock, count, hertz, seconds } from "../format.js";

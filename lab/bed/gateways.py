@@ -1,0 +1,153 @@
+"""``rmpa gateway`` as a user starts it, and two sites behind NAT that a router joins.
+
+::
+
+     arm ──┐ 10.77.1.0/24                                   10.77.1.0/24 ┌── base
+     more ─┼─ switch ── NAT ── 10.77.0.0/24 ── fleet ── NAT ── switch ───┼─ more
+     gateway┘  "warehouse"                    (router)          "yard"   └ gateway
+
+Both sites have the same addresses, as sites behind NAT do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from lab.bed.agents import Agent
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from contextlib import ExitStack
+    from pathlib import Path
+
+    from lab.bed.namespaces import Host, Lab
+
+ROUTER_PORT: Final = 7447
+"""Zenoh's usual port."""
+SUBNET: Final = 1
+"""The third byte of the addresses at every site."""
+
+
+@dataclass
+class GatewayProcess(Agent):
+    """One ``rmpa gateway`` and the commands against it; ``flags`` are its options, the rest is as of ``Agent``."""
+
+    @property
+    def command(self) -> list[str]:
+        """The command of rmpa that it runs; a gateway's core has any free port."""
+        return ["gateway"]
+
+
+@dataclass(frozen=True, slots=True)
+class SiteNetwork:
+    """One site's network.
+
+    Args:
+        name: The site's.
+        network: Its number in the lab.
+        nat: Its router; cable 1 is the uplink.
+    """
+
+    name: str
+    network: int
+    nat: Host
+
+    def host(self, lab: Lab, name: str) -> Host:
+        """A new host at this site."""
+        made = lab.host(name, self.network)
+        lab.route(made, self.nat)
+        return made
+
+    def cut(self) -> None:
+        """Pull the uplink out."""
+        self.nat.cut(1)
+
+    def restore(self) -> None:
+        """Put it in again."""
+        self.nat.restore(1)
+
+
+def site_networks(lab: Lab, *names: str) -> tuple[Host, list[SiteNetwork]]:
+    """The host of the router in the outer network (number 0), and a network behind NAT for each name."""
+    fleet = lab.host("fleet", 0)
+    sites = []
+    for number, name in enumerate(names, 1):
+        lab.network(number, subnet=SUBNET)
+        sites.append(SiteNetwork(name, number, lab.nat(f"nat{number}", number, 0)))
+    return fleet, sites
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """One site with one module and one gateway, each on a host of its own."""
+
+    network: SiteNetwork
+    module: Agent
+    gateway: GatewayProcess
+
+    @property
+    def name(self) -> str:
+        """The site's name."""
+        return self.network.name
+
+
+class JoinedSites:
+    """Sites behind NAT and the router that joins them; all of it ends with ``stack``.
+
+    Args:
+        lab: Empty.
+        home: Existing directory for logs and configurations.
+        stack: Ends the processes.
+        modules: The module of each site by the site's name.
+        log_level: Of every agent and gateway.
+        config: Text of every gateway's ``rmpa.toml``.
+    """
+
+    def __init__(
+        self,
+        lab: Lab,
+        home: Path,
+        stack: ExitStack,
+        modules: Mapping[str, str],
+        *,
+        log_level: str = "debug",
+        config: str = "",
+    ) -> None:
+        self._lab, self._home, self._stack, self._level = lab, home, stack, log_level
+        self._config = config
+        self.fleet, networks = site_networks(lab, *modules)
+        self.router = GatewayProcess(
+            self.fleet, home, name="fleet", log_level=log_level, flags=["--router", *self._listen, "--insecure"]
+        )
+        started: list[Agent] = [self.router]
+        self.sites: list[Site] = []
+        for network, module in zip(networks, modules.values(), strict=True):
+            agent = Agent(network.host(lab, module), home, name=module, log_level=log_level)
+            gateway = self._gateway(network, f"{network.name}_gateway")
+            self.sites.append(Site(network, agent, gateway))
+            started += [agent, gateway]
+        for agent in started:
+            self._start(agent)
+        for agent in started:
+            agent.wait_ready()
+
+    @property
+    def _listen(self) -> list[str]:
+        return ["--listen", f"tcp/0.0.0.0:{ROUTER_PORT}"]
+
+    def second_gateway(self, site: Site, rank: int = 200) -> GatewayProcess:
+        """One more gateway at a site; ready when this returns."""
+        made = self._gateway(site.network, f"{site.name}_second", ["--rank", str(rank)])
+        self._start(made)
+        made.wait_ready()
+        return made
+
+    def _gateway(self, network: SiteNetwork, name: str, flags: Sequence[str] = ()) -> GatewayProcess:
+        flags = ["--site", network.name, "--connect", f"tcp/{self.fleet.address}:{ROUTER_PORT}", "--insecure", *flags]
+        host = network.host(self._lab, name)
+        return GatewayProcess(host, self._home, name=name, log_level=self._level, flags=flags, config=self._config)
+
+    def _start(self, agent: Agent) -> None:
+        self._stack.enter_context(agent)
+        agent.start()

@@ -1,0 +1,83 @@
+"""The process of an agent: its signals, its readiness, and the limits that it sets for itself."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import signal
+import sys
+from typing import TYPE_CHECKING
+
+from rmpa.agent.reload import SighupHandler
+from rmpa.core.errors import StartError
+from rmpa.core.open_files import remedy
+from rmpa.runtime import limits as runtime_limits
+from rmpa.runtime import realtime
+from rmpa.runtime.descriptors import is_shortage, raise_file_limit
+from rmpa.runtime.event_loop import AgentLoop
+from rmpa.runtime.service_manager import notify_service_manager
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Collection, Coroutine
+
+    from rmpa.agent.reload import Reloader
+    from rmpa.config.settings import Settings
+
+_log = logging.getLogger(__name__)
+
+
+async def serve(
+    start: Callable[[], Awaitable[None]], close: Callable[[], Awaitable[None]], reloader: Reloader
+) -> None:
+    """Start, run until SIGINT or SIGTERM, and close; systemd is notified.
+
+    Args:
+        start: Starts everything; after an exception nothing is left running.
+        close: Closes everything.
+        reloader: Reads the settings again at SIGHUP.
+    """
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    loop.set_default_executor(realtime.worker_pool())
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop.set)
+    sighup = SighupHandler(reloader, stop.set)
+    await start()
+    sighup.start()
+    try:
+        notify_service_manager("READY=1")
+        await stop.wait()
+        notify_service_manager("STOPPING=1")
+        _log.info("= ending")
+    finally:
+        await sighup.close()
+        await close()
+
+
+def run_process(
+    settings: Settings,
+    main: Callable[[tuple[realtime.SchedulingRequest, ...], Collection[int]], Coroutine[None, None, None]],
+) -> int:
+    """Run the event loop of a process with an agent; return the exit code.
+
+    Args:
+        settings: The agent's settings.
+        main: ``(requests, cpus)``: the outcome of each request of ``--realtime``, and the CPUs that the process had
+            before.
+
+    Raises:
+        StartError: The agent cannot start on this machine with these settings.
+    """
+    raise_file_limit()
+    sys.setswitchinterval(runtime_limits.THREAD_SWITCH)
+    cpus = os.sched_getaffinity(0)  # before the agent takes some for itself
+    requests = realtime.apply(settings.realtime)
+    try:
+        with asyncio.Runner(loop_factory=AgentLoop) as runner:
+            runner.run(main(requests, cpus))
+    except OSError as error:
+        if is_shortage(error):
+            raise StartError(f"agent {settings.name}", "no file descriptors left", remedy()) from error
+        raise
+    return 0

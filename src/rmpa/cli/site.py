@@ -1,0 +1,305 @@
+"""``rmpa site list|info|last``: other sites that gateways join."""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import TYPE_CHECKING, Final, TypeVar
+
+import click
+import msgspec
+
+from rmpa.cli.options import agent_option, json_option
+from rmpa.cli.output import Column, duration, print_json, print_line, print_table, printable, size, warn
+from rmpa.config.values import did_you_mean
+from rmpa.core.errors import ConfigError, PeerRefused, RemoteProtocolError, RmpaError
+from rmpa.core.names import is_legal_name
+from rmpa.observe import limits
+from rmpa.observe.io.control_client import ControlClient, choose_agent
+from rmpa.observe.io.site_requests import BODY, INFO, LAST, REPORT
+from rmpa.observe.sites import LastValueInfo, SitesReport, ValuePortion, read_site_module
+
+if TYPE_CHECKING:
+    from rmpa.observe.sites import SiteInfo
+    from rmpa.ros.types.messages import Plain
+
+_T = TypeVar("_T")
+_COLOURS: Final = {"this site": "green", "joined": "green", "no gateway": "yellow", "unreachable": "red"}
+_COLUMNS: Final = (
+    *map(Column, ("SITE", "STATE")),
+    *(Column(title, right=True) for title in ("SINCE", "GATEWAYS", "MODULES", "SOURCES", "SHOWN")),
+    Column("BY"),
+)
+_MODULES: Final = (Column("  MODULE"), *(Column(title, right=True) for title in ("TOPICS", "SERVICES", "SHOWN")))
+_SOURCES: Final = tuple(map(Column, ("  NAME", "KIND", "TYPE", "MODULE", "NODE", "HERE")))
+_VALUES: Final = (
+    *map(Column, ("  TOPIC", "TYPE", "MODULE", "NODE")),
+    *(Column(t, right=True) for t in ("SIZE", "AGE")),
+)
+
+name_option = click.option("--name", metavar="GATEWAY", help="Ask this gateway of this machine, not --agent's.")
+
+
+def _connect(agent: str | None, name: str | None) -> ControlClient:
+    return ControlClient(choose_agent(os.environ, name or agent).path, timeout=limits.CONTROL_HANDLER_TIMEOUT)
+
+
+def _ask(client: ControlClient, what: str, kind: type[_T], **args: object) -> _T:
+    try:
+        value: object = client.call("site", object, what=what, args=args)
+    except PeerRefused as error:
+        raise RmpaError(error.reason) from None  # the agent only passes on what a gateway says
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        raise RemoteProtocolError(f"the gateway answers in another way: {error}; is it another version?") from None
+
+
+@click.command(
+    "list",
+    epilog="""\
+\b
+Exit codes: 0 each site is joined; 1 one is not, or no gateway answers.
+
+\b
+Examples:
+  rmpa site list
+  rmpa site list --name store-gateway
+  rmpa site list --json | jq -r '.[].sites[].name'
+""",
+)
+@json_option
+@agent_option
+@name_option
+def list_(as_json: bool, agent: str | None, name: str | None) -> int:
+    """List this site and the others that its gateways join.
+
+    SOURCES are the topics (one for each publisher) and services that a site offers, SHOWN those that are in the
+    graph here. BY is the gateway that was asked; one that stands by shows nothing.
+    """
+    with _connect(agent, name) as client:
+        reports = _ask(client, REPORT, tuple[SitesReport, ...])
+    if as_json:
+        print_json(reports)
+    elif not reports:
+        _no_gateway(client.name)
+    else:
+        rows = [(report, site) for report in reports for site in report.sites]
+        print_table(
+            _COLUMNS,
+            [_row(report, site) for report, site in rows],
+            colours=[_COLOURS.get(s.state, "") for _, s in rows],
+        )
+        for report in reports:
+            if report.problem:
+                warn(f"{report.gateway}: {report.problem}")
+            if not any(site.state != "this site" for site in report.sites):
+                warn(f"{report.gateway} of site {report.site} knows no other site{_where(report)}")
+    well = all(s.state in ("this site", "joined") for report in reports for s in report.sites)
+    return 0 if reports and well and not any(report.problem for report in reports) else 1
+
+
+def _no_gateway(agent: str) -> None:
+    warn(f"{agent} is no gateway, and is linked to none: start one with `rmpa gateway --site NAME`")
+
+
+def _where(report: SitesReport) -> str:
+    if report.endpoints:
+        return f": it is connected to {', '.join(report.endpoints)}, where no other gateway is"
+    return ": it is connected to nothing; is the router of gateway.connect there?"
+
+
+def _row(report: SitesReport, site: SiteInfo) -> list[str]:
+    sources = sum(module.topics + module.services for module in site.modules)
+    shown = sum(module.shown for module in site.modules)
+    return [
+        site.name,
+        site.state,
+        duration(site.since_ago),
+        str(site.gateways),
+        str(len({module.name for module in site.modules})),
+        str(sources),
+        str(shown),
+        report.gateway + ("" if report.leads else " (stands by)"),
+    ]
+
+
+@click.command(
+    epilog="""\
+\b
+Exit codes: 0 the site is joined, or this one; 1 it is not there, or not known.
+
+\b
+Examples:
+  rmpa site info warehouse
+  rmpa site info warehouse --json | jq '.sites[0].sources[] | select(.here == "")'
+"""
+)
+@click.argument("site")
+@json_option
+@agent_option
+@name_option
+def info(site: str, as_json: bool, agent: str | None, name: str | None) -> int:
+    """Show the modules of SITE, what they offer, its name here, and why something does not cross.
+
+    Of this module's own site the last values that its gateway keeps are shown too.
+    """
+    with _connect(agent, name) as client:
+        report = _ask(client, INFO, SitesReport, site=site)
+    found = next((each for each in report.sites if each.name == site), None)
+    if found is None:
+        raise RmpaError(_unknown(report, site))
+    if as_json:
+        print_json(report)
+    else:
+        _show(report, found)
+    return 0 if found.state in ("this site", "joined") else 1
+
+
+def _unknown(report: SitesReport, site: str) -> str:
+    known = [each.name for each in report.sites]
+    near = did_you_mean(site, known)
+    return f"{report.gateway} knows no site {printable(site)!r}; " + (
+        f"did you mean {near}?" if near else f"known are {', '.join(known)}"
+    )
+
+
+def _show(report: SitesReport, site: SiteInfo) -> None:
+    since = f" for {duration(site.since_ago)}" if site.since_ago is not None else ""
+    facts = [
+        ("Site", site.name),
+        ("State", site.state + since),
+        ("Gateways", str(site.gateways)),
+        ("Seen by", f"{report.gateway} of site {report.site}" + ("" if report.leads else ", which stands by")),
+        ("Connected", ", ".join(report.endpoints) or "to nothing"),
+    ]
+    if site.not_shown:
+        facts.append(("Kept out", f"{site.not_shown} topics and services, by rules or for their names"))
+    if site.beyond:
+        facts.append(("Limit", f"{site.beyond} topics and services were left out: the site has too many"))
+    for label, text in facts:
+        print_line(f"{label + ':':<10} {text}")
+    if site.modules:
+        click.echo("\nModules:")
+        rows = [[f"  {m.name}", str(m.topics), str(m.services), str(m.shown)] for m in site.modules]
+        print_table(_MODULES, rows)
+    if site.sources:
+        click.echo("\nTopics and services:")
+        print_table(
+            _SOURCES, [[f"  {s.name}", s.kind, s.type, s.module, s.node, s.here or "-"] for s in site.sources]
+        )
+    if site.values:
+        click.echo("\nLast values:")
+        print_table(_VALUES, [_value_row(value) for value in site.values])
+    for source in site.sources:
+        if source.problem:
+            warn(f"{source.name} of {source.module}: {source.problem}")
+
+
+def _value_row(value: LastValueInfo) -> list[str]:
+    return [f"  {value.topic}", value.type, value.module, value.node, size(value.size), duration(_age(value))]
+
+
+def _age(value: LastValueInfo) -> float:
+    return max(0.0, time.time() - value.stamp)
+
+
+@click.command(
+    epilog="""\
+\b
+Exit codes: 0 printed; 1 no value is kept, or it cannot be read.
+
+\b
+Examples:
+  rmpa site last warehouse/arm /map
+  rmpa site last warehouse/arm /sonar/descriptor --field data
+  rmpa site last warehouse/arm /map --header          type and age only
+  rmpa site last warehouse/arm /map --json | jq .message.info
+"""
+)
+@click.argument("module", metavar="SITE/MODULE")
+@click.argument("topic")
+@click.option("--header", is_flag=True, help="Its type, size and age, and not the message.")
+@click.option("--field", metavar="FIELD", help="This field of the message, such as pose/position.")
+@click.option("--noarr", is_flag=True, help="Leave arrays out.")
+@json_option
+@agent_option
+@name_option
+def last(
+    module: str,
+    topic: str,
+    header: bool,
+    field: str | None,
+    noarr: bool,
+    as_json: bool,
+    agent: str | None,
+    name: str | None,
+) -> None:
+    """Print the last value of TOPIC that the gateway of SITE keeps, of each publisher: MODULE may be off.
+
+    Latched topics and descriptors of Smart Resources are kept, and those that a [[gateway.rule]] says. The age is
+    the time since the gateway received it, by both machines' clocks.
+    """
+    site, of = read_site_module(module)
+    if not is_legal_name(topic) or topic.startswith("~"):
+        raise ConfigError("TOPIC", f"{topic!r} is not a topic", "write /name")
+    topic = "/" + topic.strip("/")
+    with _connect(agent, name) as client:
+        found = _ask(client, LAST, tuple[LastValueInfo, ...], site=site, module=of, topic=topic)
+        if not found:
+            raise RmpaError(
+                f"site {site} keeps no value of {topic} of {of}: it is not latched, or was never seen by the gateway"
+            )
+        bodies = [None if header else _body(client, site, value) for value in found]
+    for value, body in zip(found, bodies, strict=True):
+        _print_value(site, value, body, field, noarr=noarr, as_json=as_json)
+
+
+def _body(client: ControlClient, site: str, value: LastValueInfo) -> bytes:
+    data = bytearray()
+    while len(data) < value.size:
+        portion = _ask(
+            client,
+            BODY,
+            ValuePortion,
+            site=site,
+            module=value.module,
+            topic=value.topic,
+            node=value.node,
+            offset=len(data),
+        )
+        if portion.size != value.size or not portion.data:
+            raise RmpaError(f"the value of {value.topic} has changed meanwhile; ask again")
+        data += portion.data
+    return bytes(data)
+
+
+def _print_value(
+    site: str, value: LastValueInfo, body: bytes | None, field: str | None, *, noarr: bool, as_json: bool
+) -> None:
+    from rmpa.cli.message_text import pick, shorten, to_text
+
+    plain: Plain = None
+    if body is not None:
+        path = field.strip("/").split("/") if field else []
+        plain = shorten(pick(_plain(value, body), path), arrays=noarr, strings=False)
+    if as_json:
+        facts = msgspec.to_builtins(value) | {"site": site, "age": _age(value)}
+        del facts["definition"]
+        print_json(facts | ({"message": plain} if body is not None else {}))
+        return
+    latched = ", latched" if value.latching else ""
+    print_line(
+        f"# {value.topic} of {value.node} of {site}/{value.module}: {value.type}{latched}, "
+        f"{size(value.size)}, {duration(_age(value))} old"
+    )
+    if body is not None:
+        click.echo(to_text(plain) + "\n---")
+
+
+def _plain(value: LastValueInfo, body: bytes) -> dict[str, Plain]:
+    """The message as plain values, by the publisher's own definition."""
+    from rmpa.ros.types.messages import MessageType
+
+    kind = MessageType.learn(value.type, value.definition, value.md5sum)
+    return kind.to_plain(kind.deserialize(body))

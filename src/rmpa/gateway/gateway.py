@@ -1,0 +1,247 @@
+"""The process of ``rmpa gateway``: an agent that relays, one Zenoh session, and the neighbours that it joins."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import random
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+from rmpa.agent import Agent
+from rmpa.agent.process import run_process, serve
+from rmpa.core.backoff import Backoff
+from rmpa.core.errors import RmpaError, StartError
+from rmpa.gateway import limits
+from rmpa.gateway.graph.own_graph import AgentGraph
+from rmpa.gateway.joining import make_neighbours, open_gateway_session
+from rmpa.observe.control import GATEWAY_ROLE, ROLE
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterator, Mapping
+
+    from rmpa.config.settings import Settings
+    from rmpa.config.sources import Loaded
+    from rmpa.gateway.neighbour import Neighbour
+    from rmpa.gateway.zenoh_api import OwnedSession
+    from rmpa.runtime.realtime import SchedulingRequest
+
+_log = logging.getLogger(__name__)
+REPORT: Final = "gateway"
+"""The operation of the control socket that returns ``Gateway.report``."""
+
+
+class Gateway:
+    """A gateway: its agent, its session and its neighbours.
+
+    Args:
+        settings: Complete: the name is filled in.
+        requests: The outcome of each request of ``--realtime``.
+        load: Reads the settings again; it may block.
+        open_session: Opens the session; raises ``StartError``.
+        make_neighbours: ``(graph, session, settings)``: makes the neighbours by their names; they are not started.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        requests: tuple[SchedulingRequest, ...] = (),
+        load: Callable[[], Loaded] | None = None,
+        *,
+        open_session: Callable[[Settings], Awaitable[OwnedSession]],
+        make_neighbours: Callable[[AgentGraph, OwnedSession, Settings], Mapping[str, Neighbour]],
+    ) -> None:
+        self._settings = replace(settings, relay=True)
+        self._open_session = open_session
+        self._make_neighbours = make_neighbours
+        self.agent = Agent(self._settings, requests, load)
+        self.graph = AgentGraph(self.agent, self._settings)
+        self.agent.bridge.add(self.graph)
+        self.agent.add_operations({REPORT: lambda _: self.report(), ROLE: lambda _: GATEWAY_ROLE})
+        self.agent.other_notes.append(self._notes)
+        self.session: OwnedSession | None = None
+        """The session; ``None`` until it is open."""
+        self.neighbours: dict[str, Neighbour] = {}
+        """The neighbours by their names; empty until the session is open."""
+        self._problem = ""
+        self._opening: asyncio.Task[None] | None = None
+        self.graph.reloaded = self._reloaded
+        self._rejoining: asyncio.Task[None] | None = None
+        self._changed = self._reopen = False
+        self._looking: asyncio.Task[None] | None = None
+
+    async def start(self) -> None:
+        """Start the agent and the neighbours; where only ``connect`` is set, a router may come later.
+
+        Raises:
+            StartError: The agent or the session cannot start on this machine with these settings.
+        """
+        # At once: the library is read in another thread while the agent starts.
+        opening = asyncio.ensure_future(self._open_session(self._settings))
+        try:
+            await self.agent.start()
+        except BaseException:
+            await _discard(opening)
+            raise
+        try:
+            await self.graph.begin()
+            await self._began(opening)
+        except BaseException:
+            await _discard(opening)
+            await self.close()
+            raise
+
+    async def _began(self, opening: asyncio.Future[OwnedSession]) -> None:
+        try:
+            session = await opening
+        except StartError as error:
+            if self._settings.gateway.listen or not self._settings.gateway.connect:
+                raise
+            self._failed(error)
+            self._opening = asyncio.get_running_loop().create_task(self._open_later(), name="open the zenoh session")
+        else:
+            self._join(session)
+        self._looking = asyncio.get_running_loop().create_task(self._look(), name="look whether the session is stale")
+
+    async def close(self) -> None:
+        """Take everything back: the neighbours first, the agent last."""
+        if self._looking is not None:
+            self._looking.cancel()
+            await asyncio.wait([self._looking])
+        if self._rejoining is not None:
+            await asyncio.wait([self._rejoining])
+        if self._opening is not None:
+            self._opening.cancel()
+            await asyncio.wait([self._opening])
+        await self._close_neighbours()
+        if self.session is not None:
+            await self.session.close()
+        await self.graph.end()
+        await self.agent.close()
+
+    async def _close_neighbours(self) -> None:
+        for name, neighbour in reversed(list(self.neighbours.items())):
+            try:
+                await neighbour.close()
+            except Exception:  # noqa: BLE001 - the others have to be closed too
+                _log.exception("! %s could not be closed", name)
+        self.neighbours = {}
+
+    def _reloaded(self, settings: Settings) -> None:
+        """Have other rules hold: the neighbours are made anew, and what crosses pauses for a moment."""
+        before, self._settings = self._settings, replace(settings, relay=True)
+        if settings.gateway.listen and before.trust != settings.trust:
+            self._reopen = True  # Zenoh reads its table of access once
+        if self._reopen or _rules(before) != _rules(settings):
+            self._begin_rejoin()
+
+    def _begin_rejoin(self) -> None:
+        self._changed = True
+        if self._rejoining is None or self._rejoining.done():
+            self._rejoining = asyncio.get_running_loop().create_task(self._rejoin(), name="take other rules")
+
+    async def _rejoin(self) -> None:
+        while self._changed and self.session is not None:
+            self._changed = False
+            await self._close_neighbours()
+            self.graph.unwatch()
+            if not self._reopen:
+                self._try_to_join(self.session)
+                continue
+            self._reopen = False
+            session, self.session = self.session, None
+            await session.close()
+            _log.info("= the zenoh session is opened anew: its certificate or the permissions have changed")
+            self._opening = asyncio.get_running_loop().create_task(self._open_later(), name="open the zenoh session")
+
+    async def _look(self) -> None:
+        """Opens the session anew where it listens and its certificate was renewed: Zenoh reads that once."""
+        while True:
+            await asyncio.sleep(limits.CERTIFICATE_LOOK_PERIOD)
+            if self.session is not None and self.session.stale:
+                self._reopen = True
+                self._begin_rejoin()
+
+    def report(self) -> dict[str, object]:
+        """What the gateway joins, as JSON values: the reply to the operation ``gateway``."""
+        session = self.session
+        return {
+            "name": self._settings.name,
+            "site": self._settings.gateway.site,
+            "rank": self._settings.gateway.rank,
+            "zid": session.zid if session is not None else "",
+            "endpoints": session.endpoints if session is not None else (),
+            "problem": self._problem,
+            "sources": len(self.graph.sources),
+            "neighbours": {name: neighbour.report() for name, neighbour in self.neighbours.items()},
+        }
+
+    def _notes(self) -> Iterator[str]:
+        if self._problem:
+            yield f"gateway: {self._problem}"
+        elif self.session is not None and self._settings.gateway.connect and not self.session.endpoints:
+            yield f"gateway: no router is connected; it is to be at {', '.join(self._settings.gateway.connect)}"
+
+    def _join(self, session: OwnedSession) -> None:
+        self.session = session
+        self._problem = ""
+        self.neighbours = dict(self._make_neighbours(self.graph, session, self._settings))
+        for neighbour in self.neighbours.values():
+            neighbour.start()
+        _log.info("= joins %s; zenoh session %s", ", ".join(self.neighbours) or "nothing", session.zid)
+
+    def _failed(self, error: StartError) -> None:
+        if str(error) != self._problem:
+            self._problem = str(error)
+            _log.warning("! %s; it is tried again", error)
+
+    async def _open_later(self) -> None:
+        backoff = Backoff(limits.OPEN_RETRY_FIRST, limits.OPEN_RETRY_MAX, random.random)
+        while self.session is None:
+            await asyncio.sleep(backoff.delay())
+            try:
+                session = await self._open_session(self._settings)
+            except StartError as error:
+                self._failed(error)
+            else:
+                self._try_to_join(session)
+
+    def _try_to_join(self, session: OwnedSession) -> None:
+        """Makes the neighbours while the gateway runs: what is wrong with them is told, and ends nothing else."""
+        try:
+            self._join(session)
+        except RmpaError as error:
+            self._problem = str(error)
+            _log.error("! %s", error)
+
+
+def _rules(settings: Settings) -> tuple[object, ...]:
+    """The settings that neighbours are made with and that may change while they run."""
+    return settings.gateway.rules, settings.policy, settings.peers, settings.services, settings.contracts
+
+
+async def _discard(opening: asyncio.Future[OwnedSession]) -> None:
+    """Closes a session that is not needed any more, once it is open."""
+    with contextlib.suppress(StartError):
+        await (await opening).close()
+
+
+async def _main(
+    settings: Settings, requests: tuple[SchedulingRequest, ...], load: Callable[[], Loaded] | None
+) -> None:
+    gateway = Gateway(settings, requests, load, open_session=open_gateway_session, make_neighbours=make_neighbours)
+    await serve(gateway.start, gateway.close, gateway.agent.reloader)
+
+
+def run(settings: Settings, load: Callable[[], Loaded] | None = None) -> int:
+    """Run a gateway until SIGINT or SIGTERM; return the exit code.
+
+    Args:
+        settings: Complete: the name is filled in.
+        load: Reads the settings again, at SIGHUP and ``rmpa reload``.
+
+    Raises:
+        StartError: The gateway cannot start on this machine with these settings.
+    """
+    return run_process(settings, lambda requests, _: _main(settings, requests, load))

@@ -1,0 +1,1 @@
+"""The gateway's own graph, as its neighbours use it."""

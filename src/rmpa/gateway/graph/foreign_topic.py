@@ -1,0 +1,161 @@
+"""A topic of a neighbour in the gateway's graph: its proxy, its publication, its offer to the mesh."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING
+
+from rmpa.bridge import limits as bridge_limits
+from rmpa.bridge.messages import Source
+from rmpa.core import limits as core_limits
+from rmpa.ros.node.publication import Publication
+from rmpa.ros.wire.tcpros import LENGTH, printable
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from rmpa.bridge.messages import Origin
+    from rmpa.bridge.relay import Relay
+    from rmpa.bridge.session.peer_proxies import PeerProxies
+    from rmpa.gateway.neighbour import ForeignSource
+    from rmpa.ros.core.api import Core
+    from rmpa.ros.node.slave_node import SlaveNode
+    from rmpa.ros.wire.tcpros import Buffer, TopicDescription
+
+_log = logging.getLogger(__name__)
+
+
+class ProxiedTopic:
+    """A foreign topic; see ``neighbour.ForeignTopic``.
+
+    Args:
+        source: The topic.
+        origin: The origin to offer it with.
+        number: The number of its site in the relay.
+        core: The gateway's core.
+        relay: Offers it to the modules.
+        proxies: The proxies of its site.
+        on_demand: ``(wanted)``: a first subscriber has come, or the last one has left.
+        on_closed: Called once it is closed.
+    """
+
+    def __init__(
+        self,
+        source: ForeignSource,
+        origin: Origin,
+        number: int,
+        *,
+        core: Core,
+        relay: Relay,
+        proxies: PeerProxies,
+        on_demand: Callable[[bool], None],
+        on_closed: Callable[[], None],
+    ) -> None:
+        self.source = source
+        self._origin = origin
+        self._number = number
+        self._core = core
+        self._relay = relay
+        self._proxies = proxies
+        self._on_demand = on_demand
+        self._on_closed = on_closed
+        self._offered = Source(source.name, proxies.name(origin.node))
+        self._key = f"topic {source.name}"
+        self._node: SlaveNode | None = None
+        self._begun = False
+        self._refused = "another source of this node has its name here"
+        self._mismatch = ""
+        self._wanted = False
+        self._closed = False
+        self.publication = Publication(
+            source.name,
+            self._offered.node,
+            on_first_subscriber=lambda: self._demand(wanted=True),
+            on_last_subscriber=lambda: self._demand(wanted=False),
+            on_mismatch=self._mismatched,
+        )
+        """Its messages for subscribers, here and of the mesh."""
+
+    def begin(self) -> None:
+        """Put it into the graph, in a later turn of the loop."""
+        self._begun = True
+        self._refused = ""
+        self._proxies.hold(self._origin.node, self._key, self._ready, self._left)
+
+    def refuse(self, text: str) -> None:
+        """Say why it cannot be in the graph."""
+        self._refused = text
+
+    @property
+    def problem(self) -> str:
+        """Why it is not in the graph, or not understood by its subscribers; empty for nothing."""
+        return self._refused or self._proxies.problems.get(self._origin.node, "") or self._mismatch
+
+    def describe(self, description: TopicDescription) -> None:
+        """Set type, md5 sum, definition and latching; subscribers of another definition are disconnected."""
+        if self.publication.describe(description) and not self._closed:
+            for delay in bridge_limits.CALL_BACK_DELAYS:
+                asyncio.get_running_loop().call_later(delay, self._register)
+
+    def publish(self, body: Buffer) -> int:
+        """Send one message without its length; return the messages dropped for slow subscribers."""
+        size = len(body)
+        if size <= core_limits.CUT_THROUGH_BYTES:
+            return self.publication.publish_framed(LENGTH.pack(size) + body)
+        before = self.publication.dropped
+        self.publication.begin(LENGTH.size + size)
+        self.publication.extend(LENGTH.pack(size))
+        self.publication.extend(body)
+        return self.publication.dropped - before
+
+    def forget_latched(self) -> None:
+        """Drop the latched message: its publisher is gone."""
+        self.publication.forget_latched()
+
+    def reconcile(self, publishers: Mapping[str, Mapping[str, str]]) -> None:
+        """Register it again if the core has lost it."""
+        node = self._node
+        if node is not None and publishers.get(self.source.name, {}).get(node.name) != node.uri:
+            self._register()
+
+    def close(self) -> None:
+        """Take it out of the graph in a later turn of the loop; its callbacks end now."""
+        if self._closed:
+            return
+        self._closed = True
+        self.publication.withdraw()
+        if self._begun:
+            self._proxies.release(self._origin.node, self._key)
+        self._on_closed()
+
+    def _demand(self, *, wanted: bool) -> None:
+        if wanted != self._wanted and not self._closed:
+            self._wanted = wanted
+            self._on_demand(wanted)
+
+    def _mismatched(self, fields: Mapping[str, str], text: str) -> None:
+        self._mismatch = f"{printable(fields.get('callerid', ''))}: {text}"
+
+    def _ready(self, node: SlaveNode) -> None:
+        self._node = node
+        self._relay.shown(self._number, self._offered, (self.source.name, node.name), self._origin)
+        node.add_publication(self.publication)
+        self._register()
+
+    def _register(self) -> None:
+        node = self._node
+        if node is None:
+            return
+        code, status, _ = self._core.call(
+            "registerPublisher", node.name, self.source.name, self.source.type, node.uri
+        )
+        self._refused = "" if code == 1 else f"the gateway's core does not take it: {status}"
+        if self._refused:
+            _log.error("! %s of %s: %s", self.source.name, node.name, self._refused)
+
+    def _left(self, node: SlaveNode) -> None:
+        self._node = None
+        self._core.call("unregisterPublisher", node.name, self.source.name, node.uri)
+        node.remove_publication(self.source.name)
+        self._relay.gone(self._number, self._offered)

@@ -1,0 +1,218 @@
+"""Every bound of the gateway, with unit and reason."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from rmpa.core.sizes import KIB, MIB
+
+KEY_MAX: Final = 2048
+"""Characters of a key expression or a liveliness token that another site or a ROS 2 node sent. Longer ones are not
+read; the longest that ROS names and types make is some 900."""
+GID_MAX: Final = 255
+"""Bytes of the source's GID in an attachment of ROS 2: its length is one byte."""
+QOS_NUMBER_MAX: Final = 2**63 - 1
+"""The largest number in a QoS of ROS 2: they are 64-bit there."""
+ENTITY_ID_MAX: Final = 2**64 - 1
+"""The largest number of a node or an endpoint in a liveliness token."""
+DOMAIN_MAX: Final = 2**32 - 1
+"""The largest ROS domain id in a key; ROS 2 uses 0 to 232."""
+PATH_MAX: Final = 8
+"""Sites that a message passes at most; more mean a loop."""
+SERVICE_DESCRIPTION_MAX: Final = 8192
+"""Bytes of the description of another site's service: four names."""
+SITE_CALLS_AT_ONCE: Final = 32
+"""Calls of other sites that one service gets at once, as many as an agent opens connections to a server for."""
+SITE_CALLS_WAITING: Final = 1024
+"""Calls of other sites that may wait for one service; further ones are refused at once."""
+SITE_CALL_BYTES: Final = 256 * MIB
+"""Bytes of the requests of other sites that are under way here: four of the largest."""
+SITE_CALL_GRACE: Final = 1.0
+"""Seconds that the calling site waits longer than the serving one, whose error text tells more."""
+DESCRIBE_TIMEOUT: Final = 10.0
+"""Seconds for the description of another site's service; its server may be probed for it over two meshes."""
+LAST_VALUE_MAX: Final = 32 * MIB
+"""Bytes of a message that is kept as a last value: a map of 5,000 by 5,000 cells. Larger ones are not kept."""
+LAST_VALUES_MAX: Final = 4096
+"""Last values that are kept; the oldest go first. A module has some 20 latched topics."""
+LAST_VALUES_BYTES_MAX: Final = 256 * MIB
+"""Bytes of all last values in the file; the oldest go first."""
+LAST_VALUES_PENDING_MAX: Final = 64 * MIB
+"""Bytes of last values that wait while the disk takes none; above it the oldest are not written."""
+LAST_VALUES_INTERVAL: Final = 0.5
+"""Seconds between writes: a topic that publishes quickly is written once in each."""
+LAST_VALUES_OPEN_TIMEOUT: Final = 5.0
+"""Seconds for the file of last values to open; a disk that hangs must not stop the gateway."""
+LAST_VALUES_CLOSE_TIMEOUT: Final = 3.0
+"""Seconds for the last write; a disk that hangs must not keep the gateway from ending."""
+LAST_VALUES_READ_TIMEOUT: Final = 4.0
+"""Seconds for one query of last values: less than the session waits for its answer."""
+LAST_VALUES_ANSWER_MAX: Final = 64 * MIB
+"""Bytes of all answers to one query of last values; the newest are given first."""
+LATCH_LOOK_AFTER: Final = 5.0
+"""Seconds that a topic is there before the gateway asks its publisher whether it is latched."""
+LATCH_LOOK_TIMEOUT: Final = 10.0
+"""Seconds for the publisher's answer to that."""
+LATCH_LOOKS_AT_ONCE: Final = 2
+"""Publishers that are asked that at once: each opens a route in the mesh for a moment."""
+VALUE_HEADER_MAX: Final = 1 * MIB
+"""Bytes of the header of another site's last value: most of it is the definition of its type."""
+SITES_REMEMBERED_MAX: Final = 256
+"""Sites that are remembered as unreachable; those that left first are forgotten first."""
+SITE_REPORT_SOURCES_MAX: Final = 5000
+"""Topics and services of one site in ``rmpa site info``: some 2 MB of JSON."""
+VALUE_PORTION: Final = 256 * KIB
+"""Bytes of a last value in one message to a module that asks for it: 20 ms on a 100 Mbit/s link."""
+VALUE_READING_IDLE: Final = 60.0
+"""Seconds for which a last value that is read in portions is kept without another question for it."""
+SITE_ACTIONS_MAX: Final = 1024
+"""Connections under the names of other sites' action servers: two for each pair of a client and a server."""
+SITE_ASK_TIMEOUT: Final = 5.0
+"""Seconds for a question to another site's gateway."""
+SITE_PARAMS_AT_ONCE: Final = 256
+"""Questions of other sites about parameters that are answered at once, and parameters of other sites that modules
+here may follow."""
+SITE_PARAM_BYTES_MAX: Final = 64 * MIB
+"""Bytes of one question or answer about parameters between gateways: some of the largest values."""
+SITE_PARAM_TRANSFERS_MAX: Final = 64
+"""Modules of other sites whose parameters are read or written in portions at once."""
+SITE_FOLLOW_INTERVAL: Final = 1.0
+"""Seconds between questions for followed parameters of other sites: one question for each module."""
+SITE_PARAM_TIMEOUT: Final = 20.0
+"""Seconds for a question about a parameter to another site: less than the module that asks waits for this gateway."""
+LAST_VALUES_RETRY_MAX: Final = 30.0
+"""Seconds between attempts to write to a disk that takes nothing."""
+SITE_NAME_MAX: Final = 63
+"""Characters of a site's name, as for a module's name and for a label of DNS."""
+NODE_NAME_MAX: Final = 255
+"""Bytes of a node's name in an attachment."""
+ROS2_NAME_MAX: Final = 255
+"""Characters of a node, topic or service of ROS 2; its own limit is about that for topics."""
+ROS2_NODES_MAX: Final = 2000
+"""Nodes of ROS 2 that are shown; any program that reaches the router can declare more."""
+ROS2_ENDPOINTS_MAX: Final = 20000
+"""Publishers, subscriptions, services and clients of ROS 2 that are looked at; each costs some 3 KB."""
+ROS2_PROBLEMS_MAX: Final = 500
+"""Problems of the neighbour ROS 2 that are kept for ``rmpa site``; the oldest go first."""
+ROS2_TYPES_MAX: Final = 500
+"""Types that are learnt from publishers and ROS 2 nodes, and pairs that are kept; ROS has some 160 of its own."""
+ROS2_DESCRIPTION_MAX: Final = 1024 * 1024
+"""Bytes of a type's description from a ROS 2 node; the largest of ROS 2's own types has 30 KB."""
+ROS2_ARRAY_MAX: Final = 1_000_000
+"""Elements of all arrays of fixed size in a type that a ROS 2 node describes: an empty message must have them all."""
+
+
+# --- other sites ---------------------------------------------------------------------------------------------------
+
+SITES_MAX: Final = 256
+"""Other sites that are shown; tokens of further ones are counted and left out."""
+SITE_MODULES_MAX: Final = 512
+"""Modules of one other site that are shown, as many as the mesh has peers."""
+SITE_SOURCES_MAX: Final = 16_384
+"""Topics (once for each publisher) and services of one other site that are shown, or of this one that are offered."""
+SITE_SETTLE: Final = 0.05
+"""Seconds from the end of a token to the end of what it stands for. The tokens of a gateway that was killed go one by
+one, within some milliseconds: its own may be the last, and then the others are lost and not withdrawn."""
+SITE_GRACE: Final = 0.5
+"""Seconds for which the sources of a site stay when its leading gateway, or the way to it, is lost: longer than
+another gateway of that site needs to take over. A site that is frozen is noticed within 1 s by Zenoh's lease, and
+must be gone within 1.5 s."""
+LEADER_PATIENCE: Final = 0.3
+"""Seconds for which a gateway must have been the first of its site before it leads; below ``SITE_GRACE``, so that the
+other sites keep the sources."""
+HEADER_MAX: Final = 512 * 1024
+"""Bytes of a publisher's header from another site, with the definition; the longest of ROS 1 has some 30 KB."""
+HEADER_TIMEOUT: Final = 5.0
+"""Seconds that a query for a publisher's header waits for it: the gateway there connects to the publisher first."""
+HEADER_RETRY: Final = 2.0
+"""Seconds at most until a header is asked for again, when there was no answer and nodes wait for it; at first a
+sixteenth."""
+HEADER_QUERIES_MAX: Final = 64
+"""Queries that wait for the header of one publisher; further ones are refused at once."""
+TAP_LINGER: Final = 2.0
+"""Seconds for which a publisher stays connected after its header was asked for: its subscriber comes right after."""
+HELD_MESSAGES_MAX: Final = 1000
+"""Messages that wait at the receiver for the publisher's header; above it the oldest is dropped, and counted."""
+HELD_BYTES: Final = 64 * 1024 * 1024
+"""Bytes that wait likewise; one message always fits."""
+LATCHED_NODES_MAX: Final = 64
+"""Nodes that publish one latched topic of another site, and of which no node here wants one, whose last message is
+kept."""
+DEMAND_LINGER: Final = 1.0
+"""Seconds for which a topic of another site stays subscribed after its last subscriber left, as in the mesh."""
+LIMIT_BURST: Final = 0.5
+"""Seconds of a topic's limit of rate or size that may cross at once after a rest: jitter must not cost messages."""
+BEST_EFFORT_BYTES: Final = 8 * 1024 * 1024
+"""Bytes of one best-effort topic that wait for a slow link: what is older than that is of no use. One message always
+fits, and a burst of 1,000 small ones."""
+RELIABLE_BYTES: Final = 64 * 1024 * 1024
+"""Bytes of one reliable topic that wait for a slow link, as in a lane of the mesh."""
+LARGE_MESSAGE: Final = 8 * 1024
+"""Bytes from which on a topic's messages yield to those of others, if its contract has no priority: on a line of
+1 Mbit/s one such message takes 65 ms, for which all others of its priority wait."""
+IDLE_CHECK: Final = 1.0
+"""Seconds without a message after which a receiver asks for the last sequence number: losses at the end of a burst
+leave no gap."""
+IDLE_CHECK_MAX: Final = 60.0
+"""Seconds between two such questions at most: the pause doubles while no message comes."""
+RESUMED_WITHIN: Final = 10.0
+"""Seconds after a topic of another site is back within which a subscriber counts as the one from before: what was
+lost meanwhile is counted. roscpp's and rospy's nodes are back within two."""
+INTERRUPTED_TOPICS_MAX: Final = 1024
+"""Topics whose counts are kept while their site is away; of more, the oldest begin anew."""
+LATENCIES_KEPT: Final = 512
+"""Latencies of one topic from which the report's percentiles are computed."""
+ROS2_CALL_TIMEOUT: Final = 600.0
+"""Seconds of one call of a service between the mesh and ROS 2. Clients of ROS 1 and of rmw_zenoh wait without end; a
+server that dies ends its calls at once."""
+ROS2_CALLS_MAX: Final = 64
+"""Calls of one service that are under way at one time, each way; the next one gets an error."""
+ROS2_DESCRIBE_AGAIN: Final = (0.5, 30.0)
+"""Seconds until a service that could not be asked for its type is asked again: at first, and at most; it doubles."""
+ROS2_LINGER: Final = 5.0
+"""Seconds for which a topic of ROS 2 that is wanted stays subscribed after a publisher came or went: messages of a
+publisher that restarts are held until nodes have subscribed to it anew, which takes a module some 0.1 s."""
+ROS2_EARLY_MESSAGES: Final = 1000
+"""Messages of one topic of ROS 2 that are held so; the oldest are dropped, and counted as unheard."""
+ROS2_EARLY_BYTES: Final = 16 * 1024 * 1024
+"""Bytes of these."""
+ROS2_PUBLISHERS_MAX: Final = 1000
+"""Publishers of one topic of ROS 2 whose sequence numbers are followed; the one silent for longest is forgotten."""
+ROS2_ASKS_MAX: Final = 200
+"""ROS 2 nodes that are asked for types at one time; any program can declare tokens of types that are not known."""
+ROS2_SERVICE_WAIT: Final = 3.0
+"""Seconds in which a ROS 2 node's get_type_description may appear after its first publisher, and in which it answers:
+a node declares one after the other."""
+CERTIFICATE_LOOK_PERIOD: Final = 60.0
+"""Seconds between two looks whether the certificate of a session that listens was renewed; it is each 3.5 days."""
+OPEN_RETRY_FIRST: Final = 0.5
+"""Seconds until a session is opened again, at first, whose router did not answer."""
+OPEN_RETRY_MAX: Final = 5.0
+"""The longest time in seconds between two attempts to open a session."""
+ROS2_GOALS_MAX: Final = 1000
+"""Goals of one action that are known at one time, each way; the next one is rejected."""
+ROS2_GOAL_KEPT: Final = 5.0
+"""Seconds for which a goal that has ended stays in the status of ROS 1; actionlib's ``status_list_timeout``."""
+ROS2_RESULT_KEPT: Final = 60.0
+"""Seconds for which a client of ROS 2 may ask for the result of a goal that has ended; rcl's default is 10."""
+ROS2_STATUS_PERIOD: Final = 0.2
+"""Seconds between two messages of an action's status in ROS 1; actionlib's ``status_frequency`` is 5 Hz, and its
+clients count a server as lost after 5 s without one."""
+ROS2_ACCEPT_TIMEOUT: Final = 10.0
+"""Seconds for an action server of ROS 1 to show a goal in its status; then the goal counts as not accepted."""
+ROS2_ACTIONS_MAX: Final = 500
+"""Actions that are joined, each way; the others are reported."""
+ROS2_GOAL_TIMEOUT: Final = 86_400.0
+"""Seconds of one goal of an action at a server of ROS 2: a day. A server that dies ends its goals at once."""
+ROS2_LAST_RESULTS: Final = 1.0
+"""Seconds for which an action's topics stay in ROS 1's graph once its server is gone: its last results leave."""
+ROS2_ACTION_READY: Final = 5.0
+"""Seconds for an action server of ROS 1 to connect to the gateway's topics; then a goal is refused."""
+ROS2_PARAM_NODES_MAX: Final = 500
+"""Nodes of ROS 2 whose parameters are in the gateway's tree; those of the others are reported as missing."""
+ROS2_PARAMS_MAX: Final = 2000
+"""Parameters of one node of ROS 2 that are read; the others are left out."""
+ROS2_PARAM_TIMEOUT: Final = 5.0
+"""Seconds for a node of ROS 2, or a module, to answer a question about parameters."""
+ROS2_PARAM_LOOK: Final = 1.0
+"""Seconds between two looks at the gateway's tree, for values that were set there for nodes of ROS 2."""

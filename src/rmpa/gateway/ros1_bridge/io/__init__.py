@@ -1,0 +1,1 @@
+"""The parts of the neighbour zenoh-bridge-ros1 that do I/O."""

@@ -1,0 +1,212 @@
+"""Finds the pair of each type, and keeps the conversions.
+
+A pair is found by name and rule; the fields are those of ROS 2's distribution, of a definition that a ROS 1 publisher
+sent, or of a description that a ROS 2 node gave.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rosbags.typesys.base import TypesysError
+
+from rmpa.core.errors import RmpaError
+from rmpa.gateway import limits
+from rmpa.gateway.ros2.conversion import Conversion, NoConversion
+from rmpa.gateway.ros2.derived import derive_ros1
+from rmpa.gateway.ros2.types import ros2_name
+from rmpa.ros.types.definitions import DefinitionError, known_types
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from rmpa.gateway.ros2.mapping import TypeMapping, TypePair
+    from rmpa.gateway.ros2.types import Ros2Types
+    from rmpa.ros.types.messages import MessageType
+
+
+class Ros2Pairs:
+    """The pairs of types of one ROS 2 domain.
+
+    Args:
+        types: ROS 2's types; what is learnt is added.
+        mapping: The rules of the mapping files.
+        find: Finds a ROS 1 type on this machine by its name; raises ``RmpaError`` if there is none.
+    """
+
+    def __init__(self, types: Ros2Types, mapping: TypeMapping, find: Callable[[str], MessageType]) -> None:
+        self._types = types
+        self._mapping = mapping
+        self._find = find
+        self._ros1: dict[str, MessageType] = {}
+        self._variants: dict[tuple[str, str], Ros2Types] = {}
+        self._out: dict[tuple[str, str], Conversion | NoConversion] = {}
+        self._in: dict[tuple[str, str], Conversion | NoConversion] = {}
+
+    # --- from the mesh to ROS 2 ----------------------------------------------------------------------------------
+
+    def ros2_type(self, name: str) -> tuple[str, str] | None:
+        """The type of ROS 2 for a ROS 1 type, and its hash.
+
+        Args:
+            name: ``package/Name``.
+
+        Returns:
+            ``None`` if ROS 2 knows no such type: its definition must be learnt from a publisher (``learn``).
+
+        Raises:
+            NoConversion: A rule maps it to a type that is not known here.
+        """
+        pair = self._mapping.message(name, self._types)
+        return None if pair is None else (pair.name, self._hash(name, pair))
+
+    def learn(self, kind: MessageType) -> tuple[str, str]:
+        """Take in a definition that a publisher sent, and return the type of ROS 2 and its hash.
+
+        Raises:
+            NoConversion: A rule maps it to a type that is not known here.
+        """
+        if len(self._ros1) < limits.ROS2_TYPES_MAX:
+            self._ros1[kind.name] = kind
+        if (known := self.ros2_type(kind.name)) is not None:
+            return known
+        name = ros2_name(kind.name)
+        try:
+            self._types.learn(kind.specifications)
+            return name, self._types.type_hash(name)
+        except (KeyError, TypesysError) as error:
+            raise NoConversion(f"{kind.name} has no form in ROS 2: {error}") from error
+
+    def outgoing(self, kind: MessageType) -> Conversion:
+        """The conversion of a ROS 1 type, by the pair that ``learn`` finds.
+
+        Raises:
+            NoConversion: The types are no pair; the text says which fields differ, and what to write.
+        """
+        key = kind.name, kind.md5sum
+        if key not in self._out:
+            name, _ = self.learn(kind)
+            pair = self._mapping.message(kind.name, self._types)
+            fields = pair.fields if pair is not None else None
+            self._keep(self._out, key, lambda: Conversion(kind, name, self._types, fields))
+        return _found(self._out[key])
+
+    def _hash(self, name: str, pair: TypePair) -> str:
+        try:
+            return self._types.type_hash(pair.name)
+        except KeyError:
+            raise NoConversion(
+                f"a rule maps {name} to {pair.name}, which is not known here: let a ROS 2 node that has it offer "
+                "get_type_description, or map it to another type"
+            ) from None
+
+    # --- from ROS 2 to the mesh ----------------------------------------------------------------------------------
+
+    def ros1_name(self, name: str) -> str:
+        """The name of ROS 1 for a type of ROS 2, ``package/msg/Name``."""
+        return self._mapping.ros1_message(name, (*known_types(), *self._ros1))
+
+    def incoming(self, name: str, type_hash: str) -> Conversion | None:
+        """The conversion of a type of ROS 2.
+
+        Args:
+            name: ``package/msg/Name``.
+            type_hash: The hash that its publisher has.
+
+        Returns:
+            ``None`` if the fields behind this hash are not known: a node must describe them (``described``).
+
+        Raises:
+            NoConversion: The types are no pair; the text says which fields differ, and what to write.
+        """
+        key = name, type_hash
+        if key not in self._in:
+            types = self._types_of(name, type_hash)
+            if types is None:
+                return None
+            self._keep(self._in, key, lambda: self._make_incoming(name, types))
+        return _found(self._in[key])
+
+    def described(self, name: str, type_hash: str, fields: Mapping[str, Any]) -> None:
+        """Take in what a ROS 2 node says of a type.
+
+        Args:
+            name: ``package/msg/Name``.
+            type_hash: The hash that its publisher has.
+            fields: The fields of the type and of all that it embeds, in rosbags' form.
+
+        Raises:
+            NoConversion: The fields have another hash, or are too many.
+        """
+        if len(self._variants) >= limits.ROS2_TYPES_MAX:
+            raise NoConversion(f"{limits.ROS2_TYPES_MAX} types of ROS 2 were learnt already; {name} is not")
+        if name not in fields:
+            raise NoConversion(f"the node that has {name} described other types")
+        try:
+            variant = self._types.variant(fields)
+            hashed = variant.type_hash(name)
+        except (KeyError, RecursionError, TypesysError) as error:
+            raise NoConversion(f"the description of {name} is not complete: {error}") from error
+        if hashed != type_hash:
+            raise NoConversion(f"the description of {name} has the type hash {hashed}, its publisher {type_hash}")
+        self._variants[name, type_hash] = variant
+        if name not in self._types:  # so the mesh's own topics can have the type too
+            self._types.take(fields)
+
+    def _types_of(self, name: str, type_hash: str) -> Ros2Types | None:
+        """The types that have the fields behind a hash."""
+        if (variant := self._variants.get((name, type_hash))) is not None:
+            return variant
+        if name not in self._types:
+            ros1 = self._ros1_type(self.ros1_name(name))
+            if ros1 is None or ros2_name(ros1.name) != name:
+                return None
+            variant = self._types.variant({})
+            try:
+                variant.learn(ros1.specifications)
+                if variant.type_hash(name) != type_hash:
+                    return None
+                self._types.learn(ros1.specifications)
+            except (KeyError, TypesysError):
+                return None
+        return self._types if self._types.type_hash(name) == type_hash else None
+
+    def _make_incoming(self, name: str, types: Ros2Types) -> Conversion:
+        name1 = self.ros1_name(name)
+        ros1 = self._ros1_type(name1)
+        if ros1 is None:
+            try:
+                ros1 = derive_ros1(types.store, name, self.ros1_name)
+            except (RmpaError, KeyError) as error:
+                raise NoConversion(f"{name} has no form in ROS 1: {error}") from error
+        pair = self._mapping.message(name1, types.store.fielddefs)
+        return Conversion(ros1, name, types, pair.fields if pair is not None and pair.name == name else None)
+
+    def _ros1_type(self, name: str) -> MessageType | None:
+        if (learnt := self._ros1.get(name)) is not None:
+            return learnt
+        try:
+            return self._find(name)
+        except RmpaError:
+            return None
+
+    @staticmethod
+    def _keep(
+        into: dict[tuple[str, str], Conversion | NoConversion],
+        key: tuple[str, str],
+        make: Callable[[], Conversion],
+    ) -> None:
+        if len(into) >= limits.ROS2_TYPES_MAX:
+            del into[next(iter(into))]
+        try:
+            into[key] = make()
+        except NoConversion as error:
+            into[key] = error
+        except (DefinitionError, KeyError) as error:
+            into[key] = NoConversion(f"{key[0]} cannot be converted: {error}")
+
+
+def _found(kept: Conversion | NoConversion) -> Conversion:
+    if isinstance(kept, NoConversion):
+        raise kept.with_traceback(None)
+    return kept

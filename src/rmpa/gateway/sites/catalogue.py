@@ -1,0 +1,251 @@
+"""What other sites have, from their liveliness tokens.
+
+Sans-I/O. Tokens come and go one by one, in any order. A source is there while its own token and that of its module
+are. What a gateway withdraws goes at once (after ``limits.SITE_SETTLE``); what is lost together with the leading
+gateway of its site, or with the way to it, stays for ``limits.SITE_GRACE``, so that neither a short break of a link
+nor a change of the leading gateway takes everything down and up::
+
+    ABSENT ──token──► THERE ──token gone──► SETTLING ──0.05 s──► ABSENT
+                        ▲                      │ leading gateway gone too
+                        └──token (renewed)── GRACE ──0.5 s──► ABSENT
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import TYPE_CHECKING
+
+from rmpa.core.counters import Counters
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.timer_queue import TimerQueue
+from rmpa.gateway import limits
+from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource, parse_token
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+class CatalogueChange(Enum):
+    """What has happened to a module or a source."""
+
+    FOUND = "found"
+    RENEWED = "renewed"
+    """Its token had gone and came back in time: another gateway may have it now."""
+    GONE = "gone"
+
+
+@dataclass(frozen=True, slots=True)
+class CatalogueEvent:
+    """A change of what other sites have. A module is found before its sources, and goes after them."""
+
+    change: CatalogueChange
+    item: SiteModule | SiteSource
+
+
+@dataclass(slots=True)
+class _Site:
+    gateways: set[SiteGateway] = field(default_factory=set)
+    modules: dict[SiteModule, set[SiteSource]] = field(default_factory=dict)
+    """Those whose token is there, or just went, with the sources likewise."""
+    orphans: dict[SiteModule, set[SiteSource]] = field(default_factory=dict)
+    """Sources whose token came before that of their module."""
+    sources: int = 0
+    """With the orphans."""
+    interrupted_until: float = 0.0
+    refused: int = 0
+
+
+class SiteCatalogue:
+    """Keeps what other sites have.
+
+    Args:
+        own: This site's name, whose tokens are ignored.
+    """
+
+    def __init__(self, own: str) -> None:
+        self._own = own
+        self._sites: dict[str, _Site] = {}
+        self._ending: TimerQueue[str] = TimerQueue()
+        self._by_token: dict[str, SiteModule | SiteSource] = {}
+        self._events: list[CatalogueEvent] = []
+        self.counters = Counters()
+        """``site.token.malformed``, ``site.token.later_version``, ``site.limit``."""
+
+    # --- what is there ------------------------------------------------------------------------------------------
+
+    @property
+    def sites(self) -> tuple[str, ...]:
+        """The names of the other sites, in order."""
+        return tuple(sorted(self._sites))
+
+    def gateways(self, site: str) -> list[SiteGateway]:
+        """The gateways of another site, the leading one first."""
+        found = self._sites.get(site)
+        return sorted(found.gateways, key=lambda each: each.order) if found is not None else []
+
+    def modules(self, site: str) -> list[SiteModule]:
+        """The modules of another site, by name."""
+        found = self._sites.get(site)
+        return sorted(found.modules, key=lambda each: (each.name, each.instance)) if found is not None else []
+
+    def sources(self, module: SiteModule) -> list[SiteSource]:
+        """The sources of a module, by name and node."""
+        found = self._sites.get(module.site)
+        known = found.modules.get(module, set()) if found is not None else set()
+        return sorted(known, key=lambda each: (each.name, each.node, each.kind))
+
+    def refused(self, site: str) -> int:
+        """Tokens of a site that were left out because there are too many."""
+        found = self._sites.get(site)
+        return found.refused if found is not None else 0
+
+    def all(self) -> Iterator[SiteModule | SiteSource]:
+        """Everything that is there, modules before their sources."""
+        for site in self.sites:
+            for module in self.modules(site):
+                yield module
+                yield from self.sources(module)
+
+    def take_events(self) -> list[CatalogueEvent]:
+        """The changes since the last call, in order."""
+        events, self._events = self._events, []
+        return events
+
+    # --- tokens -------------------------------------------------------------------------------------------------
+
+    def token(self, key: str, now: float, *, alive: bool) -> None:
+        """A liveliness token came or went. What is none is counted and ignored.
+
+        Args:
+            key: The token.
+            now: Monotonic seconds.
+            alive: Whether it is there.
+        """
+        try:
+            item = parse_token(key)
+        except RemoteProtocolError:
+            self.counters.add("site.token.malformed")
+            return
+        if item is None:
+            self.counters.add("site.token.later_version")
+            return
+        name = item.module.site if isinstance(item, SiteSource) else item.site
+        if name == self._own:
+            return
+        site = self._sites.get(name)
+        if site is None:
+            if not alive:
+                return
+            if len(self._sites) >= limits.SITES_MAX:
+                self.counters.add("site.limit")
+                return
+            site = self._sites[name] = _Site()
+        if isinstance(item, SiteGateway):
+            self._gateway(site, item, now, alive=alive)
+        elif alive:
+            self._came(site, item, key)
+        else:
+            self._went(site, item, key, now)
+        self._forget_if_empty(name)
+
+    def next_timer(self) -> float | None:
+        """When ``handle_timer`` is to be called; ``None``: nothing waits."""
+        return self._ending.next()
+
+    def handle_timer(self, now: float) -> None:
+        """End what is due."""
+        while (key := self._ending.pop(now)) is not None:
+            item = self._by_token.pop(key)
+            name = item.module.site if isinstance(item, SiteSource) else item.site
+            site = self._sites[name]
+            if isinstance(item, SiteModule):
+                self._end_module(site, item)
+            else:
+                self._end_source(site, item)
+            self._forget_if_empty(name)
+
+    def _gateway(self, site: _Site, gateway: SiteGateway, now: float, *, alive: bool) -> None:
+        if alive:
+            if len(site.gateways) < limits.SITE_MODULES_MAX:
+                site.gateways.add(gateway)
+            return
+        leader = min(site.gateways, key=lambda each: each.order, default=None)
+        site.gateways.discard(gateway)
+        if gateway != leader:
+            return
+        site.interrupted_until = now + limits.SITE_GRACE
+        for key, item in self._by_token.items():
+            if (item.module.site if isinstance(item, SiteSource) else item.site) == gateway.site:
+                self._ending.set(key, site.interrupted_until)
+
+    def _came(self, site: _Site, item: SiteModule | SiteSource, key: str) -> None:
+        if self._by_token.pop(key, None) is not None:
+            self._ending.set(key, None)
+            self._tell(CatalogueChange.RENEWED, item)
+            return
+        if isinstance(item, SiteModule):
+            if item in site.modules:
+                return
+            if len(site.modules) >= limits.SITE_MODULES_MAX:
+                self._refuse(site)
+                return
+            sources = site.modules[item] = site.orphans.pop(item, set())
+            self._tell(CatalogueChange.FOUND, item)
+            for source in sorted(sources, key=SiteSource.token):
+                self._tell(CatalogueChange.FOUND, source)
+            return
+        known = site.modules.get(item.module)
+        into = known if known is not None else site.orphans.setdefault(item.module, set())
+        if item in into:
+            return
+        if site.sources >= limits.SITE_SOURCES_MAX:
+            if not into and known is None:
+                del site.orphans[item.module]
+            self._refuse(site)
+            return
+        into.add(item)
+        site.sources += 1
+        if known is not None:
+            self._tell(CatalogueChange.FOUND, item)
+
+    def _went(self, site: _Site, item: SiteModule | SiteSource, key: str, now: float) -> None:
+        if isinstance(item, SiteSource) and item in site.orphans.get(item.module, ()):
+            site.orphans[item.module].discard(item)
+            site.sources -= 1
+            if not site.orphans[item.module]:
+                del site.orphans[item.module]
+            return
+        there = item in site.modules if isinstance(item, SiteModule) else item in site.modules.get(item.module, ())
+        if there and key not in self._by_token:
+            self._by_token[key] = item
+            self._ending.set(key, max(now + limits.SITE_SETTLE, site.interrupted_until))
+
+    def _end_module(self, site: _Site, module: SiteModule) -> None:
+        for source in sorted(site.modules.pop(module), key=SiteSource.token):
+            key = source.token()
+            self._ending.set(key, None)
+            if self._by_token.pop(key, None) is None:
+                # Its token is there still: it may be shown again with its module's.
+                site.orphans.setdefault(module, set()).add(source)
+            else:
+                site.sources -= 1
+            self._tell(CatalogueChange.GONE, source)
+        self._tell(CatalogueChange.GONE, module)
+
+    def _end_source(self, site: _Site, source: SiteSource) -> None:
+        site.modules[source.module].discard(source)
+        site.sources -= 1
+        self._tell(CatalogueChange.GONE, source)
+
+    def _refuse(self, site: _Site) -> None:
+        site.refused += 1
+        self.counters.add("site.limit")
+
+    def _forget_if_empty(self, name: str) -> None:
+        site = self._sites[name]
+        if not (site.gateways or site.modules or site.orphans):
+            del self._sites[name]
+
+    def _tell(self, change: CatalogueChange, item: SiteModule | SiteSource) -> None:
+        self._events.append(CatalogueEvent(change, item))

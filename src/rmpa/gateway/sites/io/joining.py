@@ -1,0 +1,133 @@
+"""Makes the neighbour "other sites" with all its parts, from the settings."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rmpa.bridge.naming import Names
+from rmpa.bridge.policy import Policy
+from rmpa.bridge.services.rules import ServiceRules
+from rmpa.config.permission_rules import Access
+from rmpa.core.errors import UnreachableError
+from rmpa.gateway import limits
+from rmpa.gateway.graph.own_graph import AgentGraph
+from rmpa.gateway.neighbour import SourceKind
+from rmpa.gateway.site_permissions import SitePermissions
+from rmpa.gateway.sites.history import SiteHistory
+from rmpa.gateway.sites.io.action_part import SiteActions
+from rmpa.gateway.sites.io.last_value_store import LastValueStore
+from rmpa.gateway.sites.io.last_values_part import SiteLastValues
+from rmpa.gateway.sites.io.neighbour import SiteNeighbour
+from rmpa.gateway.sites.io.param_exports import SiteParamExports
+from rmpa.gateway.sites.io.param_imports import SiteParamImports
+from rmpa.gateway.sites.io.param_part import SiteParams
+from rmpa.gateway.sites.io.service_part import SiteServices
+from rmpa.gateway.sites.io.site_answers import SiteAnswers
+from rmpa.gateway.sites.io.site_why import SiteWhy
+from rmpa.gateway.sites.io.topic_part import SiteTopics
+from rmpa.gateway.sites.keys import SiteGateway
+from rmpa.gateway.sites.rules import CrossingRules
+from rmpa.runtime.state_dir import module_dir, state_dir
+from rmpa.runtime.system_clock import SystemClock
+
+if TYPE_CHECKING:
+    from rmpa.agent import Agent
+    from rmpa.bridge.policy import PolicyDecision
+    from rmpa.config.settings import Settings
+    from rmpa.gateway.neighbour import MeshSource, OwnGraph
+    from rmpa.gateway.sites.part import SitePart
+    from rmpa.gateway.zenoh_api import OwnedSession
+
+
+def make_site_neighbour(
+    graph: OwnGraph, session: OwnedSession, settings: Settings, agent: Agent | None = None
+) -> SiteNeighbour:
+    """Make the neighbour "other sites"; it is not started.
+
+    Args:
+        graph: The gateway's graph.
+        session: The Zenoh session.
+        settings: The gateway's; ``settings.gateway.site`` is not empty.
+        agent: The gateway's agent, which carries parameters and questions; ``None``: neither crosses.
+    """
+    policy = Policy(settings.policy, settings.peers, settings.time)
+    services = ServiceRules(settings.services, policy, Names(settings.peers))
+
+    def judge(kind: SourceKind, name: str, type_name: str, node: str) -> PolicyDecision:
+        if kind is SourceKind.SERVICE:
+            return services.judge(name, node)
+        return policy.judge(name, type_name, node)
+
+    gateway, clock = settings.gateway, SystemClock()
+    permissions = None if agent is None else SitePermissions(agent.bridge.gate)
+    rules = CrossingRules(gateway.rules, judge, permissions)
+
+    def refusal(site: str, module: str, name: str) -> str:
+        return rules.refusal(site, module, name)
+
+    def why_not(site: str, source: MeshSource) -> str:
+        return rules.refusal(site, source.module, source.name, Access.CALL)
+
+    history = SiteHistory(clock.now)
+    parts: list[SitePart] = [
+        SiteLastValues(
+            gateway.site, session, graph, LastValueStore(_store_file(settings)), rules.kept, refusal, clock.wall_ns
+        ),
+        SiteTopics(gateway.site, graph, session, rules, settings.make_contracts(), clock),
+        SiteServices(gateway.site, session, graph, services.timeout, why_not, clock.wall_ns),
+    ]
+    own = SiteGateway(gateway.site, gateway.rank, secrets.token_hex(16))
+    neighbour = SiteNeighbour(graph, session, own, rules, parts)
+    neighbour.on_sites = history.seen
+    neighbour.on_site_source = lambda source, there: history.source(source, there=there)
+    if isinstance(graph, AgentGraph):
+        neighbour.add(SiteActions(graph.attend))
+    if agent is not None:
+        _add_questions(neighbour, agent, session, own, rules, history, clock, settings.name)
+    return neighbour
+
+
+def _add_questions(
+    neighbour: SiteNeighbour,
+    agent: Agent,
+    session: OwnedSession,
+    own: SiteGateway,
+    rules: CrossingRules,
+    history: SiteHistory,
+    clock: SystemClock,
+    name: str,
+) -> None:
+    """Add what answers ``rmpa site``, ``rmpa param`` and ``rmpa why`` about other sites."""
+
+    async def ask_module(module: str, what: str, args: dict[str, Any]) -> object:
+        for peer in agent.bridge.sessions.linked():
+            if peer.link.name == module:
+                return await agent.bridge.rpc.request(peer, what, args, limits.SITE_PARAM_TIMEOUT)
+        where = f"site {own.site} as {module!r}"
+        raise UnreachableError("module", where, "`rmpa peer list` there shows which are linked to its gateway")
+
+    def may_not(site: str, module: str, parameter: str) -> str:
+        return rules.refusal(site, module, parameter, Access.PARAM)
+
+    exports = SiteParamExports(own.site, session, ask_module, may_not)
+    imports = SiteParamImports(own.site, session, clock.wall_ns, agent.params, lambda: neighbour.catalogue.sites)
+    params = SiteParams(exports, imports)
+    neighbour.add(params)
+    neighbour.on_leads = params.lead
+    why = SiteWhy(own.site, name, session, neighbour, history, rules)
+    answers = SiteAnswers(
+        name, own, session, neighbour, history, lambda: session.endpoints, imports.ask, why, clock.wall_ns
+    )
+    neighbour.add(answers)
+    agent.sites.serve(answers)
+
+
+def _store_file(settings: Settings) -> Path | None:
+    """The file of last values; ``None``: there is no state directory."""
+    if settings.gateway.store:
+        return Path(settings.gateway.store)
+    directory = state_dir(os.environ, settings.state_dir or None)
+    return module_dir(directory, settings.name) / "last-values.sqlite" if directory is not None else None

@@ -1,0 +1,193 @@
+"""Answers the questions of other sites about parameters of this site's modules."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import secrets
+from typing import TYPE_CHECKING, Any
+
+from rmpa.bridge.params import transfer
+from rmpa.core.errors import PeerRefused, RmpaError
+from rmpa.gateway import limits
+from rmpa.gateway.sites.attachment import SiteAttachment
+from rmpa.gateway.sites.keys import ROOT
+from rmpa.gateway.sites.params import (
+    GATEWAYS,
+    ParamAnswer,
+    ParamNews,
+    ParamQuestion,
+    digest,
+    from_json,
+    parse_param_key,
+    refused_leaf,
+    to_json,
+)
+from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Generator
+
+    from rmpa.gateway.zenoh_api import Declared, ZenohQuery, ZenohSession
+
+_log = logging.getLogger(__name__)
+_MISSING = "there is no parameter"
+
+
+class SiteParamExports:
+    """The parameters of this site's modules, as queryables.
+
+    Args:
+        site: This site's name.
+        session: The Zenoh session.
+        ask: Asks a module of this site over the mesh: module, question, arguments; raises ``RmpaError``.
+        why_not: ``(site, module, parameter)``: why a site may not have a parameter; empty if it may. The site is
+            empty for programs that do not tell theirs.
+    """
+
+    def __init__(
+        self,
+        site: str,
+        session: ZenohSession,
+        ask: Callable[[str, str, dict[str, Any]], Awaitable[object]],
+        why_not: Callable[[str, str, str], str],
+    ) -> None:
+        self._site = site
+        self._session = session
+        self._ask = ask
+        self._why_not = why_not
+        self._queryable: Declared | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
+        self.asked = 0
+        """Questions that came."""
+        self.refused = 0
+        """Questions that got an error."""
+
+    def lead(self, leads: bool) -> None:
+        """Answer while this gateway leads its site."""
+        if leads and self._queryable is None:
+            self._queryable = self._session.queryable(f"{ROOT}/{self._site}/*/p/**", self._take)
+        elif not leads and self._queryable is not None:
+            self._queryable.close()
+            self._queryable = None
+
+    async def close(self) -> None:
+        """Answer no more; questions under way get an error."""
+        self.lead(leads=False)
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    # --- inside ---------------------------------------------------------------------------------------------------
+
+    def _take(self, query: ZenohQuery) -> None:
+        self.asked += 1
+        if len(self._tasks) >= limits.SITE_PARAMS_AT_ONCE:
+            self.refused += 1
+            query.reply_error("too many questions about parameters at once; try again later")
+            return
+        task = asyncio.get_running_loop().create_task(self._answer(query), name="parameter for a site")
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _answer(self, query: ZenohQuery) -> None:
+        try:
+            site = SiteAttachment.parse(query.attachment).path[-1] if query.attachment else ""
+            module, name = parse_param_key(query.key)
+            if name == GATEWAYS:
+                reply = (await self._for_gateway(site, module, ParamQuestion.parse(query.payload))).serialize()
+            elif query.payload:
+                text = serialize_response(from_json(query.payload)).decode()
+                reply = to_json(await self._set(site, module, name, text))
+            else:
+                reply = to_json(parse_response((await self._get(site, module, name)).encode()))
+            query.reply(query.key, reply)
+            query.finish()
+        except PeerRefused as error:
+            self._fail(query, error.reason)
+        except RmpaError as error:
+            self._fail(query, str(error))
+        except asyncio.CancelledError:
+            query.reply_error(f"the gateway of site {self._site} ends")
+            raise
+        except Exception:  # noqa: BLE001 - a task's top
+            _log.exception("! a question about a parameter failed")
+            self._fail(query, f"the gateway of site {self._site} failed at the parameter; its log says why")
+
+    def _fail(self, query: ZenohQuery, text: str) -> None:
+        self.refused += 1
+        query.reply_error(text)
+
+    async def _for_gateway(self, site: str, module: str, question: ParamQuestion) -> ParamAnswer:
+        match question.op:
+            case "get":
+                return ParamAnswer(text=await self._get(site, module, question.key))
+            case "names":
+                return ParamAnswer(names=await self._names(site, module))
+            case "set":
+                return ParamAnswer(count=await self._set(site, module, question.key, question.text))
+            case "delete":
+                await self._delete(site, module, question.key)
+                return ParamAnswer()
+            case _:
+                return ParamAnswer(values=await self._values(site, module, question.last))
+
+    async def _get(self, site: str, module: str, key: str) -> str:
+        text = await self._read(module, key)
+        self._judge(site, module, key, text)
+        return text
+
+    async def _read(self, module: str, key: str) -> str:
+        text: str = await self._drive(module, transfer.reading(transfer.GET, {"key": key}))
+        return text
+
+    async def _names(self, site: str, module: str) -> list[str]:
+        text = await self._drive(module, transfer.reading(transfer.NAMES, {}))
+        names = parse_response(text.encode())
+        found = [str(name) for name in names] if isinstance(names, list) else []
+        return [name for name in found if not self._why_not(site, module, name)]
+
+    async def _set(self, site: str, module: str, key: str, text: str) -> int:
+        self._judge(site, module, key, text)
+        return int(await self._drive(module, transfer.writing(key, text, secrets.randbits(31))))
+
+    async def _delete(self, site: str, module: str, key: str) -> None:
+        self._refuse(self._why_not(site, module, key))
+        text = ""
+        with contextlib.suppress(PeerRefused):  # what is missing, or may not be read, is judged by its module
+            text = await self._read(module, key)
+        if text:
+            self._judge(site, module, key, text)
+        await self._ask(module, transfer.DELETE, {"key": key})
+
+    async def _values(self, site: str, module: str, last: dict[str, str]) -> dict[str, ParamNews]:
+        found = {}
+        for key, known in last.items():
+            text: str | None = None
+            try:
+                text = await self._get(site, module, key)
+            except RmpaError as error:
+                reason = error.reason if isinstance(error, PeerRefused) else str(error)
+                if not reason.startswith(_MISSING):
+                    found[key] = ParamNews(problem=reason)
+                    continue
+            if digest(text) != known:
+                found[key] = ParamNews(text=text)
+        return found
+
+    def _judge(self, site: str, module: str, key: str, text: str) -> None:
+        value = parse_response(text.encode())
+        self._refuse(refused_leaf(key, value, lambda name: self._why_not(site, module, name)))
+
+    def _refuse(self, why: str) -> None:
+        if why:
+            raise PeerRefused(f"site {self._site}", why)
+
+    async def _drive(self, module: str, steps: Generator[transfer.Question, object, Any]) -> Any:
+        try:
+            question = next(steps)
+            while True:
+                question = steps.send(await self._ask(module, *question))
+        except StopIteration as done:
+            return done.value

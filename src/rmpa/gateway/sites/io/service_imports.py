@@ -1,0 +1,171 @@
+"""Puts the services of other sites into the gateway's graph, and calls them."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from rmpa.core.errors import PeerRefused, UnreachableError
+from rmpa.gateway import limits
+from rmpa.gateway.sites.attachment import SiteAttachment
+from rmpa.gateway.sites.services import DESCRIPTION, NO_MD5, read_description, unanswered
+from rmpa.gateway.zenoh_api import ZenohPriority
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.gateway.neighbour import ForeignService, ForeignSource, OwnGraph
+    from rmpa.gateway.sites.keys import SiteSource
+    from rmpa.gateway.zenoh_api import ZenohSession
+    from rmpa.ros.wire.services import ServiceDescription
+
+
+@dataclass(slots=True, eq=False)
+class _Imported:
+    """One service of another site."""
+
+    source: SiteSource
+    foreign: ForeignSource
+    gone: asyncio.Event = field(default_factory=asyncio.Event)
+    service: ForeignService | None = None
+    description: ServiceDescription | None = None
+    calls: int = 0
+    failed: int = 0
+    problem: str = ""
+
+
+class SiteServiceImports:
+    """The services of other sites in the gateway's graph.
+
+    Args:
+        site: This site's name.
+        session: The Zenoh session.
+        graph: The gateway's graph.
+        timeout: Seconds that a call may take, by the service's name in the gateway's graph (``[[service]]``).
+        stamp: The wall clock, nanoseconds since 1970.
+    """
+
+    def __init__(
+        self,
+        site: str,
+        session: ZenohSession,
+        graph: OwnGraph,
+        timeout: Callable[[str], float],
+        stamp: Callable[[], int],
+    ) -> None:
+        self._site = site
+        self._session = session
+        self._graph = graph
+        self._timeout = timeout
+        self._stamp = stamp
+        self._numbers = itertools.count(1)
+        self._imported: dict[ForeignSource, _Imported] = {}
+
+    def show(self, foreign: ForeignSource, source: SiteSource) -> None:
+        """Show a service.
+
+        Args:
+            foreign: The service under its name here.
+            source: What its token says.
+        """
+        self.hide(foreign)
+        entry = _Imported(source, foreign)
+        self._imported[foreign] = entry
+        entry.service = self._graph.show_service(
+            foreign, lambda request: self._call(entry, request), lambda: self._describe(entry)
+        )
+
+    def renew(self, foreign: ForeignSource, source: SiteSource) -> None:
+        """A service is of another run of its module: calls under way end with an error, and its type is unknown."""
+        entry = self._imported.get(foreign)
+        if entry is None:
+            self.show(foreign, source)
+            return
+        entry.gone.set()
+        entry.source, entry.description, entry.gone = source, None, asyncio.Event()
+
+    def hide(self, foreign: ForeignSource) -> None:
+        """Take a service back; calls under way end with an error at once."""
+        entry = self._imported.pop(foreign, None)
+        if entry is not None:
+            entry.gone.set()
+            if entry.service is not None:
+                entry.service.close()
+
+    def close(self) -> None:
+        """Take all services back."""
+        for foreign in list(self._imported):
+            self.hide(foreign)
+
+    def report(self) -> list[dict[str, object]]:
+        """What ``rmpa site info`` shows of each, as JSON values."""
+        return [
+            {
+                "site": entry.source.module.site,
+                "module": entry.source.module.name,
+                "node": entry.source.node,
+                "name": entry.source.name,
+                "here": entry.foreign.name,
+                "type": entry.description.type if entry.description is not None else entry.source.type,
+                "calls": entry.calls,
+                "failed": entry.failed,
+                "problem": (entry.service.problem if entry.service is not None else "") or entry.problem,
+            }
+            for entry in self._imported.values()
+        ]
+
+    # --- inside ---------------------------------------------------------------------------------------------------
+
+    async def _call(self, entry: _Imported, request: bytes) -> bytes:
+        """Call the service.
+
+        Raises:
+            PeerRefused: Its server, or its site's gateway, answered with an error; the reason is its text.
+            UnreachableError: No answer came.
+        """
+        entry.calls += 1
+        try:
+            md5 = entry.description.md5sum if entry.description is not None else NO_MD5
+            timeout = self._timeout(entry.foreign.name)
+            return await self._ask(entry, "", request, md5, timeout)
+        except (PeerRefused, UnreachableError) as error:
+            entry.failed += 1
+            entry.problem = error.reason if isinstance(error, PeerRefused) else str(error)
+            raise
+
+    async def _describe(self, entry: _Imported) -> ServiceDescription:
+        """Ask for the type; raises as ``_call``, and ``RemoteProtocolError`` for a reply that is none."""
+        reply = await self._ask(entry, f"?{DESCRIPTION}", b"", NO_MD5, limits.DESCRIBE_TIMEOUT)
+        entry.description = read_description(reply)
+        return entry.description
+
+    async def _ask(self, entry: _Imported, parameters: str, request: bytes, md5: str, within: float) -> bytes:
+        source, loop = entry.source, asyncio.get_running_loop()
+        module, site = source.module.name, source.module.site
+        call = SiteAttachment(next(self._numbers), self._stamp(), md5, source.node, (self._site,))
+        began = loop.time()
+        asking = loop.create_task(
+            self._session.get(
+                source.key() + parameters,
+                request,
+                call.serialize(),
+                timeout=within + limits.SITE_CALL_GRACE,
+                priority=ZenohPriority.INTERACTIVE_HIGH,
+            )
+        )
+        leaving = loop.create_task(entry.gone.wait())  # of the run that is called, not of the next
+        try:
+            await asyncio.wait((asking, leaving), return_when=asyncio.FIRST_COMPLETED)
+            replies = asking.result() if asking.done() else []
+        finally:
+            for task in (asking, leaving):
+                task.cancel()
+            await asyncio.gather(asking, leaving, return_exceptions=True)
+        for reply in sorted(replies, key=lambda each: not each.ok):
+            if reply.ok:
+                return reply.payload
+            raise PeerRefused(f"{module} at site {site}", reply.payload.decode(errors="replace"))
+        text = unanswered(source.name, module, site, loop.time() - began, within)
+        raise PeerRefused(f"site {site}", text)

@@ -1,0 +1,283 @@
+"""Gathers what ``rmpa why`` judges of the way between sites: from this gateway, and from the other site's."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.gateway import limits
+from rmpa.gateway.neighbour import SourceKind
+from rmpa.gateway.sites.why import (
+    SourceHere,
+    SourceThere,
+    WhyAnswer,
+    WhyQuestion,
+    here_stages,
+    sent_stages,
+    site_stage,
+    there_stages,
+    why_key,
+)
+from rmpa.observe.check import FAIL, OK, Check
+from rmpa.observe.why.diagnosis import Diagnosis, until_failure
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rmpa.gateway.neighbour import MeshSource
+    from rmpa.gateway.sites.history import SiteHistory
+    from rmpa.gateway.sites.keys import SiteSource
+    from rmpa.gateway.sites.known_sites import Sites
+    from rmpa.gateway.sites.rules import CrossingRules
+    from rmpa.gateway.zenoh_api import Declared, ZenohQuery, ZenohSession
+
+_KINDS = {SourceKind.TOPIC: "topic", SourceKind.SERVICE: "service"}
+_PARTS = {SourceKind.TOPIC: "topics", SourceKind.SERVICE: "services"}
+
+
+class SiteWhy:
+    """The ways of topics and services through this gateway.
+
+    Args:
+        site: This site's name.
+        gateway: This gateway's name among its peers.
+        session: The Zenoh session.
+        sites: What is known of sites.
+        history: Since when sites are there or away.
+        rules: Decide what may cross.
+    """
+
+    def __init__(
+        self,
+        site: str,
+        gateway: str,
+        session: ZenohSession,
+        sites: Sites,
+        history: SiteHistory,
+        rules: CrossingRules,
+    ) -> None:
+        self._site = site
+        self._gateway = gateway
+        self._session = session
+        self._sites = sites
+        self._history = history
+        self._rules = rules
+        self._queryable: Declared = session.queryable(why_key(site), self._take)
+
+    def close(self) -> None:
+        """Answer no more."""
+        self._queryable.close()
+
+    async def ways(
+        self, name: str, site: str = "", module: str = "", asker: str = "", *, service: bool = False
+    ) -> list[Diagnosis]:
+        """The ways of a name to here from other sites, and from a module of this site to others.
+
+        Args:
+            name: A topic or service, by its name at the module that asks.
+            site: From this site alone; empty for all.
+            module: From this module of it alone; empty for all.
+            asker: The module that asks, whose own sources are told of too; empty for this gateway.
+            service: Whether a service is meant.
+        """
+        known = site in self._sites.catalogue.sites or site in self._history.away
+        if not self._sites.leads or (site and not known and not module):
+            return []  # a name that is no site's is a peer's
+        found = [each for each in self._here(name, site, module) if not service or each.kind is SourceKind.SERVICE]
+        ways = list(await asyncio.gather(*(self._way(each) for each in found)))
+        if site and not ways:
+            ways.append(await self._no_way(name, site, module, service=service))
+        if not site:
+            for away, had in self._history.had(name):
+                ways.append(await self._no_way(name, away, had, service=service))
+        if not site:
+            ways += self._leaving(name, asker if asker != self._gateway else "", service=service)
+        return ways
+
+    # --- what comes in ----------------------------------------------------------------------------------------------
+
+    def _here(self, name: str, site: str, module: str) -> Iterator[SourceHere]:
+        reports = self._reports("in")
+        for entry in self._sites.imports.entries:
+            source, there = entry.source, entry.announced
+            if name not in (source.name, there.name) or not _meant(there, site, module):
+                continue
+            if name != source.name and not site:
+                continue  # its name there is asked for with its site alone
+            key = source.kind, source.site, source.module, source.node, there.name
+            rule = self._rules.incoming(
+                source.kind, source.site, source.module, there.name, source.type, source.node
+            ).why
+            yield SourceHere(
+                source.kind,
+                source.site,
+                source.module,
+                source.node,
+                there.name,
+                source.name,
+                "",
+                rule,
+                reports.get(key),
+            )
+        for there, why in self._sites.imports.refusals():
+            if there.name == name and _meant(there, site, module):
+                yield SourceHere(
+                    there.kind, there.module.site, there.module.name, there.node, there.name, refused=why
+                )
+
+    async def _way(self, here: SourceHere) -> Diagnosis:
+        answer, refusal = await self._ask(here.site, here.name, here.module)
+        there = next(
+            (
+                s
+                for s in answer.sources
+                if s.kind == here.kind.value and s.module == here.module and s.node == here.node
+            ),
+            None,
+        )
+        stages = [
+            self._site_stage(here.site),
+            *there_stages(here.site, here.module, here.name, there, refusal),
+            *here_stages(self._site, here),
+        ]
+        return self._diagnosis(here.here or here.name, f"{here.site}/{here.module}", here.node, here.kind, stages)
+
+    async def _no_way(self, name: str, site: str, module: str, *, service: bool) -> Diagnosis:
+        """A site is named that has nothing of that name, as it is seen here."""
+        answer, refusal = await self._ask(site, name, module)
+        wanted = [each for each in answer.sources if not service or each.kind == SourceKind.SERVICE.value]
+        there = wanted[0] if wanted else None
+        stages = [self._site_stage(site), *there_stages(site, module, name, there, refusal)]
+        if there is not None and not there.refused:
+            text = f"site {site} offers it, and the offer has not come here"
+            remedy = "in a moment? else routers that do not reach each other, or too many sources: `rmpa site info`"
+            stages.append(Check("offer", FAIL, text, remedy))
+        elif refusal:
+            stages.append(
+                Check("offer", FAIL, f"site {site} announces no {name}", f"`rmpa why {name}` there tells more")
+            )
+        kind = SourceKind.SERVICE if service else SourceKind.TOPIC
+        return self._diagnosis(
+            name, f"{site}/{module}" if module else site, there.node if there else "", kind, stages
+        )
+
+    def _site_stage(self, site: str) -> Check:
+        catalogue = self._sites.catalogue
+        known = site in catalogue.sites
+        away = self._history.since_ago(site) if site in self._history.away else None
+        return site_stage(site, len(catalogue.gateways(site)), away, known=known)
+
+    def _diagnosis(self, name: str, peer: str, node: str, kind: SourceKind, stages: list[Check]) -> Diagnosis:
+        return Diagnosis.of(
+            until_failure(stages), kind=_KINDS[kind], name=name, peer=peer, to=f"site {self._site}", node=node
+        )
+
+    # --- what goes out ----------------------------------------------------------------------------------------------
+
+    def _leaving(self, name: str, asker: str, *, service: bool) -> Iterator[Diagnosis]:
+        for source, there in self._out(""):
+            own = source.module == asker and source.name == name if asker else source.here == name
+            if not own or (service and source.kind is not SourceKind.SERVICE):
+                continue
+            stages = [Check("gateway", OK, f"{self._gateway} of site {self._site} sees it, as {source.here}")]
+            if there.refused:
+                remedy = "change [[gateway.rule]] of the gateway, if it should cross"
+                stages.append(Check("rule here", FAIL, there.refused, remedy))
+            else:
+                stages.append(Check("rule here", OK, there.rule))
+                if there.kind == SourceKind.TOPIC.value:
+                    stages += sent_stages(self._site, there, no_demand=FAIL)
+            yield Diagnosis.of(
+                until_failure(stages),
+                kind=_KINDS[source.kind],
+                name=name,
+                peer=source.module,
+                to="other sites",
+                node=source.node,
+            )
+
+    def _out(self, asking: str) -> Iterator[tuple[MeshSource, SourceThere]]:
+        """All sources of this site, as they are for another site (empty: for any)."""
+        reports = self._reports("out")
+        for entry in self._sites.exports.entries:
+            source = entry.source
+            report = reports.get((source.kind, self._site, source.module, source.node, source.name), {})
+            refused = self._rules.refusal(asking, source.module, source.name) if asking else ""
+            rule = self._rules.outgoing(source.kind, source.module, source.name, source.type, source.node).why
+            yield (
+                source,
+                SourceThere(
+                    kind=source.kind.value,
+                    module=source.module,
+                    node=source.node,
+                    type=source.type,
+                    rule=rule,
+                    refused=refused,
+                    wanted=bool(report.get("wanted")),
+                    messages=int(report.get("messages", report.get("calls", 0))),
+                    waiting=int(report.get("waiting", 0)),
+                    dropped=int(report.get("dropped", report.get("failed", 0))),
+                    limited=int(report.get("limited", 0)),
+                    problem=str(report.get("problem", "")) if source.kind is SourceKind.TOPIC else "",
+                ),
+            )
+        for source, why in self._sites.exports.refusals():
+            yield (
+                source,
+                SourceThere(
+                    kind=source.kind.value, module=source.module, node=source.node, type=source.type, refused=why
+                ),
+            )
+
+    def _reports(self, way: str) -> dict[tuple[SourceKind, str, str, str, str], dict[str, Any]]:
+        """What the parts report of each source, by kind, site, module, node and name there."""
+        found: dict[tuple[SourceKind, str, str, str, str], dict[str, Any]] = {}
+        parts = self._sites.report().get("parts")
+        for kind, part in _PARTS.items():
+            report = parts.get(part) if isinstance(parts, dict) else None
+            for each in report.get(way, ()) if isinstance(report, dict) else ():
+                key = kind, each.get("site", self._site), each["module"], each.get("node", ""), each["name"]
+                found[key] = each
+        return found
+
+    # --- the other gateway --------------------------------------------------------------------------------------
+
+    async def _ask(self, site: str, name: str, module: str) -> tuple[WhyAnswer, str]:
+        if site not in self._sites.catalogue.sites:
+            return WhyAnswer(), "it is not there"
+        question = msgspec.json.encode(WhyQuestion(site=self._site, name=name, module=module))
+        replies = await self._session.get(why_key(site), question, timeout=limits.SITE_ASK_TIMEOUT, all_complete=True)
+        problem = "it does not answer; is it of an earlier release?"
+        for reply in replies:
+            try:
+                if reply.ok:
+                    return WhyAnswer.parse(reply.payload), ""
+                problem = reply.payload.decode(errors="replace")
+            except RemoteProtocolError as error:
+                problem = str(error)
+        return WhyAnswer(), problem
+
+    def _take(self, query: ZenohQuery) -> None:
+        if not self._sites.leads:
+            query.finish()
+            return
+        try:
+            question = WhyQuestion.parse(query.payload)
+        except RemoteProtocolError as error:
+            query.reply_error(str(error))
+            return
+        sources = tuple(
+            there
+            for source, there in self._out(question.site)
+            if source.name == question.name and question.module in ("", source.module)
+        )
+        modules = tuple(sorted({module.name for module in self._sites.exports.modules}))
+        query.reply(query.key, msgspec.json.encode(WhyAnswer(sources=sources, modules=modules)))
+        query.finish()
+
+
+def _meant(there: SiteSource, site: str, module: str) -> bool:
+    return site in ("", there.module.site) and module in ("", there.module.name)

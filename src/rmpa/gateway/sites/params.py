@@ -1,0 +1,193 @@
+"""Parameters between sites. Without I/O.
+
+``get`` on ``rmpa/1/<site>/<module>/p/<name>`` brings a parameter, or a namespace as an object, as JSON; with a
+payload it sets it to that JSON. JSON has neither binary data nor dates, so gateways ask at
+``rmpa/1/<site>/<module>/p/-`` with values as the text of an XML-RPC response::
+
+    {"op": "get", "key": "/gains"}                          {"text": "<?xml …"}
+    {"op": "names"}                                         {"names": ["/gains/p", …]}
+    {"op": "set", "key": "/gains/p", "text": "<?xml …"}     {"count": 1}
+    {"op": "delete", "key": "/gains/p"}                     {}
+    {"op": "values", "last": {"/gains": "<digest>"}}        {"values": {"/gains": {"text": …} or {"problem": …}}}
+
+``values`` brings those whose digest is another one; its ``text`` is missing where there is no such parameter.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from datetime import datetime
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from rmpa.bridge import limits as bridge_limits
+from rmpa.bridge.params.rules import key_problem
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.gateway import limits
+from rmpa.gateway.sites.keys import ROOT
+from rmpa.ros.master.parameters import leaves
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.ros.wire.tcpros import Buffer
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
+
+GATEWAYS: Final = "-"
+"""The last chunk of the key at which gateways ask."""
+OPERATIONS: Final = ("get", "names", "set", "delete", "values")
+
+
+class ParamQuestion(msgspec.Struct, omit_defaults=True, kw_only=True):
+    """One question of a gateway; see the module's text.
+
+    Attributes:
+        op: One of ``OPERATIONS``.
+        key: The parameter's global name in its module.
+        text: The value as XML-RPC text.
+        last: The digest of what is known, by key; empty for nothing.
+    """
+
+    op: str
+    key: str = ""
+    text: str = ""
+    last: dict[str, str] = {}
+
+    def serialize(self) -> bytes:
+        """As JSON."""
+        return msgspec.json.encode(self)
+
+    @classmethod
+    def parse(cls, data: Buffer) -> ParamQuestion:
+        """Read one.
+
+        Raises:
+            RemoteProtocolError: It is none, or names something that is no parameter.
+        """
+        found: ParamQuestion = _decode(data, cls)
+        if found.op not in OPERATIONS:
+            raise RemoteProtocolError(f"{found.op[:40]!r} is no question about parameters")
+        keys = {"names": (), "values": tuple(found.last)}.get(found.op, (found.key,))
+        if len(keys) > limits.SITE_PARAMS_AT_ONCE:
+            raise RemoteProtocolError(f"{len(keys)} parameters at once; at most {limits.SITE_PARAMS_AT_ONCE}")
+        for key in keys:
+            if problem := key_problem(key):
+                raise RemoteProtocolError(problem)
+        return found
+
+
+class ParamNews(msgspec.Struct, omit_defaults=True, kw_only=True):
+    """The present value of a followed parameter.
+
+    Attributes:
+        text: As XML-RPC text; ``None``: there is no such parameter.
+        problem: Why it is not told; empty for nothing.
+    """
+
+    text: str | None = None
+    problem: str = ""
+
+
+class ParamAnswer(msgspec.Struct, omit_defaults=True, kw_only=True):
+    """The answer to a ``ParamQuestion``; the fields are those that its text names."""
+
+    text: str = ""
+    names: list[str] = []
+    count: int = 0
+    values: dict[str, ParamNews] = {}
+
+    def serialize(self) -> bytes:
+        """As JSON."""
+        return msgspec.json.encode(self)
+
+    @classmethod
+    def parse(cls, data: Buffer) -> ParamAnswer:
+        """Read one.
+
+        Raises:
+            RemoteProtocolError: It is none.
+        """
+        found: ParamAnswer = _decode(data, cls)
+        return found
+
+
+def _decode(data: Buffer, kind: type[Any]) -> Any:
+    if len(data) > limits.SITE_PARAM_BYTES_MAX:
+        raise RemoteProtocolError(f"a text about parameters has {len(data)} bytes")
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise RemoteProtocolError(f"not a text about parameters: {error}") from None
+
+
+def digest(text: str | None) -> str:
+    """What ``values`` compares: of a value's text, or of no value (``None``)."""
+    return "-" if text is None else hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def param_key(site: str, module: str, name: str) -> str:
+    """The key of a parameter."""
+    return f"{ROOT}/{site}/{module}/p/{name.strip('/')}"
+
+
+def parse_param_key(key: str) -> tuple[str, str]:
+    """Module and parameter of a key; the parameter is ``-`` where gateways ask.
+
+    Raises:
+        RemoteProtocolError: It is not the key of one parameter.
+    """
+    chunks = key.split("/")
+    if len(key) > limits.KEY_MAX or len(chunks) < 6 or "/".join(chunks[:2]) != ROOT or chunks[4] != "p":
+        raise RemoteProtocolError(f"{key[:120]!r} is not the key of a parameter")
+    if any("*" in chunk for chunk in chunks):
+        raise RemoteProtocolError(f"{key[:120]!r} names several; ask for one, or for a namespace")
+    name = "/".join(chunks[5:])
+    return chunks[3], GATEWAYS if name == GATEWAYS else "/" + name
+
+
+def refused_leaf(key: str, value: XmlRpcValue, why_not: Callable[[str], str]) -> str:
+    """Why a value may not cross: the first reason for one of the parameters in it; empty if all may."""
+    names = [name for name, _ in leaves(key, value)] if isinstance(value, dict) and value else [key]
+    return next((why for name in names if (why := why_not(name.rstrip("/") or "/"))), "")
+
+
+def to_json(value: XmlRpcValue) -> bytes:
+    """A value as JSON: binary data in base64, dates in ISO 8601."""
+    return msgspec.json.encode(_plain(value))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _plain(member) for name, member in value.items()}
+    if isinstance(value, list):
+        return [_plain(member) for member in value]
+    if isinstance(value, bytes):
+        return base64.b64encode(value).decode()
+    return value.isoformat() if isinstance(value, datetime) else value
+
+
+def from_json(data: Buffer) -> Any:
+    """The value of a JSON text.
+
+    Raises:
+        RemoteProtocolError: It is none, too large, or contains null, which ROS does not have.
+    """
+    if len(data) > bridge_limits.PARAM_TEXT_MAX:
+        raise RemoteProtocolError(f"a value of {len(data)} bytes; at most {bridge_limits.PARAM_TEXT_MAX} cross")
+    value = _decode(data, object)
+    if _has_null(value):
+        raise RemoteProtocolError("the value is null or contains one, which ROS does not have; leave it out")
+    return value
+
+
+def _has_null(value: object) -> bool:
+    members = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return value is None or any(map(_has_null, members))
+
+
+def followed_of(key: str) -> tuple[str, str, str] | None:
+    """Site, module and parameter that a key of the gateway's own core stands for: ``/<site>/<module>/<name>``."""
+    parts = key.split("/", 3)
+    return (parts[1], parts[2], f"/{parts[3]}") if len(parts) == 4 and all(parts[1:]) else None

@@ -1,0 +1,255 @@
+"""Zenoh's table of access, from ``[[permission]]``: which certificate may send and get which keys through a router.
+
+A rule of ours is about modules, by their names; the common name of a certificate is that name, and a gateway connects
+with the certificate of its own module. In the keys of sites stand the names of topics, services and parameters.
+Zenoh's rules allow what one of them allows and none denies, as ours do.
+
+What Zenoh cannot say: it compares common names as they are, so a glob over them becomes the names that are known. A
+denial whose glob cannot be resolved is one for all; an allowance is left out. Both are told.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from rmpa.config.peer_rules import PEER
+from rmpa.config.permission_rules import ACTION_CLIENT, ACTION_SERVER, Access, Effect
+from rmpa.core.names import matches
+from rmpa.trust.permissions import action_topics
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from rmpa.config.permission_rules import PermissionRule
+    from rmpa.config.settings import TrustSettings
+
+_MODULE: Final = "rmpa/1/*/*"
+_TOPIC: Final = (f"{_MODULE}/t/*/{{}}", f"{_MODULE}/t/*/{{}}/@adv/**", f"{_MODULE}/d/t/{{}}", f"{_MODULE}/v/{{}}")
+_SERVICE: Final = (f"{_MODULE}/s/*/{{}}",)
+_PARAM: Final = (f"{_MODULE}/p/{{}}",)
+_ASKED_BY_GATEWAYS: Final = f"{_MODULE}/p/-"
+_IN: Final = "ingress"
+_OUT: Final = "egress"
+_ASKS: Final = {_IN: ("query",), _OUT: ("declare_queryable", "reply")}
+_ANSWERS: Final = {_IN: ("declare_queryable", "reply"), _OUT: ("query",)}
+_OFFERS: Final = {_IN: ("declare_queryable",), _OUT: ("declare_queryable",)}
+_TOKENS: Final = ("liveliness_token", "liveliness_query", "declare_liveliness_subscriber")
+_EVERYTHING: Final = ("put", "delete", "declare_subscriber", "query", "reply", "declare_queryable", *_TOKENS)
+_FLOWS: Final[dict[Access, tuple[tuple[str, ...], dict[str, tuple[str, ...]]]]] = {
+    # A cache of latched messages (@adv) is asked by the subscriber, and announced by a token of the publisher.
+    Access.PUBLISH: (
+        _TOPIC,
+        {
+            _IN: ("put", "delete", "declare_queryable", "reply", *_TOKENS),
+            _OUT: ("declare_subscriber", "query", *_TOKENS),
+        },
+    ),
+    Access.SUBSCRIBE: (
+        _TOPIC,
+        {
+            _IN: ("declare_subscriber", "query", *_TOKENS),
+            _OUT: ("put", "delete", "declare_queryable", "reply", *_TOKENS),
+        },
+    ),
+    Access.CALL: (_SERVICE, _ASKS),
+    Access.SERVE: (_SERVICE, _ANSWERS),
+    Access.PARAM: (_PARAM, _ASKS),
+}
+"""By access: the keys, and the messages from and to the subject that it needs."""
+_GLOB: Final = re.compile(r"[*?]")
+
+
+@dataclass(frozen=True, slots=True)
+class AccessTable:
+    """Zenoh's ``access_control``.
+
+    Args:
+        entries: Its value in Zenoh's configuration.
+        notes: What of the rules could not be said.
+    """
+
+    entries: dict[str, object]
+    notes: tuple[str, ...]
+
+
+def access_table(trust: TrustSettings, known: Sequence[str] = (), foreign: Sequence[str] = ()) -> AccessTable:
+    """Make the table.
+
+    Args:
+        trust: The rules, groups and the default.
+        known: Names of modules that have certificates, for globs over them.
+        foreign: Key expressions that every member may use, such as those of ROS 2.
+    """
+    return _Table(trust, known, foreign).made()
+
+
+class _Table:
+    def __init__(self, trust: TrustSettings, known: Sequence[str], foreign: Sequence[str]) -> None:
+        self._trust = trust
+        self._groups = {group.name: group.modules for group in trust.groups}
+        self._known = known
+        self._rules: list[dict[str, object]] = []
+        self._subjects: dict[tuple[str, ...], str] = {}
+        self._policies: list[dict[str, object]] = []
+        self._notes: dict[str, None] = {}
+        self._foreign = tuple(foreign)
+
+    def made(self) -> AccessTable:
+        if self._trust.default != Effect.ALLOW:
+            self._base()
+        for number, rule in enumerate(self._trust.rules, 1):
+            self._add(number, rule)
+        entries: dict[str, object] = {
+            "enabled": True,
+            "default_permission": str(self._trust.default),
+            "rules": self._rules,
+            "subjects": [
+                {"id": name, "cert_common_names": list(names)} if names else {"id": name}
+                for names, name in self._subjects.items()
+            ],
+            "policies": self._policies,
+        }
+        return AccessTable(entries, tuple(self._notes))
+
+    def _base(self) -> None:
+        """What each member needs: presence, definitions, and to offer answers; names are judged in queries."""
+        both = {_IN: _TOKENS, _OUT: _TOKENS}
+        asked = dict.fromkeys((_IN, _OUT), ("query", "reply", "declare_queryable"))
+        everything = dict.fromkeys(
+            (_IN, _OUT), ("put", "delete", "declare_subscriber", "query", "reply", "declare_queryable", *_TOKENS)
+        )
+        rules = [
+            *self._rule("presence", Effect.ALLOW, ("rmpa/1/**",), both),
+            *self._rule("definitions", Effect.ALLOW, (f"{_MODULE}/d/m/*",), asked),
+            *self._rule("questions of gateways", Effect.ALLOW, ("rmpa/1/*/-gateway/why",), asked),
+            *self._rule("answers", Effect.ALLOW, tuple(f"{_MODULE}/{each}/**" for each in "dvp"), _OFFERS),
+            *self._rule("own parameters", Effect.ALLOW, (f"{_MODULE}/p/**",), _ANSWERS),
+        ]
+        if self._foreign:
+            rules += self._rule("foreign", Effect.ALLOW, self._foreign, everything)
+        self._policy((), rules)
+
+    def _add(self, number: int, rule: PermissionRule) -> None:
+        for name in self._subject_names(number, rule):
+            rules: list[str] = []
+            for access, globs in self._names(rule, name).items():
+                found = _FLOWS.get(access)
+                if found is None:
+                    continue
+                keys = tuple(
+                    dict.fromkeys(
+                        template.format(key)
+                        for template in found[0]
+                        for glob in globs
+                        for key in self._keys(number, rule, glob)
+                    )
+                )
+                if access is Access.PARAM and rule.effect is Effect.ALLOW and keys:
+                    keys += (_ASKED_BY_GATEWAYS,)  # the name is in the question, and its gateway judges it
+                label = f"permission {number}: {access}" + (f" of {name[0]}" if name and len(name) == 1 else "")
+                rules += self._rule(label, rule.effect, keys, found[1])
+            if rules:
+                self._policy(name, rules)
+
+    def _subject_names(self, number: int, rule: PermissionRule) -> Iterator[tuple[str, ...]]:
+        """The subjects of a rule, each as its common names; no names: everybody."""
+        globs = [*rule.modules, *(glob for group in rule.groups for glob in self._groups.get(group, ()))]
+        own_name = any(PEER in written for each in rule.names.values() for written in each)
+        names: dict[str, None] = {}
+        for glob in globs:
+            if not _GLOB.search(glob):
+                names[glob] = None
+                continue
+            if glob == "*" and not own_name:
+                yield ()
+                return
+            fitting = [name for name in self._known if matches(glob, name)]
+            if not fitting and rule.effect is Effect.DENY:
+                self._note(number, f"denies it to all modules: none is known that fits {glob!r}")
+                yield ()
+                return
+            if not fitting:
+                self._note(number, f"is left out for {glob!r}: no module is known that fits it; name the modules")
+            names.update(dict.fromkeys(fitting))
+        if own_name:
+            yield from ((name,) for name in names)
+        elif names:
+            yield tuple(names)
+
+    def _names(self, rule: PermissionRule, subject: tuple[str, ...]) -> dict[Access, list[str]]:
+        found: dict[Access, list[str]] = {}
+        for key, globs in rule.names.items():
+            for written in globs:
+                glob = written.replace(PEER, subject[0] if subject else "*")
+                if key in (ACTION_CLIENT, ACTION_SERVER):
+                    for access, topic in action_topics(key, glob):
+                        found.setdefault(access, []).append(topic)
+                else:
+                    found.setdefault(Access(key), []).append(glob)
+        return found
+
+    def _keys(self, number: int, rule: PermissionRule, glob: str) -> tuple[str, ...]:
+        if "?" in glob and rule.effect is Effect.ALLOW:
+            self._note(number, f"is left out for {glob!r}: Zenoh has no ?")
+            return ()
+        return key_expressions(glob)
+
+    def _note(self, number: int, text: str) -> None:
+        self._notes[f"[[permission]] {number} {text}"] = None
+
+    def _rule(
+        self, label: str, effect: Effect, keys: Sequence[str], flows: Mapping[str, tuple[str, ...]]
+    ) -> list[str]:
+        made = []
+        for flow, messages in flows.items() if keys else ():
+            name = f"{label} ({flow})"
+            self._rules.append(
+                {
+                    "id": name,
+                    "permission": str(effect),
+                    "flows": [flow],
+                    "messages": list(messages),
+                    "key_exprs": list(keys),
+                }
+            )
+            made.append(name)
+        return made
+
+    def _policy(self, names: tuple[str, ...], rules: list[str]) -> None:
+        if names not in self._subjects:
+            self._subjects[names] = f"subject {len(self._subjects) + 1}" if names else "everybody"
+        self._policies.append({"rules": rules, "subjects": [self._subjects[names]]})
+
+
+def key_expressions(glob: str) -> tuple[str, ...]:
+    """The key expressions of Zenoh that fit the same names as a glob of ours; ``?`` becomes any characters.
+
+    A ``**`` within a part of a name stands for the rest of that part, or for more parts: two key expressions.
+    """
+    choices = []
+    for part in glob.strip("/").split("/"):
+        if part == "**":
+            choices.append(["**"])
+            continue
+        pieces = [piece.replace("?", "*") for piece in part.split("**")]
+        joined = (
+            "".join(itertools.chain(*itertools.zip_longest(pieces, between, fillvalue="")))
+            for between in itertools.product(("*", "*/**/*"), repeat=len(pieces) - 1)
+        )
+        choices.append(list(joined))
+    return tuple(dict.fromkeys(_canonical("/".join(parts)) for parts in itertools.product(*choices)))
+
+
+def _canonical(key: str) -> str:
+    chunks: list[str] = []
+    for chunk in key.split("/"):
+        each = chunk if chunk in ("*", "**") else re.sub(r"\*+", "$*", chunk)
+        each = "*" if each == "$*" else each
+        if chunks and chunks[-1] == "**" and each == "*":
+            chunks.insert(-1, each)
+        elif not (chunks and chunks[-1] == "**" and each == "**"):
+            chunks.append(each)
+    return "/".join(chunks)

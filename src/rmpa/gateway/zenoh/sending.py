@@ -1,0 +1,243 @@
+"""Publishers behind bounded queues, and the threads that put their messages to Zenoh.
+
+A put of a reliable publisher waits while the transport's queue of its priority is full: Zenoh has one such queue for
+each priority. So each priority in use has one thread here, and within it the publishers take turns. What waits for
+a full bulk lane holds no command up, and nothing holds the event loop up. Behind a full transport the oldest messages
+of each publisher are dropped, and counted.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from typing import TYPE_CHECKING, Final, Protocol
+
+from rmpa.gateway.zenoh import limits
+
+if TYPE_CHECKING:
+    import asyncio
+    from collections.abc import Callable
+
+    from rmpa.gateway.zenoh_api import ZenohQos
+    from rmpa.ros.wire.tcpros import Buffer
+
+_log = logging.getLogger(__name__)
+_Message = tuple[bytes, bytes]
+
+
+class PutHandle(Protocol):
+    """What puts: a publisher of the Zenoh library, once it is declared."""
+
+    def put(self, payload: bytes, *, attachment: bytes | None = None) -> None:
+        """Hand one message to Zenoh."""
+
+
+class QueuedPublisher:
+    """A publisher that queues, with the bounds of its QoS.
+
+    Args:
+        lane: The thread of its priority.
+        key: Its key.
+        qos: Its bounds.
+        undeclare: Called in the event loop once nothing of it is sent any more.
+    """
+
+    def __init__(self, lane: SendingLane, key: str, qos: ZenohQos, undeclare: Callable[[], None]) -> None:
+        self._lane = lane
+        self.key: Final = key
+        self._qos = qos
+        self._undeclare = undeclare
+        self.handle: PutHandle | None = None
+        """Zenoh's publisher; nothing is sent before it is declared."""
+        self._queue: deque[_Message] = deque()
+        self._queue_bytes = 0
+        self._taken = 0
+        self._scheduled = False
+        self._flush_timer: asyncio.TimerHandle | None = None
+        self._closed = False
+        self.sent = 0
+        self.dropped = 0
+
+    @property
+    def waiting(self) -> int:
+        """Messages in the queue, with those whose turn it is."""
+        return len(self._queue) + self._taken
+
+    def put(self, payload: Buffer, attachment: bytes = b"") -> int:
+        """Queue one message; the payload is copied if it is not ``bytes``. Returns the messages dropped for it."""
+        message = (payload if isinstance(payload, bytes) else bytes(payload), attachment)
+        with self._lane.changed:
+            if self._closed:
+                self.dropped += 1
+                return 1
+            self._queue.append(message)
+            self._queue_bytes += len(message[0])
+            dropped = self._make_room()
+            self._schedule()
+        return dropped
+
+    def declared(self, handle: PutHandle) -> None:
+        """Begin to send: Zenoh's publisher is there. Called from the thread that declares."""
+        with self._lane.changed:
+            self.handle = handle
+            self._schedule()
+
+    def close(self) -> None:
+        """Undeclare it, after the queue is empty or a second has passed."""
+        with self._lane.changed:
+            if self._closed:
+                return
+            self._closed = True
+            empty = not self._queue and not self._taken
+        if empty:
+            self._undeclare()
+        else:
+            self._flush_timer = self._lane.loop.call_later(limits.FLUSH_MAX, self._give_up)
+
+    def take_turn(self) -> list[_Message]:
+        """Take the messages of one turn. The caller has the lane's lock."""
+        turn: list[_Message] = []
+        size = 0
+        while self._queue and len(turn) < limits.TURN_MESSAGES and size < limits.TURN_BYTES:
+            message = self._queue.popleft()
+            turn.append(message)
+            size += len(message[0])
+        self._queue_bytes -= size
+        self._taken = len(turn)
+        return turn
+
+    def one_sent(self, sent: bool) -> None:
+        """Count one message of the turn. Called from the lane's thread, which alone writes these two."""
+        self._taken -= 1
+        if sent:
+            self.sent += 1
+        else:
+            with self._lane.changed:
+                self.dropped += 1
+
+    def end_turn(self) -> None:
+        """Queue up for another turn, or end. The caller has the lane's lock."""
+        self._taken = 0
+        self._scheduled = False
+        if self._queue:
+            self._schedule()
+        elif self._closed:
+            self._lane.call_loop(self._flushed)
+
+    def _schedule(self) -> None:
+        if self._queue and not self._scheduled and self.handle is not None:
+            self._scheduled = True
+            self._lane.schedule(self)
+
+    def _make_room(self) -> int:
+        dropped = 0
+        while len(self._queue) > 1 and (
+            len(self._queue) + self._taken > self._qos.messages or self._queue_bytes > self._qos.bytes
+        ):
+            old = self._queue.popleft()
+            self._queue_bytes -= len(old[0])
+            dropped += 1
+        self.dropped += dropped
+        return dropped
+
+    def _flushed(self) -> None:
+        if self._flush_timer is not None:
+            self._flush_timer.cancel()
+            self._flush_timer = None
+            self._undeclare()
+
+    def _give_up(self) -> None:
+        with self._lane.changed:
+            self.dropped += len(self._queue)
+            self._queue.clear()
+            self._queue_bytes = 0
+        self._flushed()
+
+
+class SendingLane:
+    """The thread that puts the messages of one priority.
+
+    Args:
+        loop: The event loop that the publishers belong to.
+        name: The thread's name.
+        failures: The exceptions of Zenoh's ``put``.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, name: str, failures: tuple[type[Exception], ...]) -> None:
+        self.loop: Final = loop
+        self._failures = failures
+        self.changed: Final = threading.Condition(threading.Lock())
+        """Guards the queues of all publishers of this lane."""
+        self._ready: deque[QueuedPublisher] = deque()
+        self._stopped = False
+        self._failed = False
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def schedule(self, publisher: QueuedPublisher) -> None:
+        """Give a publisher its turn. The caller has the lock."""
+        self._ready.append(publisher)
+        if len(self._ready) == 1:
+            self.changed.notify()
+
+    def call_loop(self, function: Callable[[], None]) -> None:
+        """Call ``function`` in the event loop, if it still runs."""
+        try:
+            self.loop.call_soon_threadsafe(function)
+        except RuntimeError:  # the loop was closed before the session
+            self._stopped = True
+
+    def stop(self) -> None:
+        """End the thread after the put that is under way."""
+        with self.changed:
+            self._stopped = True
+            self.changed.notify()
+
+    def join(self, timeout: float) -> bool:
+        """Wait for the thread's end, which ``stop`` asks for.
+
+        Args:
+            timeout: Seconds.
+
+        Returns:
+            Whether it has ended.
+        """
+        self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        window_end, in_window = 0.0, 0
+        while True:
+            if in_window >= limits.BUSY_MESSAGES and not self._ready:
+                # The loop need not wake this thread, nor wait for the interpreter's lock, for each message.
+                time.sleep(limits.BUSY_PERIOD / 2)
+            with self.changed:
+                while not self._ready and not self._stopped:
+                    self.changed.wait()
+                if self._stopped:
+                    return
+                publisher = self._ready.popleft()
+                turn = publisher.take_turn()
+            for payload, attachment in turn:
+                publisher.one_sent(self._put(publisher, payload, attachment))
+            now = time.monotonic()
+            if now >= window_end:
+                window_end, in_window = now + limits.BUSY_PERIOD, 0
+            in_window += len(turn)
+            del turn
+            with self.changed:
+                publisher.end_turn()
+
+    def _put(self, publisher: QueuedPublisher, payload: bytes, attachment: bytes) -> bool:
+        if self._stopped or publisher.handle is None:
+            return False
+        try:
+            publisher.handle.put(payload, attachment=attachment or None)
+        except self._failures as error:
+            if not self._failed:
+                self._failed = True
+                _log.warning("zenoh: a message by %s was not sent: %s", publisher.key, error)
+            return False
+        return True

@@ -1,0 +1,430 @@
+"""The Zenoh session of a gateway: the one place that calls the library ``eclipse-zenoh``.
+
+The event loop never waits for Zenoh. Declarations and their ends go in order to one thread, queries and their answers
+to a second one, and messages to a thread for each priority (``sending``). What Zenoh delivers comes by queues
+(``arrivals``).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from rmpa.core.errors import StartError
+from rmpa.gateway.zenoh import limits
+from rmpa.gateway.zenoh.arrivals import ArrivalQueue, Arrivals, keep_thread_state
+from rmpa.gateway.zenoh.queries import ArrivedQuery, PendingGet, content
+from rmpa.gateway.zenoh.sending import QueuedPublisher, SendingLane
+from rmpa.gateway.zenoh.socket_tuning import SocketTuning
+from rmpa.gateway.zenoh.worker import SerialWorker
+from rmpa.gateway.zenoh_api import ZenohPriority, ZenohSample
+from rmpa.runtime.threads import in_thread
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.gateway.zenoh.config import ZenohConfig
+    from rmpa.gateway.zenoh_api import ZenohQos, ZenohQuery, ZenohReply
+    from rmpa.ros.wire.tcpros import Buffer
+
+_log = logging.getLogger(__name__)
+_WILD: Final = frozenset("*$")
+
+
+class Declaration:
+    """Something that is declared in order by a thread, and undeclared once it is closed.
+
+    Args:
+        worker: The thread that declares.
+        kept: The open declarations of the session: Zenoh undeclares what is not referred to.
+        declare: Makes Zenoh's object, or several that are undeclared together.
+        queue: Its arrivals; ``None`` if it has none.
+    """
+
+    def __init__(
+        self,
+        worker: SerialWorker,
+        kept: set[Declaration],
+        declare: Callable[[], list[Any]],
+        queue: ArrivalQueue[Any] | None = None,
+    ) -> None:
+        self._worker = worker
+        self._kept = kept
+        self._queue = queue
+        self._declare = declare
+        self._objects: list[Any] = []
+        self._closed = False
+        kept.add(self)
+        worker.submit(self._begin)
+
+    @property
+    def dropped(self) -> int:
+        """Arrivals that found no room."""
+        return self._queue.dropped if self._queue is not None else 0
+
+    def close(self) -> None:
+        """Undeclare it; no callback is called afterwards."""
+        if not self._closed:
+            self._closed = True
+            self._kept.discard(self)
+            if self._queue is not None:
+                self._queue.close()
+            self._worker.submit(self._end)
+
+    def _begin(self) -> None:
+        if not self._closed:
+            self._objects = self._declare()
+
+    def _end(self) -> None:
+        objects, self._objects = self._objects, []
+        for thing in objects:
+            thing.undeclare()
+
+
+class OpenSession:
+    """An open session; ``open_session`` makes it.
+
+    Args:
+        library: The module ``zenoh``.
+        session: Zenoh's session.
+        loop: The event loop in which all callbacks are called.
+        listens_with: The file of the certificate that it listens with; ``None``: it does not, or has none.
+    """
+
+    def __init__(
+        self, library: Any, session: Any, loop: asyncio.AbstractEventLoop, listens_with: Path | None = None
+    ) -> None:
+        self._zenoh = library
+        self._session = session
+        self._loop = loop
+        self.zid = str(session.zid())
+        self._arrivals = Arrivals(loop)
+        self._declarations = SerialWorker("zenoh declarations")
+        self._queries = SerialWorker("zenoh queries")
+        self._lanes: dict[ZenohPriority, SendingLane] = {}
+        self._publishers: set[QueuedPublisher] = set()
+        self._kept: set[Declaration] = set()
+        self._certificate = listens_with
+        self._stamp = _stamp(listens_with)
+        self._closing = False
+        self._closed = False
+        self._flushed = asyncio.Event()
+        self._tuning = SocketTuning()
+        self._looking: asyncio.TimerHandle | None = None
+        self._look_at_links()
+
+    @property
+    def endpoints(self) -> tuple[str, ...]:
+        """The endpoints of the other side of each link that is up now, such as ``tcp/192.0.2.1:7447``."""
+        return () if self._closed else tuple(str(link.dst) for link in self._session.info.links())
+
+    def _look_at_links(self) -> None:
+        self._tuning.look(self.endpoints)
+        self._looking = self._loop.call_later(limits.LOOK_AT_LINKS, self._look_at_links)
+
+    @property
+    def stale(self) -> bool:
+        """Whether it has to be opened anew for others to connect to it: its certificate was renewed.
+
+        Zenoh reads the certificate of a listener once, and that of a connection each time.
+        """
+        return _stamp(self._certificate) != self._stamp
+
+    def publisher(self, key: str, qos: ZenohQos, on_matching: Callable[[bool], None]) -> QueuedPublisher:
+        """Declare a publisher; ``on_matching(there)`` tells whether there is a subscriber, also at the beginning."""
+        self._check(key)
+        last: list[bool] = []
+
+        def matched(there: bool) -> None:
+            if last != [there]:
+                last[:] = [there]
+                on_matching(there)
+
+        queue = ArrivalQueue(self._arrivals, matched, 1, 0)
+        holder: list[Declaration] = []
+
+        def undeclare() -> None:
+            self._publishers.discard(publisher)
+            if not self._publishers and self._closing:
+                self._flushed.set()
+            holder[0].close()
+
+        publisher = QueuedPublisher(self._lane(qos.priority), key, qos, undeclare)
+
+        def declare() -> list[Any]:
+            terms = self._terms(qos)
+            plain = self._session.declare_publisher(key, **terms)
+            listener = plain.declare_matching_listener(self._direct(lambda status: queue.add(bool(status.matching))))
+            queue.add(bool(plain.matching_status.matching))
+            objects = [listener, plain]
+            if qos.cache:
+                objects.append(self._cached(key, qos, terms))
+            publisher.declared(objects[-1])
+            return objects
+
+        holder.append(Declaration(self._declarations, self._kept, declare, queue))
+        self._publishers.add(publisher)
+        return publisher
+
+    def subscribe(self, key: str, on_sample: Callable[[ZenohSample], None], *, history: bool = False) -> Declaration:
+        """Subscribe to a key expression; ``history`` asks publishers with a cache for what they keep."""
+        self._check(key)
+        fixed = None if _WILD.intersection(key) else key
+        queue = ArrivalQueue(self._arrivals, on_sample, limits.ARRIVED_MESSAGES, limits.ARRIVED_BYTES)
+        put = self._zenoh.SampleKind.PUT
+
+        def arrived(sample: Any) -> None:
+            if sample.kind == put:
+                payload = content(sample.payload)
+                queue.add(
+                    ZenohSample(fixed or str(sample.key_expr), payload, content(sample.attachment)), len(payload)
+                )
+
+        def declare() -> list[Any]:
+            if not history:
+                return [self._session.declare_subscriber(key, self._direct(arrived))]
+            from zenoh import ext  # noqa: PLC0415 - the library is imported by what opens a session alone
+
+            asked = ext.HistoryConfig(detect_late_publishers=True)
+            return [ext.declare_advanced_subscriber(self._session, key, self._direct(arrived), history=asked)]
+
+        return Declaration(self._declarations, self._kept, declare, queue)
+
+    def token(self, key: str) -> Declaration:
+        """Declare a liveliness token."""
+        self._check(key)
+        return Declaration(self._declarations, self._kept, lambda: [self._session.liveliness().declare_token(key)])
+
+    def watch_tokens(self, key: str, on_token: Callable[[str, bool], None]) -> Declaration:
+        """Call ``on_token(key, alive)`` for each token that is there, and at each change."""
+        self._check(key)
+        put = self._zenoh.SampleKind.PUT
+        queue: ArrivalQueue[tuple[str, bool]] = ArrivalQueue(
+            self._arrivals, lambda change: on_token(*change), limits.ARRIVED_TOKENS, 0
+        )
+
+        def arrived(sample: Any) -> None:
+            queue.add((str(sample.key_expr), sample.kind == put))
+
+        def declare() -> list[Any]:
+            return [self._session.liveliness().declare_subscriber(key, self._direct(arrived), history=True)]
+
+        return Declaration(self._declarations, self._kept, declare, queue)
+
+    def queryable(self, key: str, on_query: Callable[[ZenohQuery], None], *, complete: bool = True) -> Declaration:
+        """Answer queries."""
+        self._check(key)
+        queue: ArrivalQueue[ArrivedQuery] = ArrivalQueue(
+            self._arrivals,
+            on_query,
+            limits.ARRIVED_QUERIES,
+            limits.ARRIVED_BYTES,
+            discard=lambda query: query.finish(),
+        )
+
+        def arrived(query: Any) -> None:
+            arrival = ArrivedQuery(query, self._queries)
+            queue.add(arrival, len(arrival.payload))
+
+        def declare() -> list[Any]:
+            return [self._session.declare_queryable(key, self._direct(arrived), complete=complete)]
+
+        return Declaration(self._declarations, self._kept, declare, queue)
+
+    async def get(
+        self,
+        selector: str,
+        payload: Buffer = b"",
+        attachment: bytes = b"",
+        *,
+        timeout: float = 5.0,  # noqa: ASYNC109 - Zenoh ends the query by itself
+        all_complete: bool = False,
+        priority: ZenohPriority = ZenohPriority.DATA,
+    ) -> list[ZenohReply]:
+        """Ask; wait for all answers, or for ``timeout`` seconds. ``all_complete``: ask every complete queryable."""
+        zenoh = self._zenoh
+        self._check(selector.partition("?")[0])
+        done: asyncio.Future[list[ZenohReply]] = self._loop.create_future()
+        pending = PendingGet(done, self._call_loop)
+        cancellation = zenoh.CancellationToken()
+        body = payload if isinstance(payload, bytes) else bytes(payload)
+
+        def ask() -> None:
+            try:
+                self._session.get(
+                    selector,
+                    self._direct(pending.add, pending.finish),
+                    target=zenoh.QueryTarget.ALL_COMPLETE if all_complete else zenoh.QueryTarget.BEST_MATCHING,
+                    consolidation=zenoh.ConsolidationMode.NONE,
+                    congestion_control=zenoh.CongestionControl.BLOCK,
+                    timeout=timeout,
+                    priority=getattr(zenoh.Priority, priority.name),
+                    payload=body,
+                    attachment=attachment or None,
+                    cancellation_token=cancellation,
+                )
+            except zenoh.ZError as error:
+                _log.warning("zenoh: the query %s was not sent: %s", selector, error)
+                pending.finish()
+
+        self._queries.submit(ask)
+        try:
+            async with asyncio.timeout(timeout + limits.GET_GRACE):
+                return await done
+        except TimeoutError:
+            return pending.collected()
+        finally:
+            if not done.done() or done.cancelled():
+                self._queries.submit(cancellation.cancel)
+
+    async def close(self) -> None:
+        """Close the session and end its threads; publishers send what waits, for a second at most."""
+        if self._closing:
+            return
+        self._closing = True
+        if self._looking is not None:
+            self._looking.cancel()
+        if not self._publishers:
+            self._flushed.set()
+        for publisher in tuple(self._publishers):
+            publisher.close()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(limits.FLUSH_MAX * 1.5):
+                await self._flushed.wait()
+        self._closed = True
+        self._arrivals.close()
+        await in_thread(self._end, "zenoh close")
+
+    def _end(self) -> None:
+        for lane in self._lanes.values():
+            lane.stop()
+        self._declarations.stop(discard=True)
+        self._queries.stop(discard=True)
+        closing = SerialWorker("zenoh session close")
+        closing.submit(self._session.close)
+        closing.stop()
+        threads: tuple[SerialWorker | SendingLane, ...] = (
+            closing,
+            self._declarations,
+            self._queries,
+            *self._lanes.values(),
+        )
+        for thread in threads:
+            if not thread.join(limits.CLOSE_MAX):
+                _log.warning("zenoh: a thread of the session did not end within %g s", limits.CLOSE_MAX)
+
+    def _direct(self, callback: Callable[[Any], None], ended: Callable[[], None] | None = None) -> Any:
+        """A callback that Zenoh calls in its own thread.
+
+        By default it starts a thread for each one, with an unbounded queue in front of it.
+        """
+
+        def called(arrived: Any) -> None:
+            keep_thread_state()
+            callback(arrived)
+
+        return self._zenoh.handlers.Callback(called, ended, indirect=False)
+
+    def _call_loop(self, function: Callable[[], None]) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop was closed before the session
+            self._loop.call_soon_threadsafe(function)
+
+    def _check(self, key: str) -> None:
+        """Refuse a key that Zenoh would refuse later, in another thread."""
+        try:
+            self._zenoh.KeyExpr(key)
+        except self._zenoh.ZError as error:
+            raise ValueError(f"{key!r} is not a key expression of Zenoh: {_reason(error)}") from None
+
+    def _lane(self, priority: ZenohPriority) -> SendingLane:
+        lane = self._lanes.get(priority)
+        if lane is None:
+            name = f"zenoh {priority.name.lower().replace('_', ' ')}"
+            lane = self._lanes[priority] = SendingLane(self._loop, name, (self._zenoh.ZError,))
+        return lane
+
+    def _terms(self, qos: ZenohQos) -> dict[str, Any]:
+        zenoh = self._zenoh
+        # Zenoh drops what is best effort after some milliseconds even where it is told to block, and counts nothing:
+        # on a line of 1 Mbit/s no message of more than one batch came. Our queue drops, and counts.
+        reliable = qos.reliable or qos.block
+        return {
+            "reliability": zenoh.Reliability.RELIABLE if reliable else zenoh.Reliability.BEST_EFFORT,
+            "congestion_control": zenoh.CongestionControl.BLOCK if qos.block else zenoh.CongestionControl.DROP,
+            "priority": getattr(zenoh.Priority, qos.priority.name),
+            # A gateway must not hear itself; and the cache of an advanced publisher is no subscriber to wake up for.
+            "allowed_destination": zenoh.Locality.REMOTE,
+        }
+
+    def _cached(self, key: str, qos: ZenohQos, terms: dict[str, Any]) -> Any:
+        from zenoh import ext  # noqa: PLC0415 - as above
+
+        return ext.declare_advanced_publisher(
+            self._session,
+            key,
+            **terms,
+            cache=ext.CacheConfig(
+                qos.cache,
+                replies_config=ext.RepliesConfig(
+                    congestion_control=terms["congestion_control"], priority=terms["priority"]
+                ),
+            ),
+            publisher_detection=True,
+        )
+
+
+async def open_session(config: ZenohConfig) -> OpenSession:
+    """Open a session, in a thread.
+
+    Args:
+        config: Its mode, endpoints and certificates.
+
+    Raises:
+        StartError: The library is missing, an address is taken, or the endpoints do not answer.
+    """
+    try:
+        import zenoh  # noqa: PLC0415 - it is an extra
+    except ImportError:
+        raise StartError("zenoh", "eclipse-zenoh is not installed", "pip install 'rmpa[zenoh]'") from None
+    settings = zenoh.Config()
+    try:
+        for key, value in config.entries().items():
+            settings.insert_json5(key, json.dumps(value))
+        session = await in_thread(lambda: zenoh.open(settings), "zenoh open")
+    except zenoh.ZError as error:
+        raise _start_error(config, _reason(error)) from None
+    files = config.certificates if config.listen else None
+    certificate = Path(files.certificate) if files is not None else None
+    return OpenSession(zenoh, session, asyncio.get_running_loop(), certificate)
+
+
+def _stamp(file: Path | None) -> tuple[int, int] | None:
+    """What changes when a file is replaced; ``None`` for none, and for one that cannot be seen."""
+    try:
+        info = file.stat() if file is not None else None
+    except OSError:
+        return None
+    return (info.st_ino, info.st_mtime_ns) if info is not None else None
+
+
+def _reason(error: Exception) -> str:
+    """The text of an error of Zenoh without the places in Zenoh's source."""
+    text = str(error).strip()
+    while (at := text.rfind(" at /")) > 0:
+        text = text[:at].rstrip(" .;[")
+    return text
+
+
+def _start_error(config: ZenohConfig, reason: str) -> StartError:
+    where = ", ".join((*config.connect, *config.listen)) or "its default endpoints"
+    if "listener" in reason or "in use" in reason:
+        remedy = "choose another --listen, or stop the program that listens there"
+    elif "certificate" in reason.lower() or "tls" in reason.lower():
+        remedy = "both sides need certificates of the same mesh: see rmpa trust status"
+    else:
+        remedy = "start the router there, or correct --connect"
+    return StartError(f"zenoh {where}", reason, remedy)

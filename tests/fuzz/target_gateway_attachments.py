@@ -1,0 +1,43 @@
+"""Fuzz target: the attachments of messages between sites and of ROS 2, and small documents of sites."""
+
+from __future__ import annotations
+
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.gateway.ros2.attachment import Ros2Attachment
+from rmpa.gateway.sites.attachment import SiteAttachment
+from rmpa.gateway.sites.last_values import ValueHeader
+from rmpa.gateway.sites.services import read_description, write_description
+from rmpa.ros.wire.services import ServiceDescription
+
+_MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
+SEEDS: list[bytes] = [
+    b"",
+    Ros2Attachment(1, 2**40, bytes(range(16))).serialize(),
+    Ros2Attachment(-1, 0, bytes(24)).serialize() + b"later",
+    SiteAttachment(1, 2**40, _MD5, "/talker", ("warehouse",), latched=True).serialize(),
+    SiteAttachment(2**63, 0, _MD5, "/ns/node", ("a", "b", "c")).serialize(),
+    write_description(ServiceDescription("std_srvs/Trigger", _MD5)),
+    b"{}",
+]
+
+
+def fuzz(data: bytes) -> None:
+    """What is read is written as it was, but for bytes behind it; all else is a RemoteProtocolError."""
+    for kind in (Ros2Attachment, SiteAttachment):
+        try:
+            read = kind.parse(data)
+        except RemoteProtocolError as error:
+            _check_text(error)
+            continue
+        if kind.parse(read.serialize()) != read:
+            raise AssertionError(f"{read} does not survive its bytes")
+    for parse in (read_description, ValueHeader.parse):
+        try:
+            parse(data)
+        except RemoteProtocolError as error:
+            _check_text(error)
+
+
+def _check_text(error: RemoteProtocolError) -> None:
+    if not str(error).isprintable():
+        raise AssertionError("an error's text is not safe to log")

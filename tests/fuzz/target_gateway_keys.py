@@ -1,0 +1,70 @@
+"""Fuzz target: keys and tokens of sites, of ROS 2 over Zenoh and of zenoh-bridge-ros1, and the graph of ROS 2."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, TypeVar
+
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.gateway import ros1_bridge
+from rmpa.gateway.ros2 import tokens as ros2_tokens
+from rmpa.gateway.ros2.graph import Ros2Graph
+from rmpa.gateway.ros2.tokens import Ros2Endpoint
+from rmpa.gateway.sites import keys as site_keys
+from rmpa.gateway.sites.last_values import parse_value_key
+from rmpa.gateway.sites.services import asked_type
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+_Parsed = TypeVar("_Parsed")
+_RUN: Final = "0123456789abcdef0123456789abcdef"
+_ENDPOINT: Final = (
+    "@ros2_lv/0/aac3178e146ba6f1fc6e6a4085e77f21/0/{}/{}/%/%ns/talker/%chatter/{}/RIHS01_"
+    + "0" * 64
+    + "/::,10:,:,:,,"
+)
+SEEDS: list[bytes] = [
+    b"",
+    f"rmpa/1/warehouse/arm/up/{_RUN}".encode(),
+    f"rmpa/1/warehouse/arm/up/{_RUN}/t/sensor_msgs%LaserScan/%lidar%driver/%base%scan".encode(),
+    f"rmpa/1/warehouse/arm/up/{_RUN}/s/-/%node/%stop".encode(),
+    f"rmpa/1/warehouse/-gateway/010/{_RUN}".encode(),
+    b"rmpa/1/warehouse/arm/s/std_srvs%Trigger/stop",
+    b"rmpa/1/warehouse/arm/v/map",
+    _ENDPOINT.format(1, "MP", "std_msgs::msg::dds_::String_").encode(),
+    _ENDPOINT.format(2, "SS", "std_srvs::srv::dds_::Trigger_").replace("::,10:", "2:1:2,1:3,4:").encode(),
+    b"@ros2_lv/3/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/talker",
+    b"ros1_discovery_info/*/pub/7374645f6d7367732f537472696e67/992ce8a1687cec8c8bd883ec73ca41d1/*/chatter",
+    b"7374645f6d7367732f537472696e67/992ce8a1687cec8c8bd883ec73ca41d1/*/chatter",
+]
+
+
+def fuzz(data: bytes) -> None:
+    """Each key is read as it will be written again, or refused with a text that is safe to log."""
+    key = data.decode("utf-8", "replace")
+    site = _read(site_keys.parse_token, key)
+    if site is not None and site_keys.parse_token(site.token()) != site:
+        raise AssertionError(f"{site} does not survive its token")
+    entity = _read(ros2_tokens.parse_token, key)
+    if entity is not None and ros2_tokens.parse_token(entity.token()) != entity:
+        raise AssertionError(f"{entity} does not survive its token")
+    if isinstance(entity, Ros2Endpoint) and not entity.key():
+        raise AssertionError("an endpoint has no key")
+    for parse in (ros1_bridge.parse_presence, ros1_bridge.parse_key, parse_value_key, asked_type):
+        _read(parse, key)
+    topic = _read(ros1_bridge.parse_key, key)
+    if topic is not None and ros1_bridge.parse_key(topic.key()) != topic:
+        raise AssertionError(f"{topic} does not survive its key")
+    graph = Ros2Graph(0, "own")
+    shown = graph.change(key, alive=True)
+    if graph.change(key, alive=False) != shown or len(graph) or graph.nodes:
+        raise AssertionError("a token that is gone stays in the graph")
+
+
+def _read(parse: Callable[[str], _Parsed], key: str) -> _Parsed | None:
+    try:
+        return parse(key)
+    except RemoteProtocolError as error:
+        if not str(error).isprintable():
+            raise AssertionError("an error's text is not safe to log") from error
+        return None

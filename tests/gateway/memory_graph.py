@@ -1,0 +1,178 @@
+"""A gateway's own graph in memory, for tests of neighbours: the test's sources, and what neighbours show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from rmpa.core.errors import PeerRefused
+from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Mapping
+
+    from rmpa.ros.types.messages import MessageType
+    from rmpa.ros.types.service_types import ServiceType
+    from rmpa.ros.wire.services import ServiceDescription
+    from rmpa.ros.wire.tcpros import Buffer, TopicDescription
+
+Key = tuple[SourceKind, str, str]
+
+
+@dataclass(eq=False)
+class MemoryTap:
+    """A subscription to a source of the test."""
+
+    graph: MemoryGraph
+    source: MeshSource
+    on_message: Callable[[memoryview], None]
+    description: TopicDescription | None
+    listener: str = field(default="", kw_only=True)
+
+    def close(self) -> None:
+        self.graph.taps = [tap for tap in self.graph.taps if tap is not self]
+
+
+@dataclass(eq=False)
+class MemoryTopic:
+    """A topic that a neighbour shows."""
+
+    graph: MemoryGraph
+    source: ForeignSource
+    on_demand: Callable[[bool], None]
+    problem: str = ""
+    description: TopicDescription | None = None
+    messages: list[bytes] = field(default_factory=list)
+
+    def describe(self, description: TopicDescription) -> None:
+        self.description = description
+
+    def publish(self, body: Buffer) -> int:
+        self.messages.append(bytes(body))
+        return 0
+
+    def forget_latched(self) -> None:
+        self.messages.append(b"forgotten")
+
+    def close(self) -> None:
+        self.graph.topics.pop((self.source.name, self.source.node))
+
+
+@dataclass(eq=False)
+class MemoryService:
+    """A service that a neighbour shows."""
+
+    graph: MemoryGraph
+    source: ForeignSource
+    serve: Callable[[bytes], Awaitable[bytes]]
+    describe: Callable[[], Awaitable[ServiceDescription]]
+    problem: str = ""
+
+    def close(self) -> None:
+        self.graph.services.pop(self.source.name)
+
+
+class MemoryGraph:
+    """The own graph of a gateway named ``gate``."""
+
+    def __init__(self) -> None:
+        self.name = "gate"
+        self._sources: dict[Key, MeshSource] = {}
+        self._watches: list[Callable[[MeshSource, bool], None]] = []
+        self._servers: dict[Key, tuple[ServiceType, Callable[[bytes], bytes]]] = {}
+        self._publishers: dict[Key, TopicDescription] = {}
+        self.taps: list[MemoryTap] = []
+        self.topics: dict[tuple[str, str], MemoryTopic] = {}
+        self.services: dict[str, MemoryService] = {}
+
+    @property
+    def sources(self) -> Mapping[Key, MeshSource]:
+        return self._sources
+
+    def watch(self, on_change: Callable[[MeshSource, bool], None]) -> None:
+        self._watches.append(on_change)
+        for source in list(self._sources.values()):
+            on_change(source, True)
+
+    # --- what the test declares ------------------------------------------------------------------------------------
+
+    def publisher(self, name: str, kind: MessageType, node: str = "/talker", latching: bool = False) -> MeshSource:
+        """A node of the module ``arm`` publishes."""
+        source = self._source(SourceKind.TOPIC, name, kind.name, node)
+        self._publishers[_key(source)] = kind.describe(latching=latching)
+        return self._add(source)
+
+    def server(
+        self, name: str, kind: ServiceType, serve: Callable[[bytes], bytes], node: str = "/server"
+    ) -> MeshSource:
+        """A node of the module ``arm`` has a service."""
+        source = self._source(SourceKind.SERVICE, name, "*", node)
+        self._servers[_key(source)] = kind, serve
+        return self._add(source)
+
+    def remove(self, source: MeshSource) -> None:
+        """A source is gone."""
+        del self._sources[_key(source)]
+        for watch in self._watches:
+            watch(source, False)
+
+    def send(self, source: MeshSource, body: bytes) -> int:
+        """A publisher publishes; returns how many neighbours listen."""
+        taps = [tap for tap in self.taps if tap.source == source]
+        for tap in taps:
+            tap.on_message(memoryview(body))
+        return len(taps)
+
+    def _source(self, kind: SourceKind, name: str, type_name: str, node: str) -> MeshSource:
+        return MeshSource(kind, "arm", "0" * 32, node, name, type_name, name, f"/rmpa/arm{node}")
+
+    def _add(self, source: MeshSource) -> MeshSource:
+        self._sources[_key(source)] = source
+        for watch in self._watches:
+            watch(source, True)
+        return source
+
+    # --- OwnGraph --------------------------------------------------------------------------------------------------
+
+    def tap(
+        self,
+        source: MeshSource,
+        on_message: Callable[[memoryview], None],
+        on_described: Callable[[TopicDescription], None],
+        on_lost: Callable[[str], None],
+        *,
+        listener: str = "",
+    ) -> MemoryTap:
+        del on_lost
+        description = self._publishers[_key(source)]
+        tap = MemoryTap(self, source, on_message, description, listener=listener)
+        self.taps.append(tap)
+        on_described(description)
+        return tap
+
+    async def describe(self, source: MeshSource) -> ServiceDescription:
+        return self._servers[_key(source)][0].describe()
+
+    async def call(self, source: MeshSource, request: Buffer, timeout: float) -> bytes:
+        del timeout
+        try:
+            return self._servers[_key(source)][1](bytes(request))
+        except ValueError as error:
+            raise PeerRefused(source.node, str(error)) from error
+
+    def show_topic(self, source: ForeignSource, on_demand: Callable[[bool], None]) -> MemoryTopic:
+        topic = self.topics[source.name, source.node] = MemoryTopic(self, source, on_demand)
+        return topic
+
+    def show_service(
+        self,
+        source: ForeignSource,
+        serve: Callable[[bytes], Awaitable[bytes]],
+        describe: Callable[[], Awaitable[ServiceDescription]],
+    ) -> MemoryService:
+        service = self.services[source.name] = MemoryService(self, source, serve, describe)
+        return service
+
+
+def _key(source: MeshSource) -> Key:
+    return source.kind, source.here, source.proxy

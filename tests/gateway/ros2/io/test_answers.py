@@ -1,0 +1,52 @@
+"""ROS 2 in ``rmpa site`` and ``rmpa why``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rmpa.core.errors import UnreachableError
+from rmpa.gateway.ros2.io.answers import Ros2Answers
+from rmpa.observe.io.site_requests import INFO, LAST, REPORT, WHY
+from rmpa.observe.sites import SiteInfo, SitesReport
+from tests.gateway.memory_zenoh import eventually
+from tests.gateway.ros2.io.ros2_bed import STRING, topic_bed
+
+
+class OtherSites:
+    """Answers for another site."""
+
+    async def answer(self, what: str, args: dict[str, Any], /) -> Any:
+        del args
+        sites = (SiteInfo(name="hall", state="this site"),)
+        return SitesReport(gateway="gate", site="hall", sites=sites) if what == REPORT else ["of a site"]
+
+
+async def test_ros2_is_listed_with_its_topics_and_what_is_wrong_with_them() -> None:
+    async with topic_bed() as bed:
+        bed.graph.publisher("/mine", STRING)
+        bed.publisher("/chatter")
+        bed.subscribe("/mine", [], node="/older", type_hash="RIHS01_" + "0" * 64)
+        await eventually(lambda: bed.problems and bed.topic("/chatter"))
+        alone = Ros2Answers("gate", bed.neighbour, lambda: ("tcp/192.0.2.1:7447",))
+        report: SitesReport = await alone.answer(REPORT, {})
+        assert [(site.name, site.state) for site in report.sites] == [("ros2", "joined")]
+        report = await alone.answer(INFO, {"site": "ros2"})
+        (info,) = report.sites
+        rows = {(row.name, row.node): row for row in info.sources}
+        assert rows["/chatter", "/bot"].type == "std_msgs/String"
+        assert "definitions differ" in rows["/mine", "/older"].problem
+        ways = await alone.answer(WHY, {"name": "/chatter", "site": "ros2"})
+        assert [(way.peer, way.node) for way in ways] == [("ros2", "/bot")]
+        with pytest.raises(UnreachableError):
+            await alone.answer(LAST, {"site": "hall"})
+
+
+async def test_questions_about_sites_go_to_what_answers_for_them() -> None:
+    async with topic_bed() as bed:
+        both = Ros2Answers("gate", bed.neighbour, lambda: (), OtherSites())
+        report: SitesReport = await both.answer(REPORT, {})
+        assert [site.name for site in report.sites] == ["hall", "ros2"]
+        assert await both.answer(LAST, {"site": "hall"}) == ["of a site"]
+        assert await both.answer(WHY, {"name": "/nothing"}) == ["of a site"]

@@ -1,0 +1,206 @@
+"""Actions between a module and ROS 2 through the gateway's neighbour: each side's topics, services and tokens."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from rmpa.config.gateway_rules import GatewaySettings
+from rmpa.gateway.ros2.action_messages import parse_outcome
+from rmpa.gateway.ros2.action_pair import ActionPair
+from rmpa.gateway.ros2.attachment import Ros2Attachment
+from rmpa.gateway.ros2.io.actions import Ros2Actions
+from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour
+from rmpa.gateway.ros2.mapping import ActionRule
+from rmpa.gateway.ros2.qos import Ros2Qos
+from rmpa.gateway.ros2.tokens import EntityKind, Ros2Endpoint, Ros2Node, data_key, parse_token
+from rmpa.gateway.ros2.types import Ros2Types
+from rmpa.gateway.zenoh_api import ZenohQos
+from rmpa.ros.types.messages import MessageType
+from tests.gateway.memory_graph import MemoryGraph
+from tests.gateway.memory_zenoh import MemoryQuery, MemoryZenoh, eventually
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from rmpa.gateway.neighbour import MeshSource
+
+JAZZY = Ros2Types("jazzy")
+TEST = [MessageType(f"actionlib/Test{part}") for part in ("Goal", "Result", "Feedback")]
+TYPES = ActionPair(TEST[0], TEST[1], TEST[2], ActionRule("actionlib/action/Test"), JAZZY).types
+ACTION = {part: MessageType(f"actionlib/TestAction{part.title()}") for part in ("goal", "feedback", "result")}
+ACTION["status"] = MessageType("actionlib_msgs/GoalStatusArray")
+ACTION["cancel"] = MessageType("actionlib_msgs/GoalID")
+UUID = bytes(range(16))
+ATTACHMENT = Ros2Attachment(3, 1, bytes(16)).serialize()
+KINDS = {
+    "send_goal": TYPES.send_goal, "get_result": TYPES.get_result, "cancel_goal": "action_msgs/srv/CancelGoal",
+    "feedback": TYPES.feedback, "status": "action_msgs/msg/GoalStatusArray",
+}  # fmt: skip
+
+
+def key(part: str) -> str:
+    return data_key(0, f"/count/_action/{part}", KINDS[part], TYPES.hashes[KINDS[part]])
+
+
+def made(part: str, **values: Any) -> bytes:
+    return ACTION[part].serialize(ACTION[part].make(values))
+
+
+class Bed:
+    """A gateway's neighbour ROS 2 with its part for actions, and a session of a program of ROS 2."""
+
+    def __init__(self) -> None:
+        self.network = MemoryZenoh()
+        self.graph = MemoryGraph()
+        self.ros2 = self.network.session()
+        own = self.network.session()
+        self.neighbour = Ros2Neighbour(self.graph, own, GatewaySettings(), [Ros2Actions()])
+
+    def endpoints(self, node: str) -> set[str]:
+        tokens = [parse_token(each) for each in self.network.token_keys]
+        return {each.name for each in tokens if isinstance(each, Ros2Endpoint) and each.node.name == node}
+
+    def ros1_server(self) -> dict[str, MeshSource]:
+        parts = ("status", "feedback", "result")
+        return {part: self.graph.publisher(f"/count/{part}", ACTION[part], "/counter") for part in parts}
+
+
+@pytest.fixture
+async def bed() -> AsyncIterator[Bed]:
+    bed = Bed()
+    bed.neighbour.start()
+    yield bed
+    await bed.neighbour.close()
+    assert not bed.graph.topics
+    assert not bed.graph.taps
+
+
+async def test_a_client_of_ros2_has_a_goal_done_by_a_server_of_ros1(bed: Bed) -> None:
+    server = bed.ros1_server()
+    await eventually(lambda: len(bed.endpoints("/rmpa/arm/counter")) == 5)
+    seen: list[bytes] = []
+    bed.ros2.subscribe(key("feedback"), lambda sample: seen.append(sample.payload))
+    goal, cancel = (bed.graph.topics[f"/count/{part}", "/action_clients"] for part in ("goal", "cancel"))
+    sending = asyncio.ensure_future(
+        bed.ros2.get(key("send_goal"), b"\0\1\0\0" + UUID + b"\7\0\0\0", ATTACHMENT, timeout=20)
+    )
+    for topic in (goal, cancel):
+        topic.on_demand(True)  # the server has connected
+    await eventually(lambda: goal.messages)
+    sent = ACTION["goal"].deserialize(goal.messages[0])
+    assert sent.goal.goal == 7
+    state = {"goal_id": {"id": sent.goal_id.id}, "status": 1}
+    bed.graph.send(server["status"], made("status", status_list=[state]))
+    (reply,) = await sending
+    assert (reply.ok, reply.payload[4]) == (True, 1)
+    assert Ros2Attachment.parse(reply.attachment).sequence == 3
+    waiting = asyncio.ensure_future(bed.ros2.get(key("get_result"), b"\0\1\0\0" + UUID, ATTACHMENT, timeout=20))
+    bed.graph.send(server["feedback"], made("feedback", status=state, feedback={"feedback": 2}))
+    await eventually(lambda: seen)
+    assert seen == [b"\0\1\0\0" + UUID + b"\2\0\0\0"]
+    bed.graph.send(server["result"], made("result", status={**state, "status": 3}, result={"result": 7}))
+    (reply,) = await waiting
+    assert (reply.payload[4], reply.payload[8:]) == (4, b"\7\0\0\0")
+
+
+async def test_a_server_of_ros1_that_goes_aborts_the_goal_of_ros2(bed: Bed) -> None:
+    server = bed.ros1_server()
+    await eventually(lambda: len(bed.endpoints("/rmpa/arm/counter")) == 5)
+    for part in ("goal", "cancel"):
+        bed.graph.topics[f"/count/{part}", "/action_clients"].on_demand(True)
+    sending = asyncio.ensure_future(
+        bed.ros2.get(key("send_goal"), b"\0\1\0\0" + UUID + b"\7\0\0\0", ATTACHMENT, timeout=20)
+    )
+    goal = bed.graph.topics["/count/goal", "/action_clients"]
+    await eventually(lambda: goal.messages)
+    name = ACTION["goal"].deserialize(goal.messages[0]).goal_id.id
+    bed.graph.send(server["status"], made("status", status_list=[{"goal_id": {"id": name}, "status": 1}]))
+    await sending
+    waiting = asyncio.ensure_future(bed.ros2.get(key("get_result"), b"\0\1\0\0" + UUID, ATTACHMENT, timeout=20))
+    await asyncio.sleep(0)
+    await eventually(lambda: bed.network.queryables)
+    for _ in range(3):
+        await asyncio.sleep(0)  # the query is delivered
+    for source in server.values():
+        bed.graph.remove(source)
+    (reply,) = await waiting
+    assert (reply.ok, reply.payload[4]) == (True, 6)
+    assert not bed.endpoints("/rmpa/arm/counter")
+
+
+class Ros2Server:
+    """An action server of ROS 2, as rmw_zenoh shows it."""
+
+    def __init__(self, bed: Bed) -> None:
+        self.asked: dict[str, list[MemoryQuery]] = {part: [] for part in ("send_goal", "get_result", "cancel_goal")}
+        self.session = bed.network.session()
+        node = Ros2Node(0, self.session.zid, 0, "/fib_server")
+        for number, (part, queries) in enumerate(self.asked.items(), 1):
+            self.session.queryable(key(part), queries.append)  # type: ignore[arg-type]
+            kind = KINDS[part]
+            name = f"/count/_action/{part}"
+            endpoint = Ros2Endpoint(node, number, EntityKind.SERVICE, name, kind, TYPES.hashes[kind], Ros2Qos())
+            self.session.token(endpoint.token())
+
+    def answer(self, part: str, payload: bytes) -> None:
+        query = self.asked[part][-1]
+        query.reply(query.key, payload, query.attachment)
+        query.finish()
+
+
+async def test_a_client_of_ros1_has_a_goal_done_by_a_server_of_ros2(bed: Bed) -> None:
+    server = Ros2Server(bed)
+    await eventually(lambda: len(bed.graph.topics) == 3)
+    status, feedback, result = (
+        bed.graph.topics[f"/count/{p}", "/fib_server"] for p in ("status", "feedback", "result")
+    )
+    assert result.description is not None
+    assert result.description.md5sum == ACTION["result"].md5sum
+    status.on_demand(True)
+    await eventually(lambda: len(status.messages) > 1)
+    client = bed.graph.publisher("/count/goal", ACTION["goal"], "/client")
+    cancel = bed.graph.publisher("/count/cancel", ACTION["cancel"], "/client")
+    assert {tap.listener for tap in bed.graph.taps} == {"/rmpa/ros2/fib_server"}, "clients compare these names"
+    bed.graph.send(client, made("goal", goal_id={"id": "g1"}, goal={"goal": 5}))
+    await eventually(lambda: server.asked["send_goal"])
+    request = server.asked["send_goal"][0]
+    assert request.payload[20:] == b"\5\0\0\0"
+    assert Ros2Attachment.parse(request.attachment).sequence > 0
+    server.answer("send_goal", b"\0\1\0\0\1" + bytes(11))
+    await eventually(lambda: server.asked["get_result"])
+    publisher = server.session.publisher(key("feedback"), ZenohQos(), lambda _: None)
+    publisher.put(b"\0\1\0\0" + request.payload[4:20] + b"\3\0\0\0")
+    await eventually(lambda: feedback.messages)
+    assert ACTION["feedback"].deserialize(feedback.messages[0]).feedback.feedback == 3
+    bed.graph.send(cancel, made("cancel", id="g1"))
+    await eventually(lambda: server.asked["cancel_goal"])
+    server.answer("cancel_goal", b"\0\1\0\0" + bytes(8))
+    server.answer("get_result", b"\0\1\0\0\5\0\0\0\4\0\0\0")
+    await eventually(lambda: result.messages)
+    state, body = parse_outcome(result.messages[0])
+    assert (state.goal.id, state.status, body) == ("g1", 2, b"\4\0\0\0")
+
+
+async def test_a_server_of_ros2_that_dies_aborts_the_goal_and_leaves(bed: Bed) -> None:
+    server = Ros2Server(bed)
+    await eventually(lambda: len(bed.graph.topics) == 3)
+    result = bed.graph.topics["/count/result", "/fib_server"]
+    client = bed.graph.publisher("/count/goal", ACTION["goal"], "/client")
+    bed.graph.send(client, made("goal", goal_id={"id": "g1"}, goal={"goal": 5}))
+    await eventually(lambda: server.asked["send_goal"])
+    server.session.close()
+    await eventually(lambda: result.messages)
+    assert parse_outcome(result.messages[0])[0].status == 4
+    await eventually(lambda: not bed.graph.topics)
+
+
+async def test_other_topics_of_such_names_are_left_to_other_parts(bed: Bed) -> None:
+    part = Ros2Actions()
+    part.start(bed.neighbour.context)
+    text = MessageType("std_msgs/String")
+    assert not part.mesh_source(bed.graph.publisher("/door/status", text), there=True)
+    assert not part.mesh_source(bed.graph.publisher("/goal", text), there=True)
+    assert part.mesh_source(bed.graph.publisher("/do/goal", ACTION["goal"]), there=True)

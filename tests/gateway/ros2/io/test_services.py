@@ -1,0 +1,215 @@
+"""Services between modules and ROS 2, as rmw_zenoh's clients and servers see them."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from rmpa.config.gateway_rules import Crossing, CrossingRule, GatewaySettings
+from rmpa.core.errors import PeerRefused, UnreachableError
+from rmpa.gateway.neighbour import SourceKind
+from rmpa.gateway.ros2.attachment import Ros2Attachment
+from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour
+from rmpa.gateway.ros2.io.own_nodes import gid_of
+from rmpa.gateway.ros2.io.services import Ros2Services
+from rmpa.gateway.ros2.qos import Ros2Qos
+from rmpa.gateway.ros2.tokens import EntityKind, Ros2Endpoint, Ros2Node, parse_token
+from rmpa.gateway.ros2.types import Ros2Types
+from rmpa.ros.types.service_types import ServiceType
+from tests.gateway.memory_graph import MemoryGraph
+from tests.gateway.memory_zenoh import MemoryQuery, MemorySession, MemoryZenoh, eventually
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+SET_BOOL = ServiceType("std_srvs/SetBool")
+ADD = ServiceType("rospy_tutorials/AddTwoInts")
+ADD_2 = "example_interfaces/srv/AddTwoInts"
+
+
+class Bed:
+    """A gateway's neighbour ROS 2, and one program of ROS 2."""
+
+    def __init__(self, rules: tuple[CrossingRule, ...] = ()) -> None:
+        self.network = MemoryZenoh()
+        self.graph = MemoryGraph()
+        self.ros2 = self.network.session()
+        settings = GatewaySettings(rules=rules)
+        self.neighbour = Ros2Neighbour(self.graph, self.network.session(), settings, [Ros2Services()])
+        self.types = Ros2Types("jazzy")
+        self.types.service_hash(ADD, ADD_2)
+        self.types.service_hash(SET_BOOL)
+
+    def endpoint(self, kind: EntityKind, name: str, type_name: str, node: str = "/bot") -> Ros2Endpoint:
+        return Ros2Endpoint(
+            Ros2Node(0, self.ros2.zid, 0, node), 1, kind, name, type_name, self.types.type_hash(type_name), Ros2Qos()
+        )
+
+    def cdr(self, name: str, **values: Any) -> bytes:
+        return bytes(self.types.store.serialize_cdr(self.types.store.types[name](**values), name))
+
+    def read(self, name: str, raw: bytes) -> Any:
+        return self.types.store.deserialize_cdr(raw, name)
+
+    def tokens(self, kind: EntityKind) -> list[Ros2Endpoint]:
+        parsed = [parse_token(key) for key in self.network.token_keys]
+        return [each for each in parsed if isinstance(each, Ros2Endpoint) and each.kind is kind]
+
+
+@pytest.fixture
+async def bed() -> AsyncIterator[Bed]:
+    made = Bed()
+    made.neighbour.start()
+    yield made
+    await made.neighbour.close()
+
+
+def add(request: bytes) -> bytes:
+    value = ADD.request.deserialize(request)
+    if value.a < 0:
+        raise ValueError("a is below 0")
+    return ADD.response.serialize(ADD.response.make({"sum": value.a + value.b}))
+
+
+def serve_ros2(session: MemorySession, endpoint: Ros2Endpoint, answer: Callable[[MemoryQuery], None]) -> Any:
+    """A server of ROS 2: its token and its queryable."""
+    session.queryable(endpoint.key(), answer)  # type: ignore[arg-type]
+    return session.token(endpoint.token())
+
+
+async def test_a_service_of_a_module_is_called_by_ros2(bed: Bed) -> None:
+    bed.graph.server("/add", ADD, add, node="/adder")
+    await eventually(lambda: bed.tokens(EntityKind.SERVICE))
+    (token,) = bed.tokens(EntityKind.SERVICE)
+    assert (token.name, token.type, token.node.name) == ("/add", ADD_2, "/rmpa/arm/adder")
+    client = bed.endpoint(EntityKind.CLIENT, "/add", ADD_2)
+    asked = Ros2Attachment(7, 1000, gid_of(client.token()))
+    (reply,) = await bed.ros2.get(client.key(), bed.cdr(f"{ADD_2}_Request", a=4, b=5), asked.serialize())
+    assert reply.ok
+    assert bed.read(f"{ADD_2}_Response", reply.payload).sum == 9
+    answered = Ros2Attachment.parse(reply.attachment)
+    assert (answered.sequence, answered.gid) == (7, asked.gid), "rmw_zenoh finds its request by these"
+
+
+async def test_a_call_that_fails_is_no_response_of_ros2(bed: Bed) -> None:
+    bed.graph.server("/add", ADD, add)
+    await eventually(lambda: bed.tokens(EntityKind.SERVICE))
+    client = bed.endpoint(EntityKind.CLIENT, "/add", ADD_2)
+    attachment = Ros2Attachment(1, 0, bytes(16)).serialize()
+    for request, why in ((bed.cdr(f"{ADD_2}_Request", a=-1, b=5), b"below 0"), (b"\0\1\0\0", b"cannot convert")):
+        (reply,) = await bed.ros2.get(client.key(), request, attachment)
+        assert not reply.ok
+        assert why in reply.payload
+    (reply,) = await bed.ros2.get(client.key(), bed.cdr(f"{ADD_2}_Request", a=1, b=5), b"short")
+    assert not reply.ok
+    counts = bed.neighbour.report()["service_calls"]
+    assert isinstance(counts, dict)
+    assert (counts["out"], counts["out_failed"]) == (3, 3)
+
+
+async def test_a_service_that_is_gone_is_gone_in_ros2(bed: Bed) -> None:
+    source = bed.graph.server("/add", ADD, add)
+    await eventually(lambda: bed.tokens(EntityKind.SERVICE))
+    bed.graph.remove(source)
+    assert bed.network.token_keys == []
+    assert bed.network.queryables == []
+
+
+async def test_of_two_servers_of_one_name_one_is_called(bed: Bed) -> None:
+    first = bed.graph.server("/add", ADD, add, node="/one")
+    bed.graph.server("/add", ADD, add, node="/two")
+    await eventually(lambda: bed.tokens(EntityKind.SERVICE))
+    assert [each.node.name for each in bed.tokens(EntityKind.SERVICE)] == ["/rmpa/arm/one"]
+    bed.graph.remove(first)
+    await eventually(lambda: [each.node.name for each in bed.tokens(EntityKind.SERVICE)] == ["/rmpa/arm/two"])
+
+
+async def test_a_service_of_ros2_is_called_by_a_node(bed: Bed) -> None:
+    server = bed.endpoint(EntityKind.SERVICE, "/sum", ADD_2, node="/calculator")
+    seen: list[Ros2Attachment] = []
+
+    def answer(query: MemoryQuery) -> None:
+        request = bed.read(f"{ADD_2}_Request", query.payload)
+        seen.append(Ros2Attachment.parse(query.attachment))
+        query.reply(query.key, bed.cdr(f"{ADD_2}_Response", sum=request.a + request.b), query.attachment)
+        query.finish()
+
+    serve_ros2(bed.ros2, server, answer)
+    await eventually(lambda: "/sum" in bed.graph.services)
+    service = bed.graph.services["/sum"]
+    assert (service.source.kind, service.source.site, service.source.node) == (
+        SourceKind.SERVICE, "ros2", "/calculator",
+    )  # fmt: skip
+    assert (await service.describe()).md5sum == ADD.md5sum
+    for number in (1, 2):
+        response = await service.serve(ADD.request.serialize(ADD.request.make({"a": number, "b": 2})))
+        assert ADD.response.deserialize(response).sum == number + 2
+    (client,) = bed.tokens(EntityKind.CLIENT)
+    assert [(each.sequence, each.gid) for each in seen] == [(1, gid_of(client.token())), (2, gid_of(client.token()))]
+
+
+async def test_an_error_of_ros2_and_a_server_that_is_gone_are_the_clients_error(bed: Bed) -> None:
+    server = bed.endpoint(EntityKind.SERVICE, "/sum", ADD_2)
+    queries: list[MemoryQuery] = []
+    serve_ros2(bed.ros2, server, queries.append)
+    await eventually(lambda: "/sum" in bed.graph.services)
+    request = ADD.request.serialize(ADD.request.make({"a": 1, "b": 2}))
+    call = asyncio.ensure_future(bed.graph.services["/sum"].serve(request))
+    await eventually(lambda: len(queries) == 1)
+    queries[0].reply_error("no battery")
+    with pytest.raises(PeerRefused, match="no battery"):
+        await call
+    call = asyncio.ensure_future(bed.graph.services["/sum"].serve(request))
+    await eventually(lambda: len(queries) == 2)
+    queries[1].finish()
+    with pytest.raises(UnreachableError):
+        await call
+
+
+async def test_the_next_server_of_a_name_takes_over(bed: Bed) -> None:
+    one = serve_ros2(bed.ros2, bed.endpoint(EntityKind.SERVICE, "/sum", ADD_2, node="/one"), lambda _: None)
+    await eventually(lambda: "/sum" in bed.graph.services)
+    two = serve_ros2(bed.ros2, bed.endpoint(EntityKind.SERVICE, "/sum", ADD_2, node="/two"), lambda _: None)
+    one.close()
+    await eventually(lambda: "/sum" in bed.graph.services and bed.graph.services["/sum"].source.node == "/two")
+    two.close()
+    await eventually(lambda: not bed.graph.services)
+
+
+async def test_a_service_whose_definition_differs_is_reported_and_not_shown(bed: Bed) -> None:
+    node = Ros2Node(0, bed.ros2.zid, 0, "/other")
+    other = Ros2Endpoint(node, 1, EntityKind.SERVICE, "/sum", ADD_2, "RIHS01_" + "0" * 64, Ros2Qos())
+    unknown = Ros2Endpoint(node, 2, EntityKind.SERVICE, "/odd", "odd_msgs/srv/Odd", "RIHS01_" + "0" * 64, Ros2Qos())
+    for each in (other, unknown):
+        bed.ros2.token(each.token())
+
+    def problems() -> dict[str, str]:
+        found = bed.neighbour.report()["problems"]
+        assert isinstance(found, dict)
+        return found
+
+    await eventually(lambda: len(problems()) == 2)
+    assert "definitions differ" in problems()["/sum"]
+    assert "odd_msgs/Odd" in problems()["/odd"]
+    assert not bed.graph.services
+
+
+async def test_rules_and_use_decide_what_crosses() -> None:
+    private = CrossingRule(names=("/private/**",), crossing=Crossing.NONE)
+    bed = Bed((private, CrossingRule(name="/{site}{name}")))
+    bed.neighbour.start()
+    try:
+        bed.graph.server("/private/add", ADD, add)
+        bed.graph.server("/talker/set_logger_level", ServiceType("roscpp/SetLoggerLevel"), add)
+        bed.graph.server("/add", ADD, add)
+        bed.ros2.token(bed.endpoint(EntityKind.SERVICE, "/private/sum", ADD_2).token())
+        bed.ros2.token(bed.endpoint(EntityKind.SERVICE, "/sum", ADD_2).token())
+        await eventually(lambda: bed.tokens(EntityKind.SERVICE) and bed.graph.services)
+        own = [each.name for each in bed.tokens(EntityKind.SERVICE) if each.node.zid != bed.ros2.zid]
+        assert own == ["/add"]
+        assert list(bed.graph.services) == ["/ros2/sum"]
+    finally:
+        await bed.neighbour.close()
+    assert all(f"/{bed.ros2.zid}/" in key for key in bed.network.token_keys)

@@ -1,0 +1,96 @@
+"""Pairs of types: of ROS 2's distribution, of learnt definitions, of rules; and ROS 1's form of ROS 2's types."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.gateway.ros2.conversion import NoConversion
+from rmpa.gateway.ros2.derived import derive_ros1
+from rmpa.gateway.ros2.mapping import TypeMapping
+from rmpa.gateway.ros2.pairs import Ros2Pairs
+from rmpa.gateway.ros2.types import Ros2Types
+from rmpa.ros.types.definitions import known_types
+from rmpa.ros.types.messages import MessageType
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+JAZZY = Ros2Types("jazzy")
+DIFFER = {
+    "sensor_msgs/BatteryState", "sensor_msgs/CameraInfo", "sensor_msgs/Range", "shape_msgs/SolidPrimitive",
+    "stereo_msgs/DisparityImage", "visualization_msgs/ImageMarker", "rosgraph_msgs/Log", "sensor_msgs/NavSatStatus",
+    "visualization_msgs/Marker", "std_msgs/Header", "std_msgs/Char",
+}  # fmt: skip
+"""Types whose fields or constants are not the same in Noetic and Jazzy."""
+
+
+def name1(name: str) -> str:
+    return TypeMapping().ros1_message(name, known_types())
+
+
+def test_the_ros1_form_of_ros2s_types_is_noetics_where_both_have_the_type() -> None:
+    times = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+    made = {kind.name: kind for each in JAZZY.store.fielddefs if each not in times
+            for kind in [derive_ros1(JAZZY.store, each, name1)]}  # fmt: skip
+    known = {name for name in made if name in known_types()}
+    assert len(known) > 100
+    assert {name for name in known if made[name].md5sum != MessageType(name).md5sum} == DIFFER
+
+
+def pairs(mapping: TypeMapping | None = None) -> Ros2Pairs:
+    return Ros2Pairs(Ros2Types("jazzy"), mapping or TypeMapping(), MessageType)
+
+
+def test_a_type_that_only_ros2_has_can_be_subscribed_to_in_ros1() -> None:
+    made = pairs()
+    name = "geometry_msgs/msg/VelocityStamped"
+    conversion = made.incoming(name, JAZZY.type_hash(name))
+    assert conversion is not None
+    assert conversion.ros1.name == "geometry_msgs/VelocityStamped"
+    store = conversion._store
+    header = store.types["std_msgs/msg/Header"](store.types["builtin_interfaces/msg/Time"](3, 4), "map")
+    vector = store.types["geometry_msgs/msg/Vector3"]
+    twist = store.types["geometry_msgs/msg/Twist"](vector(1.0, 2.0, 3.0), vector(4.0, 5.0, 6.0))
+    raw = bytes(store.serialize_cdr(store.types[name](header, "body", "odom", twist), name))
+    plain = conversion.ros1.to_plain(conversion.ros1.deserialize(conversion.to_ros1(raw)))
+    assert plain["body_frame_id"] == "body"
+    assert plain["header"] == {"seq": 0, "stamp": {"secs": 3, "nsecs": 4}, "frame_id": "map"}
+
+
+def test_a_learnt_type_makes_the_same_type_of_ros2_known() -> None:
+    made = pairs()
+    kind = MessageType.learn("arm_msgs/Grip", "float64 width\nstring[] fingers")
+    assert made.ros2_type("arm_msgs/Grip") is None
+    learnt = made.learn(kind)
+    assert made.ros2_type("arm_msgs/Grip") == learnt
+    conversion = made.incoming(*learnt)
+    assert conversion is not None
+    assert conversion.ros1 is kind
+    assert made.outgoing(kind) is made.outgoing(kind)
+
+
+def test_a_type_of_this_machine_makes_the_same_type_of_ros2_known() -> None:
+    kind = MessageType.learn("arm_msgs/Grip", "float64 width")
+    known = Ros2Types("jazzy")
+    known.learn(kind.specifications)
+    made = Ros2Pairs(Ros2Types("jazzy"), TypeMapping(), {"arm_msgs/Grip": kind}.__getitem__)
+    assert made.incoming("arm_msgs/msg/Grip", "RIHS01_" + "0" * 64) is None, "its fields differ there"
+    assert made.incoming("arm_msgs/msg/Grip", known.type_hash("arm_msgs/msg/Grip")) is not None
+
+
+def test_a_rule_to_a_type_that_is_not_known_says_what_to_do(tmp_path: Path) -> None:
+    rules = tmp_path / "rules.yaml"
+    rules.write_text(
+        "- {ros1_package_name: a_msgs, ros1_message_name: A, ros2_package_name: b_msgs, ros2_message_name: B}"
+    )
+    mapping = TypeMapping()
+    mapping.read(rules)
+    with pytest.raises(NoConversion, match="get_type_description"):
+        pairs(mapping).ros2_type("a_msgs/A")
+
+
+def test_a_definition_that_ros2_cannot_have_is_no_pair() -> None:
+    with pytest.raises(NoConversion, match="no form in ROS 2"):
+        pairs().learn(MessageType.learn("arm_msgs/Odd", "float64 fooBar\nfloat64 foo_bar"))

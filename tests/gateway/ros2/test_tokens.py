@@ -1,0 +1,134 @@
+"""Ros2Liveliness tokens and keys of ROS 2: golden texts, and what is no token."""
+
+from __future__ import annotations
+
+import contextlib
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.gateway import limits
+from rmpa.gateway.ros2.qos import Ros2Durability, Ros2History, Ros2Liveliness, Ros2Qos, Ros2Reliability
+from rmpa.gateway.ros2.tokens import (
+    EntityKind,
+    Ros2Endpoint,
+    Ros2Node,
+    data_key,
+    dds_type,
+    graph_key,
+    parse_token,
+    ros_type,
+)
+
+HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
+NODE = Ros2Node(2, "a1b2c3", 0, "/robot/talker")
+NODE_TOKEN = "@ros2_lv/2/a1b2c3/0/0/NN/%/%robot/talker"
+CHATTER = Ros2Endpoint(NODE, 10, EntityKind.PUBLISHER, "/robot/chatter", "std_msgs/msg/String", HASH, Ros2Qos())
+CHATTER_TOKEN = (
+    f"@ros2_lv/2/a1b2c3/0/10/MP/%/%robot/talker/%robot%chatter/std_msgs::msg::dds_::String_/{HASH}/::,10:,:,:,,"
+)
+
+
+def test_a_node_and_an_endpoint_have_the_tokens_of_rmw_zenoh() -> None:
+    assert NODE.token() == NODE_TOKEN
+    assert CHATTER.token() == CHATTER_TOKEN
+
+
+def test_a_node_without_a_namespace_has_a_mark_in_its_place() -> None:
+    assert Ros2Node(0, "ff", 3, "/talker").token() == "@ros2_lv/0/ff/3/3/NN/%/%/talker"
+
+
+def test_tokens_are_read_back() -> None:
+    assert parse_token(NODE_TOKEN) == NODE
+    assert parse_token(CHATTER_TOKEN) == CHATTER
+    root = Ros2Node(0, "ff", 3, "/talker", "/secure/enclave")
+    assert parse_token(root.token()) == root
+
+
+def test_data_of_a_topic_goes_by_its_name_type_and_hash() -> None:
+    assert CHATTER.key() == f"2/robot/chatter/std_msgs::msg::dds_::String_/{HASH}"
+    assert data_key(0, "/chatter", "std_msgs/msg/String", "*") == "0/chatter/std_msgs::msg::dds_::String_/*"
+    assert graph_key(7) == "@ros2_lv/7/**"
+
+
+def test_types_have_two_names() -> None:
+    assert dds_type("example_interfaces/srv/AddTwoInts") == "example_interfaces::srv::dds_::AddTwoInts_"
+    assert ros_type("example_interfaces::srv::dds_::AddTwoInts_") == "example_interfaces/srv/AddTwoInts"
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "",
+        "@ros2_lv",
+        "@ros2_lv/0/ff/3/3/NN/%/%",
+        "ros2_lv/0/ff/3/3/NN/%/%/talker",
+        "@ros2_lv/0/ff/3/3/XX/%/%/talker",
+        "@ros2_lv/x/ff/3/3/NN/%/%/talker",
+        "@ros2_lv/-1/ff/3/3/NN/%/%/talker",
+        "@ros2_lv/²/ff/3/3/NN/%/%/talker",
+        "@ros2_lv/0/ff/99999999999999999999999/3/NN/%/%/talker",
+        "@ros2_lv/0/ff/3/3/NN/%/%/%",
+        "@ros2_lv/0/ff/3/3/NN//%/talker",
+        "@ros2_lv/0/*/3/3/NN/%/%/talker",
+        "@ros2_lv/0/ff/3/3/MP/%/%/talker",
+        CHATTER_TOKEN.replace("dds_", "other"),
+        CHATTER_TOKEN.replace("String_", "_"),
+        CHATTER_TOKEN.replace("::,10:,:,:,,", "::,ten:,:,:,,"),
+        CHATTER_TOKEN.replace("::,10:,:,:,,", "::"),
+        "@ros2_lv/0/ff/3/3/NN/%/%/" + "a" * limits.KEY_MAX,
+    ],
+)
+def test_what_is_no_token_is_refused(key: str) -> None:
+    with pytest.raises(RemoteProtocolError):
+        parse_token(key)
+
+
+@given(st.text(max_size=120) | st.text("@ros2_lv/0%:,MPN", max_size=120).map("@ros2_lv/0/".__add__))
+def test_any_text_is_a_token_or_refused(key: str) -> None:
+    with contextlib.suppress(RemoteProtocolError):
+        parse_token(key)
+
+
+@pytest.mark.parametrize(
+    ("qos", "text"),
+    [
+        (Ros2Qos(), "::,10:,:,:,,"),
+        (Ros2Qos(durability=Ros2Durability.TRANSIENT_LOCAL, depth=1), ":1:,1:,:,:,,"),
+        (Ros2Qos(reliability=Ros2Reliability.BEST_EFFORT, depth=5), "2::,5:,:,:,,"),
+        (Ros2Qos(history=Ros2History.KEEP_ALL, depth=0), "::2,0:,:,:,,"),
+        (Ros2Qos(deadline=1_500_000_000, lifespan=2), "::,10:1,500000000:0,2:,,"),
+        (Ros2Qos(liveliness=Ros2Liveliness.MANUAL_BY_TOPIC, lease=3_000_000_000), "::,10:,:,:3,3,0"),
+    ],
+)
+def test_a_qos_and_its_text(qos: Ros2Qos, text: str) -> None:
+    assert qos.serialize() == text
+    assert Ros2Qos.parse(text) == qos
+
+
+def test_kinds_that_are_not_known_count_as_the_default() -> None:
+    assert Ros2Qos.parse("0:9:7,10:,:,:4,,") == Ros2Qos()
+    assert Ros2Qos.parse("1:2:1,10:,:,:1,,") == Ros2Qos()
+
+
+def test_a_latched_publisher_is_transient_local() -> None:
+    assert Ros2Qos.parse(":1:,1:,:,:,,").latched
+    assert not Ros2Qos().latched
+
+
+@given(
+    st.builds(
+        Ros2Qos,
+        st.sampled_from(Ros2Reliability),
+        st.sampled_from(Ros2Durability),
+        st.sampled_from(Ros2History),
+        st.integers(0, limits.QOS_NUMBER_MAX),
+        *[st.integers(0, 2**63 - 1)] * 2,
+        st.sampled_from(Ros2Liveliness),
+        st.integers(0, 2**63 - 1),
+    )
+)
+def test_each_qos_is_read_back(qos: Ros2Qos) -> None:
+    assert Ros2Qos.parse(qos.serialize()) == qos

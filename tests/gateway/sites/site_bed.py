@@ -1,0 +1,176 @@
+"""Sites in one process: gateways with a graph in memory, joined by a real Zenoh router."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from rmpa.core.contract import Contracts
+from rmpa.gateway.neighbour import MeshSource, SourceKind
+from rmpa.gateway.sites.io.neighbour import SiteNeighbour
+from rmpa.gateway.sites.io.topic_part import SiteTopics
+from rmpa.gateway.sites.keys import SiteGateway
+from rmpa.gateway.sites.rules import CrossingRules
+from rmpa.ros.wire.tcpros import TopicDescription
+from rmpa.runtime.system_clock import SystemClock
+from tests.gateway.memory_graph import MemoryGraph, MemoryTap, MemoryTopic
+from tests.gateway.zenoh_bed import ZenohBed, bed, until
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    from rmpa.config.gateway_rules import CrossingRule
+    from rmpa.core.contract import ContractRule
+    from rmpa.gateway.zenoh.session import OpenSession
+
+MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
+
+
+def described(latching: bool = False, md5sum: str = MD5, type_name: str = "odd_msgs/Odd") -> TopicDescription:
+    """A header of a type that no other program knows."""
+    return TopicDescription(type_name, md5sum, "string data\n", latching)
+
+
+class SiteGraph(MemoryGraph):
+    """A graph whose publishers answer later, and give their latched message to each new connection."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.latched: dict[MeshSource, bytes] = {}
+
+    def add(
+        self, name: str, description: TopicDescription, *, module: str = "arm", node: str = "/talker", run: str = "0"
+    ) -> MeshSource:
+        """A node of a module publishes."""
+        proxy = f"/rmpa/{module}{node}"
+        source = MeshSource(SourceKind.TOPIC, module, run * 32, node, name, description.type, name, proxy)
+        self._publishers[source.kind, name, proxy] = description
+        return self._add(source)
+
+    def describe_anew(self, source: MeshSource, description: TopicDescription) -> None:
+        """The publisher starts again with another definition."""
+        self._publishers[source.kind, source.here, source.proxy] = description
+        for tap in self.taps:
+            if tap.source == source:
+                asyncio.get_running_loop().call_soon(self._describe, tap, tap.on_described)  # type: ignore[attr-defined]
+
+    def send(self, source: MeshSource, body: bytes) -> int:
+        if self._publishers[source.kind, source.here, source.proxy].latching:
+            self.latched[source] = body
+        return super().send(source, body)
+
+    def tap(
+        self,
+        source: MeshSource,
+        on_message: Callable[[memoryview], None],
+        on_described: Callable[[TopicDescription], None],
+        on_lost: Callable[[str], None],
+        *,
+        listener: str = "",
+    ) -> MemoryTap:
+        tap = LateTap(self, source, on_message, None, on_described)
+        asyncio.get_running_loop().call_soon(self._describe, tap, on_described)
+        return tap
+
+    def _describe(self, tap: MemoryTap, on_described: Callable[[TopicDescription], None]) -> None:
+        source = tap.source
+        if isinstance(tap, LateTap) and tap.closed:
+            return
+        tap.description = self._publishers[source.kind, source.here, source.proxy]
+        if tap not in self.taps:
+            self.taps.append(tap)
+        on_described(tap.description)
+        if source in self.latched:
+            tap.on_message(memoryview(self.latched[source]))
+
+
+@dataclass(eq=False)
+class LateTap(MemoryTap):
+    """A tap that is connected after a turn of the loop."""
+
+    on_described: Callable[[TopicDescription], None]
+    closed: bool = False
+
+    def close(self) -> None:
+        self.closed = True
+        super().close()
+
+
+@dataclass(eq=False)
+class Site:
+    """One gateway of a site."""
+
+    neighbour: SiteNeighbour
+    graph: SiteGraph
+    session: OpenSession
+
+    def topic(self, name: str, node: str = "/talker") -> MemoryTopic:
+        """A topic that is shown here."""
+        return self.graph.topics[name, node]
+
+    def shows(self, name: str, node: str = "/talker") -> bool:
+        return (name, node) in self.graph.topics
+
+    def topics(self, way: str) -> list[dict[str, object]]:
+        """The report of the topics that go ``out`` or come ``in``."""
+        parts = self.neighbour.report()["parts"]
+        assert isinstance(parts, dict)
+        found = parts["topics"][way]
+        assert isinstance(found, list)
+        return found
+
+    async def subscribed(self, name: str, node: str = "/talker") -> MemoryTopic:
+        """Subscribe to a topic of the other site, and wait until its messages come."""
+        await until(lambda: self.shows(name, node))
+        topic = self.topic(name, node)
+        topic.on_demand(True)
+        await until(lambda: topic.description)
+        return topic
+
+
+@dataclass(eq=False)
+class SiteBed:
+    """Gateways at one router."""
+
+    zenoh: ZenohBed
+    opened: list[Site] = field(default_factory=list)
+
+    async def site(
+        self,
+        name: str,
+        rank: int = 100,
+        *,
+        graph: SiteGraph | None = None,
+        rules: tuple[CrossingRule, ...] = (),
+        contracts: tuple[ContractRule, ...] = (),
+    ) -> Site:
+        """Open one more gateway, and start it."""
+        session = await self.zenoh.session()
+        graph = graph if graph is not None else SiteGraph()
+        own = SiteGateway(name, rank, f"{len(self.opened) + 1:032x}")
+        crossing = CrossingRules(rules)
+        topics = SiteTopics(name, graph, session, crossing, Contracts(contracts), SystemClock())
+        site = Site(SiteNeighbour(graph, session, own, crossing, [topics]), graph, session)
+        self.opened.append(site)
+        site.neighbour.start()
+        return site
+
+    async def pair(self) -> tuple[Site, Site]:
+        """The sites ``yard`` and ``hall``, which lead."""
+        sites = await self.site("yard"), await self.site("hall")
+        await until(lambda: all(site.neighbour.leads for site in sites))
+        return sites
+
+
+@contextlib.asynccontextmanager
+async def site_bed() -> AsyncIterator[SiteBed]:
+    """A router without gateways; everything is closed at the end."""
+    async with bed() as zenoh:
+        made = SiteBed(zenoh)
+        try:
+            yield made
+        finally:
+            for site in made.opened:
+                await site.neighbour.close()

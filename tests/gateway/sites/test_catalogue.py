@@ -1,0 +1,194 @@
+"""What other sites have: tokens in any order, short breaks, bounds, and tokens that are none."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rmpa.gateway import limits
+from rmpa.gateway.neighbour import SourceKind
+from rmpa.gateway.sites.catalogue import CatalogueChange, CatalogueEvent, SiteCatalogue
+from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource
+
+FOUND, RENEWED, GONE = CatalogueChange.FOUND, CatalogueChange.RENEWED, CatalogueChange.GONE
+FIRST = SiteGateway("cloud", 1, "1" * 32)
+SECOND = SiteGateway("cloud", 2, "2" * 32)
+ARM = SiteModule("cloud", "arm", "a" * 32)
+BASE = SiteModule("cloud", "base", "b" * 32)
+SCAN = SiteSource(ARM, SourceKind.TOPIC, "sensor_msgs/LaserScan", "/lidar", "/scan")
+STOP = SiteSource(BASE, SourceKind.SERVICE, "std_srvs/Trigger", "/driver", "/stop")
+EVERYTHING = (FIRST, SECOND, ARM, BASE, SCAN, STOP)
+
+
+def told(catalogue: SiteCatalogue) -> list[tuple[CatalogueChange, object]]:
+    return [(event.change, event.item) for event in catalogue.take_events()]
+
+
+def with_everything() -> SiteCatalogue:
+    catalogue = SiteCatalogue("home")
+    for item in EVERYTHING:
+        catalogue.token(item.token(), 0.0, alive=True)
+    catalogue.take_events()
+    return catalogue
+
+
+def test_a_source_is_there_with_its_module() -> None:
+    catalogue = SiteCatalogue("home")
+    catalogue.token(SCAN.token(), 0.0, alive=True)
+    assert told(catalogue) == []
+    catalogue.token(ARM.token(), 0.0, alive=True)
+    assert told(catalogue) == [(FOUND, ARM), (FOUND, SCAN)]
+    assert catalogue.sources(ARM) == [SCAN]
+
+
+def test_a_module_that_is_killed_is_gone_within_a_fifth_of_a_second_with_its_sources() -> None:
+    catalogue = with_everything()
+    catalogue.token(ARM.token(), 10.0, alive=False)
+    due = catalogue.next_timer()
+    assert due is not None
+    assert due <= 10.2
+    catalogue.handle_timer(due)
+    assert told(catalogue) == [(GONE, SCAN), (GONE, ARM)]
+    assert catalogue.modules("cloud") == [BASE]
+
+
+def test_a_source_that_is_withdrawn_goes_alone() -> None:
+    catalogue = with_everything()
+    catalogue.token(SCAN.token(), 10.0, alive=False)
+    catalogue.handle_timer(10.2)
+    assert told(catalogue) == [(GONE, SCAN)]
+    assert catalogue.modules("cloud") == [ARM, BASE]
+
+
+@pytest.mark.parametrize("order", [EVERYTHING, EVERYTHING[::-1]])
+def test_another_gateway_that_takes_over_takes_nothing_down(
+    order: tuple[SiteGateway | SiteModule | SiteSource, ...],
+) -> None:
+    catalogue = with_everything()
+    for number, item in enumerate(order):
+        if item is not SECOND:
+            catalogue.token(item.token(), 10.0 + number / 1000, alive=False)
+    catalogue.handle_timer(10.0 + limits.LEADER_PATIENCE)
+    assert told(catalogue) == []
+    for back in (ARM, BASE, SCAN, STOP):
+        catalogue.token(back.token(), 10.0 + limits.LEADER_PATIENCE + 0.1, alive=True)
+    catalogue.handle_timer(20.0)
+    changes = told(catalogue)
+    assert {change for change, _ in changes} == {RENEWED}
+    assert {item for _, item in changes} == {ARM, BASE, SCAN, STOP}
+
+
+def test_a_site_that_does_not_come_back_is_gone_after_the_grace() -> None:
+    catalogue = with_everything()
+    for item in EVERYTHING:
+        catalogue.token(item.token(), 10.0, alive=False)
+    catalogue.handle_timer(10.0 + limits.SITE_GRACE)
+    changes = told(catalogue)
+    assert {item for change, item in changes if change is GONE} == {ARM, BASE, SCAN, STOP}
+    assert changes.index((GONE, SCAN)) < changes.index((GONE, ARM))
+    assert catalogue.sites == ()
+    assert catalogue.next_timer() is None
+
+
+def test_a_short_break_of_the_link_takes_nothing_down() -> None:
+    catalogue = with_everything()
+    for item in EVERYTHING:
+        catalogue.token(item.token(), 10.0, alive=False)
+    for item in EVERYTHING:
+        catalogue.token(item.token(), 10.4, alive=True)
+    catalogue.handle_timer(100.0)
+    assert GONE not in {change for change, _ in told(catalogue)}
+    assert catalogue.sources(ARM) == [SCAN]
+
+
+def test_a_source_whose_token_stays_is_shown_again_with_its_module() -> None:
+    catalogue = with_everything()
+    catalogue.token(ARM.token(), 10.0, alive=False)
+    catalogue.handle_timer(11.0)
+    catalogue.take_events()
+    catalogue.token(ARM.token(), 12.0, alive=True)
+    assert told(catalogue) == [(FOUND, ARM), (FOUND, SCAN)]
+
+
+def test_tokens_of_this_site_are_not_another_sites() -> None:
+    catalogue = SiteCatalogue("cloud")
+    for item in EVERYTHING:
+        catalogue.token(item.token(), 0.0, alive=True)
+    assert catalogue.sites == ()
+
+
+def test_tokens_that_are_none_are_counted() -> None:
+    catalogue = SiteCatalogue("home")
+    for key in ("", "rmpa/1/cloud", ARM.token() + "x", f"rmpa/2{ARM.token()[6:]}", SCAN.token() + "/later"):
+        catalogue.token(key, 0.0, alive=True)
+    assert catalogue.sites == ()
+    assert catalogue.counters["site.token.malformed"] == 4
+    assert catalogue.counters["site.token.later_version"] == 1
+
+
+def test_sites_modules_and_sources_have_bounds_that_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "SITES_MAX", 2)
+    monkeypatch.setattr(limits, "SITE_MODULES_MAX", 2)
+    monkeypatch.setattr(limits, "SITE_SOURCES_MAX", 3)
+    catalogue = SiteCatalogue("home")
+    modules = [SiteModule("cloud", f"m{number}", "0" * 32) for number in range(4)]
+    for module in modules:
+        catalogue.token(module.token(), 0.0, alive=True)
+    for number in range(5):
+        source = SiteSource(modules[0], SourceKind.TOPIC, "std_msgs/String", "/n", f"/t{number}")
+        catalogue.token(source.token(), 0.0, alive=True)
+        orphan = SiteSource(modules[3], SourceKind.TOPIC, "std_msgs/String", "/n", f"/t{number}")
+        catalogue.token(orphan.token(), 0.0, alive=True)
+    for number in range(4):
+        catalogue.token(SiteModule(f"site{number}", "arm", "0" * 32).token(), 0.0, alive=True)
+    assert len(catalogue.modules("cloud")) == 2
+    assert len(catalogue.sources(modules[0])) == 2
+    assert catalogue.refused("cloud") == 2 + 7
+    assert catalogue.sites == ("cloud", "site0")
+    assert catalogue.counters["site.limit"] == 2 + 7 + 3
+
+
+ITEMS = st.sampled_from(
+    [FIRST, SECOND, ARM, BASE, SCAN, STOP, SiteSource(ARM, SourceKind.TOPIC, "std_msgs/String", "/x", "/y")]
+)
+
+
+@given(st.lists(st.tuples(ITEMS, st.booleans(), st.floats(0, 1))))
+def test_events_say_what_the_tokens_say_in_any_order(changes: list[tuple[SiteSource, bool, float]]) -> None:
+    catalogue = SiteCatalogue("home")
+    alive: set[object] = set()
+    shown: set[object] = set()
+    now = 0.0
+
+    def follow(event: CatalogueEvent) -> None:
+        item = event.item
+        if event.change is FOUND:
+            assert item not in shown
+            assert isinstance(item, SiteModule) or item.module in shown
+            shown.add(item)
+        elif event.change is RENEWED:
+            assert item in shown
+        else:
+            assert not any(isinstance(each, SiteSource) and each.module == item for each in shown)
+            shown.remove(item)
+
+    for item, there, pause in changes:
+        now += pause
+        due = catalogue.next_timer()
+        if due is not None and due <= now:
+            catalogue.handle_timer(now)
+        catalogue.token(item.token(), now, alive=there)
+        (alive.add if there else alive.discard)(item)
+        for event in catalogue.take_events():
+            follow(event)
+    catalogue.handle_timer(now + 10)
+    for event in catalogue.take_events():
+        follow(event)
+    wanted = {
+        item
+        for item in alive
+        if isinstance(item, SiteModule) or (isinstance(item, SiteSource) and item.module in alive)
+    }
+    assert shown == wanted == set(catalogue.all())
+    assert catalogue.next_timer() is None

@@ -1,0 +1,93 @@
+"""Keys and tokens of sites: golden texts, and what is no token."""
+
+from __future__ import annotations
+
+import contextlib
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.gateway import limits
+from rmpa.gateway.neighbour import SourceKind
+from rmpa.gateway.sites.keys import (
+    SiteGateway,
+    SiteModule,
+    SiteSource,
+    data_key,
+    parse_token,
+    tokens_key,
+)
+
+RUN = "0123456789abcdef0123456789abcdef"
+ARM = SiteModule("warehouse", "arm", RUN)
+SCAN = SiteSource(ARM, SourceKind.TOPIC, "sensor_msgs/LaserScan", "/lidar/driver", "/base/scan")
+GATEWAY = SiteGateway("warehouse", 10, RUN)
+
+
+def test_golden_tokens() -> None:
+    assert ARM.token() == f"rmpa/1/warehouse/arm/up/{RUN}"
+    assert SCAN.token() == f"rmpa/1/warehouse/arm/up/{RUN}/t/sensor_msgs%LaserScan/%lidar%driver/%base%scan"
+    assert GATEWAY.token() == f"rmpa/1/warehouse/-gateway/010/{RUN}"
+
+
+def test_golden_keys() -> None:
+    assert SCAN.key() == "rmpa/1/warehouse/arm/t/sensor_msgs%LaserScan/base/scan"
+    assert data_key("*", "*", SourceKind.SERVICE, "std_srvs/Trigger", "/stop") == "rmpa/1/*/*/s/std_srvs%Trigger/stop"
+    assert tokens_key() == "rmpa/1/*/**"
+
+
+@pytest.mark.parametrize("each", [ARM, SCAN, GATEWAY])
+def test_tokens_are_read_back(each: SiteModule | SiteSource | SiteGateway) -> None:
+    assert parse_token(each.token()) == each
+
+
+def test_a_service_whose_type_is_unknown_is_announced_and_called_by_any_type() -> None:
+    stop = SiteSource(ARM, SourceKind.SERVICE, "*", "/driver", "/stop")
+    assert stop.token() == f"{ARM.token()}/s/-/%driver/%stop"
+    assert stop.key() == "rmpa/1/warehouse/arm/s/*/stop"
+    assert parse_token(stop.token()) == stop
+    with pytest.raises(RemoteProtocolError):
+        parse_token(f"{ARM.token()}/t/-/%driver/%stop")
+
+
+def test_a_module_may_be_called_gateway() -> None:
+    module = SiteModule("home", "gateway", RUN)
+    assert parse_token(module.token()) == module
+
+
+@pytest.mark.parametrize("more", ["/x", "/t/a%B/%n/%t/more", "/z/a%B/%n/%t"])
+def test_what_a_later_version_announces_is_ignored(more: str) -> None:
+    assert parse_token(ARM.token() + more) is None
+    assert parse_token(f"rmpa/1/home/arm/later/{RUN}") is None
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "",
+        "rmpa/1/home",
+        f"rmpa/2/home/arm/up/{RUN}",
+        f"rmpa/1/ho-me/arm/up/{RUN}",
+        f"rmpa/1/home/4rm/up/{RUN}",
+        f"rmpa/1/home/arm/up/{RUN[:-1]}",
+        f"rmpa/1/home/arm/up/{RUN.upper()}",
+        f"rmpa/1/home/-gateway/first/{RUN}",
+        f"rmpa/1/home/-gateway/1000/{RUN}",
+        f"rmpa/1/home/-gateway/²/{RUN}",
+        f"rmpa/1/home/arm/up/{RUN}/t/std_msgs/%node/%topic",
+        f"rmpa/1/home/arm/up/{RUN}/t/std_msgs%String/node/%topic",
+        f"rmpa/1/home/arm/up/{RUN}/t/std_msgs%String/%node/%to pic",
+        f"rmpa/1/home/arm/up/{RUN}/t/std_msgs%String/%node/%{'a' * limits.KEY_MAX}",
+    ],
+)
+def test_what_is_no_token_is_refused(key: str) -> None:
+    with pytest.raises(RemoteProtocolError):
+        parse_token(key)
+
+
+@given(st.text(max_size=100) | st.text("abz%/-019_*", max_size=100).map(f"rmpa/1/home/arm/up/{RUN}/".__add__))
+def test_any_text_is_a_token_or_refused(key: str) -> None:
+    with contextlib.suppress(RemoteProtocolError):
+        parse_token(key)

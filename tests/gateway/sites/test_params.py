@@ -1,0 +1,264 @@
+"""Parameters between sites: read, written and followed, as policy and rules let them."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any, cast
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rmpa.bridge import limits as bridge_limits
+from rmpa.bridge.params import transfer
+from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.gateway.sites.io.param_exports import SiteParamExports
+from rmpa.gateway.sites.io.param_imports import SiteParamImports
+from rmpa.gateway.sites.io.param_part import SiteParams
+from rmpa.gateway.sites.params import (
+    ParamAnswer,
+    ParamQuestion,
+    digest,
+    followed_of,
+    from_json,
+    param_key,
+    parse_param_key,
+    to_json,
+)
+from rmpa.ros.master.parameters import leaves
+from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
+from tests.gateway.sites.loopback_session import LoopbackSession
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+
+class ArmParams:
+    """The module arm: what its agent answers over the mesh."""
+
+    def __init__(self) -> None:
+        self.values: dict[str, Any] = {"/speed": 1.5, "/gains": {"p": 1, "i": 2}, "/big": "x" * 100_000}
+        self.there = True
+        self.transfers = transfer.Transfers()
+
+    async def ask(self, module: str, what: str, args: dict[str, Any]) -> object:
+        if not self.there or module != "arm":
+            raise UnreachableError("linked peer", repr(module))
+        if what == transfer.GET:
+            return self.transfers.answer(serialize_response(self._get(args["key"])).decode(), 0.0)
+        if what == transfer.NAMES:
+            names = [name for key, value in self.values.items() for name, _ in leaves(key, value)]
+            return self.transfers.answer(serialize_response(names).decode(), 0.0)
+        if what == transfer.MORE:
+            return self.transfers.more(args, 0.0)
+        if what == transfer.PUT:
+            return self.transfers.put(args, 0.0)
+        if what == transfer.SET:
+            self.values[args["key"]] = parse_response(self.transfers.written(args, 0.0).encode())
+            return {"count": 1}
+        self._get(args["key"])
+        del self.values[args["key"]]
+        return {}
+
+    def _get(self, key: str) -> Any:
+        if key not in self.values:
+            raise PeerRefused("arm", f"there is no parameter {key}")
+        return self.values[key]
+
+
+class OwnParams:
+    """The gateway's own parameters."""
+
+    def __init__(self) -> None:
+        self.followed_by_peers: list[str] = []
+        self.values: dict[str, Any] = {}
+        self.provided = 0
+
+    async def provide(self, key: str, value: Any) -> None:
+        self.provided += 1
+        if value is None:
+            self.values.pop(key, None)
+        else:
+            self.values[key] = value
+
+
+class ParamSites:
+    """Two sites, of which the second asks."""
+
+    def __init__(self) -> None:
+        self.session, self.arm, self.own = LoopbackSession(), ArmParams(), OwnParams()
+        self.denied: set[str] = set()
+        self.sites = ["warehouse"]
+        self.exports = SiteParamExports("warehouse", cast("Any", self.session), self.arm.ask, self._why_not)
+        self.imports = SiteParamImports("office", cast("Any", self.session), lambda: 1, self.own, lambda: self.sites)
+        self.part = SiteParams(self.exports, self.imports)
+        self.part.lead(leads=True)
+
+    def _why_not(self, site: str, module: str, name: str) -> str:
+        return f"a rule keeps {name} of {module} from {site}" if name in self.denied else ""
+
+    async def drive(self, steps: Any) -> Any:
+        try:
+            question = next(steps)
+            while True:
+                question = steps.send(await self.imports.ask("warehouse", "arm", *question))
+        except StopIteration as done:
+            return done.value
+
+    async def get(self, key: str) -> Any:
+        return parse_response((await self.drive(transfer.reading(transfer.GET, {"key": key}))).encode())
+
+    async def set(self, key: str, value: Any) -> Any:
+        return await self.drive(transfer.writing(key, serialize_response(value).decode(), 7))
+
+
+@pytest.fixture
+async def sites() -> AsyncIterator[ParamSites]:
+    found = ParamSites()
+    yield found
+    await found.part.close()
+
+
+async def test_parameters_of_another_site_are_read_and_written_also_large_ones(sites: ParamSites) -> None:
+    assert await sites.get("/speed") == 1.5
+    assert await sites.get("/gains") == {"p": 1, "i": 2}
+    assert await sites.get("/big") == "x" * 100_000
+    assert await sites.set("/speed", 2.5) == 1
+    assert sites.arm.values["/speed"] == 2.5
+    large = "y" * (5 * bridge_limits.PARAM_PORTION)
+    assert await sites.set("/big", large) == 1
+    assert sites.arm.values["/big"] == large
+    names = await sites.drive(transfer.reading(transfer.NAMES, {}))
+    assert parse_response(names.encode()) == ["/speed", "/gains/p", "/gains/i", "/big"]
+    assert await sites.imports.ask("warehouse", "arm", transfer.DELETE, {"key": "/speed"}) == {}
+    assert "/speed" not in sites.arm.values
+
+
+async def test_what_the_module_refuses_arrives_with_its_text(sites: ParamSites) -> None:
+    with pytest.raises(PeerRefused) as caught:
+        await sites.get("/none")
+    assert caught.value.reason == "there is no parameter /none"
+    sites.arm.there = False
+    with pytest.raises(PeerRefused, match="no linked peer answers at 'arm'"):
+        await sites.get("/speed")
+
+
+async def test_a_rule_of_the_gateway_keeps_parameters_home_also_within_a_namespace(sites: ParamSites) -> None:
+    sites.denied = {"/speed", "/gains/p"}
+    for key in ("/speed", "/gains"):
+        with pytest.raises(PeerRefused, match="a rule keeps"):
+            await sites.get(key)
+        with pytest.raises(PeerRefused, match="a rule keeps"):
+            await sites.imports.ask("warehouse", "arm", transfer.DELETE, {"key": key})
+    with pytest.raises(PeerRefused, match="a rule keeps"):
+        await sites.set("/gains", {"p": 5})
+    assert sites.arm.values["/gains"] == {"p": 1, "i": 2}
+    names = await sites.drive(transfer.reading(transfer.NAMES, {}))
+    assert parse_response(names.encode()) == ["/gains/i", "/big"]
+
+
+async def test_a_program_reads_and_sets_them_as_json(sites: ParamSites) -> None:
+    (reply,) = await sites.session.get("rmpa/1/warehouse/arm/p/gains")
+    assert msgspec.json.decode(reply.payload) == {"p": 1, "i": 2}
+    (reply,) = await sites.session.get("rmpa/1/warehouse/arm/p/speed", b"[1, true]")
+    assert (reply.ok, reply.payload) == (True, b"1")
+    assert sites.arm.values["/speed"] == [1, True]
+    for payload in (b"null", b"{", b'{"a": null}'):
+        (reply,) = await sites.session.get("rmpa/1/warehouse/arm/p/speed", payload)
+        assert not reply.ok
+    (reply,) = await sites.session.get("rmpa/1/warehouse/arm/p/**")
+    assert not reply.ok
+    assert "names several" in reply.payload.decode()
+
+
+async def test_a_gateway_that_stands_by_does_not_answer(sites: ParamSites) -> None:
+    sites.part.lead(leads=False)
+    with pytest.raises(UnreachableError, match="site warehouse for its module arm"):
+        await sites.get("/speed")
+
+
+async def test_followed_parameters_are_kept_equal_in_the_gateways_core(sites: ParamSites) -> None:
+    sites.own.followed_by_peers = ["/warehouse/arm/speed", "/warehouse/arm/gains", "/own", "/elsewhere/arm/speed"]
+    await sites.imports.look()
+    assert sites.own.values == {"/warehouse/arm/speed": 1.5, "/warehouse/arm/gains": {"p": 1, "i": 2}}
+    await sites.imports.look()
+    assert sites.own.provided == 2  # what is equal is not set again
+    sites.arm.values["/speed"] = 3.5
+    del sites.arm.values["/gains"]
+    await sites.imports.look()
+    assert sites.own.values == {"/warehouse/arm/speed": 3.5}
+    sites.arm.there = False
+    await sites.imports.look()
+    assert sites.own.values == {"/warehouse/arm/speed": 3.5}
+    assert "no linked peer" in sites.imports.problems["/warehouse/arm/speed"]
+    sites.arm.there = True
+    sites.denied = {"/speed"}
+    await sites.imports.look()
+    assert "a rule keeps" in sites.imports.problems["/warehouse/arm/speed"]
+    sites.own.followed_by_peers = []
+    await sites.imports.look()
+    assert sites.imports.problems == {}
+    assert sites.imports.followed == 0
+
+
+async def test_questions_under_way_end_with_the_gateway(sites: ParamSites) -> None:
+    begun = asyncio.Event()
+
+    async def hang(module: str, what: str, args: dict[str, Any]) -> object:
+        begun.set()
+        return await asyncio.Event().wait()
+
+    sites.exports._ask = hang
+    question = asyncio.create_task(sites.get("/speed"))
+    await begun.wait()
+    await sites.exports.close()
+    with pytest.raises(PeerRefused, match="the gateway of site warehouse ends"):
+        await question
+
+
+plain = st.recursive(
+    st.booleans() | st.integers(-(2**31), 2**31 - 1) | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text("abc", min_size=1), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@given(plain)
+def test_values_are_the_same_as_json(value: Any) -> None:
+    assert from_json(to_json(value)) == value
+
+
+@given(st.binary(max_size=200))
+def test_no_text_crashes_the_readers(data: bytes) -> None:
+    for parse in (ParamQuestion.parse, ParamAnswer.parse, from_json):
+        try:
+            parse(data)
+        except RmpaError:
+            continue
+
+
+def test_questions_are_checked() -> None:
+    for bad in (
+        {"op": "shout", "key": "/a"},
+        {"op": "get", "key": "a"},
+        {"op": "get"},
+        {"op": "set", "key": "/a//b"},
+        {"op": "values", "last": {"a": ""}},
+        {"op": "values", "last": {f"/a{n}": "" for n in range(300)}},
+    ):
+        with pytest.raises(RemoteProtocolError):
+            ParamQuestion.parse(msgspec.json.encode(bad))
+    question = ParamQuestion(op="values", last={"/a": digest(None)})
+    assert ParamQuestion.parse(question.serialize()) == question
+
+
+def test_keys() -> None:
+    assert param_key("home", "arm", "/gains/p") == "rmpa/1/home/arm/p/gains/p"
+    assert parse_param_key("rmpa/1/home/arm/p/gains/p") == ("arm", "/gains/p")
+    assert parse_param_key("rmpa/1/home/arm/p/-") == ("arm", "-")
+    for key in ("rmpa/1/home/arm/p", "rmpa/1/home/arm/t/x", "rmpa/1/home/*/p/x", "rmpa/1/home/arm/p/" + "x" * 3000):
+        with pytest.raises(RemoteProtocolError):
+            parse_param_key(key)
+    assert followed_of("/warehouse/arm/gains/p") == ("warehouse", "arm", "/gains/p")
+    assert followed_of("/warehouse/arm") is None

@@ -1,0 +1,231 @@
+"""What a site offers, and what is shown of others: pairs of the two plans, conflicts of types, and new runs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rmpa.config.gateway_rules import Crossing, CrossingRule
+from rmpa.gateway import limits
+from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
+from rmpa.gateway.sites.exports import SiteExports
+from rmpa.gateway.sites.imports import ImportChange, SiteImports
+from rmpa.gateway.sites.keys import SiteModule, SiteSource, parse_token
+from rmpa.gateway.sites.part import SiteExport
+from rmpa.gateway.sites.rules import CrossingRules
+
+if TYPE_CHECKING:
+    import pytest
+
+T, S = SourceKind.TOPIC, SourceKind.SERVICE
+RUN = "0123456789abcdef" * 2
+
+
+def mesh_source(
+    name: str, module: str = "arm", type_name: str = "std_msgs/String", kind: SourceKind = T
+) -> MeshSource:
+    return MeshSource(kind, module, RUN, "/node", name, type_name, name, f"/rmpa/{module}/node")
+
+
+def announced(name: str, module: str = "arm", type_name: str = "std_msgs/String", kind: SourceKind = T) -> SiteSource:
+    return SiteSource(SiteModule("cloud", module, RUN), kind, type_name, "/node", name)
+
+
+def tokens(exports: SiteExports) -> set[str]:
+    return {each.token() for each in exports.modules} | {each.announced.token() for each in exports.entries}
+
+
+def test_a_module_is_announced_before_its_first_source_and_withdrawn_after_its_last() -> None:
+    exports = SiteExports("home", CrossingRules())
+    one, two = mesh_source("/one"), mesh_source("/two")
+    for source in (one, two):
+        exports.changed(source, there=True)
+    for source in (one, two):
+        exports.changed(source, there=False)
+    told = [(isinstance(change.item, SiteExport), change.there) for change in exports.take_changes()]
+    assert told == [(False, True), (True, True), (True, True), (True, False), (True, False), (False, False)]
+    assert tokens(exports) == set()
+
+
+def test_what_stays_home_is_told_with_its_rule() -> None:
+    exports = SiteExports("home", CrossingRules((CrossingRule(names=("/secret",), crossing=Crossing.IN),)))
+    exports.changed(mesh_source("/secret"), there=True)
+    exports.changed(mesh_source("/scan"), there=True)
+    assert [entry.source.name for entry in exports.entries] == ["/scan"]
+    [(source, why)] = exports.refusals()
+    assert source.name == "/secret"
+    assert "gateway.rule 1" in why
+
+
+def test_names_that_no_key_can_hold_are_told() -> None:
+    exports = SiteExports("home", CrossingRules())
+    exports.changed(replace(mesh_source("/one"), node="/" + "n" * 255), there=True)
+    exports.changed(mesh_source("/" + "t" * limits.KEY_MAX), there=True)
+    exports.changed(mesh_source("/odd", type_name="odd"), there=True)
+    assert exports.entries == []
+    assert len(list(exports.refusals())) == 3
+
+
+def test_a_service_crosses_before_its_type_is_known() -> None:
+    exports = SiteExports("home", CrossingRules())
+    exports.changed(mesh_source("/stop", type_name="*", kind=S), there=True)
+    [entry] = exports.entries
+    assert parse_token(entry.announced.token()) == entry.announced
+
+
+def test_what_exceeds_the_bound_is_told_and_offered_when_there_is_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "SITE_SOURCES_MAX", 1)
+    exports = SiteExports("home", CrossingRules())
+    for name in ("/one", "/two"):
+        exports.changed(mesh_source(name), there=True)
+    [(source, why)] = exports.refusals()
+    assert source.name == "/two"
+    assert "already" in why
+    exports.changed(mesh_source("/one"), there=False)
+    assert [entry.source.name for entry in exports.entries] == ["/two"]
+    assert list(exports.refusals()) == []
+
+
+def test_another_run_of_a_module_replaces_its_tokens() -> None:
+    exports = SiteExports("home", CrossingRules())
+    exports.changed(mesh_source("/one"), there=True)
+    before = tokens(exports)
+    exports.changed(replace(mesh_source("/one"), instance="f" * 32), there=True)
+    assert len(tokens(exports)) == 2
+    assert not before & tokens(exports)
+
+
+def test_a_source_is_shown_under_the_name_of_the_rule() -> None:
+    imports = SiteImports(CrossingRules((CrossingRule(name="/{site}{name}"),)))
+    imports.found(announced("/scan"))
+    [change] = imports.take_changes()
+    assert change.new is not None
+    assert change.new.source == ForeignSource(T, "cloud", "arm", "/node", "/cloud/scan", "std_msgs/String")
+
+
+def test_of_two_types_under_one_name_the_first_is_shown_and_the_other_told() -> None:
+    imports = SiteImports(CrossingRules())
+    first, second = announced("/scan"), announced("/scan", "base", "std_msgs/Bool")
+    imports.found(first)
+    imports.found(second)
+    assert [entry.announced for entry in imports.entries] == [first]
+    [(source, why)] = imports.refusals()
+    assert source == second
+    assert "std_msgs/String" in why
+    assert "std_msgs/Bool" in why
+    imports.gone(first)
+    assert [entry.announced for entry in imports.entries] == [second]
+    assert list(imports.refusals()) == []
+
+
+def test_two_publishers_of_one_type_share_a_name() -> None:
+    imports = SiteImports(CrossingRules())
+    imports.found(announced("/scan"))
+    imports.found(announced("/scan", "base"))
+    assert len(imports.entries) == 2
+
+
+def test_a_source_of_this_site_goes_before_those_of_others() -> None:
+    imports = SiteImports(CrossingRules())
+    imports.found(announced("/scan"))
+    own = mesh_source("/scan", type_name="std_msgs/Bool")
+    imports.own_changed(own, there=True)
+    assert imports.entries == []
+    assert "of this site" in next(why for _, why in imports.refusals())
+    imports.own_changed(own, there=False)
+    assert len(imports.entries) == 1
+
+
+def test_one_service_has_one_server() -> None:
+    imports = SiteImports(CrossingRules())
+    imports.found(announced("/stop", kind=S, type_name="std_srvs/Trigger"))
+    imports.found(announced("/stop", "base", kind=S, type_name="std_srvs/Trigger"))
+    assert len(imports.entries) == 1
+    assert "already" in next(why for _, why in imports.refusals())
+
+
+def test_a_new_run_of_a_module_continues_its_sources() -> None:
+    imports = SiteImports(CrossingRules())
+    old = announced("/scan")
+    new = replace(old, module=replace(old.module, instance="f" * 32))
+    imports.found(old)
+    imports.take_changes()
+    imports.found(new)
+    imports.gone(old)
+    [change] = imports.take_changes()
+    assert change.old is not None
+    assert change.new is not None
+    assert change.old.source == change.new.source
+    assert change.new.announced == new
+    imports.gone(new)
+    [change] = imports.take_changes()
+    assert change.new is None
+
+
+def test_what_was_interrupted_is_renewed() -> None:
+    imports = SiteImports(CrossingRules())
+    imports.found(announced("/scan"))
+    [shown] = imports.entries
+    imports.take_changes()
+    imports.renewed(announced("/scan"))
+    assert imports.take_changes() == [ImportChange(shown, shown)]
+
+
+NAMES = st.sampled_from(["/a", "/b"])
+MODULES = st.sampled_from(["arm", "base", "cam"])
+TYPES = st.sampled_from(["std_msgs/String", "std_msgs/Bool"])
+
+
+@given(st.lists(st.tuples(NAMES, MODULES, TYPES, st.sampled_from([T, S]), st.booleans(), st.booleans())))
+def test_what_one_site_offers_is_shown_at_the_other_without_mixed_types(
+    changes: list[tuple[str, str, str, SourceKind, bool, bool]],
+) -> None:
+    exports, imports = SiteExports("cloud", CrossingRules()), SiteImports(CrossingRules())
+    shown: dict[ForeignSource, SiteSource] = {}
+    there: set[str] = set()
+    own: dict[tuple[SourceKind, str], set[str]] = {}
+    for name, module, type_name, kind, come, at_home in changes:
+        source = mesh_source(name, module, type_name, kind)
+        if at_home:
+            imports.own_changed(source, there=come)
+            types = own.setdefault((kind, name), set())
+            if come:
+                types.add(f"{module} {type_name}")
+            else:
+                types.discard(f"{module} {type_name}")
+        else:
+            exports.changed(source, there=come)
+        for change in exports.take_changes():
+            if isinstance(change.item, SiteExport):
+                token = change.item.announced.token()
+                read = parse_token(token)
+                assert isinstance(read, SiteSource)
+                if change.there:
+                    there.add(token)
+                    imports.found(read)
+                else:
+                    there.discard(token)
+                    imports.gone(read)
+        for each in imports.take_changes():
+            if each.old is not None:
+                assert shown.pop(each.old.source) == each.old.announced
+            if each.new is not None:
+                assert each.new.source not in shown
+                shown[each.new.source] = each.new.announced
+    assert list(shown.values()) == [entry.announced for entry in imports.entries] or set(shown.values()) == {
+        entry.announced for entry in imports.entries
+    }
+    refused = {source.token() for source, _ in imports.refusals()}
+    assert {source.token() for source in shown.values()} | refused == there
+    for foreign in shown:
+        same = [each for each in shown if (each.kind, each.name) == (foreign.kind, foreign.name)]
+        assert len({each.type for each in same}) == 1
+        at_home_types = {text.split()[1] for text in own.get((foreign.kind, foreign.name), set())}
+        if foreign.kind is S:
+            assert len(same) == 1
+            assert not at_home_types
+        else:
+            assert at_home_types <= {foreign.type}

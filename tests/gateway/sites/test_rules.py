@@ -1,0 +1,109 @@
+"""What crosses between sites: the first rule that fits holds, and the gateway's own policy stands above all."""
+
+from __future__ import annotations
+
+from rmpa.bridge.permission_gate import PermissionGate
+from rmpa.bridge.policy import Policy, PolicyDecision
+from rmpa.config.gateway_rules import Crossing, CrossingRule
+from rmpa.config.permission_rules import Access, PermissionRule
+from rmpa.config.policy import PolicySettings
+from rmpa.config.settings import TrustSettings
+from rmpa.core.counters import Counters
+from rmpa.gateway.neighbour import SourceKind
+from rmpa.gateway.site_permissions import SitePermissions
+from rmpa.gateway.sites.rules import CrossingDecision, CrossingRules
+from rmpa.trust.permissions import Permissions
+
+T = SourceKind.TOPIC
+
+
+def out(rules: CrossingRules, name: str, module: str = "arm") -> CrossingDecision:
+    return rules.outgoing(T, module, name, "std_msgs/String", "/node")
+
+
+def into(rules: CrossingRules, name: str, site: str = "cloud", module: str = "arm") -> CrossingDecision:
+    return rules.incoming(T, site, module, name, "std_msgs/String", "/node")
+
+
+def test_without_a_rule_everything_crosses_under_its_own_name() -> None:
+    assert out(CrossingRules(), "/scan").allowed
+    assert into(CrossingRules(), "/scan").name == "/scan"
+
+
+def test_the_first_rule_that_fits_holds_and_is_named() -> None:
+    rules = CrossingRules(
+        (
+            CrossingRule(names=("/cmd_vel",), crossing=Crossing.IN),
+            CrossingRule(names=("/camera/**",), rate=5.0, size=1000),
+            CrossingRule(crossing=Crossing.NONE),
+        )
+    )
+    assert not out(rules, "/cmd_vel").allowed
+    assert "gateway.rule 1" in out(rules, "/cmd_vel").why
+    assert into(rules, "/cmd_vel").allowed
+    camera = out(rules, "/camera/image")
+    assert (camera.allowed, camera.rate, camera.size) == (True, 5.0, 1000)
+    assert "gateway.rule 3" in out(rules, "/other").why
+    assert not into(rules, "/other").allowed
+
+
+def test_a_rule_for_modules_leaves_others_alone() -> None:
+    rules = CrossingRules((CrossingRule(modules=("arm",), crossing=Crossing.NONE),))
+    assert not out(rules, "/scan", "arm").allowed
+    assert out(rules, "/scan", "base").allowed
+
+
+def test_what_one_site_may_have_is_offered_and_refused_to_the_others() -> None:
+    rules = CrossingRules((CrossingRule(sites=("cloud",)), CrossingRule(crossing=Crossing.NONE)))
+    assert out(rules, "/scan").allowed
+    assert rules.refusal("cloud", "arm", "/scan") == ""
+    assert "gateway.rule 2" in rules.refusal("yard", "arm", "/scan")
+    assert not into(rules, "/scan", "yard").allowed
+
+
+def test_what_one_site_may_not_have_is_offered_to_the_others() -> None:
+    rules = CrossingRules((CrossingRule(sites=("cloud",), crossing=Crossing.IN),))
+    assert out(rules, "/scan").allowed
+    assert "cloud" in rules.refusal("cloud", "arm", "/scan")
+    assert rules.refusal("yard", "arm", "/scan") == ""
+
+
+def test_what_comes_in_is_renamed() -> None:
+    rules = CrossingRules((CrossingRule(name="/{site}/{module}{name}"),))
+    assert into(rules, "/scan").name == "/cloud/arm/scan"
+
+
+def test_a_name_that_is_none_is_told() -> None:
+    decision = into(CrossingRules((CrossingRule(name="{site}{name}"),)), "/scan")
+    assert not decision.allowed
+    assert "'cloud/scan'" in decision.why
+
+
+def test_the_gateways_policy_stands_above_the_rules() -> None:
+    policy = Policy(PolicySettings(deny=("/secret/**",)))
+
+    def judge(_kind: SourceKind, name: str, type_name: str, node: str) -> PolicyDecision:
+        return policy.judge(name, type_name, node)
+
+    rules = CrossingRules((CrossingRule(name="/{site}{name}"),), judge)
+    assert "bridge.deny" in out(rules, "/secret/plan").why
+    assert not out(rules, "/rosout").allowed
+    assert into(rules, "/secret/plan").name == "/cloud/secret/plan"
+    assert not into(CrossingRules((), judge), "/secret/plan").allowed
+
+
+def test_permissions_stand_above_the_rules_and_what_they_refuse_is_counted() -> None:
+    counters = Counters()
+    trust = TrustSettings(
+        rules=(PermissionRule(("cloud",), names={"publish": ("/scan",), "call": ("/stop",), "param": ("/arm/**",)}),)
+    )
+    rules = CrossingRules(permissions=SitePermissions(PermissionGate(Permissions(trust), counters)))
+    assert into(rules, "/scan").allowed
+    refused = into(rules, "/cmd_vel")
+    assert (refused.allowed, refused.why) == (False, "no [[permission]] lets cloud publish /cmd_vel")
+    assert not into(rules, "/scan", site="elsewhere").allowed
+    assert rules.refusal("cloud", "arm", "/stop", Access.CALL) == ""
+    assert "do not let cloud call /off" in rules.refusal("cloud", "arm", "/off", Access.CALL)
+    assert rules.refusal("cloud", "arm", "/arm/speed", Access.PARAM) == ""
+    assert rules.refusal("", "arm", "/arm/speed", Access.PARAM), "a program that names no site"
+    assert (counters["permission.publish"], counters["permission.call"], counters["permission.param"]) == (2, 1, 1)

@@ -1,0 +1,303 @@
+"""Topics between two sites over a real Zenoh router: demand, types, latched messages, losses, several gateways."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from rmpa.config.gateway_rules import Crossing, CrossingRule
+from rmpa.core.contract import ContractRule
+from rmpa.gateway import limits
+from rmpa.gateway.zenoh.sending import QueuedPublisher
+from tests.gateway.sites.site_bed import MD5, SiteBed, described, site_bed
+from tests.gateway.zenoh_bed import until
+
+pytest.importorskip("zenoh")
+
+
+async def test_nothing_is_read_at_one_site_until_a_node_subscribes_at_the_other() -> None:
+    async with site_bed() as bed:
+        yard, hall = await bed.pair()
+        source = yard.graph.add("/scan", described())
+        await until(lambda: hall.shows("/scan"))
+        assert hall.topic("/scan").source.module == "arm"
+        assert yard.graph.send(source, b"early") == 0
+        topic = await hall.subscribed("/scan")
+        assert topic.description == described()
+        yard.graph.send(source, b"one")
+        yard.graph.send(source, b"two")
+        await until(lambda: len(topic.messages) == 2)
+        assert topic.messages == [b"one", b"two"]
+        topic.on_demand(False)
+        await until(lambda: not yard.graph.taps)
+
+
+async def test_topics_cross_both_ways_and_what_came_in_does_not_go_out_again() -> None:
+    async with site_bed() as bed:
+        yard, hall = await bed.pair()
+        there, here = yard.graph.add("/a", described()), hall.graph.add("/b", described())
+        shown_here, shown_there = await hall.subscribed("/a"), await yard.subscribed("/b")
+        yard.graph.send(there, b"from yard")
+        hall.graph.send(here, b"from hall")
+        await until(lambda: shown_here.messages and shown_there.messages)
+        assert (shown_here.messages, shown_there.messages) == ([b"from yard"], [b"from hall"])
+
+
+async def test_a_late_subscriber_gets_the_latched_message_once() -> None:
+    async with site_bed() as bed:
+        yard, hall = await bed.pair()
+        source = yard.graph.add("/map", described(latching=True))
+        yard.graph.send(source, b"old")
+        yard.graph.send(source, b"map")
+        topic = await hall.subscribed("/map")
+        assert topic.description == described(latching=True)
+        await until(lambda: topic.messages)
+        cellar = await bed.site("cellar")
+        late = await cellar.subscribed("/map")
+        await until(lambda: late.messages)
+        yard.graph.send(source, b"new map")
+        await until(lambda: b"new map" in topic.messages and b"new map" in late.messages)
+        assert topic.messages == [b"map", b"new map"]
+        assert late.messages == [b"map", b"new map"]
+
+
+async def test_a_subscriber_that_comes_back_gets_the_present_latched_message_alone() -> None:
+    async with site_bed() as bed:
+        yard, hall = await bed.pair()
+        source = yard.graph.add("/map", described(latching=True))
+        yard.graph.send(source, b"first")
+        topic = await hall.subscribed("/map")
+        await until(lambda: topic.messages)
+        topic.on_demand(False)
+        await until(lambda: not yard.graph.taps)
+        yard.graph.send(source, b"second")
+        topic.on_demand(True)
+        await until(lambda: topic.messages[-1] == b"second")
+        assert topic.messages == [b"first", b"forgotten", b"second"]
+
+
+async def test_two_publishers_of_one_topic_are_told_apart() -> None:
+    async with site_bed() as bed:
+        yard, hall = await bed.pair()
+        one = yard.graph.add("/chat", described(), node="/one")
+        two = yard.graph.add("/chat", described(), node="/two")
+        first, second = await hall.subscribed("/chat", "/one"), await hall.subscribed("/chat", "/two")
+        yard.graph.send(one, b"1")
+        yard.graph.send(two, b"2")
+        await until(lambda: first.messages and second.messages)
+        assert (first.messages, second.messages) == ([b"1"], [b"2"])
+
+
+async def test_two_latched_publishers_of_one_topic_each_keep_their_last_message() -> None:
+    async with site_bed() as bed:
+        yard, hall = await bed.pair()
+        for node in ("/one", "/two"):
+            yard.graph.send(yard.graph.add("/map", described(latching=True), node=node), node.encode())
+        topics = [await hall.subscribed("/map", node) for node in ("/one", "/two")]
+        await until(lambda: all(topic.messages for topic in topics))
+        assert [topic.messages for topic in topics] == [[b"/one"], [b"/two"]]
+
+
+async def test_a_burst_of_a_thousand_messages_arrives_or_is_counted() -> None:
+    async with site_bed() as bed:
+        yard, hall = await bed.pair()
+        source = yard.graph.add("/burst", described())
+        topic = await hall.subscribed("/burst")
+        await until(lambda: yard.graph.send(source, b"first"))
+        await until(lambda: topic.messages)
+        for number in range(1000):
+            yard.graph.send(source, number.to_bytes(4, "big") * 25)
+        await until(lambda: len(topic.messages) + int(str(hall.topics("in")[0]["lost"])) >= 1001, 30)
+        report = hall.topics("in")[0]
+        assert report["messages"] == len(topic.messages) == 1001
+        assert report["lost"] == 0
+
+
+async def test_what_the_queue_drops_is_counted_at_both_ends() -> None:
+    async with site_bed() as bed:
+        rule = ContractRule(("/burst",), (), {"depth": 1})
+        yard, hall = await bed.site("yard", contracts=(rule,)), await bed.site("hall")
+        source = yard.graph.add("/burst", described())
+        topic = await hall.subscribed("/burst")
+        await until(lambda: yard.graph.send(source, b"first"))
+        for _ in range(2000):
+            yard.graph.send(source, b"x" * 2000)
+
+        def dropped() -> int:
+            return int(str(yard.topics("out")[0]["dropped"]))
+
+        def lost() -> int:
+            return int(str(hall.topics("in")[0]["lost"]))
+
+        await until(lambda: len(topic.messages) + lost() == 2001 and dropped() == lost(), 30)
+        assert dropped() > 0
+
+
+async def test_a_loss_at_the_end_is_counted_although_no_message_follows(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with site_bed() as bed:
+        yard, hall = await bed.pair()
+        source = yard.graph.add("/burst", described())
+        topic = await hall.subscribed("/burst")
+        await until(lambda: yard.graph.send(source, b"first"))
+        await until(lambda: topic.messages)
+        monkeypatch.setattr(QueuedPublisher, "put", lambda _publisher, _payload, _attachment: 0)
+        for _ in range(3):
+            yard.graph.send(source, b"swallowed by the network")
+        await until(lambda: hall.topics("in")[0]["lost"] == 3)
+        assert hall.topics("in")[0]["messages"] == 1
+
+
+async def test_a_rule_limits_the_rate_at_the_near_end_and_counts() -> None:
+    async with site_bed() as bed:
+        yard = await bed.site("yard", rules=(CrossingRule(names=("/fast",), rate=10.0),))
+        hall = await bed.site("hall")
+        source = yard.graph.add("/fast", described())
+        topic = await hall.subscribed("/fast")
+        await until(lambda: yard.graph.send(source, b"0"))
+        for _ in range(500):
+            yard.graph.send(source, b"x")
+        out = yard.topics("out")[0]
+        assert int(str(out["limited"])) > 450
+        await until(lambda: len(topic.messages) == 501 - int(str(out["limited"])))
+        assert hall.topics("in")[0]["lost"] == 0
+
+
+async def test_the_last_message_of_a_latched_topic_is_sent_when_its_limit_lets_it() -> None:
+    async with site_bed() as bed:
+        yard = await bed.site("yard", rules=(CrossingRule(rate=4.0),))
+        hall = await bed.site("hall")
+        source = yard.graph.add("/state", described(latching=True))
+        topic = await hall.subscribed("/state")
+        for number in range(20):
+            yard.graph.send(source, str(number).encode())
+        await until(lambda: topic.messages and topic.messages[-1] == b"19")
+        assert len(topic.messages) < 10
+
+
+async def test_a_rule_keeps_a_topic_from_one_site_and_says_so_there() -> None:
+    async with site_bed() as bed:
+        yard = await bed.site("yard", rules=(CrossingRule(sites=("hall",), crossing=Crossing.NONE),))
+        hall, cellar = await bed.site("hall"), await bed.site("cellar")
+        yard.graph.add("/scan", described())
+        await cellar.subscribed("/scan")
+        await until(lambda: hall.shows("/scan"))
+        hall.topic("/scan").on_demand(True)
+        await until(lambda: "gateway.rule 1" in str(hall.topics("in")[0]["problem"]))
+        assert not hall.topics("in")[0]["wanted"]
+        assert hall.topic("/scan").messages in ([], [b"forgotten"])
+
+
+async def test_a_publisher_with_another_definition_is_described_anew() -> None:
+    async with site_bed() as bed:
+        yard, hall = await bed.pair()
+        source = yard.graph.add("/odd", described())
+        topic = await hall.subscribed("/odd")
+        other = described(md5sum="f" * 32)
+        yard.graph.describe_anew(source, other)
+        await until(lambda: yard.topics("out")[0]["md5sum"] == "f" * 32)
+        yard.graph.send(source, b"new form")
+        await until(lambda: topic.messages == [b"new form"])
+        assert topic.description == other
+
+
+async def test_a_module_that_goes_takes_its_topics_with_it() -> None:
+    async with site_bed() as bed:
+        yard, hall = await bed.pair()
+        source = yard.graph.add("/scan", described())
+        await hall.subscribed("/scan")
+        yard.graph.remove(source)
+        await until(lambda: not hall.shows("/scan"))
+        again = yard.graph.add("/scan", described(), run="f")
+        topic = await hall.subscribed("/scan")
+        yard.graph.send(again, b"back")
+        await until(lambda: topic.messages == [b"back"])
+
+
+async def test_the_report_tells_site_module_and_latency_and_whose_clock() -> None:
+    async with site_bed() as bed:
+        yard, hall = await bed.pair()
+        source = yard.graph.add("/scan", described())
+        topic = await hall.subscribed("/scan")
+        await until(lambda: yard.graph.send(source, b"one"))
+        await until(lambda: topic.messages)
+        report = hall.neighbour.report()
+        sites = report["sites"]
+        assert isinstance(sites, dict)
+        assert [module["name"] for module in sites["yard"]["modules"]] == ["arm"]
+        latency = hall.topics("in")[0]["latency"]
+        assert isinstance(latency, dict)
+        assert -1 < latency["median"] < 1
+        assert "yard" in latency["clock"]
+
+
+async def _second_gateway(bed: SiteBed) -> None:
+    first = await bed.site("yard", 1)
+    await until(lambda: first.neighbour.leads)
+    second = await bed.site("yard", 2, graph=first.graph)
+    hall = await bed.site("hall")
+    source = first.graph.add("/scan", described())
+    topic = await hall.subscribed("/scan")
+    await until(lambda: first.graph.send(source, b"0") == 1)
+    await until(lambda: topic.messages)
+    assert not second.neighbour.leads
+    loop = asyncio.get_running_loop()
+    lost_at = loop.time()
+    await first.session.close()
+    await until(lambda: second.neighbour.leads)
+    assert loop.time() - lost_at < 10
+    await first.neighbour.close()
+    await until(lambda: first.graph.send(source, b"1") == 1)
+    await until(lambda: topic.messages[-1] == b"1")
+    assert hall.topic("/scan") is topic, "a takeover must not take the topic down and up"
+
+
+async def test_another_gateway_takes_over_and_the_other_site_keeps_its_topics() -> None:
+    async with site_bed() as bed:
+        await _second_gateway(bed)
+
+
+async def test_when_the_router_returns_everything_resumes() -> None:
+    async with site_bed() as bed:
+        yard, hall = await bed.pair()
+        source = yard.graph.add("/scan", described())
+        topic = await hall.subscribed("/scan")
+        await until(lambda: yard.graph.send(source, b"0"))
+        await until(lambda: topic.messages)
+        await bed.zenoh.stop_router()
+        await until(lambda: not hall.shows("/scan"))
+        await bed.zenoh.start_router()
+        again = await hall.subscribed("/scan")
+        await until(lambda: yard.graph.send(source, b"1") and again.messages, 30)
+
+
+async def test_a_definition_is_answered_by_its_md5_sum() -> None:
+    async with site_bed() as bed:
+        yard, hall = await bed.pair()
+        yard.graph.add("/odd", described())
+        await hall.subscribed("/odd")
+        [reply] = await hall.session.get(f"rmpa/1/yard/arm/d/m/{MD5}", timeout=5)
+        assert reply.payload == b"string data\n"
+        [unknown] = await hall.session.get(f"rmpa/1/yard/arm/d/m/{'0' * 32}", timeout=5)
+        assert not unknown.ok
+
+
+async def test_a_message_without_a_true_attachment_is_counted_and_dropped() -> None:
+    async with site_bed() as bed:
+        yard, hall = await bed.pair()
+        yard.graph.add("/scan", described())
+        topic = await hall.subscribed("/scan")
+        from rmpa.gateway.zenoh_api import ZenohQos
+
+        stranger = await bed.zenoh.session()
+        publisher = stranger.publisher("rmpa/1/yard/arm/t/odd_msgs%Odd/scan", ZenohQos(), lambda _there: None)
+
+        def malformed() -> int:
+            publisher.put(b"x", b"nonsense")
+            counters = hall.neighbour.report()["parts"]
+            assert isinstance(counters, dict)
+            return int(counters["topics"]["counters"].get("site.message.malformed", 0))
+
+        await until(malformed)
+        assert topic.messages == []
+        assert limits.SITE_GRACE < 1

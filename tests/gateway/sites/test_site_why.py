@@ -1,0 +1,262 @@
+"""``rmpa why`` and ``rmpa site`` between two gateways at one router: which site, hop and rule, and what is lost."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from rmpa.config.gateway_rules import Crossing, CrossingRule
+from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.gateway.neighbour import SourceKind
+from rmpa.gateway.sites.history import SiteHistory
+from rmpa.gateway.sites.io.site_answers import SiteAnswers
+from rmpa.gateway.sites.io.site_why import SiteWhy
+from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource
+from rmpa.gateway.sites.rules import CrossingRules
+from rmpa.gateway.sites.why import (
+    SourceHere,
+    SourceThere,
+    WhyAnswer,
+    WhyQuestion,
+    here_stages,
+    sent_stages,
+    there_stages,
+)
+from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN
+from rmpa.observe.io.site_requests import BODY, INFO, LAST, PARAM, REPORT, WHY
+from rmpa.ros.wire.tcpros import TopicDescription
+from tests.gateway.memory_zenoh import eventually as until
+from tests.gateway.sites.site_bed import site_bed
+
+if TYPE_CHECKING:
+    from rmpa.observe.sites import SitesReport
+    from rmpa.observe.why.diagnosis import Diagnosis
+    from tests.gateway.sites.site_bed import Site, SiteBed
+
+pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")
+
+TEXT = TopicDescription("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1", "string data\n")
+
+
+@dataclass
+class Asked:
+    """One site, and what answers for it."""
+
+    site: Site
+    history: SiteHistory
+    answers: SiteAnswers
+    params: list[tuple[str, str, str]]
+
+    async def why(self, name: str, site: str = "", module: str = "", asker: str = "") -> list[Diagnosis]:
+        found: list[Diagnosis] = await self.answers.answer(
+            WHY, {"name": name, "site": site, "module": module, "asker": asker}
+        )
+        return found
+
+    async def report(self, what: str = REPORT, **args: str) -> SitesReport:
+        found: SitesReport = await self.answers.answer(what, args)
+        return found
+
+
+async def asked(bed: SiteBed, name: str, rules: tuple[CrossingRule, ...] = ()) -> Asked:
+    site = await bed.site(name, rules=rules)
+    history = SiteHistory(time.monotonic)
+    site.neighbour.on_sites = history.seen
+    site.neighbour.on_site_source = lambda source, there: history.source(source, there=there)
+    why = SiteWhy(name, f"{name}_gateway", site.session, site.neighbour, history, CrossingRules(rules))
+    params: list[tuple[str, str, str]] = []
+
+    async def ask_param(at: str, module: str, what: str, args: dict[str, Any]) -> object:
+        params.append((at, module, what))
+        return args
+
+    answers = SiteAnswers(
+        f"{name}_gateway",
+        SiteGateway(name, 100, "0" * 32),
+        site.session,
+        site.neighbour,
+        history,
+        lambda: ("tcp/x:1",),
+        ask_param,
+        why,
+        lambda: 1,
+    )
+    site.neighbour.add(answers)
+    await until(lambda: site.neighbour.leads)
+    return Asked(site, history, answers, params)
+
+
+def levels(diagnosis: Diagnosis) -> dict[str, str]:
+    return {stage.name: stage.level.value for stage in diagnosis.stages}
+
+
+async def test_the_way_of_a_topic_is_told_from_both_gateways() -> None:
+    async with site_bed() as bed:
+        yard, hall = await asked(bed, "yard"), await asked(bed, "hall")
+        source = yard.site.graph.add("/chatter", TEXT)
+        await until(lambda: hall.site.shows("/chatter"))
+        (way,) = await hall.why("/chatter")
+        assert (way.flows, way.node, way.peer, way.to) == (False, "/talker", "yard/arm", "site hall")
+        assert (levels(way)["demand there"], levels(way)["demand here"]) == ("warn", "fail")
+        (leaving,) = await yard.why("/chatter", asker="arm")
+        assert levels(leaving)["demand there"] == "fail"
+        await hall.site.subscribed("/chatter")
+        await until(lambda: any(topic["wanted"] for topic in yard.site.topics("out")))
+        yard.site.graph.send(source, b"hello")
+        await until(lambda: hall.site.topic("/chatter").messages)
+        (way,) = await hall.why("/chatter", "yard", "arm")
+        assert set(levels(way).values()) == {"ok"}
+        assert [stage.name for stage in way.stages][-2:] == ["demand here", "arrived"]
+        (leaving,) = await yard.why("/chatter", asker="arm")
+        assert (leaving.peer, leaving.to, leaving.flows) == ("arm", "other sites", True)
+        assert "the gateway of yard has sent 1 messages" in leaving.stages[-1].text
+
+
+async def test_rules_of_both_sites_are_named() -> None:
+    out = CrossingRule(names=("/home/**",), crossing=Crossing.NONE)
+    into = CrossingRule(names=("/noise",), crossing=Crossing.OUT)
+    async with site_bed() as bed:
+        yard, hall = await asked(bed, "yard", (out,)), await asked(bed, "hall", (into,))
+        for name in ("/home/diary", "/noise", "/told"):
+            yard.site.graph.add(name, TEXT)
+        await until(lambda: hall.site.shows("/told"))
+        (kept,) = await hall.why("/home/diary", "yard")
+        assert kept.failed is not None
+        assert (kept.failed.name, "gateway.rule 1 (none: /home/**)" in kept.failed.text) == ("rule there", True)
+        (noise,) = await hall.why("/noise")
+        assert noise.failed is not None
+        assert (noise.failed.name, "gateway.rule 1 (out: /noise)" in noise.failed.text) == ("rule here", True)
+        (own,) = await yard.why("/home/diary", asker="arm")
+        assert own.failed is not None
+        assert own.failed.name == "rule here"
+        (none,) = await hall.why("/none", "yard", "arm")
+        assert none.failed is not None
+        assert none.failed.text == "no node of arm at yard has /none, as the gateway there sees it"
+        info = await hall.report(INFO, site="yard")
+        (site,) = info.sites
+        problems = {source.name: source.problem for source in site.sources}
+        assert problems["/told"] == ""
+        assert "lets it not come in" in problems["/noise"]
+        assert site.not_shown == 1
+
+
+async def test_a_site_that_left_is_unreachable_since_then_and_one_that_never_was_is_no_site() -> None:
+    async with site_bed() as bed:
+        yard, hall = await asked(bed, "yard"), await asked(bed, "hall")
+        yard.site.graph.add("/chatter", TEXT)
+        await until(lambda: hall.site.shows("/chatter"))
+        report = await hall.report()
+        assert [(site.name, site.state) for site in report.sites] == [("hall", "this site"), ("yard", "joined")]
+        assert report.leads
+        (module,) = report.sites[1].modules
+        assert (module.name, module.topics, module.services, module.shown) == ("arm", 1, 0, 1)
+        await yard.site.neighbour.close()
+        await until(lambda: hall.history.away == ("yard",))
+        report = await hall.report()
+        assert report.sites[1].state == "unreachable"
+        assert report.sites[1].since_ago is not None
+        (way,) = await hall.why("/chatter", "yard")
+        assert way.failed is not None
+        assert way.failed.text.startswith("site yard is unreachable since")
+        (unnamed,) = await hall.why("/chatter")  # the question of a user who does not know whose it was
+        assert unnamed.failed is not None
+        assert unnamed.failed.text.startswith("site yard is unreachable since")
+        assert await hall.why("/other") == []
+        assert await hall.why("/chatter", "joystick") == []  # a peer's name
+        (moon,) = await hall.why("/chatter", "moon", "arm")
+        assert moon.failed is not None
+        assert "no gateway of a site moon" in moon.failed.text
+        with pytest.raises(RmpaError, match="site yard is unreachable since"):
+            await hall.answers.answer(LAST, {"site": "yard", "module": "arm", "topic": "/chatter"})
+        with pytest.raises(UnreachableError, match="known are: none"):
+            await hall.answers.answer(LAST, {"site": "moon", "module": "arm", "topic": "/chatter"})
+
+
+async def test_questions_are_checked_before_they_are_passed_on() -> None:
+    async with site_bed() as bed:
+        hall = await asked(bed, "hall")
+        for what, args in (
+            ("site.shout", {"site": "hall", "module": "arm"}),
+            (LAST, {"site": "ha ll", "module": "arm", "topic": "/x"}),
+            (LAST, {"site": "hall", "module": "*", "topic": "/x"}),
+            (LAST, {"site": "hall", "module": "arm", "topic": "x y"}),
+            (BODY, {"site": "hall", "module": "arm", "topic": "/x", "offset": -1}),
+            (PARAM, {"site": "hall", "module": "arm", "what": "param.get"}),
+        ):
+            with pytest.raises(RmpaError):
+                await hall.answers.answer(what, args)
+        assert hall.params == []
+        question = {"site": "hall", "module": "arm", "what": "param.get", "args": {"key": "/x"}}
+        assert await hall.answers.answer(PARAM, question) == {"key": "/x"}
+        assert hall.params == [("hall", "arm", "param.get")]
+
+
+def test_losses_are_told_with_the_hop_where_they_happen() -> None:
+    there = SourceThere(kind="t", module="arm", node="/n", wanted=True, messages=90, waiting=2, dropped=7, limited=3)
+    sent = sent_stages("yard", there)[-1]
+    assert sent.level is WARN
+    assert "7 were dropped by its queue" in sent.text
+    assert "3 were left out by rate or size of the rule" in sent.text
+    report = {"wanted": True, "messages": 80, "rate": 9.5, "lost": 10, "dropped": 0, "mismatched": 2}
+    here = SourceHere(SourceKind.TOPIC, "yard", "arm", "/n", "/t", "/t", report=report)
+    arrived = here_stages("hall", here)[-1]
+    assert (arrived.name, arrived.level) == ("arrived", WARN)
+    assert arrived.text == (
+        "80 messages have come, 9.5 Hz; 10 were lost between the gateways; 2 have another md5 sum than their header"
+    )
+
+
+def test_another_definition_is_the_stage_md5() -> None:
+    report = {"wanted": True, "problem": "its messages have the md5 sum aa, its header bb"}
+    stages = here_stages("hall", SourceHere(SourceKind.TOPIC, "yard", "arm", "/n", "/t", "/t", report=report))
+    assert (stages[-1].name, stages[-1].level) == ("md5", FAIL)
+
+
+def test_a_gateway_that_does_not_tell_leaves_its_half_open() -> None:
+    (stage,) = there_stages("yard", "arm", "/t", None, "it does not answer")
+    assert stage.level is UNKNOWN
+    service = SourceThere(kind="s", module="arm", node="/n", rule="no gateway.rule fits: everything crosses")
+    assert [s.level for s in there_stages("yard", "arm", "/t", service, "")] == [OK, OK]
+
+
+def test_history() -> None:
+    now = 0.0
+    history = SiteHistory(lambda: now)
+    history.seen(["yard", "hall"])
+    now = 5.0
+    history.seen(["hall"])
+    now = 7.0
+    history.seen(["hall"])
+    assert history.away == ("yard",)
+    assert (history.since_ago("yard"), history.since_ago("hall"), history.since_ago("moon")) == (2.0, 7.0, None)
+
+
+def test_what_a_site_had_is_remembered_while_it_is_away() -> None:
+    now = 0.0
+    history = SiteHistory(lambda: now)
+    arm = SiteModule("yard", "arm", "0" * 32)
+    scan, old, last = (SiteSource(arm, SourceKind.TOPIC, "a/B", "/n", name) for name in ("/scan", "/old", "/last"))
+    for source in (scan, old, last):
+        history.source(source, there=True)
+    history.seen(["yard"])
+    assert history.had("/scan") == (), "it is there"
+    history.source(old, there=False)
+    now = 9.0
+    history.source(last, there=False)  # withdrawn by a gateway that ends
+    history.seen([])
+    assert [history.had(name) for name in ("/scan", "/last", "/old")] == [(("yard", "arm"),), (("yard", "arm"),), ()]
+    history.source(last, there=True)
+    history.seen(["yard"])
+    history.seen([])
+    assert [history.had(name) for name in ("/scan", "/last")] == [(), (("yard", "arm"),)]
+
+
+def test_a_question_that_is_none_is_refused() -> None:
+    for data in (b"", b"{}", b'{"site": "a", "name": "x y"}', b"[" * 5000):
+        with pytest.raises(RemoteProtocolError):
+            WhyQuestion.parse(data)
+    with pytest.raises(RemoteProtocolError):
+        WhyAnswer.parse(b"{")

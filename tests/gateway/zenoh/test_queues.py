@@ -1,0 +1,198 @@
+"""The bounds of the queues between the event loop and Zenoh's threads, with a stand-in for Zenoh."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.gateway.zenoh.arrivals import ArrivalQueue, Arrivals
+from rmpa.gateway.zenoh.sending import QueuedPublisher, SendingLane
+from rmpa.gateway.zenoh_api import ZenohQos
+from tests.gateway.zenoh_bed import until
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+
+class Handle:
+    """A publisher of Zenoh whose transport may be full."""
+
+    def __init__(self) -> None:
+        self.free = threading.Event()
+        self.free.set()
+        self.got: list[bytes] = []
+
+    def put(self, payload: bytes, *, attachment: bytes | None = None) -> None:
+        if not self.free.wait(20):
+            raise TimeoutError
+        self.got.append(payload)
+
+
+@pytest.fixture
+async def lane() -> AsyncIterator[SendingLane]:
+    made = SendingLane(asyncio.get_running_loop(), "test lane", (TimeoutError,))
+    yield made
+    made.stop()
+    assert await asyncio.to_thread(made.join, 20)
+
+
+def publisher(lane: SendingLane, handle: Handle, qos: ZenohQos, ended: list[str] | None = None) -> QueuedPublisher:
+    made = QueuedPublisher(lane, "key", qos, lambda: ended.append("undeclared") if ended is not None else None)
+    made.declared(handle)
+    return made
+
+
+async def test_behind_a_full_transport_the_oldest_are_dropped_and_all_are_counted(lane: SendingLane) -> None:
+    handle = Handle()
+    handle.free.clear()
+    made = publisher(lane, handle, ZenohQos(messages=100))
+    dropped = sum(made.put(b"%d" % number) for number in range(1000))
+    assert made.waiting <= 100
+    handle.free.set()
+    await until(lambda: not made.waiting)
+    assert handle.got[-1] == b"999"
+    assert (made.sent, made.dropped, made.sent + made.dropped) == (len(handle.got), dropped, 1000)
+
+
+async def test_a_message_larger_than_the_bound_still_goes_alone(lane: SendingLane) -> None:
+    handle = Handle()
+    handle.free.clear()
+    made = publisher(lane, handle, ZenohQos(bytes=10))
+    assert made.put(bytes(100)) == 0
+    await until(lambda: lane_took(made))
+    assert made.put(bytes(100)) == 0
+    assert made.put(bytes(200)) == 1
+    handle.free.set()
+    await until(lambda: not made.waiting)
+    assert [len(each) for each in handle.got] == [100, 200]
+
+
+def lane_took(made: QueuedPublisher) -> bool:
+    return made.waiting == 1 and not made._queue
+
+
+async def test_a_flood_does_not_starve_another_publisher_of_its_priority(lane: SendingLane) -> None:
+    handle = Handle()
+    handle.free.clear()
+    flood, other = publisher(lane, handle, ZenohQos(messages=5000)), publisher(lane, handle, ZenohQos())
+    for _ in range(5000):
+        flood.put(bytes(1000))
+    other.put(b"other")
+    handle.free.set()
+    await until(lambda: not flood.waiting and not other.waiting)
+    assert handle.got.index(b"other") <= 130
+
+
+async def test_a_publisher_that_cannot_send_is_undeclared_after_a_second_and_counts_the_rest(
+    lane: SendingLane,
+) -> None:
+    handle, ended = Handle(), list[str]()
+    handle.free.clear()
+    made = publisher(lane, handle, ZenohQos(), ended)
+    for _ in range(200):
+        made.put(b"x")
+    made.close()
+    await until(lambda: ended)
+    assert made.dropped >= 200 - 64
+    handle.free.set()
+    await until(lambda: not made.waiting)
+    assert made.sent + made.dropped == 200
+    assert ended == ["undeclared"]
+
+
+async def test_what_zenoh_refuses_counts_as_dropped(lane: SendingLane) -> None:
+    class Closed(Handle):
+        def put(self, payload: bytes, *, attachment: bytes | None = None) -> None:
+            raise TimeoutError
+
+    made = publisher(lane, Closed(), ZenohQos())
+    made.put(b"x")
+    await until(lambda: made.dropped == 1)
+    assert made.sent == 0
+
+
+async def test_while_the_loop_is_away_the_oldest_arrivals_are_dropped_and_counted() -> None:
+    got: list[int] = []
+    discarded: list[int] = []
+    arrivals = Arrivals(asyncio.get_running_loop())
+    queue = ArrivalQueue(arrivals, got.append, 10, 1000, discarded.append)
+
+    def flood() -> None:
+        for number in range(100):
+            queue.add(number, 1)
+
+    thread = threading.Thread(target=flood)
+    thread.start()
+    thread.join()
+    await until(lambda: len(got) == 10)
+    assert got == list(range(90, 100))
+    assert queue.dropped == 90
+    assert discarded == list(range(90))
+
+
+async def test_large_arrivals_are_bounded_by_their_bytes() -> None:
+    got: list[int] = []
+    queue = ArrivalQueue(Arrivals(asyncio.get_running_loop()), got.append, 1000, 1000)
+    for number in range(10):
+        queue.add(number, 400)
+    queue.add(99, 5000)
+    await until(lambda: got)
+    assert got == [99]
+    assert queue.dropped == 10
+
+
+async def test_a_flood_on_one_subscriber_leaves_the_loop_and_the_others_their_turns() -> None:
+    order: list[str] = []
+    loop = asyncio.get_running_loop()
+    arrivals = Arrivals(loop)
+    flood: ArrivalQueue[int] = ArrivalQueue(arrivals, lambda _: order.append("flood"), 100_000, 10**9)
+    other: ArrivalQueue[int] = ArrivalQueue(arrivals, lambda _: order.append("other"), 10, 1000)
+
+    def turn() -> None:
+        order.append("loop")
+        if order.count("flood") < 5000:
+            loop.call_soon(turn)
+
+    for _ in range(5000):
+        flood.add(0)
+    other.add(0)
+    loop.call_soon(turn)
+    await until(lambda: order.count("flood") == 5000)
+    assert order.index("other") <= 64
+    assert order.count("loop") >= 10
+
+
+async def test_an_error_of_one_subscriber_keeps_nothing_from_the_others(caplog: pytest.LogCaptureFixture) -> None:
+    got: list[int] = []
+    arrivals = Arrivals(asyncio.get_running_loop())
+
+    def fails(_: int) -> None:
+        raise ZeroDivisionError
+
+    broken, whole = ArrivalQueue(arrivals, fails, 10, 10), ArrivalQueue(arrivals, got.append, 10, 10)
+    broken.add(1)
+    whole.add(2)
+    await until(lambda: got)
+    assert "could not be handled" in caplog.text
+
+
+async def test_each_of_a_steady_stream_arrives_soon_at_any_rate() -> None:
+    arrivals = Arrivals(asyncio.get_running_loop())
+    got: list[int] = []
+    queue = ArrivalQueue(arrivals, got.append, 100_000, 10**9)
+
+    def produce() -> None:
+        for number in range(3000):
+            queue.add(number)
+            if number % 50 == 0:
+                time.sleep(0.0005)
+
+    thread = threading.Thread(target=produce)
+    thread.start()
+    await until(lambda: len(got) == 3000)
+    thread.join()
+    assert (got, queue.dropped) == (list(range(3000)), 0)

@@ -1,0 +1,94 @@
+"""A plain Zenoh program that has nothing of RMPA but what its page on sites says.
+
+Runs with RMPA's interpreter: ``zenoh_end.py ENDPOINT``. Reads lines of JSON; payloads are hexadecimal:
+
+* ``{"do": "subscribe", "key"}``: then ``sample`` with ``key``, ``payload`` and ``attachment``;
+* ``{"do": "put", "key", "payload", "times", "period"}``: in a thread of its own, ``times`` times (0: for ever);
+* ``{"do": "get", "key", "payload"}``: then ``replies`` with ``ok`` (payloads) and ``errors`` (texts);
+* ``{"do": "serve", "key", "payload"}``: a complete queryable that answers each query so, and says ``query`` with the
+  payload that came;
+* ``{"do": "tokens", "key"}``: then ``tokens`` with those that are alive.
+
+Events beside: ``up``; ``done`` after each line.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from typing import Any
+
+import zenoh
+
+from node import say
+
+_kept: list[Any] = []
+
+
+def _hex(data: zenoh.ZBytes | None) -> str:
+    return data.to_bytes().hex() if data is not None else ""
+
+
+def _subscribe(session: zenoh.Session, told: dict[str, Any]) -> None:
+    def take(sample: zenoh.Sample) -> None:
+        say("sample", key=str(sample.key_expr), payload=_hex(sample.payload), attachment=_hex(sample.attachment))
+
+    _kept.append(session.declare_subscriber(told["key"], take))
+
+
+def _put(session: zenoh.Session, told: dict[str, Any]) -> None:
+    def work() -> None:
+        number = 0
+        while not told.get("times") or number < told["times"]:
+            number += 1
+            session.put(told["key"], bytes.fromhex(told.get("payload", "")))
+            time.sleep(told.get("period", 0.0))
+
+    threading.Thread(target=work, daemon=True).start()
+
+
+def _get(session: zenoh.Session, told: dict[str, Any]) -> None:
+    ok, errors = [], []
+    payload = bytes.fromhex(told["payload"]) if "payload" in told else None
+    for reply in session.get(told["key"], payload=payload, timeout=5.0):
+        if reply.ok is not None:
+            ok.append(_hex(reply.ok.payload))
+        else:
+            errors.append(reply.err.payload.to_string())
+    say("replies", ok=ok, errors=errors)
+
+
+def _serve(session: zenoh.Session, told: dict[str, Any]) -> None:
+    def answer(query: zenoh.Query) -> None:
+        say("query", payload=_hex(query.payload))
+        query.reply(query.key_expr, bytes.fromhex(told["payload"]))
+
+    _kept.append(session.declare_queryable(told["key"], answer, complete=True))
+
+
+def _tokens(session: zenoh.Session, told: dict[str, Any]) -> None:
+    replies = session.liveliness().get(told["key"], timeout=2.0)
+    say("tokens", keys=sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None))
+
+
+DO = {"subscribe": _subscribe, "put": _put, "get": _get, "serve": _serve, "tokens": _tokens}
+
+
+def main() -> None:
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    session = zenoh.open(config)
+    say("up")
+    for line in sys.stdin:
+        told = json.loads(line)
+        DO[told["do"]](session, told)
+        say("done", do=told["do"])
+    session.close()
+
+
+if __name__ == "__main__":
+    main()

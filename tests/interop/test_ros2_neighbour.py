@@ -1,0 +1,257 @@
+"""ROS 1 nodes beside those of other worlds, by one gateway: ROS 2 of rmw_zenoh, Zenoh programs, zenoh-bridge-ros1.
+
+The other ends are ``zenoh-ros2-sdk`` and plain eclipse-zenoh: they have no code of ours.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from contextlib import ExitStack
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, Final
+
+import pytest
+
+from lab.bed.agents import Agent
+from lab.bed.gateways import ROUTER_PORT, GatewayProcess
+from lab.bed.namespaces import Lab
+from lab.bed.processes import Event, Process, eventually
+from tests.interop.modules import Module
+from tests.interop.ros import NODES, Ros
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from lab.bed.namespaces import Host
+
+pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")
+pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
+needs_sdk = pytest.mark.skipif(find_spec("zenoh_ros2_sdk") is None, reason="zenoh-ros2-sdk is not installed")
+
+LONG: Final = 30.0
+CONFIG: Final = f"""
+[gateway]
+site = "hall"
+router = true
+listen = ["tcp/0.0.0.0:{ROUTER_PORT}"]
+insecure = true
+ros1_bridge = true
+
+[gateway.ros2]
+enabled = true
+"""
+STRING: Final = b"std_msgs/String".hex() + "/992ce8a1687cec8c8bd883ec73ca41d1"
+SET_BOOL: Final = b"std_srvs/SetBool".hex() + "/09fb03525b03e7ea1fd3992bafd87e16"
+
+
+@dataclass(frozen=True, slots=True)
+class OtherEnd:
+    """A program of another world that does what lines of JSON say."""
+
+    process: Process
+
+    def do(self, what: str, **words: object) -> None:
+        """Let it do something; return when it is done."""
+        since = self.process.mark_events()
+        self.process.tell(json.dumps({"do": what, **words}))
+        self.process.wait_event("done", LONG, since=since)
+
+    def ask(self, what: str, event: str, **words: object) -> Event:
+        """Let it do something; return the event that it says of it."""
+        since = self.process.mark_events()
+        self.do(what, **words)
+        return self.process.wait_event(event, since=since)
+
+
+@dataclass(frozen=True, slots=True)
+class Hall:
+    """One module, its gateway, and a host for the other ends."""
+
+    robot: Module
+    gateway: GatewayProcess
+    other: Host
+    home: Path
+    stack: ExitStack
+
+    def end(self, program: str, *words: str) -> OtherEnd:
+        """Start a program of ``nodes/`` on the other host."""
+        env = {"PATH": "/usr/bin:/bin", "HOME": str(self.home), "PYTHONPATH": f"{NODES}:{NODES.parents[2]}/lab/nodes"}
+        argv = self.other.command([sys.executable, NODES / f"{program}.py", *words])
+        process = self.stack.enter_context(Process(argv, env=env, name=program, commands=True))
+        process.wait_event("up", LONG)
+        return OtherEnd(process)
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
+    """The gateway is a Zenoh router, on the robot's own host."""
+    with ExitStack() as stack:
+        lab = stack.enter_context(Lab())
+        home = tmp_path_factory.mktemp("hall")
+        robot, other = lab.hosts("robot", "other")
+        agent = stack.enter_context(Agent(robot, home, name="robot"))
+        gateway = stack.enter_context(GatewayProcess(robot, home, name="gate", config=CONFIG))
+        for one in (agent, gateway):
+            one.start()
+        for one in (agent, gateway):
+            one.wait_ready()
+        agent.wait_peer(gateway.name)
+        module = Module(robot, agent, stack.enter_context(Ros(robot, home, 11311)))
+        yield Hall(module, gateway, other, home, stack)
+
+
+@pytest.fixture(scope="module")
+def ros2(hall: Hall) -> OtherEnd:
+    """A ROS 2 node."""
+    return hall.end("ros2_end", hall.robot.host.address)
+
+
+@pytest.fixture(scope="module")
+def plain(hall: Hall) -> OtherEnd:
+    """A Zenoh program."""
+    return hall.end("zenoh_end", f"tcp/{hall.robot.host.address}:{ROUTER_PORT}")
+
+
+def text_of(data: str) -> str:
+    """A std_msgs/String as ROS 1 serializes it, hexadecimal."""
+    raw = data.encode()
+    return (len(raw).to_bytes(4, "little") + raw).hex()
+
+
+def listed(ros2: OtherEnd, kind: str, name: str, type_name: str) -> None:
+    """Wait until ROS 2 lists a topic or service with this type alone."""
+
+    def there() -> bool:
+        found: Any = ros2.ask("list", "graph")[kind]
+        return dict(found).get(name) == [type_name]
+
+    eventually(there, LONG, what=f"{name} in the {kind} of ROS 2", every=0.1)
+
+
+def hears_all(listener: Process, ros2: OtherEnd, text: str) -> None:
+    """Fail unless a listener on /from2 hears each message of ROS 2 once, in order, after the first one."""
+
+    def told() -> bool:
+        ros2.do("publish", topic="/from2", text="first", count=1)  # ROS 2 keeps nothing for a late subscriber
+        return bool(listener.events("text"))
+
+    eventually(told, what="a message of ROS 2", every=0.2)
+    ros2.do("publish", topic="/from2", text=text, count=50, rate=200)
+    listener.wait_event("text", where=lambda e: e["data"] == f"{text} 50")
+    heard = [e["data"] for e in listener.events("text") if str(e["data"]).startswith(text)]
+    assert heard == [f"{text} {number}" for number in range(1, 51)]
+
+
+@needs_sdk
+def test_ros2_lists_and_hears_a_rospy_talker(hall: Hall, ros2: OtherEnd) -> None:
+    with hall.robot.ros.rospy("talker", "__name:=talker", topic="/hello", type="String", rate=50, wait=1):
+        listed(ros2, "topics", "/hello", "std_msgs/msg/String")
+        ros2.do("subscribe", topic="/hello")
+        ros2.process.wait_event("heard", where=lambda e: e["data"] == "message 21")
+        heard = [e["data"] for e in ros2.process.events("heard") if e["topic"] == "/hello"]
+        assert heard[:21] == [f"message {number}" for number in range(1, 22)]
+
+
+@needs_sdk
+def test_ros1_lists_and_hears_a_ros2_talker(hall: Hall, ros2: OtherEnd) -> None:
+    ros2.do("publish", topic="/from2", text="early", count=1)
+    hall.robot.wait_topic("/from2")
+    assert "/rmpa/ros2/talker2" in hall.robot.ros.tool("rosnode", "list").split()
+    assert "std_msgs/String" in hall.robot.ros.tool("rostopic", "info", "/from2")
+    for number in range(2):
+        with hall.robot.ros.rospy("listener", topic="/from2", type="String", name=f"l_{number}") as listener:
+            hears_all(listener, ros2, f"turn{number}")
+            code, text = hall.robot.agent.rmpa("why", "ros2:/from2")
+            assert code == 0, text
+            assert "std_msgs/msg/String of ROS 2 is std_msgs/String here" in text
+    code, text = hall.robot.agent.rmpa("site", "info", "ros2")
+    assert code == 0, text
+    assert "/from2" in text
+
+
+@needs_sdk
+def test_latched_is_transient_local_both_ways(hall: Hall, ros2: OtherEnd) -> None:
+    with hall.robot.ros.rospy("text_teller", topic="/map1", latch=True, commands=True) as teller:
+        teller.wait_event("up")
+        teller.tell(json.dumps({"data": "kept by ROS 1"}))
+        listed(ros2, "topics", "/map1", "std_msgs/msg/String")
+        ros2.do("subscribe", topic="/map1", latched=True)
+        ros2.process.wait_event("heard", where=lambda e: e["data"] == "kept by ROS 1")
+
+
+@needs_sdk
+def test_services_are_called_both_ways(hall: Hall, ros2: OtherEnd) -> None:
+    with hall.robot.ros.rospy("switch", service="/lamp") as switch:
+        switch.wait_event("up")
+        listed(ros2, "services", "/lamp", "std_srvs/srv/SetBool")
+        answer = ros2.ask("call", "answered", service="/lamp", data=True)
+        assert (answer.get("success"), answer.get("message")) == (True, "on"), answer
+        assert switch.events("call")[-1]["data"] is True
+    ros2.do("serve", service="/gate2")
+    eventually(lambda: "/gate2" in hall.robot.ros.tool("rosservice", "list").split(), what="/gate2 in ROS 1")
+    assert hall.robot.ros.tool("rosservice", "type", "/gate2").strip() == "std_srvs/SetBool"
+    output = hall.robot.ros.tool("rosservice", "call", "/gate2", "false")
+    assert "success: True" in output
+    assert "from ROS 2" in output
+
+
+def test_a_zenoh_program_hears_a_topic_and_finds_its_module(hall: Hall, plain: OtherEnd) -> None:
+    """The keys and payloads are simple on purpose: what the page on sites says is enough."""
+    key = "rmpa/1/hall/robot/t/std_msgs%String/plain"
+    with hall.robot.ros.rospy("talker", topic="/plain", type="String", rate=50, wait=1) as talker:
+        talker.wait_event("up")
+        plain.do("subscribe", key=key)
+        sample = plain.process.wait_event("sample", LONG, where=lambda e: e["key"] == key)
+        assert bytes.fromhex(str(sample["payload"]))[4:].startswith(b"message ")
+        tokens = plain.ask("tokens", "tokens", key="rmpa/1/hall/robot/up/*")
+        assert len(tokens["keys"]) == 1  # type: ignore[arg-type]
+        header = plain.ask("get", "replies", key="rmpa/1/hall/robot/d/t/plain")
+        assert '"std_msgs/String"' in bytes.fromhex(header["ok"][0]).decode()  # type: ignore[index]
+
+
+def test_a_zenoh_program_calls_a_service(hall: Hall, plain: OtherEnd) -> None:
+    with hall.robot.ros.rospy("switch", service="/simple") as switch:
+        switch.wait_event("up")
+        key = "rmpa/1/hall/robot/s/*/simple"
+
+        def answered() -> bool:
+            replies = plain.ask("get", "replies", key=key, payload="01")
+            return replies["ok"] == ["01" + text_of("on")]
+
+        eventually(answered, what="the service's answer", every=0.3)
+
+
+def test_zenoh_bridge_ros1_hears_and_is_heard(hall: Hall, plain: OtherEnd) -> None:
+    """Presence once a second, and data under hexadecimal types, as that bridge has them."""
+    plain.do("put", key=f"ros1_discovery_info/*/pub/{STRING}/*/bridged", period=1.0)
+    hall.robot.wait_topic("/bridged", LONG)
+    with hall.robot.ros.rospy("listener", topic="/bridged", type="String", name="bridged_listener") as listener:
+        plain.do("put", key=f"{STRING}/*/bridged", payload=text_of("over the bridge"), period=0.1, times=100)
+        assert listener.wait_event("text", LONG)["data"] == "over the bridge"
+    with hall.robot.ros.rospy("talker", topic="/to_bridge", type="String", rate=20, wait=1):
+        plain.do("subscribe", key="ros1_discovery_info/**")
+        present = f"/pub/{STRING}/*/to_bridge"
+        plain.process.wait_event("sample", LONG, where=lambda e: str(e["key"]).endswith(present))
+        plain.do("put", key=f"ros1_discovery_info/*/sub/{STRING}/*/to_bridge", period=1.0)
+        plain.do("subscribe", key=f"{STRING}/*/to_bridge")
+        sample = plain.process.wait_event("sample", LONG, where=lambda e: str(e["key"]).startswith(STRING))
+        assert bytes.fromhex(str(sample["payload"]))[4:].startswith(b"message ")
+
+
+def test_zenoh_bridge_ros1_serves_and_calls(hall: Hall, plain: OtherEnd) -> None:
+    plain.do("put", key=f"ros1_discovery_info/*/srv/{SET_BOOL}/*/bridge_lamp", period=1.0)
+    plain.do("serve", key=f"{SET_BOOL}/*/bridge_lamp", payload="01" + text_of("bridged"))
+    eventually(lambda: "/bridge_lamp" in hall.robot.ros.tool("rosservice", "list").split(), LONG, what="/bridge_lamp")
+    assert "bridged" in hall.robot.ros.tool("rosservice", "call", "/bridge_lamp", "true")
+    with hall.robot.ros.rospy("switch", service="/our_lamp") as switch:
+        switch.wait_event("up")
+        plain.do("put", key=f"ros1_discovery_info/*/cl/{SET_BOOL}/*/our_lamp", period=1.0)
+
+        def answered() -> bool:
+            replies = plain.ask("get", "replies", key=f"{SET_BOOL}/*/our_lamp", payload="01")
+            return replies["ok"] == ["01" + text_of("on")]
+
+        eventually(answered, LONG, what="the service's answer", every=0.3)

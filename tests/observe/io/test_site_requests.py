@@ -1,0 +1,114 @@
+"""Questions about other sites: a module asks its gateways; a gateway answers, and judges who asks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
+
+import pytest
+
+from rmpa.bridge.params import transfer
+from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
+from rmpa.observe.io.site_requests import BODY, INFO, LAST, PARAM, REPORT, SiteRequests
+
+if TYPE_CHECKING:
+    from rmpa.config.permission_rules import Access
+
+
+def peer(name: str) -> Any:
+    return SimpleNamespace(link=SimpleNamespace(name=name, guid=f"guid of {name}"))
+
+
+@dataclass
+class Rpc:
+    """Requests to peers: each answers, or refuses."""
+
+    replies: dict[str, Any]
+
+    def __post_init__(self) -> None:
+        self.asked: list[str] = []
+        self.handlers: dict[str, Any] = {}
+
+    def on_request(self, what: str, handler: Any) -> None:
+        self.handlers[what] = handler
+
+    async def request(self, session: Any, what: str, args: dict[str, Any], timeout: float) -> Any:
+        name = session.link.name
+        self.asked.append(name)
+        reply = self.replies[name]
+        if isinstance(reply, RmpaError):
+            raise reply
+        return reply
+
+
+class Gate:
+    """Lets ``desk`` do what is listed, and nobody else anything."""
+
+    def __init__(self, *allowed: tuple[str, str]) -> None:
+        self.allowed, self.on = allowed, True
+
+    def admits(self, access: Access, module: str, name: str) -> bool:
+        return module == "desk" and (access.value, name) in self.allowed
+
+
+class Gateway:
+    def __init__(self) -> None:
+        self.answered: list[str] = []
+
+    async def answer(self, what: str, _args: dict[str, Any], /) -> object:
+        self.answered.append(what)
+        return "answer"
+
+
+def requests(rpc: Rpc, *peers: str, gate: Gate | None = None) -> SiteRequests:
+    gates = (cast("Any", gate),) if gate is not None else ()
+    return SiteRequests(cast("Any", rpc), lambda: [peer(name) for name in peers], *gates)
+
+
+NO_GATEWAY = PeerRefused("arm", "this agent does not know the question 'site.info'")
+
+
+async def test_the_peer_that_is_a_gateway_answers_and_is_asked_first_the_next_time() -> None:
+    rpc = Rpc({"arm": NO_GATEWAY, "gate": {"x": 1}})
+    asks = requests(rpc, "arm", "gate")
+    args = {"what": INFO, "args": {"site": "hall"}}
+    assert await asks.answer(args) == {"x": 1}
+    assert await asks.answer(args) == {"x": 1}
+    assert rpc.asked == ["arm", "gate", "gate"]
+    assert await asks.answer({"what": REPORT, "args": {}}) == [{"x": 1}]
+
+
+async def test_the_error_of_a_gateway_goes_before_that_of_others() -> None:
+    rpc = Rpc({"arm": NO_GATEWAY, "gate": PeerRefused("gate", "site hall is unreachable since 3 s")})
+    with pytest.raises(PeerRefused, match="site hall is unreachable"):
+        await requests(rpc, "arm", "gate").one(INFO, {"site": "hall"})
+    with pytest.raises(UnreachableError, match="no gateway answers at any linked peer"):
+        await requests(rpc, "arm").one(INFO, {"site": "hall"})
+    assert await requests(rpc, "arm").all(REPORT, {}) == []
+    with pytest.raises(ConfigError):
+        await requests(rpc).answer({"what": "site.shout", "args": {}})
+
+
+async def test_a_gateway_answers_itself_and_judges_the_modules_that_ask() -> None:
+    rpc, gateway = Rpc({}), Gateway()
+    asks = requests(rpc, gate=Gate(("param", "/speed"), ("subscribe", "/map")))
+    asks.serve(gateway)
+    assert await asks.answer({"what": REPORT, "args": {}}) == ["answer"]
+
+    async def ask(who: str, what: str, args: dict[str, Any]) -> object:
+        return await rpc.handlers[what](peer(who), args)
+
+    for what, args in (
+        (LAST, {"topic": "/map"}),
+        (BODY, {"topic": "/map"}),
+        (PARAM, {"what": transfer.SET, "args": {"key": "/speed"}}),
+    ):
+        assert await ask("desk", what, args) == "answer"
+        with pytest.raises(PeerRefused):
+            await ask("other", what, args)
+    with pytest.raises(PeerRefused):
+        await ask("desk", PARAM, {"what": transfer.GET, "args": {"key": "/secret"}})
+    with pytest.raises(PeerRefused):
+        await ask("desk", PARAM, {"what": transfer.NAMES, "args": {}})
+    assert await ask("other", PARAM, {"what": transfer.PUT, "args": {"writing": 1}}) == "answer"
