@@ -28,7 +28,7 @@ from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from rmpa.core.outbox import FIRST, LAST
 from rmpa.mesh import frames, limits
 from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.handshake import HandshakeError, Hello, Lane, Refuse, judge_welcome
+from rmpa.mesh.handshake import Feature, HandshakeError, Hello, Lane, Refuse, judge_welcome
 from rmpa.mesh.keepalive import Keepalive
 from rmpa.mesh.remote_clock import RemoteClock
 from rmpa.runtime import limits as runtime_limits
@@ -93,6 +93,7 @@ _WHEN_UP: Final[frozenset[int]] = frozenset(
         FrameKind.ACK,
         FrameKind.FENCE,
         FrameKind.FENCED,
+        FrameKind.PACE,
     }
 )
 _ALLOWED: Final[Mapping[tuple[ConnectionRole, ConnectionState], frozenset[int]]] = MappingProxyType(
@@ -392,6 +393,34 @@ class ConnectionProtocol:
             raise LocalProtocolError(f"no ping on a link that is {self._state.name}")
         return self._ping(now)
 
+    def need(self, now: float, *, needed: bool) -> None:
+        """Say whether something depends on this connection; if neither side needs it, it rests.
+
+        Without effect on a connection that is not up, or whose remote side cannot rest.
+        """
+        keepalive = self._keepalive
+        if (
+            self._state is not ConnectionState.UP
+            or keepalive.needed is needed
+            or self.remote is None
+            or not self.remote.features & Feature.PACE
+        ):
+            return
+        keepalive.needed = needed
+        if keepalive.agree() and needed:
+            keepalive.ask(now)
+        self._send_pace(now)
+
+    @property
+    def rests(self) -> bool:
+        """Whether the connection is at rest: its keepalives are rare."""
+        return self._state is ConnectionState.UP and self._keepalive.rests
+
+    @property
+    def quiet_after(self) -> float:
+        """Seconds without bytes after which the remote side is worth a check."""
+        return self._keepalive.quiet_after
+
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due, in monotonic seconds."""
         if self._state is ConnectionState.CLOSED:
@@ -465,6 +494,11 @@ class ConnectionProtocol:
                 self.on_event(PongReceived(t1, sample.rtt))
         elif kind is FrameKind.CONTROL:
             self.on_event(ControlReceived(bytes(payload)))
+        elif kind is FrameKind.PACE:
+            lease = min(max(sequence / 1000, limits.LINK_LEASE_MIN), limits.LINK_LEASE_MAX)
+            self._keepalive.remote_pace(lease, now, needed=route != 0)
+            if self._keepalive.agree():
+                self._send_pace(now)
         elif kind in {FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED}:
             self.on_event(MarkReceived(kind, route, sequence))
         elif kind is FrameKind.BYE:
@@ -541,6 +575,12 @@ class ConnectionProtocol:
         self._send(Frame(FrameKind.PING, stamp_ns=stamp))
         self._keepalive.pinged(now)
         return stamp
+
+    def _send_pace(self, now: float) -> None:
+        """Promise the lease that holds from now on; the ping measures the path, and is the first sign of life."""
+        keepalive = self._keepalive
+        self._send(Frame(FrameKind.PACE, route=int(keepalive.needed), sequence=round(keepalive.lease * 1000)))
+        self._ping(now)
 
     def _send(self, frame: Frame) -> None:
         if _log.isEnabledFor(logging.DEBUG):

@@ -50,6 +50,7 @@ class FrameKind(IntEnum):
     ACK = 9
     FENCE = 10
     FENCED = 11
+    PACE = 12
 
 
 PAYLOAD_MAX: Final[Mapping[int, int]] = MappingProxyType(
@@ -65,6 +66,7 @@ PAYLOAD_MAX: Final[Mapping[int, int]] = MappingProxyType(
         FrameKind.ACK: 0,
         FrameKind.FENCE: 0,
         FrameKind.FENCED: 0,
+        FrameKind.PACE: 0,
     }
 )
 """The most bytes of payload that a frame of each kind may claim."""

@@ -275,6 +275,7 @@ class Mesh:
     def connection_control(self, connection: Connection, payload: bytes) -> None:
         """A control frame came."""
         if (link := self._used(connection)) is not None:
+            link.touch()
             self._on_control(link, payload)
 
     def connection_ponged(self, connection: Connection) -> None:
@@ -387,9 +388,9 @@ class Mesh:
         self._act()
 
     def _alive(self, link_id: int) -> bool:
-        """Whether bytes were received on a link within ``limits.GHOST_QUIET``."""
+        """Whether bytes were received on a link lately, at its pace."""
         link = self._links.get(link_id)
-        return link is not None and self._clock.now() - link.heard_at < limits.GHOST_QUIET
+        return link is not None and self._clock.now() - link.heard_at < link.connection.quiet_after
 
     # --- bulk lanes -----------------------------------------------------------------------------------------
 

@@ -318,6 +318,10 @@ class Services(Part):
         if change.kind is RegistrationKind.SERVICE:
             self._driver.look((change.name,))
 
+    def depends(self, session: PeerSession) -> bool:
+        """Whether nodes of this module have direct connections to the peer's."""
+        return any(key.peer == session.peer and each.grant for key, each in self.direct_imports.services)
+
     def lane_lost(self, session: PeerSession) -> None:
         """Report calls that the loss of the bulk lane's connection may have left without an answer."""
         peer = session.peer
