@@ -393,20 +393,19 @@ class ConnectionProtocol:
             raise LocalProtocolError(f"no ping on a link that is {self._state.name}")
         return self._ping(now)
 
-    def need(self, now: float, *, needed: bool) -> None:
+    def need(self, now: float, *, needed: bool, parks: bool = False) -> None:
         """Say whether something depends on this connection; if neither side needs it, it rests.
 
-        Without effect on a connection that is not up, or whose remote side cannot rest.
+        Without effect on a connection that is not up, or whose remote side cannot rest. ``parks`` says that this side
+        would end a link that nothing needs (``Feature.PARK``).
         """
         keepalive = self._keepalive
-        if (
-            self._state is not ConnectionState.UP
-            or keepalive.needed is needed
-            or self.remote is None
-            or not self.remote.features & Feature.PACE
-        ):
+        if self._state is not ConnectionState.UP or self.remote is None or not self.remote.features & Feature.PACE:
             return
-        keepalive.needed = needed
+        parks = parks and not needed
+        if keepalive.needed is needed and keepalive.parks is parks:
+            return
+        keepalive.needed, keepalive.parks = needed, parks
         if keepalive.agree() and needed:
             keepalive.ask(now)
         self._send_pace(now)
@@ -415,6 +414,11 @@ class ConnectionProtocol:
     def rests(self) -> bool:
         """Whether the connection is at rest: its keepalives are rare."""
         return self._state is ConnectionState.UP and self._keepalive.rests
+
+    @property
+    def remote_parks(self) -> bool:
+        """Whether the remote side would end the link for now, because nothing there needs it."""
+        return self._keepalive.remote_parks
 
     @property
     def quiet_after(self) -> float:
@@ -496,7 +500,7 @@ class ConnectionProtocol:
             self.on_event(ControlReceived(bytes(payload)))
         elif kind is FrameKind.PACE:
             lease = min(max(sequence / 1000, limits.LINK_LEASE_MIN), limits.LINK_LEASE_MAX)
-            self._keepalive.remote_pace(lease, now, needed=route != 0)
+            self._keepalive.remote_pace(lease, now, route)
             if self._keepalive.agree():
                 self._send_pace(now)
         elif kind in {FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED}:
@@ -579,7 +583,7 @@ class ConnectionProtocol:
     def _send_pace(self, now: float) -> None:
         """Promise the lease that holds from now on; the ping measures the path, and is the first sign of life."""
         keepalive = self._keepalive
-        self._send(Frame(FrameKind.PACE, route=int(keepalive.needed), sequence=round(keepalive.lease * 1000)))
+        self._send(Frame(FrameKind.PACE, route=int(keepalive.flags), sequence=round(keepalive.lease * 1000)))
         self._ping(now)
 
     def _send(self, frame: Frame) -> None:

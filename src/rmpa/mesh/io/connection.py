@@ -269,9 +269,9 @@ class Connection:
         self.stream.send((self._machine.control(payload),), URGENT)
         self._check_urgent()
 
-    def need(self, *, needed: bool) -> None:
+    def need(self, *, needed: bool, parks: bool = False) -> None:
         """Say whether something depends on this connection; see ``ConnectionProtocol.need``."""
-        self._machine.need(self._clock.now(), needed=needed)
+        self._machine.need(self._clock.now(), needed=needed, parks=parks)
         if self._machine.has_output:
             self._send_output()
             self._timer.arm()
@@ -280,6 +280,11 @@ class Connection:
     def rests(self) -> bool:
         """Whether the connection is at rest: its keepalives are rare, and silence is noticed later."""
         return self._machine.rests
+
+    @property
+    def remote_parks(self) -> bool:
+        """Whether the remote side would end the link for now, because nothing there needs it."""
+        return self._machine.remote_parks
 
     @property
     def quiet_after(self) -> float:
