@@ -144,6 +144,8 @@ class Ros2Neighbour:
             return
         if rival := self.context.ros2.rival(key, alive=alive):
             self._judge_again(rival)
+            for part in self._parts:
+                part.rival(rival)
         entity = self.context.ros2.change(key, alive=alive)
         if isinstance(entity, Ros2Endpoint):
             _log.debug("%s %s", "+" if alive else "-", entity.token())

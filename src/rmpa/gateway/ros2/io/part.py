@@ -80,6 +80,12 @@ class Ros2Part(Protocol):
             Whether this part takes it: then no other part is told.
         """
 
+    def rival(self, node: str) -> None:
+        """Another gateway shows a node below ``/rmpa/``, or does not any more.
+
+        ``Ros2Graph.led_by`` tells which of them leads. The node's sources were taken back or offered again already.
+        """
+
     def close(self) -> None:
         """Take back everything that was declared."""
 
