@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RemoteProtocolError
@@ -42,6 +43,7 @@ class Ros2Topics:
         self._exports_named: dict[str, dict[tuple[str, str], Ros2TopicExport]] = {}
         self._imports: dict[str, Ros2TopicImport] = {}
         self._refused: dict[str, str] = {}
+        self._looks = asyncio.Semaphore(limits.LATCH_LOOKS_AT_ONCE)
 
     def start(self, context: Ros2Context) -> None:
         """Begin."""
@@ -91,7 +93,9 @@ class Ros2Topics:
         elif not decision.allowed:
             self._refuse(refused, decision.why)
         else:
-            export = self._exports[key] = Ros2TopicExport(context, pairs, source, decision, self._declared)
+            export = self._exports[key] = Ros2TopicExport(
+                context, pairs, source, decision, self._looks, self._declared
+            )
             self._exports_named.setdefault(source.here, {})[key] = export
             export.start()
         return True
