@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from enum import Enum, auto
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
@@ -27,6 +26,16 @@ from rmpa.core import limits as core_limits
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from rmpa.core.outbox import FIRST, LAST
 from rmpa.mesh import frames, limits
+from rmpa.mesh.connection_events import (
+    ConnectionClosed,
+    ConnectionEvent,
+    ControlReceived,
+    HandshakeDone,
+    HelloReceived,
+    MarkReceived,
+    PongReceived,
+    Refused,
+)
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Feature, HandshakeError, Hello, Lane, Refuse, judge_welcome
 from rmpa.mesh.keepalive import Keepalive
@@ -108,88 +117,6 @@ _ALLOWED: Final[Mapping[tuple[ConnectionRole, ConnectionState], frozenset[int]]]
 )
 
 
-@dataclass(frozen=True, slots=True)
-class HelloReceived:
-    """Acceptor: a hello was received; the driver answers it with ``accept`` or ``refuse``."""
-
-    hello: Hello
-
-
-@dataclass(frozen=True, slots=True)
-class HandshakeDone:
-    """Both sides accepted the connection; frames may be sent."""
-
-    hello: Hello
-
-
-@dataclass(frozen=True, slots=True)
-class ControlReceived:
-    """A control frame was received.
-
-    Args:
-        payload: A copy of its bytes.
-    """
-
-    payload: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class PongReceived:
-    """The answer to a ping was received.
-
-    Args:
-        stamp: The time stamp of the ping, which identifies it.
-        rtt: Round trip on the wire in seconds, without the time that the remote side took to answer.
-    """
-
-    stamp: int
-    rtt: float
-
-
-@dataclass(frozen=True, slots=True)
-class Refused:
-    """One of the two sides refused the connection. ``ConnectionClosed`` follows.
-
-    Args:
-        refuse: Why.
-        by_us: Whether this side refused.
-    """
-
-    refuse: Refuse
-    by_us: bool
-
-
-@dataclass(frozen=True, slots=True)
-class ConnectionClosed:
-    """The connection is over: the driver sends the remaining output and closes the socket.
-
-    Args:
-        reason: Why, for people.
-        orderly: Whether one side ended the connection by a frame (bye, refuse), and not an error or silence.
-    """
-
-    reason: str
-    orderly: bool
-
-
-@dataclass(frozen=True, slots=True)
-class MarkReceived:
-    """An acknowledgement, a fence or the answer to a fence was received.
-
-    Args:
-        kind: ``ACK``, ``FENCE`` or ``FENCED``.
-        route: The id of the route.
-        sequence: For ``ACK`` the last message that arrived; otherwise the fence's number.
-    """
-
-    kind: FrameKind
-    route: int
-    sequence: int
-
-
-ConnectionEvent = (
-    HelloReceived | HandshakeDone | ControlReceived | PongReceived | MarkReceived | Refused | ConnectionClosed
-)
 OnEvent = Callable[[ConnectionEvent], None]
 OnData = Callable[[int, int, int, memoryview], None]
 OnPart = Callable[[int, int, int, int, memoryview], None]
