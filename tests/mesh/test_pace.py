@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.mesh import limits
-from rmpa.mesh.connection import ConnectionClosed, ConnectionRole, ConnectionState
+from rmpa.mesh.connection import ConnectionRole, ConnectionState
+from rmpa.mesh.connection_events import ConnectionClosed
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Feature, Hello
 from tests.mesh.worlds import HIGH, LOW, Side, Time, deliver, exchange, pair, pass_time, side
@@ -126,6 +127,31 @@ def test_the_hello_of_the_last_release_is_taken_as_one_that_cannot_rest() -> Non
     acceptor.link.need(time.now, needed=False)
     assert not acceptor.link.has_output
     assert not Hello.parse(golden).features & Feature.PACE
+
+
+def test_willingness_to_park_is_told_and_ends_with_the_next_need() -> None:
+    time = Time()
+    dialler, acceptor = pair(time)
+    rest(dialler, acceptor, time)
+    dialler.link.need(time.now, needed=False, parks=True)
+    exchange(dialler, acceptor, time)
+    assert [dialler.link.remote_parks, acceptor.link.remote_parks] == [False, True]
+    assert resting(dialler, acceptor) == [True, True]
+    dialler.link.need(time.now, needed=True, parks=True)
+    exchange(dialler, acceptor, time)
+    assert not acceptor.link.remote_parks
+    assert resting(dialler, acceptor) == [False, False]
+
+
+@pytest.mark.parametrize("needed", [False, True])
+def test_bits_of_later_versions_in_a_pace_frame_are_ignored(*, needed: bool) -> None:
+    time = Time()
+    dialler, acceptor = pair(time)
+    rest(dialler, acceptor, time)
+    frame = Frame(FrameKind.PACE, route=0xFFFFFFFC | needed, sequence=16_000).serialize()
+    deliver(frame, dialler.link, time.now)
+    assert dialler.link.rests is not needed
+    assert not dialler.link.remote_parks
 
 
 @pytest.mark.parametrize("claimed", [0, 1, 10**9])

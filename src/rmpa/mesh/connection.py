@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from enum import Enum, auto
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
@@ -27,6 +26,16 @@ from rmpa.core import limits as core_limits
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from rmpa.core.outbox import FIRST, LAST
 from rmpa.mesh import frames, limits
+from rmpa.mesh.connection_events import (
+    ConnectionClosed,
+    ConnectionEvent,
+    ControlReceived,
+    HandshakeDone,
+    HelloReceived,
+    MarkReceived,
+    PongReceived,
+    Refused,
+)
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Feature, HandshakeError, Hello, Lane, Refuse, judge_welcome
 from rmpa.mesh.keepalive import Keepalive
@@ -108,88 +117,6 @@ _ALLOWED: Final[Mapping[tuple[ConnectionRole, ConnectionState], frozenset[int]]]
 )
 
 
-@dataclass(frozen=True, slots=True)
-class HelloReceived:
-    """Acceptor: a hello was received; the driver answers it with ``accept`` or ``refuse``."""
-
-    hello: Hello
-
-
-@dataclass(frozen=True, slots=True)
-class HandshakeDone:
-    """Both sides accepted the connection; frames may be sent."""
-
-    hello: Hello
-
-
-@dataclass(frozen=True, slots=True)
-class ControlReceived:
-    """A control frame was received.
-
-    Args:
-        payload: A copy of its bytes.
-    """
-
-    payload: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class PongReceived:
-    """The answer to a ping was received.
-
-    Args:
-        stamp: The time stamp of the ping, which identifies it.
-        rtt: Round trip on the wire in seconds, without the time that the remote side took to answer.
-    """
-
-    stamp: int
-    rtt: float
-
-
-@dataclass(frozen=True, slots=True)
-class Refused:
-    """One of the two sides refused the connection. ``ConnectionClosed`` follows.
-
-    Args:
-        refuse: Why.
-        by_us: Whether this side refused.
-    """
-
-    refuse: Refuse
-    by_us: bool
-
-
-@dataclass(frozen=True, slots=True)
-class ConnectionClosed:
-    """The connection is over: the driver sends the remaining output and closes the socket.
-
-    Args:
-        reason: Why, for people.
-        orderly: Whether one side ended the connection by a frame (bye, refuse), and not an error or silence.
-    """
-
-    reason: str
-    orderly: bool
-
-
-@dataclass(frozen=True, slots=True)
-class MarkReceived:
-    """An acknowledgement, a fence or the answer to a fence was received.
-
-    Args:
-        kind: ``ACK``, ``FENCE`` or ``FENCED``.
-        route: The id of the route.
-        sequence: For ``ACK`` the last message that arrived; otherwise the fence's number.
-    """
-
-    kind: FrameKind
-    route: int
-    sequence: int
-
-
-ConnectionEvent = (
-    HelloReceived | HandshakeDone | ControlReceived | PongReceived | MarkReceived | Refused | ConnectionClosed
-)
 OnEvent = Callable[[ConnectionEvent], None]
 OnData = Callable[[int, int, int, memoryview], None]
 OnPart = Callable[[int, int, int, int, memoryview], None]
@@ -393,20 +320,19 @@ class ConnectionProtocol:
             raise LocalProtocolError(f"no ping on a link that is {self._state.name}")
         return self._ping(now)
 
-    def need(self, now: float, *, needed: bool) -> None:
+    def need(self, now: float, *, needed: bool, parks: bool = False) -> None:
         """Say whether something depends on this connection; if neither side needs it, it rests.
 
-        Without effect on a connection that is not up, or whose remote side cannot rest.
+        Without effect on a connection that is not up, or whose remote side cannot rest. ``parks`` says that this side
+        would end a link that nothing needs (``Feature.PARK``).
         """
         keepalive = self._keepalive
-        if (
-            self._state is not ConnectionState.UP
-            or keepalive.needed is needed
-            or self.remote is None
-            or not self.remote.features & Feature.PACE
-        ):
+        if self._state is not ConnectionState.UP or self.remote is None or not self.remote.features & Feature.PACE:
             return
-        keepalive.needed = needed
+        parks = parks and not needed
+        if keepalive.needed is needed and keepalive.parks is parks:
+            return
+        keepalive.needed, keepalive.parks = needed, parks
         if keepalive.agree() and needed:
             keepalive.ask(now)
         self._send_pace(now)
@@ -415,6 +341,11 @@ class ConnectionProtocol:
     def rests(self) -> bool:
         """Whether the connection is at rest: its keepalives are rare."""
         return self._state is ConnectionState.UP and self._keepalive.rests
+
+    @property
+    def remote_parks(self) -> bool:
+        """Whether the remote side would end the link for now, because nothing there needs it."""
+        return self._keepalive.remote_parks
 
     @property
     def quiet_after(self) -> float:
@@ -496,7 +427,7 @@ class ConnectionProtocol:
             self.on_event(ControlReceived(bytes(payload)))
         elif kind is FrameKind.PACE:
             lease = min(max(sequence / 1000, limits.LINK_LEASE_MIN), limits.LINK_LEASE_MAX)
-            self._keepalive.remote_pace(lease, now, needed=route != 0)
+            self._keepalive.remote_pace(lease, now, route)
             if self._keepalive.agree():
                 self._send_pace(now)
         elif kind in {FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED}:
@@ -579,7 +510,7 @@ class ConnectionProtocol:
     def _send_pace(self, now: float) -> None:
         """Promise the lease that holds from now on; the ping measures the path, and is the first sign of life."""
         keepalive = self._keepalive
-        self._send(Frame(FrameKind.PACE, route=int(keepalive.needed), sequence=round(keepalive.lease * 1000)))
+        self._send(Frame(FrameKind.PACE, route=int(keepalive.flags), sequence=round(keepalive.lease * 1000)))
         self._ping(now)
 
     def _send(self, frame: Frame) -> None:

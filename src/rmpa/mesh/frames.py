@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import IntEnum, IntFlag
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
@@ -51,6 +51,15 @@ class FrameKind(IntEnum):
     FENCE = 10
     FENCED = 11
     PACE = 12
+
+
+class PaceFlag(IntFlag):
+    """What the route field of a pace frame says; bits that are not known are ignored."""
+
+    NEEDED = 1
+    """Something at the sender depends on the connection, so that neither side may rest."""
+    PARKS = 2
+    """The sender would end the link for now; see ``Feature.PARK``."""
 
 
 PAYLOAD_MAX: Final[Mapping[int, int]] = MappingProxyType(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from rmpa.mesh import limits
+from rmpa.mesh.frames import PaceFlag
 
 
 class Keepalive:
@@ -35,7 +36,9 @@ class Keepalive:
         "heard",
         "lease",
         "needed",
+        "parks",
         "remote_needs",
+        "remote_parks",
         "sent",
     )
 
@@ -44,6 +47,8 @@ class Keepalive:
         self.promise(lease)
         self.needed = self.remote_needs = True
         """Whether this side, and the remote one, needs the short lease."""
+        self.parks = self.remote_parks = False
+        """Whether this side, and the remote one, would end the link for now; never while it is needed."""
         self.heard = now
         """When bytes were last received."""
         self.sent = now
@@ -77,12 +82,18 @@ class Keepalive:
         """This side needs the short lease of a remote side that rests: it has to answer soon."""
         self._asked = now
 
-    def remote_pace(self, lease: float, now: float, *, needed: bool) -> None:
-        """The remote side promises ``lease`` seconds from now on, and says whether it needs the short lease."""
+    def remote_pace(self, lease: float, now: float, flags: int) -> None:
+        """The remote side promises ``lease`` seconds from now on; ``flags`` are bits of ``PaceFlag``."""
         self._remote_lease = lease
-        self.remote_needs = needed
+        self.remote_needs = bool(flags & PaceFlag.NEEDED)
+        self.remote_parks = bool(flags & PaceFlag.PARKS)
         self.heard = now
         self._asked = None
+
+    @property
+    def flags(self) -> PaceFlag:
+        """What this side says in a pace frame."""
+        return PaceFlag.NEEDED if self.needed else PaceFlag.PARKS if self.parks else PaceFlag(0)
 
     @property
     def rests(self) -> bool:

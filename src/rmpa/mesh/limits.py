@@ -25,6 +25,15 @@ IDLE_KEEPALIVE_INTERVAL: Final = 5.0
 """Interval of the keepalives of a link at rest: two of them may be late before the link falls."""
 REST_AFTER: Final = 5.0
 """A link rests when nothing has depended on it for this long, so that a short pause of use changes nothing."""
+PARK_AFTER: Final = 10.0
+"""Where links stand on demand, a link that has been at rest for this long is closed by agreement. Making it again
+takes one round trip and the exchange of both catalogues, so a function that is used now and then keeps its link."""
+WANT_GRACE: Final = 5.0
+"""How long a parked peer may be dialled in vain, once something needs it, before it counts as lost: more than two
+rounds over all of its addresses (DIAL_TIMEOUT)."""
+FULL_MESH_AGAIN: Final = 0.75
+"""The share of ``mesh.full_mesh_up_to`` below which all links are made again: a quarter of the modules may come and
+go without a change of the mode."""
 ACCEPTOR_KEEPALIVE_FACTOR: Final = 1.2
 """The acceptor's keepalive interval, as a multiple of the dialler's: on an idle link only the dialler pings, and each
 ping and pong is a sign of life."""

@@ -14,12 +14,10 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import URGENT, Outbox
 from rmpa.core.serial_number import SERIAL_MASK
 from rmpa.mesh import limits
-from rmpa.mesh.connection import (
+from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole, ConnectionState
+from rmpa.mesh.connection_events import (
     ConnectionClosed,
     ConnectionEvent,
-    ConnectionProtocol,
-    ConnectionRole,
-    ConnectionState,
     ControlReceived,
     HandshakeDone,
     HelloReceived,
@@ -269,9 +267,9 @@ class Connection:
         self.stream.send((self._machine.control(payload),), URGENT)
         self._check_urgent()
 
-    def need(self, *, needed: bool) -> None:
+    def need(self, *, needed: bool, parks: bool = False) -> None:
         """Say whether something depends on this connection; see ``ConnectionProtocol.need``."""
-        self._machine.need(self._clock.now(), needed=needed)
+        self._machine.need(self._clock.now(), needed=needed, parks=parks)
         if self._machine.has_output:
             self._send_output()
             self._timer.arm()
@@ -280,6 +278,11 @@ class Connection:
     def rests(self) -> bool:
         """Whether the connection is at rest: its keepalives are rare, and silence is noticed later."""
         return self._machine.rests
+
+    @property
+    def remote_parks(self) -> bool:
+        """Whether the remote side would end the link for now, because nothing there needs it."""
+        return self._machine.remote_parks
 
     @property
     def quiet_after(self) -> float:
