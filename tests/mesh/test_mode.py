@@ -10,11 +10,8 @@ from rmpa.mesh.mode import MeshMode
 
 def test_a_small_mesh_is_a_full_one_and_a_large_one_links_on_demand() -> None:
     mode = MeshMode(Links.AUTO, 64)
-    assert not mode.demand
-    assert not mode.count(64)
-    assert not mode.demand
-    assert mode.count(65)
-    assert mode.demand
+    assert [mode.count(64), mode.demand] == [False, False]
+    assert [mode.count(65), mode.demand] == [True, True]
     assert str(mode) == "links on demand (65 modules, more than mesh.full_mesh_up_to = 64)"
 
 

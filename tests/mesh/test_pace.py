@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.mesh import limits
-from rmpa.mesh.connection import ConnectionClosed, ConnectionRole, ConnectionState
+from rmpa.mesh.connection import ConnectionRole, ConnectionState
+from rmpa.mesh.connection_events import ConnectionClosed
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Feature, Hello
 from tests.mesh.worlds import HIGH, LOW, Side, Time, deliver, exchange, pair, pass_time, side
