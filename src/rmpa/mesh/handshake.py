@@ -45,9 +45,11 @@ class Feature(IntFlag):
 
     PACE = 1
     """It takes pace frames: the link may rest."""
+    PARK = 2
+    """It takes a bye that says "parked": the link may be ended for now, by agreement."""
 
 
-FEATURES: Final = Feature.PACE
+FEATURES: Final = Feature.PACE | Feature.PARK
 """The features of this version."""
 
 

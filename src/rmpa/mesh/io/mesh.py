@@ -22,14 +22,14 @@ from rmpa.mesh.io.link import LinkHandlers, PeerLink
 from rmpa.mesh.io.path_monitor import PathMonitor
 from rmpa.mesh.io.securing import Securing, SecuringError, prove, secure_dialled
 from rmpa.mesh.io.sockets import tune_bulk, tune_express, unacknowledged
-from rmpa.mesh.peering import (
+from rmpa.mesh.peering import Peering
+from rmpa.mesh.peering_events import (
     CloseLink,
     Dial,
     LinkDown,
     LinkDownCause,
     LinkRefused,
     LinkUp,
-    Peering,
     PeeringOutput,
     PeerStatus,
 )
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
     from rmpa.mesh.handshake import Hello, Refuse
     from rmpa.mesh.io.securing import MeshSecurity, OnJoin, SecuredSocket
-    from rmpa.mesh.peering import SocketAddress
+    from rmpa.mesh.peering_events import SocketAddress
 
 _log = logging.getLogger(__name__)
 
