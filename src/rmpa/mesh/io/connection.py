@@ -14,16 +14,16 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import URGENT, Outbox
 from rmpa.core.serial_number import SERIAL_MASK
 from rmpa.mesh import limits
-from rmpa.mesh.connection import (
+from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole, ConnectionState
+from rmpa.mesh.connection_events import (
     ConnectionClosed,
     ConnectionEvent,
-    ConnectionProtocol,
-    ConnectionRole,
-    ConnectionState,
     ControlReceived,
     HandshakeDone,
     HelloReceived,
     MarkReceived,
+    Parted,
+    PartingEnded,
     PongReceived,
     Refused,
 )
@@ -90,11 +90,15 @@ class ConnectionOwner(Protocol):
         ...
 
     def connection_quiet(self, connection: Connection) -> None:
-        """No bytes were received for ``limits.GHOST_QUIET``; called again from time to time during the silence."""
+        """No bytes were received for ``quiet_after``; called again from time to time during the silence."""
         ...
 
     def connection_tick(self, connection: Connection) -> None:
         """The connection is up and its timer fired, about once in a keepalive interval."""
+        ...
+
+    def connection_parted(self, connection: Connection) -> None:
+        """Both sides agreed to end the connection for now; ``connection_closing`` follows."""
         ...
 
     def connection_closing(self, connection: Connection, reason: str) -> None:
@@ -155,6 +159,8 @@ class Connection:
         """Whether the remote side broke the protocol."""
         self.silent = False
         """Once ended: whether it ended by silence (lease expired, no route, reset) rather than by a bye."""
+        self.held: list[bytes] = []
+        """Payloads of control frames that were not sent, because this side has agreed to park the link."""
         self.stalls = StallWatch(segment, clock.now())
         """Judges whether sent data gets through."""
         self._owner = owner
@@ -266,8 +272,33 @@ class Connection:
         """
         if self._machine.state is not ConnectionState.UP:
             return
+        if self._machine.holding:
+            self.held.append(payload)
+            return
         self.stream.send((self._machine.control(payload),), URGENT)
         self._check_urgent()
+
+    def need(self, *, needed: bool, parks: bool = False) -> None:
+        """Say whether something depends on this connection; see ``ConnectionProtocol.need``."""
+        self._machine.need(self._clock.now(), needed=needed, parks=parks)
+        if self._machine.has_output:
+            self._send_output()
+            self._timer.arm()
+
+    @property
+    def rests(self) -> bool:
+        """Whether the connection is at rest: its keepalives are rare, and silence is noticed later."""
+        return self._machine.rests
+
+    @property
+    def remote_parks(self) -> bool:
+        """Whether the remote side would end the link for now, because nothing there needs it."""
+        return self._machine.remote_parks
+
+    @property
+    def quiet_after(self) -> float:
+        """Seconds without bytes after which the remote side is worth a check."""
+        return self._machine.quiet_after
 
     async def ping(self) -> float | None:
         """Measure one round trip now, in seconds; ``None`` if no answer came within ``limits.PING_TIMEOUT``."""
@@ -352,6 +383,7 @@ class Connection:
             raise
         if self._machine.has_output:
             self._send_output()
+            self._timer.arm()  # the remote side may have changed the pace
         return taken
 
     def _event(self, event: ConnectionEvent) -> None:
@@ -375,6 +407,13 @@ class Connection:
             self._owner.connection_opened(self)
         elif isinstance(event, Refused):
             self._owner.connection_refused(self, event.refuse, by_us=event.by_us)
+        elif isinstance(event, Parted):
+            self._owner.connection_parted(self)
+        elif isinstance(event, PartingEnded):
+            self._send_output()
+            held, self.held = self.held, []
+            for payload in held:
+                self.send_control(payload)
         elif isinstance(event, ConnectionClosed):
             self._finish(event.reason)
 
@@ -439,7 +478,7 @@ class Connection:
             self._owner.connection_tick(self)
         self._machine.handle_timer(now)
         self.silent = was_up and self._machine.state is ConnectionState.CLOSED
-        if was_up and not self.silent and now - self.heard_at > limits.GHOST_QUIET:
+        if was_up and not self.silent and now - self.heard_at > self.quiet_after:
             self._owner.connection_quiet(self)
         self._send_output()
 

@@ -101,6 +101,7 @@ class ExportedTopic:
             "module": entry.source.module,
             "node": entry.source.node,
             "name": entry.source.name,
+            "to": entry.announced.to,
             "type": entry.announced.type,
             "md5sum": self.description.md5sum if self.description is not None else "",
             "latching": self.description is not None and self.description.latching,

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from rmpa.core.contract import Contracts
     from rmpa.gateway.neighbour import OwnGraph
     from rmpa.gateway.sites.attachment import MessageSource
+    from rmpa.gateway.sites.io.imported_topic import OnLatched
     from rmpa.gateway.sites.keys import SiteModule
     from rmpa.gateway.sites.part import SiteExport, SiteImport
     from rmpa.gateway.sites.rules import CrossingRules
@@ -48,6 +49,7 @@ class SiteTopics:
         rules: Tell which site may have which topic.
         contracts: The contracts of topics, which become Zenoh's QoS.
         clock: Both clocks.
+        on_latched: Called with each message of a latched topic of another site.
     """
 
     name = "topics"
@@ -60,15 +62,17 @@ class SiteTopics:
         rules: CrossingRules,
         contracts: Contracts,
         clock: Clock,
+        on_latched: OnLatched = lambda *_: None,
     ) -> None:
+        self._on_latched = on_latched
         self._site = site
         self._graph = graph
         self._session = session
         self._rules = rules
         self._contracts = contracts
         self._clock = clock
-        self._exported: dict[tuple[str, str], dict[str, ExportedTopic]] = {}
-        """By module and topic, then by node."""
+        self._exported: dict[tuple[str, str], dict[tuple[str, str], ExportedTopic]] = {}
+        """By module and topic, then by node and the site that it is for (empty: for all)."""
         self._imported: dict[tuple[str, str, str, str], ImportedTopic] = {}
         """By site, module, node and name there."""
         self._interrupted: dict[tuple[str, str, str, str], InterruptedTopic] = {}
@@ -88,15 +92,17 @@ class SiteTopics:
             return
         self.withdraw(entry)
         contract = self._contracts.of(entry.source.here, entry.announced.type)
-        nodes = self._exported.setdefault((entry.source.module, entry.source.name), {})
-        nodes[entry.source.node] = ExportedTopic(entry, self._graph, self._session, contract, self._clock)
+        topics = self._exported.setdefault((entry.source.module, entry.source.name), {})
+        topics[entry.source.node, entry.announced.to] = ExportedTopic(
+            entry, self._graph, self._session, contract, self._clock
+        )
 
     def withdraw(self, entry: SiteExport) -> None:
         """Undeclare it."""
         if entry.source.kind is not SourceKind.TOPIC:
             return  # a service of a node may have the name of its topic
         key = (entry.source.module, entry.source.name)
-        topic = self._exported.get(key, {}).pop(entry.source.node, None)
+        topic = self._exported.get(key, {}).pop((entry.source.node, entry.announced.to), None)
         if topic is not None:
             topic.close()
             if not self._exported[key]:
@@ -109,7 +115,14 @@ class SiteTopics:
             ident = _ident(entry)
             interrupted = self._interrupted.pop(ident, None)
             self._imported[ident] = ImportedTopic(
-                entry, self._site, self._graph, self._session, self._clock, self._on_demand, interrupted
+                entry,
+                self._site,
+                self._graph,
+                self._session,
+                self._clock,
+                self._on_demand,
+                self._on_latched,
+                interrupted,
             )
 
     def renew(self, old: SiteImport, new: SiteImport) -> None:
@@ -223,11 +236,13 @@ class SiteTopics:
     def _on_header_query(self, module: SiteModule, query: ZenohQuery) -> None:
         name = query.key.removeprefix(f"{ROOT}/{module.site}/{module.name}/d/t")
         asked = dict(pair.partition("=")[::2] for pair in query.parameters.split(";"))
-        if refusal := self._rules.refusal(asked.get("site", ""), module.name, name):
+        node, site = asked.get("node", ""), asked.get("site", "")
+        if refusal := self._rules.refusal(site, module.name, name):
             query.reply_error(f"{REFUSED}{refusal}")
             return
-        nodes = self._exported.get((module.name, name), {})
-        topic = nodes.get(asked["node"]) if asked.get("node") else next(iter(nodes.values()), None)
+        topics = self._exported.get((module.name, name), {})
+        fitting = (each for (its, to), each in topics.items() if node in ("", its) and to in ("", site))
+        topic = next(fitting, None)
         if topic is None:
             query.reply_error(f"no such publisher of {name[:200]} at {module.name}")
             return
