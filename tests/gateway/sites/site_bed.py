@@ -105,6 +105,7 @@ class Site:
     neighbour: SiteNeighbour
     graph: SiteGraph
     session: OpenSession
+    topic_part: SiteTopics
 
     def topic(self, name: str, node: str = "/talker") -> MemoryTopic:
         """A topic that is shown here."""
@@ -152,7 +153,7 @@ class SiteBed:
         own = SiteGateway(name, rank, f"{len(self.opened) + 1:032x}")
         crossing = CrossingRules(rules)
         topics = SiteTopics(name, graph, session, crossing, Contracts(contracts), SystemClock())
-        site = Site(SiteNeighbour(graph, session, own, crossing, [topics]), graph, session)
+        site = Site(SiteNeighbour(graph, session, own, crossing, [topics]), graph, session, topics)
         self.opened.append(site)
         site.neighbour.start()
         return site
