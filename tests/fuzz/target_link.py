@@ -6,7 +6,8 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
-from rmpa.mesh.connection import ConnectionEvent, ConnectionProtocol, ConnectionRole, ConnectionState, HelloReceived
+from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole, ConnectionState
+from rmpa.mesh.connection_events import ConnectionEvent, HelloReceived
 from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, pong
 from rmpa.mesh.handshake import Hello, Refuse
 

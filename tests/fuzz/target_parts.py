@@ -11,7 +11,8 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
-from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole, HelloReceived
+from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole
+from rmpa.mesh.connection_events import HelloReceived
 from rmpa.mesh.frames import WHOLE, Frame, FrameKind
 from rmpa.mesh.handshake import Hello
 from rmpa.ros import limits
@@ -19,7 +20,7 @@ from tests.simulation.network import World
 from tests.simulation.process import Process
 
 if TYPE_CHECKING:
-    from rmpa.mesh.connection import ConnectionEvent
+    from rmpa.mesh.connection_events import ConnectionEvent
 
 _OURS = Identity(Guid.of("10.0.0.2", 40002, 1), b"O" * 16, "ours")
 _THEIRS = Identity(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base")

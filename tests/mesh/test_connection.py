@@ -8,10 +8,9 @@ from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolEr
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.mesh import limits
-from rmpa.mesh.connection import (
+from rmpa.mesh.connection import ConnectionRole, ConnectionState
+from rmpa.mesh.connection_events import (
     ConnectionClosed,
-    ConnectionRole,
-    ConnectionState,
     ControlReceived,
     HandshakeDone,
     HelloReceived,

@@ -8,10 +8,9 @@ from rmpa.core import limits as core_limits
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh import limits
-from rmpa.mesh.connection import (
+from rmpa.mesh.connection import ConnectionRole, ConnectionState
+from rmpa.mesh.connection_events import (
     ConnectionClosed,
-    ConnectionRole,
-    ConnectionState,
     ControlReceived,
     HandshakeDone,
     HelloReceived,

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
-from rmpa.mesh.connection import ConnectionEvent, ConnectionProtocol, ConnectionRole, ConnectionState
+from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole, ConnectionState
 from rmpa.mesh.handshake import Lane
+
+if TYPE_CHECKING:
+    from rmpa.mesh.connection_events import ConnectionEvent
 
 LOW = Identity(Guid.of("10.0.0.1", 40001, 1), b"L" * 16, "low")
 HIGH = Identity(Guid.of("10.0.0.2", 40002, 1), b"H" * 16, "high")

@@ -22,6 +22,17 @@ BURST_OFFSETS: Final = (0.0, 0.1, 0.3, 0.7)
 enough."""
 HEARTBEAT_INTERVAL: Final = 5.0
 """Paper, section 4.3: "each five seconds a heartbeat will check that network is still alive"."""
+MANY_MEMBERS: Final = 64
+"""Members above which answers and early heartbeats are delayed or gathered, lest a start of many agents be a storm of
+packets. Up to here each announcement is answered at once, as in the paper."""
+HEARTBEATS_PER_SECOND: Final = 50.0
+"""Heartbeats a second, of all members together, that each agent of a large mesh hears: its own interval is the number
+of members divided by this. They take 0.2 % of a core. The failure detector notices a dead peer before its lease."""
+HEARTBEAT_INTERVAL_MAX: Final = 39.0
+"""The longest interval of heartbeats: three of them and a second fit into ``LEASE_MAX``."""
+HEARTBEAT_GROWTH: Final = 1.25
+"""Factor by which the interval of heartbeats grows at most from one to the next: peers that missed the beacon with
+the longer lease still count by the shorter one."""
 CONFLICT_AFTER: Final = 2.0
 """A packet of a replaced instance after this long is not a late one: two live peers share one GUID."""
 ADDRESS_SHARED_AFTER: Final = 5.0
@@ -50,14 +61,18 @@ LEASE_MIN: Final = 2.0
 """The shortest lease: with a shorter one a peer would come and go with every lost packet."""
 LEASE_MAX: Final = 120.0
 """The longest lease: with a longer one a peer would be shown long after its end."""
+ANSWERS_TOGETHER: Final = 8
+"""Newcomers of a large mesh that wait for an answer at one time, from which on one multicast answers all of them: it
+costs each member one packet to read, as much as the answers would cost their senders."""
 ENDPOINT_RUNS_MAX: Final = 4
 """Runs remembered for one (address, port): the present one, the last one and two rivals."""
 ANSWER_ADDRESSES_MAX: Final = 1024
 """Addresses remembered for ``ANSWER_INTERVAL``; the oldest is forgotten first."""
 ANSWERS_PER_SECOND: Final = 500
 """Unicast answers a second over all addresses: forged beacons must not turn an agent into an amplifier; a start of
-100 peers stays below this."""
-CANDIDATES_MAX: Final = 256
+100 peers stays below this. In a large mesh it is also the number of answers a second that one newcomer gets: 1,000
+members answer within 2 s, each at a random time."""
+CANDIDATES_MAX: Final = 1024
 """Addresses kept that are known only from gossip; further ones are ignored until there is room."""
 CANDIDATE_RETRY_FIRST: Final = 0.5
 """Delay before the second announcement to an address known from gossip; it doubles each time."""
@@ -67,11 +82,16 @@ CANDIDATE_LIFETIME: Final = 20.0
 """An address that no gossip had for this long (four heartbeats) is given up."""
 DISSEMINATION_INTERVAL: Final = 0.5
 """Newly found peers are gathered for this long before peers without multicast are notified; the first at once."""
+DISSEMINATIONS_PER_SECOND: Final = 100.0
+"""Such early heartbeats a second, of all members of a large mesh together: while a thousand agents start, each of
+them finds new peers all the time."""
+CANDIDATES_BURST: Final = 256
+"""Announcements to addresses known from gossip that may be sent at once."""
 CANDIDATES_PER_SECOND: Final = 25.0
 """Announcements a second to all addresses known from gossip, beyond one for each: gossiped peers may be forged."""
 UNICAST_HEARTBEATS_PER_SECOND: Final = 10.0
-"""Heartbeats by unicast to peers without a link, over all of them: each takes 0.2 ms, and with as many forged
-peers as are accepted each still gets one a minute."""
+"""Heartbeats by unicast to peers that never had a link, over all of them: each takes 0.2 ms, and with 500 such peers
+each still gets one a minute."""
 UNICAST_HEARTBEATS_AT_ONCE: Final = 8
 """Unicast heartbeats, to linked and unlinked peers, in one run of the timer; each takes some 0.1 ms."""
 EVICTIONS_PER_SECOND: Final = 10.0
@@ -89,10 +109,15 @@ BEACONS_UNPROVED_PAUSE: Final = 0.05
 BEACONS_PER_SOURCE: Final = 200
 """Packets a second from one address; a host with twenty agents that all start at once stays below."""
 BEACONS_UNLINKED_PER_SECOND: Final = 200.0
-"""Beacons a second that are accepted from unlinked peers, over all addresses (they can be forged): 5 % of a core."""
-BEACONS_UNLINKED_BURST: Final = 1000
-"""Beacons of unlinked peers accepted at once: a hundred peers that start together send 400 and answer each other."""
-BEACON_SOURCES_MAX: Final = 1024
+"""Beacons a second that are accepted from peers that never had a link, over all addresses (they can be forged): 5 %
+of a core."""
+BEACONS_UNLINKED_BURST: Final = 4096
+"""Beacons of such peers accepted at once, which take 0.4 s: a thousand agents that start together announce themselves
+four times each. Data is handled between them."""
+RECEIVE_BUFFER_BYTES: Final = 1 << 20
+"""The kernel's buffer of each socket that receives beacons (SO_RCVBUF; net.core.rmem_max bounds it): 1,300 packets,
+so that the announcements of a thousand agents that start at once wait until they are read."""
+BEACON_SOURCES_MAX: Final = 4096
 """Source addresses whose packets are counted; the oldest is forgotten first."""
 BEACON_REPEATS: Final = 128
 """Packets remembered, so that one that arrives over two interfaces is read once."""

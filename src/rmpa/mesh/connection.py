@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from enum import Enum, auto
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
@@ -27,9 +26,22 @@ from rmpa.core import limits as core_limits
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from rmpa.core.outbox import FIRST, LAST
 from rmpa.mesh import frames, limits
+from rmpa.mesh.connection_events import (
+    ConnectionClosed,
+    ConnectionEvent,
+    ControlReceived,
+    HandshakeDone,
+    HelloReceived,
+    MarkReceived,
+    Parted,
+    PartingEnded,
+    PongReceived,
+    Refused,
+)
 from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.handshake import HandshakeError, Hello, Lane, Refuse, judge_welcome
+from rmpa.mesh.handshake import Feature, HandshakeError, Hello, Lane, Refuse, judge_welcome
 from rmpa.mesh.keepalive import Keepalive
+from rmpa.mesh.parting import Parting, PartingStep
 from rmpa.mesh.remote_clock import RemoteClock
 from rmpa.runtime import limits as runtime_limits
 from rmpa.trust.preface import is_preface
@@ -93,6 +105,7 @@ _WHEN_UP: Final[frozenset[int]] = frozenset(
         FrameKind.ACK,
         FrameKind.FENCE,
         FrameKind.FENCED,
+        FrameKind.PACE,
     }
 )
 _ALLOWED: Final[Mapping[tuple[ConnectionRole, ConnectionState], frozenset[int]]] = MappingProxyType(
@@ -107,88 +120,6 @@ _ALLOWED: Final[Mapping[tuple[ConnectionRole, ConnectionState], frozenset[int]]]
 )
 
 
-@dataclass(frozen=True, slots=True)
-class HelloReceived:
-    """Acceptor: a hello was received; the driver answers it with ``accept`` or ``refuse``."""
-
-    hello: Hello
-
-
-@dataclass(frozen=True, slots=True)
-class HandshakeDone:
-    """Both sides accepted the connection; frames may be sent."""
-
-    hello: Hello
-
-
-@dataclass(frozen=True, slots=True)
-class ControlReceived:
-    """A control frame was received.
-
-    Args:
-        payload: A copy of its bytes.
-    """
-
-    payload: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class PongReceived:
-    """The answer to a ping was received.
-
-    Args:
-        stamp: The time stamp of the ping, which identifies it.
-        rtt: Round trip on the wire in seconds, without the time that the remote side took to answer.
-    """
-
-    stamp: int
-    rtt: float
-
-
-@dataclass(frozen=True, slots=True)
-class Refused:
-    """One of the two sides refused the connection. ``ConnectionClosed`` follows.
-
-    Args:
-        refuse: Why.
-        by_us: Whether this side refused.
-    """
-
-    refuse: Refuse
-    by_us: bool
-
-
-@dataclass(frozen=True, slots=True)
-class ConnectionClosed:
-    """The connection is over: the driver sends the remaining output and closes the socket.
-
-    Args:
-        reason: Why, for people.
-        orderly: Whether one side ended the connection by a frame (bye, refuse), and not an error or silence.
-    """
-
-    reason: str
-    orderly: bool
-
-
-@dataclass(frozen=True, slots=True)
-class MarkReceived:
-    """An acknowledgement, a fence or the answer to a fence was received.
-
-    Args:
-        kind: ``ACK``, ``FENCE`` or ``FENCED``.
-        route: The id of the route.
-        sequence: For ``ACK`` the last message that arrived; otherwise the fence's number.
-    """
-
-    kind: FrameKind
-    route: int
-    sequence: int
-
-
-ConnectionEvent = (
-    HelloReceived | HandshakeDone | ControlReceived | PongReceived | MarkReceived | Refused | ConnectionClosed
-)
 OnEvent = Callable[[ConnectionEvent], None]
 OnData = Callable[[int, int, int, memoryview], None]
 OnPart = Callable[[int, int, int, int, memoryview], None]
@@ -249,6 +180,7 @@ class ConnectionProtocol:
         self._label = label
         self._state = ConnectionState.HANDSHAKING
         self._keepalive = Keepalive(lease, now, acceptor=role is ConnectionRole.ACCEPTOR)
+        self._parting = Parting(self._keepalive, dialler=role is ConnectionRole.DIALLER)
         self._deadline = now + limits.HANDSHAKE_TIMEOUT
         self._reason = ""
         self._output = bytearray()
@@ -374,7 +306,7 @@ class ConnectionProtocol:
         if self._state in (ConnectionState.CLOSING, ConnectionState.CLOSED):
             return
         if self._state is ConnectionState.UP:
-            self._send(Frame(FrameKind.BYE, frames.text_payload(reason), stamp_ns=self._wall_ns()))
+            self._send(frames.bye(reason, stamp_ns=self._wall_ns()))
         self._close(_Step.LEAVING, reason, now)
 
     def lost(self, reason: str) -> None:
@@ -391,6 +323,45 @@ class ConnectionProtocol:
         if self._state is not ConnectionState.UP:
             raise LocalProtocolError(f"no ping on a link that is {self._state.name}")
         return self._ping(now)
+
+    def need(self, now: float, *, needed: bool, parks: bool = False) -> None:
+        """Say whether something depends on this connection; if neither side needs it, it rests.
+
+        Without effect on a connection that is not up, or whose remote side cannot rest. ``parks`` says that this side
+        would end a link that nothing needs (``Feature.PARK``).
+        """
+        keepalive = self._keepalive
+        if self._state is not ConnectionState.UP or self.remote is None or not self.remote.features & Feature.PACE:
+            return
+        parks = parks and not needed and bool(self.remote.features & Feature.PARK)
+        if keepalive.needed is needed and keepalive.parks is parks:
+            return
+        keepalive.needed, keepalive.parks = needed, parks
+        self._parting.changed(now)
+        if (self._parting.holding or keepalive.agree()) and needed:
+            keepalive.ask(now)
+        if not self._parting.holding:
+            self._send_pace(now)
+
+    @property
+    def rests(self) -> bool:
+        """Whether the connection is at rest: its keepalives are rare."""
+        return self._state is ConnectionState.UP and self._keepalive.rests
+
+    @property
+    def remote_parks(self) -> bool:
+        """Whether the remote side would end the link for now, because nothing there needs it."""
+        return self._keepalive.remote_parks
+
+    @property
+    def holding(self) -> bool:
+        """Whether this side has agreed to part, and sends nothing until ``Parted`` or ``PartingEnded``."""
+        return self._state is ConnectionState.UP and self._parting.holding
+
+    @property
+    def quiet_after(self) -> float:
+        """Seconds without bytes after which the remote side is worth a check."""
+        return self._keepalive.quiet_after
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due, in monotonic seconds."""
@@ -414,6 +385,8 @@ class ConnectionProtocol:
             excused = keepalive.excused
             ours = f", our own pauses of {excused:.2g} s not counted" if excused else ""
             self._end(f"{self._name} was silent for its lease of {keepalive.awaited_lease:g} s{ours}")
+        elif self._parting.ask(now):
+            self._send_pace(now)
         else:
             self._ping(now)
 
@@ -465,9 +438,14 @@ class ConnectionProtocol:
                 self.on_event(PongReceived(t1, sample.rtt))
         elif kind is FrameKind.CONTROL:
             self.on_event(ControlReceived(bytes(payload)))
+        elif kind is FrameKind.PACE:
+            lease = min(max(sequence / 1000, limits.LINK_LEASE_MIN), limits.LINK_LEASE_MAX)
+            self._paced(lease, route, now)
         elif kind in {FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED}:
             self.on_event(MarkReceived(kind, route, sequence))
         elif kind is FrameKind.BYE:
+            if route == frames.BYE_PARKED and self._parting.holding:
+                self.on_event(Parted())
             self._end(f"{self._name} left: {frames.parse_text(payload)}", orderly=True)
         elif kind is FrameKind.REFUSE:
             refuse = Refuse.parse(payload)
@@ -516,7 +494,7 @@ class ConnectionProtocol:
         self._send(
             Frame(FrameKind.REFUSE, refuse.serialize())
             if self.role is ConnectionRole.ACCEPTOR or self.prove is not None
-            else Frame(FrameKind.BYE, frames.text_payload(refuse.text))
+            else frames.bye(refuse.text)
         )
         self._close(_Step.LEAVING if up else _Step.REFUSING, f"refused: {refuse}", now)
         self.on_event(Refused(refuse, by_us=True))
@@ -541,6 +519,25 @@ class ConnectionProtocol:
         self._send(Frame(FrameKind.PING, stamp_ns=stamp))
         self._keepalive.pinged(now)
         return stamp
+
+    def _paced(self, lease: float, flags: int, now: float) -> None:
+        self._keepalive.remote_pace(lease, now, flags)
+        step = self._parting.paced(flags, now)
+        if step is PartingStep.PART:
+            self._send(frames.bye(f"{self._ours.name} parked the link", parked=True))
+            self._close(_Step.LEAVING, f"parked: nothing needs the link with {self._name}", now)
+            self.on_event(Parted())
+            return
+        if self._keepalive.agree() or step is not PartingStep.NOTHING:
+            self._send_pace(now)
+        if step is PartingStep.GO_ON:
+            self.on_event(PartingEnded())
+
+    def _send_pace(self, now: float) -> None:
+        """Promise the lease that holds from now on; the ping measures the path, and is the first sign of life."""
+        keepalive = self._keepalive
+        self._send(Frame(FrameKind.PACE, route=int(self._parting.flags), sequence=round(keepalive.lease * 1000)))
+        self._ping(now)
 
     def _send(self, frame: Frame) -> None:
         if _log.isEnabledFor(logging.DEBUG):

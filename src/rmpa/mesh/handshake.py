@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import IntEnum, IntFlag
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RemoteProtocolError
@@ -38,6 +38,19 @@ class Lane(IntEnum):
 
 LANES: Final = frozenset({Lane.EXPRESS, Lane.BULK})
 """The lanes that this version knows."""
+
+
+class Feature(IntFlag):
+    """What a side of a link can do beyond the first release; a bit that is not known is ignored."""
+
+    PACE = 1
+    """It takes pace frames: the link may rest."""
+    PARK = 2
+    """It takes a bye that says "parked": the link may be ended for now, by agreement."""
+
+
+FEATURES: Final = Feature.PACE | Feature.PARK
+"""The features of this version."""
 
 
 class Refusal(IntEnum):
@@ -121,7 +134,7 @@ class Hello:
         expected: Hello: the GUID that the sender dialled, ``None`` if it knows only an address; welcome: the
             hello's GUID.
         lane: What the connection is for; an ``int``, because a later version may know more lanes.
-        features: Bits for later versions.
+        features: What the sender can do, as bits of ``Feature``; a later version may have more.
     """
 
     guid: Guid
@@ -137,7 +150,14 @@ class Hello:
     def of(cls, identity: Identity, *, lease: float, expected: Guid | None, lane: int = Lane.EXPRESS) -> Hello:
         """The hello of this identity; ``lease`` in seconds."""
         return cls(
-            identity.guid, identity.instance, identity.name, identity.domain, round(lease * 1000), expected, lane
+            identity.guid,
+            identity.instance,
+            identity.name,
+            identity.domain,
+            round(lease * 1000),
+            expected,
+            lane,
+            FEATURES,
         )
 
     @classmethod

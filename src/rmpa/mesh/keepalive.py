@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from rmpa.mesh import limits
+from rmpa.mesh.frames import PaceFlag
 
 
 class Keepalive:
@@ -10,6 +11,10 @@ class Keepalive:
 
     Each side promises a *lease* in its handshake: a side that is silent for its lease counts as dead. A side pings
     four times in its lease, and less often if the pongs that it sends are sufficient signs of life.
+
+    A link on which nothing depends may *rest*: both sides then promise a longer lease, and ping less often. Each side
+    says in a pace frame whether it needs the short lease, and which one it promises from then on; a link rests when
+    neither side needs it. TCP keeps the order, so a side has always promised what it does.
 
     Args:
         lease: Seconds that this side promises.
@@ -20,20 +25,30 @@ class Keepalive:
 
     __slots__ = (
         "_acceptor",
+        "_asked",
         "_excused",
         "_excused_at",
         "_interval",
         "_pinged",
         "_remote_lease",
+        "_short",
         "_up_at",
         "heard",
         "lease",
+        "needed",
+        "parks",
+        "remote_needs",
+        "remote_parks",
         "sent",
     )
 
     def __init__(self, lease: float, now: float, *, acceptor: bool) -> None:
         self._acceptor = acceptor
         self.promise(lease)
+        self.needed = self.remote_needs = True
+        """Whether this side, and the remote one, needs the short lease."""
+        self.parks = self.remote_parks = False
+        """Whether this side, and the remote one, would end the link for now; never while it is needed."""
         self.heard = now
         """When bytes were last received."""
         self.sent = now
@@ -41,18 +56,56 @@ class Keepalive:
         self._pinged = self._up_at = now
         self._remote_lease = limits.EXPRESS_LEASE
         self._excused = self._excused_at = 0.0
+        self._asked: float | None = None
+        """When this side began to need a link at rest, while the remote side's promise has not come."""
 
     def promise(self, lease: float) -> None:
-        """Promise another lease, in seconds; only before the end of the handshake."""
-        self.lease = lease
-        self._interval = lease * limits.KEEPALIVE_INTERVAL / limits.EXPRESS_LEASE
-        if self._acceptor:
-            self._interval *= limits.ACCEPTOR_KEEPALIVE_FACTOR
+        """Promise another lease, in seconds, as the one of a link in use; only before the end of the handshake."""
+        self._short = lease
+        self._hold(lease, lease * limits.KEEPALIVE_INTERVAL / limits.EXPRESS_LEASE)
 
     def begin(self, remote_lease: float, now: float) -> None:
         """Start after the handshake, in which the remote side promised ``remote_lease`` seconds."""
         self._remote_lease = remote_lease
         self.heard = self._up_at = now
+
+    def agree(self) -> bool:
+        """Promise the lease that fits what both sides need; return whether it is another one than before."""
+        before = self.lease
+        if self.needed or self.remote_needs:
+            self._hold(self._short, self._short * limits.KEEPALIVE_INTERVAL / limits.EXPRESS_LEASE)
+        else:
+            self._hold(limits.IDLE_LEASE, limits.IDLE_KEEPALIVE_INTERVAL)
+        return self.lease != before
+
+    def ask(self, now: float) -> None:
+        """This side needs the short lease of a remote side that rests: it has to answer soon."""
+        self._asked = now
+
+    def remote_pace(self, lease: float, now: float, flags: int) -> None:
+        """The remote side promises ``lease`` seconds from now on; ``flags`` are bits of ``PaceFlag``."""
+        self._remote_lease = lease
+        self.remote_needs = bool(flags & PaceFlag.NEEDED)
+        self.remote_parks = bool(flags & PaceFlag.PARKS)
+        self.heard = now
+        self._asked = None
+
+    @property
+    def flags(self) -> PaceFlag:
+        """What this side says in a pace frame."""
+        return PaceFlag.NEEDED if self.needed else PaceFlag.PARKS if self.parks else PaceFlag(0)
+
+    @property
+    def rests(self) -> bool:
+        """Whether this side pings seldom, because nothing depends on the link."""
+        return self.lease != self._short
+
+    @property
+    def quiet_after(self) -> float:
+        """Seconds without bytes, at the present pace, after which the remote side is worth a check."""
+        if self._asked is not None:
+            return limits.GHOST_QUIET
+        return max(limits.GHOST_QUIET, self._remote_lease * limits.GHOST_QUIET / limits.EXPRESS_LEASE)
 
     def pinged(self, now: float) -> None:
         """Record that a ping was sent."""
@@ -62,16 +115,22 @@ class Keepalive:
     def due(self) -> float:
         """When to check next: at the next ping, or at the end of the lease.
 
-        While the connection is up, this time may only move to a later one, because the driver does not arm its timer
-        again after each receive. The same timer checks the path MTU and whether the peer is gone, so its interval
-        stays below ``limits.GHOST_QUIET``.
+        While the connection is up and neither side changes the pace, this time may only move to a later one, because
+        the driver does not arm its timer again after each receive. The same timer checks the path MTU and whether the
+        peer is gone, so its interval stays below ``quiet_after``.
         """
-        return min(self.lease_end, self.sent + self._interval, self._pinged + limits.CLOCK_INTERVAL)
+        next_ping = self.sent + self._interval
+        if not self.rests:
+            next_ping = min(next_ping, self._pinged + limits.CLOCK_INTERVAL)
+        return min(self.lease_end, next_ping)
 
     @property
     def lease_end(self) -> float:
         """When the silence of the remote side ends the connection."""
-        return self.heard + self.awaited_lease + self.excused
+        end = self.heard + self.awaited_lease
+        if self._asked is not None:
+            end = min(end, max(self._asked, self.heard) + limits.HANDSHAKE_TIMEOUT)
+        return end + self.excused
 
     @property
     def awaited_lease(self) -> float:
@@ -95,3 +154,7 @@ class Keepalive:
         This process was stopped, or had no CPU, for that long, so the silence is not the remote side's.
         """
         self._excused, self._excused_at = self.excused + min(late, now - self.heard), self.heard
+
+    def _hold(self, lease: float, interval: float) -> None:
+        self.lease = lease
+        self._interval = interval * (limits.ACCEPTOR_KEEPALIVE_FACTOR if self._acceptor else 1.0)

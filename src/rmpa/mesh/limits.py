@@ -18,6 +18,22 @@ PAUSE_NOTICED: Final = 0.1
 silence."""
 KEEPALIVE_INTERVAL: Final = 0.25
 """Interval of the keepalives, a quarter of the lease: three of them may be late before the link falls."""
+IDLE_LEASE: Final = 16.0
+"""The lease of a link at rest: no route, no call and no request depends on it. Its silence is noticed later, and it
+costs a twentieth of the packets. Both ends agree on it; an earlier release never does."""
+IDLE_KEEPALIVE_INTERVAL: Final = 5.0
+"""Interval of the keepalives of a link at rest: two of them may be late before the link falls."""
+REST_AFTER: Final = 5.0
+"""A link rests when nothing has depended on it for this long, so that a short pause of use changes nothing."""
+PARK_AFTER: Final = 10.0
+"""Where links stand on demand, a link that has been at rest for this long is closed by agreement. Making it again
+takes one round trip and the exchange of both catalogues, so a function that is used now and then keeps its link."""
+WANT_GRACE: Final = 5.0
+"""How long a parked peer may be dialled in vain, once something needs it, before it counts as lost: more than two
+rounds over all of its addresses (DIAL_TIMEOUT)."""
+FULL_MESH_AGAIN: Final = 0.75
+"""The share of ``mesh.full_mesh_up_to`` below which all links are made again: a quarter of the modules may come and
+go without a change of the mode."""
 ACCEPTOR_KEEPALIVE_FACTOR: Final = 1.2
 """The acceptor's keepalive interval, as a multiple of the dialler's: on an idle link only the dialler pings, and each
 ping and pong is a sign of life."""
@@ -50,8 +66,9 @@ CONTROL_PAYLOAD_MAX: Final = 16 * MIB
 """Longest payload of a control frame: the graph of a peer with a few thousand topics and their definitions."""
 HELLO_PAYLOAD_MAX: Final = 4 * KIB
 """Longest payload of a frame that is accepted before the handshake is done."""
-PENDING_CONNECTIONS_MAX: Final = 64
-"""Accepted connections that may be without a finished handshake at one time."""
+PENDING_CONNECTIONS_MAX: Final = 256
+"""Accepted connections that may be without a finished handshake at one time, some 10 KB each. A member needs a few
+milliseconds for its handshake, so that a thousand that dial within some seconds find room."""
 LANE_QUEUE_BYTES: Final = 64 * MIB
 """Bytes of data that may wait for one lane of a slow link, over all topics; beyond it the oldest message is
 dropped."""
@@ -100,7 +117,7 @@ LINK_LEASE_MAX: Final = 60.0
 """The longest lease; a longer one that a peer claims is lowered to it."""
 GHOST_QUIET: Final = 0.5
 """A link that was silent for this long (two keepalive intervals) does not prevent a link to a new run of its peer."""
-LINKS_MAX: Final = 512
+LINKS_MAX: Final = 4096
 """Peers that may be linked at one time; as many as the membership holds."""
 LINK_STABLE: Final = 5.0
 """After the loss of a link that was up for at least this long, the back-off begins at the shortest delay."""
@@ -135,7 +152,7 @@ PATH_NO_HELP: Final = 60.0
 """How long smaller packets are not tried again for an address where they did not help."""
 PATH_PROVEN_SEGMENTS: Final = 2
 """Full segments of the smaller size that must be acknowledged before the packet size counts as the cause."""
-PATHS_MAX: Final = 512
+PATHS_MAX: Final = 4096
 """Addresses remembered as black holes, as many as there are links; the oldest is forgotten first."""
 EXPRESS_UNSENT_BYTES: Final = 64 * KIB
 """Unsent bytes of one link that the kernel may hold (TCP_NOTSENT_LOWAT): control frames cannot overtake them, and the
@@ -205,7 +222,7 @@ LOST_TOLD_MAX: Final = UINT32_MAX
 """The highest number of lost messages that one ``opened`` message can report."""
 LOSSES_REMEMBERED: Final = 8192
 """(peer, source) pairs of closed reliable routes whose losses are remembered."""
-ABSENT_PEERS_MAX: Final = 128
+ABSENT_PEERS_MAX: Final = 1024
 """Peers whose losses, in both directions, are remembered although they have had no link for longer than their routes
 wait. The peer that has been away longest is forgotten first."""
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, field
-from enum import Enum
 from typing import TYPE_CHECKING, Final, Literal
 
 from rmpa.core import limits as core_limits
@@ -22,6 +21,17 @@ from rmpa.core.timer_queue import TimerQueue
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.mesh import limits
 from rmpa.mesh.handshake import Hello, KnownLink, Refusal, Refuse, judge
+from rmpa.mesh.peering_events import (
+    CloseLink,
+    Dial,
+    LinkDown,
+    LinkDownCause,
+    LinkRefused,
+    LinkUp,
+    PeeringOutput,
+    PeerStatus,
+    SocketAddress,
+)
 from rmpa.trust.reasons import TrustReason
 
 if TYPE_CHECKING:
@@ -31,8 +41,6 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
 
 _log = logging.getLogger(__name__)
-
-SocketAddress = tuple[str, int]
 
 _SELDOM_MENDED: Final = frozenset(
     {
@@ -54,101 +62,6 @@ _UNPROVEN: Final = frozenset({TrustReason.UNSECURED, TrustReason.KEY, TrustReaso
 """Refusals that a secured agent receives without proof of the sender: they are shown, and change no pause."""
 _OTHER_PEER: Final = frozenset({Refusal.MYSELF, Refusal.WRONG_PEER})
 """Refusals that concern one endpoint only, because another agent, or this agent itself, answered there."""
-
-
-@dataclass(frozen=True, slots=True)
-class Dial:
-    """Connect to this peer, at the endpoint that answers first.
-
-    Args:
-        guid: The peer.
-        endpoints: Its endpoints, best first; a peer with several addresses may be reachable at some of them only.
-    """
-
-    guid: Guid
-    endpoints: tuple[SocketAddress, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class CloseLink:
-    """Send a bye on this link and close it."""
-
-    link_id: int
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class LinkUp:
-    """This link is the one that is used with its peer."""
-
-    link_id: int
-    identity: Identity
-
-
-class LinkDownCause(Enum):
-    """Why a link is no longer used; the value is the text for users."""
-
-    REPLACED = "replaced by a newer link"
-    """The same run of the peer has another link from the same moment on."""
-    RESTARTED = "the peer restarted"
-    """Another run of the peer has taken its place."""
-    ENDED = "the connection ended"
-    """The connection of its express lane ended; ``LinkDown.reason`` says how."""
-
-
-@dataclass(frozen=True, slots=True)
-class LinkDown:
-    """The link that was used with this peer is no longer used.
-
-    Args:
-        link_id: Its number.
-        identity: The peer.
-        cause: The kind of its end.
-        reason: Why, for people.
-    """
-
-    link_id: int
-    identity: Identity
-    cause: LinkDownCause
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class LinkRefused:
-    """A peer refuses links for a reason that was not reported before; ``refuse`` says what to do."""
-
-    identity: Identity
-    refuse: Refuse
-
-
-PeeringOutput = Dial | CloseLink | LinkUp | LinkDown | LinkRefused
-
-
-@dataclass(frozen=True, slots=True)
-class PeerStatus:
-    """The state of one peer, for the snapshot.
-
-    Args:
-        identity: The peer.
-        state: ``refused``: waiting after a refusal for a reason that seldom passes by itself.
-        link_id: Its link, if linked.
-        lower: Whether this agent has the lower GUID of the two, and dials first.
-        since: When the link came up, or the last link fell, monotonic seconds; ``None`` before the first link.
-        attempts: Dials since the last link.
-        last_error: Why there is no link, as far as is known; for a linked peer, why its previous link ended.
-        next_attempt: When it is dialled next, monotonic seconds.
-        endpoint: The endpoint that is dialled, or was dialled last.
-    """
-
-    identity: Identity
-    state: Literal["linked", "dialling", "waiting", "refused"]
-    link_id: int | None
-    lower: bool
-    since: float | None
-    attempts: int
-    last_error: str
-    next_attempt: float | None
-    endpoint: SocketAddress | None
 
 
 @dataclass(slots=True)

@@ -107,6 +107,8 @@ class LinkEnd:
         self.expects_the_worst = False
         self.aborted = ""
         self.resumed_at = -math.inf
+        self.touched_at = -math.inf
+        self.needed = True
         self._loop = asyncio.get_running_loop()
         self._heard = self._loop.time()
         self.far: LinkEnd | None = None
@@ -130,6 +132,10 @@ class LinkEnd:
         """Send a control message."""
         assert not self.gone
         self.wires["express"].send((Frame(FrameKind.CONTROL, payload).serialize(),), URGENT)
+
+    def need(self, *, needed: bool) -> None:
+        """What the bridge says of this link."""
+        self.needed = needed
 
     def mark(self, kind: FrameKind, route: int, sequence: int) -> None:
         """Send a mark."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -17,11 +18,13 @@ from rmpa.gateway.sites.keys import (
     SiteSource,
     data_key,
     parse_token,
-    tokens_key,
+    token_keys,
 )
+from tests.gateway.memory_zenoh import fits
 
 RUN = "0123456789abcdef0123456789abcdef"
 ARM = SiteModule("warehouse", "arm", RUN)
+FOR_YARD = SiteSource(ARM, SourceKind.TOPIC, "sensor_msgs/LaserScan", "/lidar/driver", "/base/scan", "yard")
 SCAN = SiteSource(ARM, SourceKind.TOPIC, "sensor_msgs/LaserScan", "/lidar/driver", "/base/scan")
 GATEWAY = SiteGateway("warehouse", 10, RUN)
 
@@ -29,16 +32,26 @@ GATEWAY = SiteGateway("warehouse", 10, RUN)
 def test_golden_tokens() -> None:
     assert ARM.token() == f"rmpa/1/warehouse/arm/up/{RUN}"
     assert SCAN.token() == f"rmpa/1/warehouse/arm/up/{RUN}/t/sensor_msgs%LaserScan/%lidar%driver/%base%scan"
+    assert FOR_YARD.token() == (
+        f"rmpa/1/warehouse/arm/to/{RUN}/yard/t/sensor_msgs%LaserScan/%lidar%driver/%base%scan"
+    )
     assert GATEWAY.token() == f"rmpa/1/warehouse/-gateway/010/{RUN}"
 
 
 def test_golden_keys() -> None:
     assert SCAN.key() == "rmpa/1/warehouse/arm/t/sensor_msgs%LaserScan/base/scan"
     assert data_key("*", "*", SourceKind.SERVICE, "std_srvs/Trigger", "/stop") == "rmpa/1/*/*/s/std_srvs%Trigger/stop"
-    assert tokens_key() == "rmpa/1/*/**"
+    assert FOR_YARD.key() == "rmpa/1/warehouse/arm/to/yard/t/sensor_msgs%LaserScan/base/scan"
+    assert token_keys("yard") == ("rmpa/1/*/-gateway/**", "rmpa/1/*/*/up/**", "rmpa/1/*/*/to/*/yard/**")
 
 
-@pytest.mark.parametrize("each", [ARM, SCAN, GATEWAY])
+def test_a_gateway_follows_each_token_that_is_for_all_or_for_its_site_once() -> None:
+    for each, sites in ((ARM, "ab"), (SCAN, "ab"), (GATEWAY, "ab"), (replace(FOR_YARD, to="a"), "a")):
+        told = [site for site in "ab" for key in token_keys(site) if fits(key, each.token())]
+        assert "".join(told) == sites
+
+
+@pytest.mark.parametrize("each", [ARM, SCAN, FOR_YARD, GATEWAY])
 def test_tokens_are_read_back(each: SiteModule | SiteSource | SiteGateway) -> None:
     assert parse_token(each.token()) == each
 
@@ -77,6 +90,7 @@ def test_what_a_later_version_announces_is_ignored(more: str) -> None:
         f"rmpa/1/home/-gateway/1000/{RUN}",
         f"rmpa/1/home/-gateway/²/{RUN}",
         f"rmpa/1/home/arm/up/{RUN}/t/std_msgs/%node/%topic",
+        f"rmpa/1/home/arm/to/{RUN}/ya-rd/t/std_msgs%String/%node/%topic",
         f"rmpa/1/home/arm/up/{RUN}/t/std_msgs%String/node/%topic",
         f"rmpa/1/home/arm/up/{RUN}/t/std_msgs%String/%node/%to pic",
         f"rmpa/1/home/arm/up/{RUN}/t/std_msgs%String/%node/%{'a' * limits.KEY_MAX}",

@@ -89,6 +89,49 @@ def test_what_exceeds_the_bound_is_told_and_offered_when_there_is_room(monkeypat
     assert list(exports.refusals()) == []
 
 
+def test_what_rules_let_out_to_some_sites_is_announced_to_each_of_them_alone() -> None:
+    rules = (
+        CrossingRule(sites=("yard*",), rate=2.0),
+        CrossingRule(sites=("hall",)),
+        CrossingRule(sites=("*",), crossing=Crossing.NONE),
+    )
+    exports = SiteExports("home", CrossingRules(rules))
+    exports.changed(mesh_source("/scan"), there=True)
+    assert exports.entries == []
+    assert "of which none was here yet" in next(why for _, why in exports.refusals())
+    exports.sites_seen(["hall", "street", "yard1"])
+    exports.changed(mesh_source("/stop", kind=S, type_name="*"), there=True)
+    assert [(each.source.name, each.announced.to, each.rate) for each in exports.entries] == [
+        ("/scan", "hall", None),
+        ("/scan", "yard1", 2.0),
+        ("/stop", "hall", None),
+        ("/stop", "yard1", 2.0),
+    ]
+    assert [each.name for each in exports.sources] == ["/scan", "/stop"]
+    assert list(exports.refusals()) == []
+    exports.take_changes()
+    exports.sites_seen(["street"])
+    assert exports.take_changes() == [], "a site that is away for a while keeps what is addressed to it"
+    exports.sites_seen(["yard2"])
+    assert [change.item.announced.to for change in exports.take_changes() if isinstance(change.item, SiteExport)] == [
+        "yard2",
+        "yard2",
+    ]
+    for source in exports.sources:
+        exports.changed(source, there=False)
+    assert tokens(exports) == set()
+
+
+def test_sites_that_were_away_for_long_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "SITES_REMEMBERED_MAX", 2)
+    rules = (CrossingRule(sites=("yard*",)), CrossingRule(crossing=Crossing.NONE))
+    exports = SiteExports("home", CrossingRules(rules))
+    exports.changed(mesh_source("/scan"), there=True)
+    for site in ("yard1", "yard2", "yard3"):
+        exports.sites_seen([site])
+    assert [each.announced.to for each in exports.entries] == ["yard3"]
+
+
 def test_another_run_of_a_module_replaces_its_tokens() -> None:
     exports = SiteExports("home", CrossingRules())
     exports.changed(mesh_source("/one"), there=True)

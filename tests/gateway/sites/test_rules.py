@@ -63,9 +63,32 @@ def test_what_one_site_may_have_is_offered_and_refused_to_the_others() -> None:
 
 def test_what_one_site_may_not_have_is_offered_to_the_others() -> None:
     rules = CrossingRules((CrossingRule(sites=("cloud",), crossing=Crossing.IN),))
+    assert out(rules, "/scan").addressed
     assert out(rules, "/scan").allowed
     assert "cloud" in rules.refusal("cloud", "arm", "/scan")
     assert rules.refusal("yard", "arm", "/scan") == ""
+
+
+def test_a_source_is_for_all_sites_unless_a_rule_treats_one_of_them_otherwise() -> None:
+    everyone = CrossingRule(crossing=Crossing.OUT)
+    assert not out(CrossingRules(), "/scan").addressed
+    for rule, addressed in (
+        (CrossingRule(sites=("yard*",), crossing=Crossing.BOTH), False),
+        (CrossingRule(sites=("ros2", "ros1_bridge"), crossing=Crossing.NONE), False),
+        (CrossingRule(sites=("ros2", "yard"), crossing=Crossing.NONE), True),
+        (CrossingRule(sites=("yard",), rate=2.0), True),
+        (CrossingRule(names=("/other",), sites=("yard",), crossing=Crossing.NONE), False),
+    ):
+        assert out(CrossingRules((rule, everyone)), "/scan").addressed is addressed, rule
+        assert out(CrossingRules((everyone, rule)), "/scan").addressed is False
+    thin = CrossingRules((CrossingRule(sites=("yard",), rate=2.0), everyone))
+    assert thin.outgoing_to("yard", "arm", "/scan").rate == 2.0
+    assert thin.outgoing_to("hall", "arm", "/scan").rate is None
+
+
+def test_what_may_go_out_to_no_site_is_not_offered() -> None:
+    rules = CrossingRules((CrossingRule(sites=("yard",), crossing=Crossing.IN), CrossingRule(crossing=Crossing.NONE)))
+    assert not out(rules, "/scan").allowed
 
 
 def test_what_comes_in_is_renamed() -> None:

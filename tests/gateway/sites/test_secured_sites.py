@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.config.gateway_rules import Crossing, CrossingRule
 from rmpa.gateway.zenoh_api import ZenohQos
 from tests.gateway.sites.site_bed import SiteBed, described
 from tests.gateway.zenoh_bed import ZenohBed, until
@@ -61,6 +62,30 @@ async def test_a_topic_and_its_header_cross_where_both_sites_may_and_nothing_els
         yard.graph.send(scan, b"again")
         await until(lambda: len(topic.messages) == 2)
         assert topic.messages == [b"ranges", b"again"]
+    finally:
+        for site in sites.opened:
+            await site.neighbour.close()
+        await fleet.close()
+
+
+async def test_a_topic_for_one_site_alone_crosses_a_router_that_knows_its_permission(tmp_path: Path) -> None:
+    fleet = Fleet(tmp_path)
+    sites = SiteBed(SecuredBed(fleet, "yard_gateway", "hall_gateway", "cellar_gateway"))
+    try:
+        await fleet.router(
+            allow("yard_gateway", publish="/scan"),
+            allow("hall_gateway", subscribe="/scan"),
+            allow("cellar_gateway", subscribe="/scan"),
+        )
+        rules = (CrossingRule(sites=("hall",)), CrossingRule(crossing=Crossing.NONE))
+        yard = await sites.site("yard", rules=rules)
+        hall, cellar = await sites.site("hall"), await sites.site("cellar")
+        scan = yard.graph.add("/scan", described(latching=True))
+        yard.graph.send(scan, b"ranges")
+        topic = await hall.subscribed("/scan")
+        await until(lambda: topic.messages)
+        assert topic.messages == [b"ranges"]
+        assert not cellar.shows("/scan")
     finally:
         for site in sites.opened:
             await site.neighbour.close()

@@ -9,6 +9,7 @@ import pytest
 from rmpa.config.gateway_rules import Crossing, CrossingRule
 from rmpa.core.contract import ContractRule
 from rmpa.gateway import limits
+from rmpa.gateway.sites.keys import token_keys
 from rmpa.gateway.zenoh.sending import NumberedPublisher
 from tests.gateway.sites.site_bed import MD5, SiteBed, described, site_bed
 from tests.gateway.zenoh_bed import until
@@ -175,17 +176,58 @@ async def test_the_last_message_of_a_latched_topic_is_sent_when_its_limit_lets_i
         assert len(topic.messages) < 10
 
 
-async def test_a_rule_keeps_a_topic_from_one_site_and_says_so_there() -> None:
+async def test_a_topic_that_a_rule_keeps_from_one_site_is_neither_sent_nor_announced_there() -> None:
     async with site_bed() as bed:
-        yard = await bed.site("yard", rules=(CrossingRule(sites=("hall",), crossing=Crossing.NONE),))
+        rules = (CrossingRule(names=("/secret",), sites=("hall",), crossing=Crossing.NONE),)
+        yard = await bed.site("yard", rules=rules)
         hall, cellar = await bed.site("hall"), await bed.site("cellar")
-        yard.graph.add("/scan", described())
-        await cellar.subscribed("/scan")
-        await until(lambda: hall.shows("/scan"))
-        hall.topic("/scan").on_demand(True)
-        await until(lambda: "gateway.rule 1" in str(hall.topics("in")[0]["problem"]))
-        assert not hall.topics("in")[0]["wanted"]
-        assert hall.topic("/scan").messages in ([], [b"forgotten"])
+        eavesdropped: list[str] = []
+        told: list[str] = []
+        listener = await bed.zenoh.session()
+        listener.subscribe("rmpa/1/*/*/t/**", lambda sample: eavesdropped.append(sample.key))
+        for key in token_keys("hall"):
+            listener.watch_tokens(key, lambda key, _alive: told.append(key))
+        secret, scan = yard.graph.add("/secret", described()), yard.graph.add("/scan", described())
+        topic, other = await cellar.subscribed("/secret"), await hall.subscribed("/scan")
+        yard.graph.send(secret, b"plan")
+        yard.graph.send(scan, b"ranges")
+        await until(lambda: topic.messages and other.messages and eavesdropped)
+        assert (topic.messages, other.messages) == ([b"plan"], [b"ranges"])
+        assert not hall.shows("/secret")
+        assert not [key for key in (*eavesdropped, *told) if "secret" in key]
+        [report] = [each for each in yard.topics("out") if each["name"] == "/secret"]
+        assert (report["to"], report["messages"]) == ("cellar", 1)
+
+
+async def test_each_site_has_the_limits_of_the_first_rule_that_fits_it() -> None:
+    async with site_bed() as bed:
+        yard = await bed.site("yard", rules=(CrossingRule(sites=("thin*",), rate=1.0),))
+        thin, hall = await bed.site("thin7"), await bed.site("hall")
+        source = yard.graph.add("/scan", described())
+        slow, fast = await thin.subscribed("/scan"), await hall.subscribed("/scan")
+        for _ in range(50):
+            yard.graph.send(source, b"ranges")
+        await until(lambda: len(fast.messages) == 50 and slow.messages)
+        assert len(slow.messages) < 10
+
+
+async def test_a_site_that_is_addressed_and_was_away_counts_what_it_lost() -> None:
+    async with site_bed() as bed:
+        yard = await bed.site("yard", rules=(CrossingRule(sites=("street",), crossing=Crossing.NONE),))
+        hall = await bed.site("hall")
+        source = yard.graph.add("/scan", described())
+        topic = await hall.subscribed("/scan")
+        yard.graph.send(source, b"1")
+        await until(lambda: topic.messages)
+        await bed.zenoh.stop_router()
+        await until(lambda: not hall.shows("/scan"))
+        yard.graph.send(source, b"2")
+        await bed.zenoh.start_router()
+        again = await hall.subscribed("/scan")
+        await until(lambda: yard.topics("out")[0]["wanted"])
+        yard.graph.send(source, b"3")
+        await until(lambda: b"3" in again.messages)
+        await until(lambda: hall.topics("in")[0]["lost"] == 1 or b"2" in again.messages)
 
 
 async def test_a_publisher_with_another_definition_is_described_anew() -> None:

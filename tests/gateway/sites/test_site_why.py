@@ -254,6 +254,27 @@ def test_what_a_site_had_is_remembered_while_it_is_away() -> None:
     assert [history.had(name) for name in ("/scan", "/last")] == [(), (("yard", "arm"),)]
 
 
+async def test_a_topic_for_some_sites_is_told_of_to_each_as_the_rules_are_for_it() -> None:
+    async with site_bed() as bed:
+        rules = (CrossingRule(sites=("hall",), crossing=Crossing.NONE),)
+        yard = await asked(bed, "yard", rules)
+        hall, cellar, attic = await asked(bed, "hall"), await asked(bed, "cellar"), await asked(bed, "attic")
+        yard.site.graph.add("/chatter", TEXT)
+        await cellar.site.subscribed("/chatter")
+        await until(lambda: attic.site.shows("/chatter"))
+        await until(lambda: any(topic["wanted"] for topic in yard.site.topics("out")))
+        (way,) = await cellar.why("/chatter")
+        assert levels(way)["demand there"] == "ok"
+        (way,) = await attic.why("/chatter")
+        assert levels(way)["demand there"] == "warn", "the subscriber is at another site"
+        (way,) = await hall.why("/chatter", "yard", "arm")
+        assert levels(way)["rule there"] == "fail"
+        assert "gateway.rule 1" in way.stages[-1].text
+        assert {way.to for way in await yard.why("/chatter", asker="arm")} == {"site attic", "site cellar"}
+        report = await yard.report(INFO, site="yard")
+        assert [(module.name, module.topics) for module in report.sites[0].modules] == [("arm", 1)]
+
+
 def test_a_question_that_is_none_is_refused() -> None:
     for data in (b"", b"{}", b'{"site": "a", "name": "x y"}', b"[" * 5000):
         with pytest.raises(RemoteProtocolError):

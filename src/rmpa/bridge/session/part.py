@@ -61,6 +61,13 @@ class Part:
     def lane_lost(self, session: PeerSession) -> None:
         """A link lost its bulk lane, perhaps in the middle of a message in either direction."""
 
+    def depends(self, session: PeerSession) -> bool:  # noqa: ARG002 - for those that override it
+        """Whether something here needs to know within a second that this linked peer is gone.
+
+        Open routes are known by the session's handlers; this is for what has no handler.
+        """
+        return False
+
     # --- messages ----------------------------------------------------------------------------------------------
 
     def message(self, session: PeerSession, message: Message) -> bool:  # noqa: ARG002 - for those that override it

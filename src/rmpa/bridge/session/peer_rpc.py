@@ -97,6 +97,10 @@ class PeerRpc(Part):
         for task in self._answering.pop(session.peer, ()):
             task.cancel()
 
+    def depends(self, session: PeerSession) -> bool:
+        """Whether a request to or from a peer waits for its response."""
+        return session.peer in self._answering or any(peer == session.peer for peer, _ in self._waiting)
+
     def message(self, session: PeerSession, message: Message) -> bool:
         """Take a request, a response or a notification."""
         match message:

@@ -210,8 +210,16 @@ class PeerSessions:
         if session is not None:
             session.time.set(link.clock_offset, link.clock_error)
 
+    def _depends(self, session: PeerSession) -> bool:
+        """Whether anything of this module needs to know within a second that a peer is gone."""
+        return bool(session.handlers) or any(part.depends(session) for part in self._parts)
+
     def reconcile(self) -> None:
-        """Try failed proxies again, and forget unused namespaces of relayed modules."""
+        """Try failed proxies again, let unused links rest, and forget unused namespaces of relayed modules."""
+        now = asyncio.get_running_loop().time()
+        for session in self.linked():
+            if now - session.link.touched_at >= mesh_limits.REST_AFTER:
+                session.link.need(needed=self._depends(session))
         for session in self:
             yield_to_data()
             session.proxies.reconcile()

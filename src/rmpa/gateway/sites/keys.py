@@ -7,11 +7,17 @@
     rmpa/1/<site>/<module>/s/<package>%<Type>/<service>        calls (queryable)
     rmpa/1/<site>/<module>/up/<instance>                       token: the module
     rmpa/1/<site>/<module>/up/<instance>/<t or s>/<package>%<Type>/<%node>/<%name>      token: a source
+    rmpa/1/<site>/<module>/to/<other>/<t or s>/…               messages or calls of a source for one other site alone
+    rmpa/1/<site>/<module>/to/<instance>/<other>/<t or s>/…    token: such a source
     rmpa/1/<site>/-gateway/<rank>/<instance>                   token: a gateway; the lowest rank leads
 
 Names of sites and modules are ROS base names, so they need no escape, and none is ``-gateway``. In the last chunks of
 a token ``/`` is ``%``, which no ROS name has. The type of a service that no program has asked for is ``-`` in its
 token: a ROS master does not know it. Queryables of services have ``*`` in the place of the type.
+
+A source that rules let out to some sites alone, or with other limits to some, is *addressed*: for each site that may
+have it there are a key and a token, which name that site. A gateway follows the tokens that are for all and those
+that name its site. Releases without addressed sources ignore their tokens.
 """
 
 from __future__ import annotations
@@ -28,6 +34,9 @@ from rmpa.gateway.neighbour import SourceKind
 
 ROOT: Final = "rmpa/1"
 """The first two chunks of each key; the number is that of the format."""
+_UP: Final = "up"
+TO: Final = "to"
+"""The chunk before the one other site that a source is for."""
 GATEWAY: Final = "-gateway"
 """Stands in the place of the module in the tokens of gateways."""
 BATCH: Final = "@batch"
@@ -55,7 +64,7 @@ class SiteModule:
 
     def token(self) -> str:
         """The module's liveliness token."""
-        return f"{ROOT}/{self.site}/{self.name}/up/{self.instance}"
+        return f"{ROOT}/{self.site}/{self.name}/{_UP}/{self.instance}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +77,7 @@ class SiteSource:
         type: ``package/Name``; ``*`` for a service whose server was not asked.
         node: The node, ``/like/this``.
         name: The topic or service, ``/like/this``.
+        to: The one other site that it is for; empty: it is for all.
     """
 
     module: SiteModule
@@ -75,16 +85,18 @@ class SiteSource:
     type: str
     node: str
     name: str
+    to: str = ""
 
     def token(self) -> str:
         """The source's liveliness token."""
+        module = self.module
+        head = f"{ROOT}/{module.site}/{module.name}/{TO}/{module.instance}/{self.to}" if self.to else module.token()
         type_name = _UNKNOWN if self.type == UNKNOWN_TYPE else _chunk(self.type)
-        parts = (self.kind, type_name, _chunk(self.node), _chunk(self.name))
-        return "/".join((self.module.token(), *parts))
+        return "/".join((head, self.kind, type_name, _chunk(self.node), _chunk(self.name)))
 
     def key(self) -> str:
         """The key of its messages or calls: sources of one topic share it, and the attachment says which it is."""
-        return data_key(self.module.site, self.module.name, self.kind, self.type, self.name)
+        return data_key(self.module.site, self.module.name, self.kind, self.type, self.name, self.to)
 
     def batch_key(self) -> str:
         """The key of its messages in batches, for gateways."""
@@ -115,14 +127,24 @@ class SiteGateway:
         return self.rank, self.instance
 
 
-def data_key(site: str, module: str, kind: SourceKind, type_name: str, name: str) -> str:
-    """The key of messages or calls; ``*`` may stand for the site, the module or the type."""
-    return f"{ROOT}/{site}/{module}/{kind}/{_chunk(type_name)}/{name.strip('/')}"
+def data_key(site: str, module: str, kind: SourceKind, type_name: str, name: str, to: str = "") -> str:
+    """The key of messages or calls; ``*`` may stand for the site, the module or the type.
+
+    Args:
+        site: The site that has the source.
+        module: The module that has it.
+        kind: What it is.
+        type_name: Its type.
+        name: The topic or service.
+        to: The one other site that it is for; empty: it is for all.
+    """
+    audience = f"{TO}/{to}/" if to else ""
+    return f"{ROOT}/{site}/{module}/{audience}{kind}/{_chunk(type_name)}/{name.strip('/')}"
 
 
-def tokens_key(site: str = "*") -> str:
-    """The key expression that all tokens of a site match, or of all sites; gateways' are among them."""
-    return f"{ROOT}/{site}/**"
+def token_keys(own: str) -> tuple[str, ...]:
+    """The key expressions of the tokens that a gateway of the site ``own`` follows; no token fits two of them."""
+    return f"{ROOT}/*/{GATEWAY}/**", f"{ROOT}/*/*/{_UP}/**", f"{ROOT}/*/*/{TO}/*/{own}/**"
 
 
 def parse_token(key: str) -> SiteModule | SiteSource | SiteGateway | None:
@@ -145,15 +167,18 @@ def parse_token(key: str) -> SiteModule | SiteSource | SiteGateway | None:
             raise RemoteProtocolError(f"{key[:120]!r}: {what[:20]!r} is not a rank from 0 to {_RANK_MAX}")
         return SiteGateway(site, int(what), instance) if len(chunks) == 6 else None
     _check_name("module", module, limits.SITE_NAME_MAX, key)
-    if what != "up":
-        return None
     found = SiteModule(site, module, instance)
+    if what == TO and len(chunks) > 6:
+        _check_name("site", chunks[6], limits.SITE_NAME_MAX, key)
+        return _source(found, chunks[7:], key, chunks[6])
+    if what != _UP:
+        return None
     if len(chunks) == 6:
         return found
     return _source(found, chunks[6:], key)
 
 
-def _source(module: SiteModule, chunks: list[str], key: str) -> SiteSource | None:
+def _source(module: SiteModule, chunks: list[str], key: str, to: str = "") -> SiteSource | None:
     if len(chunks) != 4:
         return None
     try:
@@ -168,7 +193,7 @@ def _source(module: SiteModule, chunks: list[str], key: str) -> SiteSource | Non
     for each in (node, name):
         if not is_global_name(each):
             raise RemoteProtocolError(f"{key[:200]!r}: {each[:80]!r} is not a global name")
-    return SiteSource(module, kind, type_name, node, name)
+    return SiteSource(module, kind, type_name, node, name, to)
 
 
 def _check_name(what: str, name: str, longest: int, key: str) -> None:

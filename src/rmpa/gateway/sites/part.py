@@ -16,7 +16,8 @@ class SiteExport:
 
     Args:
         source: The source in the gateway's graph.
-        announced: What its token says of it; ``announced.key()`` is the key of its messages or calls.
+        announced: What its token says of it; ``announced.key()`` is the key of its messages or calls. A source that
+            is offered to some sites alone has an export for each of them, which ``announced.to`` names.
         rate: Messages a second that cross at most; ``None``: no limit.
         size: Bytes a second that cross at most; ``None``: no limit.
     """

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rmpa.config.gateway_rules import Crossing
+from rmpa.config.gateway_rules import RESERVED_SITES, Crossing
 from rmpa.config.permission_rules import Access
 from rmpa.core.names import is_global_name, matches
 from rmpa.gateway.neighbour import SourceKind
@@ -35,6 +35,7 @@ class CrossingDecision:
         name: The name here of what comes in; empty if it may not cross.
         rate: Messages a second of what goes out; ``None``: no limit.
         size: Bytes a second of what goes out; ``None``: no limit.
+        addressed: Whether what goes out does not go to all other sites alike: ``outgoing_to`` decides for each.
     """
 
     allowed: bool
@@ -42,6 +43,7 @@ class CrossingDecision:
     name: str = ""
     rate: float | None = None
     size: int | None = None
+    addressed: bool = False
 
 
 class CrossingRules:
@@ -66,9 +68,7 @@ class CrossingRules:
         self._permissions = permissions
 
     def outgoing(self, kind: SourceKind, module: str, name: str, type_name: str, node: str) -> CrossingDecision:
-        """Decide whether a source of this site is offered, which all sites see that Zenoh's rules of access let.
-
-        It is offered if any other site may have it; ``refusal`` says to which it is refused.
+        """Decide whether a source of this site goes out to any other site, and whether to all of them alike.
 
         Args:
             kind: What it is.
@@ -80,12 +80,33 @@ class CrossingRules:
         decision = self._policy(kind, name, type_name, node)
         if not decision.allowed:
             return decision
+        found = []
         for number, rule in self._fitting(module, name):
-            if rule.crossing in _OUT:
-                return CrossingDecision(True, _named(number, rule), rate=rule.rate, size=rule.size)
+            if all(site in RESERVED_SITES for site in rule.sites):
+                continue  # it is about other neighbours
+            found.append(_outgoing(number, rule))
             if any(glob in _EVERY_SITE for glob in rule.sites):
-                return CrossingDecision(False, f"{_named(number, rule)} lets it not go out")
-        return decision
+                break
+        else:
+            found.append(decision)
+        first = found[0]
+        if all((each.allowed, each.rate, each.size) == (first.allowed, first.rate, first.size) for each in found):
+            return first
+        named = next(each for each in found if each.allowed)
+        return CrossingDecision(True, named.why, addressed=True)
+
+    def outgoing_to(self, site: str, module: str, name: str) -> CrossingDecision:
+        """Decide whether a source that ``outgoing`` lets out goes to one other site; permissions are not asked.
+
+        Args:
+            site: The other site; empty for a program that names none.
+            module: The module that has it.
+            name: Its name in its module.
+        """
+        for number, rule in self._fitting(module, name):
+            if any(matches(glob, site) for glob in rule.sites):
+                return _outgoing(number, rule, site)
+        return CrossingDecision(True, _NO_RULE)
 
     def refusal(self, site: str, module: str, name: str, access: Access = Access.SUBSCRIBE) -> str:
         """Why another site may not have a source or parameter of this one; empty if it may.
@@ -96,11 +117,9 @@ class CrossingRules:
             name: Its name in its module.
             access: What the other site would do with it.
         """
-        for number, rule in self._fitting(module, name):
-            if any(matches(glob, site) for glob in rule.sites):
-                if rule.crossing not in _OUT:
-                    return f"{_named(number, rule)} lets it not go out to {site}"
-                break
+        decision = self.outgoing_to(site, module, name)
+        if not decision.allowed:
+            return decision.why
         return "" if self._permissions is None else self._permissions.why_not(access, site, "", name)
 
     def kept(self, module: str, name: str) -> bool:
@@ -151,6 +170,13 @@ class CrossingRules:
         if decision is None or decision.allowed:
             return CrossingDecision(True, _NO_RULE)
         return CrossingDecision(False, decision.rule)
+
+
+def _outgoing(number: int, rule: CrossingRule, site: str = "") -> CrossingDecision:
+    """What one rule says of a source that it fits; ``site`` is named in the reason."""
+    if rule.crossing in _OUT:
+        return CrossingDecision(True, _named(number, rule), rate=rule.rate, size=rule.size)
+    return CrossingDecision(False, f"{_named(number, rule)} lets it not go out{f' to {site}' if site else ''}")
 
 
 def _named(number: int, rule: CrossingRule) -> str:

@@ -18,7 +18,7 @@ import msgspec
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.names import is_type_name
 from rmpa.gateway import limits
-from rmpa.gateway.sites.keys import ROOT, UNKNOWN_TYPE
+from rmpa.gateway.sites.keys import ROOT, TO, UNKNOWN_TYPE
 from rmpa.ros.wire.services import ServiceDescription
 
 if TYPE_CHECKING:
@@ -69,6 +69,8 @@ def asked_type(key: str) -> str:
         RemoteProtocolError: It is not the key of a service.
     """
     chunks = key.split("/")
+    if len(chunks) > 6 and chunks[4] == TO:
+        del chunks[4:6]
     if len(key) > limits.KEY_MAX or len(chunks) < 7 or "/".join(chunks[:2]) != ROOT or chunks[4] != "s":
         raise RemoteProtocolError(f"{key[:120]!r} is not the key of a service")
     return UNKNOWN_TYPE if "*" in chunks[5] else chunks[5].replace("%", "/")

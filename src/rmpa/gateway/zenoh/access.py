@@ -27,14 +27,13 @@ if TYPE_CHECKING:
     from rmpa.config.settings import TrustSettings
 
 _MODULE: Final = "rmpa/1/*/*"
+_ADDRESSED: Final = f"{_MODULE}/to/*"
 _TOPIC: Final = (
-    f"{_MODULE}/t/*/{{}}",
-    f"{_MODULE}/t/*/{{}}/@batch",
-    f"{_MODULE}/t/*/{{}}/@adv/**",
+    *(f"{head}/t/*/{{}}{end}" for head in (_MODULE, _ADDRESSED) for end in ("", "/@batch", "/@adv/**")),
     f"{_MODULE}/d/t/{{}}",
     f"{_MODULE}/v/{{}}",
 )
-_SERVICE: Final = (f"{_MODULE}/s/*/{{}}",)
+_SERVICE: Final = (f"{_MODULE}/s/*/{{}}", f"{_ADDRESSED}/s/*/{{}}")
 _PARAM: Final = (f"{_MODULE}/p/{{}}",)
 _ASKED_BY_GATEWAYS: Final = f"{_MODULE}/p/-"
 _IN: Final = "ingress"

@@ -14,12 +14,10 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import URGENT, Outbox
 from rmpa.core.serial_number import SERIAL_MASK
 from rmpa.mesh import limits
-from rmpa.mesh.connection import (
+from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole, ConnectionState
+from rmpa.mesh.connection_events import (
     ConnectionClosed,
     ConnectionEvent,
-    ConnectionProtocol,
-    ConnectionRole,
-    ConnectionState,
     ControlReceived,
     HandshakeDone,
     HelloReceived,
@@ -90,7 +88,7 @@ class ConnectionOwner(Protocol):
         ...
 
     def connection_quiet(self, connection: Connection) -> None:
-        """No bytes were received for ``limits.GHOST_QUIET``; called again from time to time during the silence."""
+        """No bytes were received for ``quiet_after``; called again from time to time during the silence."""
         ...
 
     def connection_tick(self, connection: Connection) -> None:
@@ -269,6 +267,28 @@ class Connection:
         self.stream.send((self._machine.control(payload),), URGENT)
         self._check_urgent()
 
+    def need(self, *, needed: bool, parks: bool = False) -> None:
+        """Say whether something depends on this connection; see ``ConnectionProtocol.need``."""
+        self._machine.need(self._clock.now(), needed=needed, parks=parks)
+        if self._machine.has_output:
+            self._send_output()
+            self._timer.arm()
+
+    @property
+    def rests(self) -> bool:
+        """Whether the connection is at rest: its keepalives are rare, and silence is noticed later."""
+        return self._machine.rests
+
+    @property
+    def remote_parks(self) -> bool:
+        """Whether the remote side would end the link for now, because nothing there needs it."""
+        return self._machine.remote_parks
+
+    @property
+    def quiet_after(self) -> float:
+        """Seconds without bytes after which the remote side is worth a check."""
+        return self._machine.quiet_after
+
     async def ping(self) -> float | None:
         """Measure one round trip now, in seconds; ``None`` if no answer came within ``limits.PING_TIMEOUT``."""
         if not self.up:
@@ -352,6 +372,7 @@ class Connection:
             raise
         if self._machine.has_output:
             self._send_output()
+            self._timer.arm()  # the remote side may have changed the pace
         return taken
 
     def _event(self, event: ConnectionEvent) -> None:
@@ -439,7 +460,7 @@ class Connection:
             self._owner.connection_tick(self)
         self._machine.handle_timer(now)
         self.silent = was_up and self._machine.state is ConnectionState.CLOSED
-        if was_up and not self.silent and now - self.heard_at > limits.GHOST_QUIET:
+        if was_up and not self.silent and now - self.heard_at > self.quiet_after:
             self._owner.connection_quiet(self)
         self._send_output()
 

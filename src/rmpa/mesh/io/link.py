@@ -72,7 +72,10 @@ class PeerLink:
         """Once the link is down: whether the peer's agent died, or a better link took over; its nodes go on."""
         self.mark: Final = connection.send_mark
         """``(kind, route, sequence)``: acknowledges messages of a route, before all waiting data."""
+        self.touched_at = clock.now()
+        """Monotonic seconds of the last control frame in either direction."""
         self._clock = clock
+        self._needed = True
         self._handlers: LinkHandlers | None = None
         self._bulk_bytes_in = self._bulk_bytes_out = 0  # of the bulk lane's earlier connections
         self.express.connect(connection.stream)
@@ -149,7 +152,29 @@ class PeerLink:
 
     def send_control(self, payload: bytes) -> None:
         """Send one control frame, before all data that waits; never dropped; see ``Connection``."""
+        self.touch()
         self.connection.send_control(payload)
+
+    @property
+    def rests(self) -> bool:
+        """Whether the link is at rest: keepalives are rare, and silence is noticed within ``limits.IDLE_LEASE``."""
+        return self.connection.rests
+
+    def need(self, *, needed: bool) -> None:
+        """Say whether something of this module depends on the link; it rests when neither side needs it.
+
+        A control frame in either direction makes the link needed; only its user can say that it is not.
+        """
+        self._needed = needed
+        for connection in (self.connection, self.bulk_connection):
+            if connection is not None:
+                connection.need(needed=needed)
+
+    def touch(self) -> None:
+        """A control frame was sent or received: something begins."""
+        self.touched_at = self._clock.now()
+        if not self._needed:
+            self.need(needed=True)
 
     async def ping(self) -> float | None:
         """Measure one round trip now, in seconds; ``None`` if no answer came within ``limits.PING_TIMEOUT``."""
@@ -188,6 +213,7 @@ class PeerLink:
             self.detach(old)
             old.sever("replaced by a newer bulk lane")
         self.bulk_connection = bulk
+        bulk.need(needed=self._needed)
         self._receive_from(bulk)
         self.bulk.connect(bulk.stream)
 

@@ -22,14 +22,14 @@ from rmpa.mesh.io.link import LinkHandlers, PeerLink
 from rmpa.mesh.io.path_monitor import PathMonitor
 from rmpa.mesh.io.securing import Securing, SecuringError, prove, secure_dialled
 from rmpa.mesh.io.sockets import tune_bulk, tune_express, unacknowledged
-from rmpa.mesh.peering import (
+from rmpa.mesh.peering import Peering
+from rmpa.mesh.peering_events import (
     CloseLink,
     Dial,
     LinkDown,
     LinkDownCause,
     LinkRefused,
     LinkUp,
-    Peering,
     PeeringOutput,
     PeerStatus,
 )
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
     from rmpa.mesh.handshake import Hello, Refuse
     from rmpa.mesh.io.securing import MeshSecurity, OnJoin, SecuredSocket
-    from rmpa.mesh.peering import SocketAddress
+    from rmpa.mesh.peering_events import SocketAddress
 
 _log = logging.getLogger(__name__)
 
@@ -275,6 +275,7 @@ class Mesh:
     def connection_control(self, connection: Connection, payload: bytes) -> None:
         """A control frame came."""
         if (link := self._used(connection)) is not None:
+            link.touch()
             self._on_control(link, payload)
 
     def connection_ponged(self, connection: Connection) -> None:
@@ -387,9 +388,9 @@ class Mesh:
         self._act()
 
     def _alive(self, link_id: int) -> bool:
-        """Whether bytes were received on a link within ``limits.GHOST_QUIET``."""
+        """Whether bytes were received on a link lately, at its pace."""
         link = self._links.get(link_id)
-        return link is not None and self._clock.now() - link.heard_at < limits.GHOST_QUIET
+        return link is not None and self._clock.now() - link.heard_at < link.connection.quiet_after
 
     # --- bulk lanes -----------------------------------------------------------------------------------------
 

@@ -155,6 +155,7 @@ class Services(Part):
             advertisement=AdvertiseServices,
             apply=self._apply,
             do=self._do,
+            on_idle=self._settled,
         )
         self._act = self._driver.act
         self._serving = Serving(core, self.exports, sessions, self._budgets, self._act)
@@ -317,6 +318,13 @@ class Services(Part):
         """Have a service examined for which a node was registered or unregistered."""
         if change.kind is RegistrationKind.SERVICE:
             self._driver.look((change.name,))
+
+    def _settled(self) -> None:
+        self._serving.changed()
+
+    def depends(self, session: PeerSession) -> bool:
+        """Whether nodes of this module have direct connections to the peer's."""
+        return any(key.peer == session.peer and each.grant for key, each in self.direct_imports.services)
 
     def lane_lost(self, session: PeerSession) -> None:
         """Report calls that the loss of the bulk lane's connection may have left without an answer."""

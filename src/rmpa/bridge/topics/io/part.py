@@ -333,6 +333,10 @@ class Topics(Part):
         else:
             self.outbound.forget(peer)
 
+    def depends(self, session: PeerSession) -> bool:
+        """Whether nodes of this module have direct connections to the peer's."""
+        return any(key.peer == session.peer for key, _ in self.direct_imports.routes)
+
     def lane_lost(self, session: PeerSession) -> None:
         """Aborts messages that came in part over a lost bulk lane, and lets the senders repeat or drop theirs."""
         for flow in self._peers[session.peer].flows.values():

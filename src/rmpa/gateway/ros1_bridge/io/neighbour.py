@@ -110,6 +110,8 @@ class Ros1BridgeNeighbour:
             self._refused.pop(("out", source.here), None)
             return
         decision = self._rules.outgoing(source.kind, source.module, source.name, source.type, source.node)
+        if decision.allowed:
+            decision = self._rules.outgoing_to(SITE, source.module, source.name)
         access = Access.SUBSCRIBE if source.kind is SourceKind.TOPIC else Access.CALL
         refusal = decision.why
         if decision.allowed:

@@ -36,6 +36,8 @@ class SiteActions(PassivePart):
         self._attend = attend
         self._clients: dict[MeshSource, str] = {}
         """The topics of goals and cancellations of this site, with the action's name."""
+        self._offered: dict[MeshSource, set[str]] = {}
+        """The sites that each of them is offered to; empty text: all."""
         self._servers: dict[ForeignSource, str] = {}
         """The topics of status of other sites, likewise."""
         self._listening: dict[tuple[MeshSource, ForeignSource], Tap] = {}
@@ -43,14 +45,20 @@ class SiteActions(PassivePart):
     def export(self, entry: SiteExport) -> None:
         """A client of this site sends goals or cancellations."""
         source = entry.source
-        if source.kind is SourceKind.TOPIC and is_watched(source.type):
+        if source.kind is not SourceKind.TOPIC or not is_watched(source.type):
+            return
+        self._offered.setdefault(source, set()).add(entry.announced.to)
+        if source not in self._clients:
             self._clients[source] = _action(source.here)
             for server, action in self._servers.items():
                 self._join(source, server, action)
 
     def withdraw(self, entry: SiteExport) -> None:
         """It has gone."""
-        if self._clients.pop(entry.source, None) is not None:
+        sites = self._offered.get(entry.source, set())
+        sites.discard(entry.announced.to)
+        if not sites and self._clients.pop(entry.source, None) is not None:
+            self._offered.pop(entry.source, None)
             self._leave(lambda client, _: client == entry.source)
 
     def show(self, entry: SiteImport) -> None:

@@ -92,6 +92,11 @@ class ExportedTopic:
         """Messages that the queues to Zenoh dropped."""
         return self._dropped_before + sum(each.dropped for each in (self._publisher, *self._retired))
 
+    @property
+    def offers_batches(self) -> bool:
+        """Whether another site has asked for the topic in batches."""
+        return self._batches
+
     def offer_batches(self) -> None:
         """Put messages together as batches under a key of their own too, while a gateway subscribes to it."""
         if not self._batches:
@@ -118,6 +123,7 @@ class ExportedTopic:
             "module": entry.source.module,
             "node": entry.source.node,
             "name": entry.source.name,
+            "to": entry.announced.to,
             "type": entry.announced.type,
             "md5sum": self.description.md5sum if self.description is not None else "",
             "latching": self.description is not None and self.description.latching,

@@ -169,7 +169,12 @@ class ImportedTopic:
         if entry.announced.module != self.entry.announced.module:
             self._topic.forget_latched()
             self._last_latched = None
+        moved = self.wanted and entry.announced.key() != self.entry.announced.key()
+        if moved:
+            self._on_demand(self, False)
         self.entry = entry
+        if moved:
+            self._on_demand(self, True)
         if self._wants_batches:
             self._wants_batches = False
             self._on_batches(self, False)

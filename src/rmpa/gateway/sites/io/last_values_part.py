@@ -43,6 +43,8 @@ class _Watched:
 
     source: MeshSource
     wanted: bool
+    sites: set[str]
+    """To which it is offered; empty text: to all."""
     tap: Tap | None = None
     description: TopicDescription | None = None
     described: asyncio.Event | None = None
@@ -94,9 +96,14 @@ class SiteLastValues(PassivePart):
         source = entry.source
         if source.kind is not SourceKind.TOPIC:
             return
-        self.withdraw(entry)
+        known = self._watched.get(_key(source))
+        if known is not None and known.source == source:
+            known.sites.add(entry.announced.to)
+            return
+        if known is not None:
+            self._forget(known)
         wanted = is_descriptor(source.name, source.type) or self._wanted(source.module, source.name)
-        watched = self._watched[_key(source)] = _Watched(source, wanted)
+        watched = self._watched[_key(source)] = _Watched(source, wanted, {entry.announced.to})
         if wanted:
             self._listen(watched)
         elif may_be_latched(source.type):
@@ -107,12 +114,11 @@ class SiteLastValues(PassivePart):
         """End listening; the value stays."""
         if entry.source.kind is not SourceKind.TOPIC:
             return
-        key = _key(entry.source)
-        watched = self._watched.pop(key, None)
-        if watched is not None and watched.tap is not None:
-            watched.tap.close()
-        if (task := self._looking.pop(key, None)) is not None:
-            task.cancel()
+        watched = self._watched.get(_key(entry.source))
+        if watched is not None:
+            watched.sites.discard(entry.announced.to)
+            if not watched.sites:
+                self._forget(watched)
 
     def report(self) -> dict[str, object]:
         """What is kept, as JSON values."""
@@ -144,6 +150,14 @@ class SiteLastValues(PassivePart):
         await self._store.close()
 
     # --- what is kept -----------------------------------------------------------------------------------------------
+
+    def _forget(self, watched: _Watched) -> None:
+        key = _key(watched.source)
+        del self._watched[key]
+        if watched.tap is not None:
+            watched.tap.close()
+        if (task := self._looking.pop(key, None)) is not None:
+            task.cancel()
 
     def _listen(self, watched: _Watched) -> None:
         watched.tap = self._graph.tap(

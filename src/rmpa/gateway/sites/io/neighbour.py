@@ -12,7 +12,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.sites.catalogue import CatalogueChange, SiteCatalogue
 from rmpa.gateway.sites.exports import SiteExports
 from rmpa.gateway.sites.imports import SiteImports
-from rmpa.gateway.sites.keys import GATEWAY, SiteGateway, SiteModule, SiteSource, parse_token, tokens_key
+from rmpa.gateway.sites.keys import GATEWAY, SiteGateway, SiteModule, SiteSource, parse_token, token_keys
 from rmpa.gateway.sites.leader import Leader
 from rmpa.gateway.sites.report import refusals_report, sites_report
 from rmpa.runtime.machine_timer import MachineTimer
@@ -83,7 +83,8 @@ class SiteNeighbour:
     def start(self) -> None:
         """Announce this gateway, and begin to follow the graph and the other sites."""
         self._leader = Leader(self._own, limits.LEADER_PATIENCE, self._now())
-        self._declared.append(self._session.watch_tokens(tokens_key(), self._on_token))
+        for key in token_keys(self._own.site):
+            self._declared.append(self._session.watch_tokens(key, self._on_token))
         self._declared.append(self._session.token(self._own.token()))
         self._graph.watch(self._on_source)
         self._timer.arm()
@@ -112,7 +113,7 @@ class SiteNeighbour:
             "rank": self._own.rank,
             "instance": self._own.instance,
             "sites": sites_report(self.catalogue, self.imports),
-            "offered": len(self.exports.entries),
+            "offered": len(self.exports.sources),
             "refused": refusals_report(self.exports, self.imports),
             "counters": self.catalogue.counters.as_dict(),
             "parts": {part.name: part.report() for part in self._parts},
@@ -182,6 +183,7 @@ class SiteNeighbour:
         elif self._active and not leads:
             _log.info("= another gateway of site %s leads now", self._own.site)
             self._rest()
+        self.exports.sites_seen(self.catalogue.sites)
         self._act()
         self._tell_sites()
         self.on_sites(self.catalogue.sites)

@@ -40,6 +40,7 @@ class _Exported:
     """One service that other sites may call."""
 
     source: MeshSource
+    to: str
     queryable: Declared
     slots: asyncio.Semaphore
     tasks: set[asyncio.Task[None]] = field(default_factory=set)
@@ -75,20 +76,26 @@ class SiteServiceExports:
         self._graph = graph
         self._timeout = timeout
         self._why_not = why_not
-        self._exported: dict[tuple[str, str], _Exported] = {}
+        self._exported: dict[tuple[str, str, str], _Exported] = {}
+        """By module, service and the site that it is for."""
         self._bytes = 0
 
-    def export(self, source: MeshSource) -> None:
-        """Let other sites call a service."""
-        self.withdraw(source)
-        key = data_key(self._site, source.module, SourceKind.SERVICE, UNKNOWN_TYPE, source.name)
-        queryable = self._session.queryable(key, lambda query: self._take(source, query))
-        slots = asyncio.Semaphore(limits.SITE_CALLS_AT_ONCE)
-        self._exported[source.module, source.name] = _Exported(source, queryable, slots)
+    def export(self, source: MeshSource, to: str = "") -> None:
+        """Let other sites call a service.
 
-    def withdraw(self, source: MeshSource) -> None:
+        Args:
+            source: The service.
+            to: The one other site that may; empty: all.
+        """
+        self.withdraw(source, to)
+        key = data_key(self._site, source.module, SourceKind.SERVICE, UNKNOWN_TYPE, source.name, to)
+        queryable = self._session.queryable(key, lambda query: self._take(source, to, query))
+        slots = asyncio.Semaphore(limits.SITE_CALLS_AT_ONCE)
+        self._exported[source.module, source.name, to] = _Exported(source, to, queryable, slots)
+
+    def withdraw(self, source: MeshSource, to: str = "") -> None:
         """End that; calls under way end as the server lets them."""
-        entry = self._exported.pop((source.module, source.name), None)
+        entry = self._exported.pop((source.module, source.name, to), None)
         if entry is not None:
             entry.queryable.close()
 
@@ -110,6 +117,7 @@ class SiteServiceExports:
                 "module": entry.source.module,
                 "node": entry.source.node,
                 "name": entry.source.name,
+                "to": entry.to,
                 "type": entry.description.type if entry.description is not None else entry.source.type,
                 "calls": entry.calls,
                 "failed": entry.failed,
@@ -122,8 +130,8 @@ class SiteServiceExports:
 
     # --- inside ---------------------------------------------------------------------------------------------------
 
-    def _take(self, source: MeshSource, query: ZenohQuery) -> None:
-        entry = self._exported.get((source.module, source.name))
+    def _take(self, source: MeshSource, to: str, query: ZenohQuery) -> None:
+        entry = self._exported.get((source.module, source.name, to))
         if entry is None or entry.source is not source:
             query.reply_error(f"service {source.name} of {source.module} has left")
             return

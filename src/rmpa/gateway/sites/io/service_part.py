@@ -46,12 +46,12 @@ class SiteServices(PassivePart):
     def export(self, entry: SiteExport) -> None:
         """Let other sites call a service."""
         if entry.source.kind is SourceKind.SERVICE:
-            self._exports.export(entry.source)
+            self._exports.export(entry.source, entry.announced.to)
 
     def withdraw(self, entry: SiteExport) -> None:
         """Take it back; calls under way end as the server lets them."""
         if entry.source.kind is SourceKind.SERVICE:
-            self._exports.withdraw(entry.source)
+            self._exports.withdraw(entry.source, entry.announced.to)
 
     def show(self, entry: SiteImport) -> None:
         """Put a service of another site into the graph."""

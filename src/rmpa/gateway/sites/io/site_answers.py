@@ -140,13 +140,13 @@ class SiteAnswers(PassivePart):
     def _this_site(self, *, sources: bool, parts: object) -> SiteInfo:
         exports = self._sites.exports
         modules: dict[tuple[str, str], list[int]] = {}
-        for entry in exports.entries:
-            counts = modules.setdefault((entry.source.module, entry.source.instance), [0, 0])
-            counts[entry.source.kind is SourceKind.SERVICE] += 1
+        for source in exports.sources:
+            counts = modules.setdefault((source.module, source.instance), [0, 0])
+            counts[source.kind is SourceKind.SERVICE] += 1
         refused = list(exports.refusals())
         listed: list[SiteSourceInfo] = []
         if sources:
-            offered = [(entry.source, "") for entry in exports.entries]
+            offered = [(source, "") for source in exports.sources]
             listed = [
                 SiteSourceInfo(
                     kind=_KINDS[source.kind],

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 _KINDS = {SourceKind.TOPIC: "topic", SourceKind.SERVICE: "service"}
 _PARTS = {SourceKind.TOPIC: "topics", SourceKind.SERVICE: "services"}
+_ReportKey = tuple[SourceKind, str, str, str, str, str]
+"""Kind, site, module, node, name there, and the site that it is for (empty: for all)."""
 
 
 class SiteWhy:
@@ -107,7 +109,7 @@ class SiteWhy:
                 continue
             if name != source.name and not site:
                 continue  # its name there is asked for with its site alone
-            key = source.kind, source.site, source.module, source.node, there.name
+            key = source.kind, source.site, source.module, source.node, there.name, ""
             rule = self._rules.incoming(
                 source.kind, source.site, source.module, there.name, source.type, source.node
             ).why
@@ -178,7 +180,7 @@ class SiteWhy:
     # --- what goes out ----------------------------------------------------------------------------------------------
 
     def _leaving(self, name: str, asker: str, *, service: bool) -> Iterator[Diagnosis]:
-        for source, there in self._out(""):
+        for source, there, to in self._out(""):
             own = source.module == asker and source.name == name if asker else source.here == name
             if not own or (service and source.kind is not SourceKind.SERVICE):
                 continue
@@ -195,52 +197,38 @@ class SiteWhy:
                 kind=_KINDS[source.kind],
                 name=name,
                 peer=source.module,
-                to="other sites",
+                to=f"site {to}" if to else "other sites",
                 node=source.node,
             )
 
-    def _out(self, asking: str) -> Iterator[tuple[MeshSource, SourceThere]]:
-        """All sources of this site, as they are for another site (empty: for any)."""
+    def _out(self, asking: str) -> Iterator[tuple[MeshSource, SourceThere, str]]:
+        """All sources of this site, as they are for another site (empty: for any), and the site that they are for."""
         reports = self._reports("out")
-        for entry in self._sites.exports.entries:
-            source = entry.source
-            report = reports.get((source.kind, self._site, source.module, source.node, source.name), {})
+        exports, hidden = self._sites.exports, set()
+        for entry in exports.entries:
+            source, to = entry.source, entry.announced.to
             refused = self._rules.refusal(asking, source.module, source.name) if asking else ""
+            if asking and to not in ("", asking):
+                if not refused or source in hidden:
+                    continue  # another entry is the one for the site that asks
+                hidden.add(source)
+            report = reports.get((source.kind, self._site, source.module, source.node, source.name, to), {})
             rule = self._rules.outgoing(source.kind, source.module, source.name, source.type, source.node).why
-            yield (
-                source,
-                SourceThere(
-                    kind=source.kind.value,
-                    module=source.module,
-                    node=source.node,
-                    type=source.type,
-                    rule=rule,
-                    refused=refused,
-                    wanted=bool(report.get("wanted")),
-                    messages=int(report.get("messages", report.get("calls", 0))),
-                    waiting=int(report.get("waiting", 0)),
-                    dropped=int(report.get("dropped", report.get("failed", 0))),
-                    limited=int(report.get("limited", 0)),
-                    problem=str(report.get("problem", "")) if source.kind is SourceKind.TOPIC else "",
-                ),
-            )
-        for source, why in self._sites.exports.refusals():
-            yield (
-                source,
-                SourceThere(
-                    kind=source.kind.value, module=source.module, node=source.node, type=source.type, refused=why
-                ),
-            )
+            if to:
+                rule = self._rules.outgoing_to(to, source.module, source.name).why
+            yield source, _there(source, rule, refused, report), to
+        for source, why in exports.refusals():
+            yield source, _there(source, "", why, {}), ""
 
-    def _reports(self, way: str) -> dict[tuple[SourceKind, str, str, str, str], dict[str, Any]]:
-        """What the parts report of each source, by kind, site, module, node and name there."""
-        found: dict[tuple[SourceKind, str, str, str, str], dict[str, Any]] = {}
+    def _reports(self, way: str) -> dict[_ReportKey, dict[str, Any]]:
+        """What the parts report of each source."""
+        found: dict[_ReportKey, dict[str, Any]] = {}
         parts = self._sites.report().get("parts")
         for kind, part in _PARTS.items():
             report = parts.get(part) if isinstance(parts, dict) else None
             for each in report.get(way, ()) if isinstance(report, dict) else ():
-                key = kind, each.get("site", self._site), each["module"], each.get("node", ""), each["name"]
-                found[key] = each
+                site, node, to = each.get("site", self._site), each.get("node", ""), each.get("to", "")
+                found[kind, site, each["module"], node, each["name"], to] = each
         return found
 
     # --- the other gateway --------------------------------------------------------------------------------------
@@ -271,12 +259,29 @@ class SiteWhy:
             return
         sources = tuple(
             there
-            for source, there in self._out(question.site)
+            for source, there, _ in self._out(question.site)
             if source.name == question.name and question.module in ("", source.module)
         )
         modules = tuple(sorted({module.name for module in self._sites.exports.modules}))
         query.reply(query.key, msgspec.json.encode(WhyAnswer(sources=sources, modules=modules)))
         query.finish()
+
+
+def _there(source: MeshSource, rule: str, refused: str, report: dict[str, Any]) -> SourceThere:
+    return SourceThere(
+        kind=source.kind.value,
+        module=source.module,
+        node=source.node,
+        type=source.type,
+        rule=rule,
+        refused=refused,
+        wanted=bool(report.get("wanted")),
+        messages=int(report.get("messages", report.get("calls", 0))),
+        waiting=int(report.get("waiting", 0)),
+        dropped=int(report.get("dropped", report.get("failed", 0))),
+        limited=int(report.get("limited", 0)),
+        problem=str(report.get("problem", "")) if source.kind is SourceKind.TOPIC else "",
+    )
 
 
 def _meant(there: SiteSource, site: str, module: str) -> bool:

@@ -57,14 +57,12 @@ class SiteTopics:
         self._rules = rules
         self._contracts = contracts
         self._clock = clock
-        self._exported: dict[tuple[str, str], dict[str, ExportedTopic]] = {}
-        """By module and topic, then by node."""
+        self._exported: dict[tuple[str, str], dict[tuple[str, str], ExportedTopic]] = {}
+        """By module and topic, then by node and the site that it is for (empty: for all)."""
         self._imported: dict[tuple[str, str, str, str], ImportedTopic] = {}
         """By site, module, node and name there."""
         self._interrupted: dict[tuple[str, str, str, str], InterruptedTopic] = {}
         """Likewise: those that went while nodes subscribed."""
-        self._batched: set[tuple[str, str]] = set()
-        """Modules and topics of this site that another site would have in batches."""
         self._subscriptions: dict[str, TopicSubscription] = {}
         self._questions: dict[SiteModule, tuple[Declared, Declared]] = {}
         self._reader = AttachmentReader()
@@ -80,9 +78,12 @@ class SiteTopics:
             return
         self.withdraw(entry)
         contract = self._contracts.of(entry.source.here, entry.announced.type)
-        key = (entry.source.module, entry.source.name)
-        self._exported.setdefault(key, {})[entry.source.node] = ExportedTopic(
-            entry, self._graph, self._session, contract, self._clock, batches=key in self._batched
+        topics = self._exported.setdefault((entry.source.module, entry.source.name), {})
+        batches = any(
+            each.offers_batches for each in topics.values() if each.entry.announced.to == entry.announced.to
+        )
+        topics[entry.source.node, entry.announced.to] = ExportedTopic(
+            entry, self._graph, self._session, contract, self._clock, batches=batches
         )
 
     def withdraw(self, entry: SiteExport) -> None:
@@ -90,12 +91,11 @@ class SiteTopics:
         if entry.source.kind is not SourceKind.TOPIC:
             return  # a service of a node may have the name of its topic
         key = (entry.source.module, entry.source.name)
-        topic = self._exported.get(key, {}).pop(entry.source.node, None)
+        topic = self._exported.get(key, {}).pop((entry.source.node, entry.announced.to), None)
         if topic is not None:
             topic.close()
             if not self._exported[key]:
                 del self._exported[key]
-                self._batched.discard(key)
 
     def show(self, entry: SiteImport) -> None:
         """Show a publisher of another site."""
@@ -241,19 +241,21 @@ class SiteTopics:
     def _on_header_query(self, module: SiteModule, query: ZenohQuery) -> None:
         name = query.key.removeprefix(f"{ROOT}/{module.site}/{module.name}/d/t")
         asked = dict(pair.partition("=")[::2] for pair in query.parameters.split(";"))
-        if refusal := self._rules.refusal(asked.get("site", ""), module.name, name):
+        node, site = asked.get("node", ""), asked.get("site", "")
+        if refusal := self._rules.refusal(site, module.name, name):
             query.reply_error(f"{REFUSED}{refusal}")
             return
-        nodes = self._exported.get((module.name, name), {})
-        topic = nodes.get(asked["node"]) if asked.get("node") else next(iter(nodes.values()), None)
+        topics = self._exported.get((module.name, name), {})
+        fitting = (each for (its, to), each in topics.items() if node in ("", its) and to in ("", site))
+        topic = next(fitting, None)
         if topic is None:
             query.reply_error(f"no such publisher of {name[:200]} at {module.name}")
             return
         if "batches" in asked:
-            # All publishers of the topic: a subscriber of batches subscribes to nothing else of it.
-            self._batched.add((module.name, name))
-            for each in nodes.values():
-                each.offer_batches()
+            # All publishers of the key: a subscriber of batches subscribes to nothing else of it.
+            for (_, to), each in topics.items():
+                if to == topic.entry.announced.to:
+                    each.offer_batches()
         topic.ask(query)
 
     def _on_definition_query(self, module: SiteModule, query: ZenohQuery) -> None:

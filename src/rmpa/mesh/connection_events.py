@@ -1,0 +1,112 @@
+"""The events that the protocol machine of a connection reports; see ``mesh.connection``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rmpa.mesh.frames import FrameKind
+    from rmpa.mesh.handshake import Hello, Refuse
+
+
+@dataclass(frozen=True, slots=True)
+class HelloReceived:
+    """Acceptor: a hello was received; the driver answers it with ``accept`` or ``refuse``."""
+
+    hello: Hello
+
+
+@dataclass(frozen=True, slots=True)
+class HandshakeDone:
+    """Both sides accepted the connection; frames may be sent."""
+
+    hello: Hello
+
+
+@dataclass(frozen=True, slots=True)
+class ControlReceived:
+    """A control frame was received.
+
+    Args:
+        payload: A copy of its bytes.
+    """
+
+    payload: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class PongReceived:
+    """The answer to a ping was received.
+
+    Args:
+        stamp: The time stamp of the ping, which identifies it.
+        rtt: Round trip on the wire in seconds, without the time that the remote side took to answer.
+    """
+
+    stamp: int
+    rtt: float
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """One of the two sides refused the connection. ``ConnectionClosed`` follows.
+
+    Args:
+        refuse: Why.
+        by_us: Whether this side refused.
+    """
+
+    refuse: Refuse
+    by_us: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Parted:
+    """Both sides agreed to part for now: the link may be made again at any time. ``ConnectionClosed`` follows."""
+
+
+@dataclass(frozen=True, slots=True)
+class PartingEnded:
+    """The remote side needs the connection after all; what was held back while it decided may be sent."""
+
+
+@dataclass(frozen=True, slots=True)
+class ConnectionClosed:
+    """The connection is over: the driver sends the remaining output and closes the socket.
+
+    Args:
+        reason: Why, for people.
+        orderly: Whether one side ended the connection by a frame (bye, refuse), and not an error or silence.
+    """
+
+    reason: str
+    orderly: bool
+
+
+@dataclass(frozen=True, slots=True)
+class MarkReceived:
+    """An acknowledgement, a fence or the answer to a fence was received.
+
+    Args:
+        kind: ``ACK``, ``FENCE`` or ``FENCED``.
+        route: The id of the route.
+        sequence: For ``ACK`` the last message that arrived; otherwise the fence's number.
+    """
+
+    kind: FrameKind
+    route: int
+    sequence: int
+
+
+ConnectionEvent = (
+    HelloReceived
+    | HandshakeDone
+    | ControlReceived
+    | PongReceived
+    | MarkReceived
+    | Refused
+    | Parted
+    | PartingEnded
+    | ConnectionClosed
+)

@@ -1,0 +1,188 @@
+"""Links at rest: both ends agree, silence of a link in use is still noticed within a second."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.mesh import limits
+from rmpa.mesh.connection import ConnectionRole, ConnectionState
+from rmpa.mesh.connection_events import ConnectionClosed
+from rmpa.mesh.frames import Frame, FrameKind
+from rmpa.mesh.handshake import Feature, Hello
+from tests.mesh.worlds import HIGH, LOW, Side, Time, deliver, exchange, pair, pass_time, side
+
+if TYPE_CHECKING:
+    from rmpa.mesh.connection import ConnectionProtocol
+
+
+def run(one: Side, other: Side, time: Time, seconds: float) -> int:
+    """Let both run on a path without delay; return how often a timer fired."""
+    end, fired = time.now + seconds, 0
+    while True:
+        due = min((t for each in (one, other) if (t := each.link.next_timer()) is not None), default=end + 1)
+        if due > end:
+            time.now = end
+            return fired
+        time.now = max(time.now, due)
+        for each in (one, other):
+            timer = each.link.next_timer()
+            if timer is not None and timer <= time.now:
+                fired += 1
+                each.link.handle_timer(time.now)
+        exchange(one, other, time)
+
+
+def resting(*sides: Side) -> list[bool]:
+    return [each.link.rests for each in sides]
+
+
+def rest(one: Side, other: Side, time: Time) -> None:
+    for each in (one, other):
+        each.link.need(time.now, needed=False)
+    exchange(one, other, time)
+    assert resting(one, other) == [True, True]
+
+
+def test_a_link_rests_when_neither_side_needs_it() -> None:
+    time = Time()
+    dialler, acceptor = pair(time)
+    dialler.link.need(time.now, needed=False)
+    exchange(dialler, acceptor, time)
+    assert resting(dialler, acceptor) == [False, False], "the other side needs it still"
+    busy = run(dialler, acceptor, time, 60.0)
+    acceptor.link.need(time.now, needed=False)
+    exchange(dialler, acceptor, time)
+    assert resting(dialler, acceptor) == [True, True]
+    calm = run(dialler, acceptor, time, 60.0)
+    assert dialler.link.state is acceptor.link.state is ConnectionState.UP
+    assert calm * 15 < busy
+
+
+def test_silence_at_rest_ends_the_link_by_the_longer_lease() -> None:
+    time = Time()
+    dialler, acceptor = pair(time)
+    rest(dialler, acceptor, time)
+    pass_time(dialler.link, time, limits.IDLE_LEASE - 0.01)
+    assert dialler.link.state is ConnectionState.UP
+    pass_time(dialler.link, time, 0.02)
+    assert dialler.last() == ConnectionClosed("high was silent for its lease of 16 s", orderly=False)
+
+
+@pytest.mark.parametrize("who", [0, 1])
+def test_one_side_that_needs_the_link_brings_back_the_short_lease(who: int) -> None:
+    time = Time()
+    both = pair(time)
+    rest(*both, time)
+    run(*both, time, 33.0)
+    both[who].link.need(time.now, needed=True)
+    exchange(*both, time)
+    assert not any(each.link.rests for each in both)
+    run(*both, time, 5.0)
+    dead, alive = both[1 - who], both[who]
+    dead.link.take_output()
+    pass_time(alive.link, time, limits.EXPRESS_LEASE + 0.3)
+    assert alive.link.state is ConnectionState.CLOSED
+
+
+def test_a_peer_that_died_at_rest_is_noticed_soon_once_it_is_needed() -> None:
+    time = Time()
+    dialler, acceptor = pair(time)
+    rest(dialler, acceptor, time)
+    pass_time(dialler.link, time, 3.0)
+    dialler.link.need(time.now, needed=True)
+    pass_time(dialler.link, time, limits.GHOST_QUIET)
+    assert dialler.link.quiet_after == limits.GHOST_QUIET
+    pass_time(dialler.link, time, limits.HANDSHAKE_TIMEOUT)
+    assert dialler.link.state is ConnectionState.CLOSED
+
+
+def test_an_earlier_release_never_rests_and_gets_no_frame_that_it_does_not_know() -> None:
+    time = Time()
+    dialler, _ = pair(time)
+    assert dialler.link.remote is not None
+    dialler.link.remote = replace(dialler.link.remote, features=0)
+    dialler.link.need(time.now, needed=False)
+    assert not dialler.link.has_output
+    assert not dialler.link.rests
+
+
+def test_the_hello_of_the_last_release_is_taken_as_one_that_cannot_rest() -> None:
+    time = Time()
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
+    hello = replace(Hello.of(LOW, lease=1.0, expected=HIGH.guid), features=0).serialize()
+    golden = bytes.fromhex(
+        "524d5041 01 01 0000 0a0000019c410001".replace(" ", "")
+        + (b"L" * 16).hex()
+        + "000003e80a0000029c420001 00000000 03".replace(" ", "")
+        + b"low".hex()
+    )
+    assert hello == golden
+    deliver(Frame(FrameKind.HELLO, golden).serialize(), acceptor.link, time.now)
+    acceptor.link.accept(time.now)
+    acceptor.link.take_output()
+    acceptor.link.need(time.now, needed=False)
+    assert not acceptor.link.has_output
+    assert not Hello.parse(golden).features & Feature.PACE
+
+
+def test_willingness_to_park_is_told_and_ends_with_the_next_need() -> None:
+    time = Time()
+    dialler, acceptor = pair(time)
+    rest(dialler, acceptor, time)
+    dialler.link.need(time.now, needed=False, parks=True)
+    exchange(dialler, acceptor, time)
+    assert [dialler.link.remote_parks, acceptor.link.remote_parks] == [False, True]
+    assert resting(dialler, acceptor) == [True, True]
+    dialler.link.need(time.now, needed=True, parks=True)
+    exchange(dialler, acceptor, time)
+    assert not acceptor.link.remote_parks
+    assert resting(dialler, acceptor) == [False, False]
+
+
+@pytest.mark.parametrize("needed", [False, True])
+def test_bits_of_later_versions_in_a_pace_frame_are_ignored(*, needed: bool) -> None:
+    time = Time()
+    dialler, acceptor = pair(time)
+    rest(dialler, acceptor, time)
+    frame = Frame(FrameKind.PACE, route=0xFFFFFFFC | needed, sequence=16_000).serialize()
+    deliver(frame, dialler.link, time.now)
+    assert dialler.link.rests is not needed
+    assert not dialler.link.remote_parks
+
+
+@pytest.mark.parametrize("claimed", [0, 1, 10**9])
+def test_a_claimed_lease_is_held_within_bounds(claimed: int) -> None:
+    time = Time()
+    dialler, _ = pair(time)
+    deliver(Frame(FrameKind.PACE, route=1, sequence=claimed).serialize(), dialler.link, time.now)
+    pass_time(dialler.link, time, limits.LINK_LEASE_MAX + 1.0)
+    assert dialler.link.state is ConnectionState.CLOSED
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_whatever_both_say_when_they_agree_in_the_end(seed: int) -> None:
+    """Frames are under way for up to 0.3 s: no lease is broken, and both end with the pace of what they said last."""
+    rng, time = random.Random(seed), Time()
+    both = pair(time)
+    wires: tuple[list[tuple[float, bytes]], list[tuple[float, bytes]]] = ([], [])
+    last = [True, True]
+    for step in range(4000):
+        time.now += 0.01
+        for number, each in enumerate(both):
+            link: ConnectionProtocol = each.link
+            if step < 3000 and rng.random() < 0.01:
+                last[number] = rng.random() < 0.5
+                link.need(time.now, needed=last[number])
+            if (due := link.next_timer()) is not None and due <= time.now:
+                link.handle_timer(time.now)
+            if link.has_output:
+                at = max([time.now + rng.random() * 0.3, *(when for when, _ in wires[number])])
+                wires[number].append((at, link.take_output()))
+            while wires[1 - number] and wires[1 - number][0][0] <= time.now:
+                deliver(wires[1 - number].pop(0)[1], link, time.now)
+    assert all(each.link.state is ConnectionState.UP for each in both)
+    assert [each.link.rests for each in both] == [not any(last)] * 2
