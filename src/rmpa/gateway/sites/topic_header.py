@@ -61,6 +61,8 @@ class TopicHeader:
     def serialize(self) -> bytes:
         """The JSON of it."""
         fields = asdict(self)
+        if not self.batches:
+            del fields["batches"]
         return json.dumps({**fields.pop("description"), **fields}).encode()
 
     @classmethod

@@ -295,7 +295,7 @@ class ExportedTopic:
         collected.append(bytes(message))
         if len(collected) == 1:
             after_read(self._flush)
-        elif len(collected) >= limits.COLLECTED_MESSAGES_MAX:
+        elif len(collected) >= limits.COLLECTED_MESSAGES:
             self._flush()
 
     def _flush(self) -> None:

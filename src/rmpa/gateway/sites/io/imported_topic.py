@@ -159,7 +159,7 @@ class ImportedTopic:
         if (
             not self._wants_batches
             and messages >= limits.BATCH_RATE * passed > 0
-            and size <= limits.BATCH_MESSAGE_MAX * messages
+            and size <= limits.BATCH_MESSAGE_BYTES * messages
         ):
             self._wants_batches = True
             self._ask()
