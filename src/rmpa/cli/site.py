@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -15,6 +16,7 @@ from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.core.names import is_legal_name
 from rmpa.observe import limits
+from rmpa.observe.control import GATEWAY_REPORT
 from rmpa.observe.io.control_client import ControlClient, choose_agent
 from rmpa.observe.io.site_requests import BODY, INFO, LAST, REPORT
 from rmpa.observe.sites import LastValueInfo, SitesReport, ValuePortion, read_site_module
@@ -79,10 +81,11 @@ def list_(as_json: bool, agent: str | None, name: str | None) -> int:
     """
     with _connect(agent, name) as client:
         reports = _ask(client, REPORT, tuple[SitesReport, ...])
+        absent = "" if reports else _why_none(client)
     if as_json:
         print_json(reports)
     elif not reports:
-        _no_gateway(client.name)
+        warn(absent)
     else:
         rows = [(report, site) for report in reports for site in report.sites]
         print_table(
@@ -99,8 +102,12 @@ def list_(as_json: bool, agent: str | None, name: str | None) -> int:
     return 0 if reports and well and not any(report.problem for report in reports) else 1
 
 
-def _no_gateway(agent: str) -> None:
-    warn(f"{agent} is no gateway, and is linked to none: start one with `rmpa gateway --site NAME`")
+def _why_none(client: ControlClient) -> str:
+    """Why no gateway answers: this agent is a gateway whose session is not open, or it knows none."""
+    with contextlib.suppress(RmpaError):  # no gateway: it has no such operation
+        problem = str(client.call(GATEWAY_REPORT, dict[str, object]).get("problem", ""))
+        return f"{client.name} joins no site: {problem or 'it is a gateway without --site'}"
+    return f"{client.name} is no gateway, and is linked to none: start one with `rmpa gateway --site NAME`"
 
 
 def _where(report: SitesReport) -> str:
@@ -142,7 +149,8 @@ Examples:
 def info(site: str, as_json: bool, agent: str | None, name: str | None) -> int:
     """Show the modules of SITE, what they offer, its name here, and why something does not cross.
 
-    Of this module's own site the last values that its gateway keeps are shown too.
+    Of this module's own site the last values that its gateway keeps are shown too, and of a site that is unreachable
+    those that came of it.
     """
     with _connect(agent, name) as client:
         report = _ask(client, INFO, SitesReport, site=site)
@@ -238,7 +246,8 @@ def last(
     """Print the last value of TOPIC that the gateway of SITE keeps, of each publisher: MODULE may be off.
 
     Latched topics and descriptors of Smart Resources are kept, and those that a [[gateway.rule]] says. The age is
-    the time since the gateway received it, by both machines' clocks.
+    the time since the gateway received it, by both machines' clocks. If the whole site is off, this one's gateway
+    answers with what came of its latched topics.
     """
     site, of = read_site_module(module)
     if not is_legal_name(topic) or topic.startswith("~"):
@@ -289,6 +298,8 @@ def _print_value(
         print_json(facts | ({"message": plain} if body is not None else {}))
         return
     latched = ", latched" if value.latching else ""
+    if value.seen_at:
+        warn(f"site {site} does not give it now: this is what site {value.seen_at} saw of it last")
     print_line(
         f"# {value.topic} of {value.node} of {site}/{value.module}: {value.type}{latched}, "
         f"{size(value.size)}, {duration(_age(value))} old"

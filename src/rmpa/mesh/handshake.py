@@ -45,9 +45,13 @@ class Feature(IntFlag):
 
     PACE = 1
     """It takes pace frames: the link may rest."""
+    PARK = 2
+    """It takes a bye that says "parked": the link may be ended for now, by agreement."""
+    SWIM = 4
+    """It answers the probes of failure detectors."""
 
 
-FEATURES: Final = Feature.PACE
+FEATURES: Final = Feature.PACE | Feature.PARK | Feature.SWIM
 """The features of this version."""
 
 
