@@ -103,6 +103,7 @@ _WHEN_UP: Final[frozenset[int]] = frozenset(
         FrameKind.FENCE,
         FrameKind.FENCED,
         FrameKind.PACE,
+        FrameKind.LANE,
     }
 )
 _ALLOWED: Final[Mapping[tuple[ConnectionRole, ConnectionState], frozenset[int]]] = MappingProxyType(
@@ -430,7 +431,7 @@ class ConnectionProtocol:
             self._keepalive.remote_pace(lease, now, route)
             if self._keepalive.agree():
                 self._send_pace(now)
-        elif kind in {FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED}:
+        elif kind in {FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED, FrameKind.LANE}:
             self.on_event(MarkReceived(kind, route, sequence))
         elif kind is FrameKind.BYE:
             self._end(f"{self._name} left: {frames.parse_text(payload)}", orderly=True)

@@ -51,6 +51,7 @@ class FrameKind(IntEnum):
     FENCE = 10
     FENCED = 11
     PACE = 12
+    LANE = 13
 
 
 class PaceFlag(IntFlag):
@@ -60,6 +61,17 @@ class PaceFlag(IntFlag):
     """Something at the sender depends on the connection, so that neither side may rest."""
     PARKS = 2
     """The sender would end the link for now; see ``Feature.PARK``."""
+
+
+class LaneWord(IntEnum):
+    """What the route field of a lane frame says about the link's bulk lane; see ``mesh.lane_demand``."""
+
+    WANT = 1
+    """Acceptor: dial it."""
+    LEAVE = 2
+    """Dialler: it is not used here; end its connection, or answer KEEP."""
+    KEEP = 3
+    """Acceptor: it is used here."""
 
 
 PAYLOAD_MAX: Final[Mapping[int, int]] = MappingProxyType(
@@ -76,6 +88,7 @@ PAYLOAD_MAX: Final[Mapping[int, int]] = MappingProxyType(
         FrameKind.FENCE: 0,
         FrameKind.FENCED: 0,
         FrameKind.PACE: 0,
+        FrameKind.LANE: 0,
     }
 )
 """The most bytes of payload that a frame of each kind may claim."""

@@ -45,9 +45,11 @@ class Feature(IntFlag):
 
     PACE = 1
     """It takes pace frames: the link may rest."""
+    LANES = 8
+    """It takes lane frames: the bulk lane is dialled when it is first wanted, and ends when it is not used."""
 
 
-FEATURES: Final = Feature.PACE
+FEATURES: Final = Feature.PACE | Feature.LANES
 """The features of this version."""
 
 
