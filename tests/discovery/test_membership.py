@@ -521,11 +521,11 @@ def test_gossiped_address_of_an_unknown_peer_is_contacted(one: Harness) -> None:
 
 def test_gossip_is_bounded(one: Harness) -> None:
     speaker = Speaker(who(2))
-    for i in range(10):
+    for i in range(20):
         guids = [Guid.of(IPv4Address(0x0A020000 + 100 * i + j), 1) for j in range(limits.BEACON_GOSSIP_MAX)]
         one.hear(speaker(BeaconKind.HEARTBEAT, *guids))
     greeted = unicasts(one.membership.outputs(), BeaconKind.ANNOUNCE)
-    assert len(greeted) == limits.CANDIDATES_MAX
+    assert len(greeted) == limits.CANDIDATES_BURST
     assert one.membership.counters["gossip.full"]
 
 
@@ -646,7 +646,7 @@ def flood(one: Harness, count: int, *, first: int = 0) -> None:
 
 
 def test_unlinked_peers_share_a_few_unicast_heartbeats(one: Harness) -> None:
-    flood(one, core_limits.PEERS_MAX - 2)
+    flood(one, 500)
     one.hear(Speaker(who(2))(BeaconKind.ANNOUNCE), multicast=False)
     one.membership.link_up(who(2), one.now)
     one.run(limits.MULTICAST_SILENCE + limits.HEARTBEAT_INTERVAL)
@@ -655,7 +655,7 @@ def test_unlinked_peers_share_a_few_unicast_heartbeats(one: Harness) -> None:
     assert sent.count(linked) >= 11, "who is linked gets each heartbeat"
     others = [address for address in sent if address != linked]
     assert len(others) <= (60 + limits.HEARTBEAT_INTERVAL) * limits.UNICAST_HEARTBEATS_PER_SECOND
-    assert len(set(others)) == core_limits.PEERS_MAX - 2, "each in turn"
+    assert len(set(others)) == 500, "each in turn"
     assert one.membership.counters["beacon.whisper_limited"]
 
 
@@ -677,7 +677,7 @@ def test_announcements_to_many_forged_addresses_are_few(one: Harness) -> None:
             guids = [Guid.of(IPv4Address(0x0A020000 + 64 * part + j), 1) for j in range(limits.BEACON_GOSSIP_MAX)]
             one.hear(speaker(BeaconKind.HEARTBEAT, *guids))
         sent += len(unicasts(one.membership.outputs() + one.run(1.0), BeaconKind.ANNOUNCE))
-        assert sent <= limits.CANDIDATES_MAX + (second + 1) * limits.CANDIDATES_PER_SECOND
+        assert sent <= limits.CANDIDATES_BURST + (second + 1) * limits.CANDIDATES_PER_SECOND
     assert sent >= 40 * limits.CANDIDATES_PER_SECOND
 
 
@@ -688,9 +688,9 @@ def test_full_membership_evicts_silent_peers_at_a_limited_rate(one: Harness) -> 
     one.run(limits.HEARTBEAT_LATE)
     one.hear(Speaker(who(4))())
     assert "peer4" in one.present()
-    flood(one, 1000, first=1000)
+    flood(one, 1000, first=5000)
     assert len(one.present()) == core_limits.PEERS_MAX - 1
-    new = [name for name in one.present() if name.startswith("n1") and len(name) > 4]
+    new = [name for name in one.present() if name.startswith("n5") and len(name) > 4]
     assert len(new) <= limits.EVICTIONS_PER_SECOND
     assert one.membership.counters["roster.full"] >= 1000 - limits.EVICTIONS_PER_SECOND
 
@@ -700,7 +700,7 @@ def test_a_linked_peer_gives_way_to_nobody(one: Harness) -> None:
     flood(one, core_limits.PEERS_MAX - 2)
     for second in range(60):
         one.run(1.0)
-        flood(one, 100, first=1000 + 100 * second)
+        flood(one, 100, first=5000 + 100 * second)
     assert "peer3" in one.present()
     assert len(one.membership.peers()) == core_limits.PEERS_MAX - 1
 
@@ -717,15 +717,15 @@ def test_old_forged_beacon_takes_no_endpoint_when_the_link_falls(one: Harness) -
     assert one.present() == ["peer2"]
 
 
-def test_whose_link_is_known(one: Harness) -> None:
-    assert one.membership.is_linked(who(1).guid, who(1).instance), "our own echo"
+def test_who_had_a_link_is_known(one: Harness) -> None:
+    assert one.membership.is_verified(who(1).guid, who(1).instance), "our own echo"
     one.hear(Speaker(who(2))())
-    assert not one.membership.is_linked(who(2).guid, who(2).instance)
+    assert not one.membership.is_verified(who(2).guid, who(2).instance)
     one.membership.link_up(who(2), one.now)
-    assert one.membership.is_linked(who(2).guid, who(2).instance)
-    assert not one.membership.is_linked(who(2).guid, who(2, 2).instance)
+    assert one.membership.is_verified(who(2).guid, who(2).instance)
+    assert not one.membership.is_verified(who(2).guid, who(2, 2).instance)
     one.membership.link_down(who(2).guid, one.now)
-    assert not one.membership.is_linked(who(2).guid, who(2).instance)
+    assert one.membership.is_verified(who(2).guid, who(2).instance), "it is no forgery without its link either"
 
 
 def test_indexes_agree_with_the_endpoints() -> None:

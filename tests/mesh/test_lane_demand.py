@@ -194,9 +194,9 @@ def test_no_message_is_lost_whatever_both_want_when(seed: int) -> None:
     for _ in range(30):
         for _ in range(path.rng.randrange(200)):
             path.step(0.05)
-        for _ in range(path.rng.randrange(620)):  # up to the time when the lane is about to leave
+        for _ in range(path.rng.randrange(1400)):  # until the lane is about to leave, or has left
             path.step(0.0)
-    for _ in range(1500):
+    for _ in range(3000):
         path.step(0.0)
     assert path.carried == path.sent > 10
     assert not any(end.waiting or end.inbox for end in path.ends)

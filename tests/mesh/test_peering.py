@@ -13,7 +13,16 @@ from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.mesh import limits
 from rmpa.mesh.handshake import Hello, Refusal, Refuse
-from rmpa.mesh.peering import CloseLink, Dial, LinkDown, LinkDownCause, LinkRefused, LinkUp, Peering, PeeringOutput
+from rmpa.mesh.peering import Peering
+from rmpa.mesh.peering_events import (
+    CloseLink,
+    Dial,
+    LinkDown,
+    LinkDownCause,
+    LinkRefused,
+    LinkUp,
+    PeeringOutput,
+)
 from tests.mesh.worlds import HIGH, LOW
 
 DUAL = replace(HIGH, addresses=(IPv4Address("192.168.0.2"),))

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rmpa.mesh.frames import FrameKind
     from rmpa.mesh.handshake import Lane
     from rmpa.mesh.io.link import PeerLink
-    from rmpa.mesh.peering import LinkDown
+    from rmpa.mesh.peering_events import LinkDown
     from tests.simulation.network import Address, World
 
 

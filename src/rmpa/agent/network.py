@@ -21,7 +21,7 @@ from rmpa.discovery.io.interfaces import choose, further_addresses, list_interfa
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
-from rmpa.mesh.peering import LinkDown, LinkDownCause
+from rmpa.mesh.peering_events import LinkDown, LinkDownCause
 from rmpa.runtime.sockets import open_mesh_port
 from rmpa.runtime.system_clock import SystemClock
 

@@ -28,8 +28,8 @@ CONTRACTS_REMEMBERED: Final = 4096
 # --- discovery --------------------------------------------------------------------------------------------------
 PEER_LEASE: Final = 16.0
 """A peer without a link is gone when it was silent for three heartbeats and a second."""
-PEERS_MAX: Final = 512
-"""Peers that may be known at one time: a hostile sender of forged GUIDs cannot fill the memory."""
+PEERS_MAX: Final = 4096
+"""Peers that may be known at one time: a hostile sender of forged GUIDs cannot fill the memory (2 KB each)."""
 
 # --- mesh -------------------------------------------------------------------------------------------------------
 FRAGMENT_BYTES: Final = 128 * KIB

@@ -55,6 +55,7 @@ class PeerInstance:
         sequence: The number of its last beacon.
         multicast_at: When it was last heard by multicast.
         linked: Whether there is a link with it.
+        verified: Whether it had a link: it is no forgery.
         leaving: Whether it said goodbye.
         superseded_at: When another run took its endpoint.
     """
@@ -69,6 +70,7 @@ class PeerInstance:
     sequence: int | None = None
     multicast_at: float = _NEVER
     linked: bool = False
+    verified: bool = False
     leaving: bool = False
     superseded_at: float = _NEVER
 
@@ -76,6 +78,15 @@ class PeerInstance:
     def deadline(self) -> float:
         """When its lease is over, if it stays silent."""
         return self.heard + self.lease
+
+    @property
+    def silence(self) -> float:
+        """Seconds without a beacon that show two missed ones.
+
+        Members of a large mesh send theirs more rarely and promise a longer lease, which counts if one is verified.
+        """
+        longer = self.lease / core_limits.PEER_LEASE if self.verified else 1.0
+        return limits.MULTICAST_SILENCE * max(1.0, longer)
 
     @property
     def addresses(self) -> tuple[Address, ...]:
@@ -144,7 +155,7 @@ class Endpoint:
         previous = peer.identity
         # A handshake carries no further addresses; those of the beacons stay.
         peer.identity = identity if identity.addresses else replace(identity, addresses=previous.addresses)
-        peer.linked = True
+        peer.linked = peer.verified = True
         peer.leaving = False
         peer.heard = now
         if peer is self.current:

@@ -6,6 +6,8 @@ from bisect import bisect_left, insort
 from typing import TYPE_CHECKING
 
 from rmpa.core.timer_queue import TimerQueue
+from rmpa.core.token_bucket import TokenBucket
+from rmpa.discovery import limits
 from rmpa.discovery.events import ConflictKind, HeardBy, PeerConflict, PeerView
 
 if TYPE_CHECKING:
@@ -24,8 +26,10 @@ class EndpointTable:
         self._all: dict[int, Endpoint] = {}
         self._order: list[int] = []
         self._timers: TimerQueue[int] = TimerQueue()
-        self._present: list[PeerInstance] | None = None
-        self._by_name: dict[str, list[Endpoint]] | None = None
+        self._present: list[PeerInstance] = []
+        self._present_places: list[int] = []
+        self._names: dict[int, str] = {}
+        self._by_name: dict[str, list[int]] = {}
 
     def __len__(self) -> int:
         return len(self._all)
@@ -53,7 +57,7 @@ class EndpointTable:
         del self._all[place]
         del self._order[bisect_left(self._order, place)]
         self._timers.set(place, None)
-        self._clear_indexes()
+        self._index(place, None)
 
     def heard(self, place: int) -> None:
         """Update the endpoint's timer, the only part of it that has changed."""
@@ -64,10 +68,33 @@ class EndpointTable:
     def changed(self, place: int) -> None:
         """Update all indexes after any change of the endpoint: its peer, its name, whether it is present."""
         self.heard(place)
-        self._clear_indexes()
+        self._index(place, self._all.get(place))
 
-    def _clear_indexes(self) -> None:
-        self._present = self._by_name = None
+    def _index(self, place: int, endpoint: Endpoint | None) -> None:
+        """Update the indexes at one place; a thousand peers that appear at once must not cost a million steps."""
+        peer = endpoint.current if endpoint is not None else None
+        name = peer.identity.name if peer is not None else None
+        before = self._names.get(place)
+        if name != before:
+            if before is not None:
+                there = self._by_name[before]
+                there.remove(place)
+                if not there:
+                    del self._by_name[before]
+                del self._names[place]
+            if name is not None:
+                insort(self._by_name.setdefault(name, []), place)
+                self._names[place] = name
+        member = peer if endpoint is not None and endpoint.present else None
+        at = bisect_left(self._present_places, place)
+        listed = at < len(self._present_places) and self._present_places[at] == place
+        if member is None and listed:
+            del self._present_places[at], self._present[at]
+        elif member is not None and listed:
+            self._present[at] = member
+        elif member is not None:
+            self._present_places.insert(at, place)
+            self._present.insert(at, member)
 
     def next_timer(self) -> float | None:
         """When the next lease is over, on the clock of ``take_expired``; ``None``: never."""
@@ -78,31 +105,27 @@ class EndpointTable:
         return sorted(self._timers.take(now))
 
     def present(self) -> list[PeerInstance]:
-        """The peers that are members, without this agent, by GUID; not to be changed by the caller."""
-        if self._present is None:
-            self._present = [e.current for e in self if e.present and e.current is not None]
+        """The peers that are members, without this agent, by GUID; not to be changed or kept by the caller."""
         return self._present
 
     def with_name(self, name: str) -> list[Endpoint]:
         """The endpoints whose peer has this name, in order; peers in conflict and this agent itself included."""
-        if self._by_name is None:
-            self._by_name = {}
-            for endpoint in self:
-                if endpoint.current is not None:
-                    self._by_name.setdefault(endpoint.current.identity.name, []).append(endpoint)
-        return list(self._by_name.get(name, ()))
+        return [self._all[place] for place in self._by_name.get(name, ())]
 
-    def oldest_unlinked(self) -> tuple[float, int] | None:
-        """``(heard, place)`` of the endpoint without a linked peer that has been silent the longest."""
+    def oldest_unlinked(self, *, verified: bool) -> tuple[float, int] | None:
+        """``(heard, place)`` of the endpoint without a linked peer that has been silent the longest.
+
+        Args:
+            verified: Whether peers that had a link count too, if there are no others.
+        """
         never = float("-inf")
-        return min(
-            (
-                (endpoint.current.heard if endpoint.current is not None else never, place)
-                for place, endpoint in self._all.items()
-                if endpoint.current is None or not endpoint.current.linked
-            ),
-            default=None,
-        )
+        unlinked = [
+            (peer is not None and peer.verified, peer.heard if peer is not None else never, place)
+            for place, peer in ((place, endpoint.current) for place, endpoint in self._all.items())
+            if peer is None or not peer.linked
+        ]
+        had_link, heard, place = min(unlinked, default=(True, never, -1))
+        return None if place < 0 or (had_link and not verified) else (heard, place)
 
     def same_name(self, endpoint: Endpoint) -> list[tuple[PeerInstance, PeerInstance]]:
         """Pairs of this endpoint's peer and each other live peer with its name, the newer peer first."""
@@ -151,3 +174,35 @@ class EndpointTable:
             tuple(conflicts),
             endpoint.present and peer is endpoint.current,
         )
+
+
+class Eviction:
+    """Selects the peers that give way to new ones when as many are known as may be.
+
+    Args:
+        endpoints: All of them.
+    """
+
+    def __init__(self, endpoints: EndpointTable) -> None:
+        self._endpoints = endpoints
+        self._rate = TokenBucket(limits.EVICTIONS_PER_SECOND, limits.EVICTIONS_PER_SECOND)
+        self._none_until = float("-inf")
+
+    def for_linked(self) -> int | None:
+        """The place of the peer that gives way to a linked one: an unlinked one, silent for longest."""
+        oldest = self._endpoints.oldest_unlinked(verified=True)
+        return oldest[1] if oldest is not None else None
+
+    def for_heard(self, now: float) -> int | None:
+        """The place of the peer that gives way to a newly heard one: it never had a link, and missed a heartbeat.
+
+        The rate is limited, because the newly heard peer may be forged too.
+        """
+        if now < self._none_until:
+            return None
+        heard, place = self._endpoints.oldest_unlinked(verified=False) or (now, -1)
+        self._none_until = heard + limits.HEARTBEAT_LATE
+        if now >= self._none_until and self._rate.take(now):
+            return place
+        self._none_until = max(self._none_until, self._rate.next(now))
+        return None

@@ -43,7 +43,7 @@ class GossipSelector:
         guids: list[Guid] = []
         for number in range(start, start + count):
             peer = peers[number % count]
-            if peer is to or not (peer.linked or now - peer.heard <= limits.MULTICAST_SILENCE):
+            if peer is to or not (peer.linked or now - peer.heard <= peer.silence):
                 continue
             guid = peer.identity.guid
             if loopback or not guid.is_loopback:
@@ -73,7 +73,7 @@ class GossipCandidates:
         self._rng = rng
         self._all: dict[Address, _Candidate] = {}
         self._due: TimerQueue[Address] = TimerQueue()
-        self._allowed = TokenBucket(limits.CANDIDATES_PER_SECOND, limits.CANDIDATES_MAX)
+        self._allowed = TokenBucket(limits.CANDIDATES_PER_SECOND, limits.CANDIDATES_BURST)
         self._resume = float("-inf")
 
     def __contains__(self, address: Address) -> bool:

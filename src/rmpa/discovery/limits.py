@@ -22,6 +22,17 @@ BURST_OFFSETS: Final = (0.0, 0.1, 0.3, 0.7)
 enough."""
 HEARTBEAT_INTERVAL: Final = 5.0
 """Paper, section 4.3: "each five seconds a heartbeat will check that network is still alive"."""
+MANY_MEMBERS: Final = 64
+"""Members above which answers and early heartbeats are delayed or gathered, lest a start of many agents be a storm of
+packets. Up to here each announcement is answered at once, as in the paper."""
+HEARTBEATS_PER_SECOND: Final = 50.0
+"""Heartbeats a second, of all members together, that each agent of a large mesh hears: its own interval is the number
+of members divided by this. They take 0.2 % of a core. The failure detector notices a dead peer before its lease."""
+HEARTBEAT_INTERVAL_MAX: Final = 39.0
+"""The longest interval of heartbeats: three of them and a second fit into ``LEASE_MAX``."""
+HEARTBEAT_GROWTH: Final = 1.25
+"""Factor by which the interval of heartbeats grows at most from one to the next: peers that missed the beacon with
+the longer lease still count by the shorter one."""
 CONFLICT_AFTER: Final = 2.0
 """A packet of a replaced instance after this long is not a late one: two live peers share one GUID."""
 ADDRESS_SHARED_AFTER: Final = 5.0
@@ -50,14 +61,18 @@ LEASE_MIN: Final = 2.0
 """The shortest lease: with a shorter one a peer would come and go with every lost packet."""
 LEASE_MAX: Final = 120.0
 """The longest lease: with a longer one a peer would be shown long after its end."""
+ANSWERS_TOGETHER: Final = 8
+"""Newcomers of a large mesh that wait for an answer at one time, from which on one multicast answers all of them: it
+costs each member one packet to read, as much as the answers would cost their senders."""
 ENDPOINT_RUNS_MAX: Final = 4
 """Runs remembered for one (address, port): the present one, the last one and two rivals."""
 ANSWER_ADDRESSES_MAX: Final = 1024
 """Addresses remembered for ``ANSWER_INTERVAL``; the oldest is forgotten first."""
 ANSWERS_PER_SECOND: Final = 500
 """Unicast answers a second over all addresses: forged beacons must not turn an agent into an amplifier; a start of
-100 peers stays below this."""
-CANDIDATES_MAX: Final = 256
+100 peers stays below this. In a large mesh it is also the number of answers a second that one newcomer gets: 1,000
+members answer within 2 s, each at a random time."""
+CANDIDATES_MAX: Final = 1024
 """Addresses kept that are known only from gossip; further ones are ignored until there is room."""
 CANDIDATE_RETRY_FIRST: Final = 0.5
 """Delay before the second announcement to an address known from gossip; it doubles each time."""
@@ -67,11 +82,16 @@ CANDIDATE_LIFETIME: Final = 20.0
 """An address that no gossip had for this long (four heartbeats) is given up."""
 DISSEMINATION_INTERVAL: Final = 0.5
 """Newly found peers are gathered for this long before peers without multicast are notified; the first at once."""
+DISSEMINATIONS_PER_SECOND: Final = 100.0
+"""Such early heartbeats a second, of all members of a large mesh together: while a thousand agents start, each of
+them finds new peers all the time."""
+CANDIDATES_BURST: Final = 256
+"""Announcements to addresses known from gossip that may be sent at once."""
 CANDIDATES_PER_SECOND: Final = 25.0
 """Announcements a second to all addresses known from gossip, beyond one for each: gossiped peers may be forged."""
 UNICAST_HEARTBEATS_PER_SECOND: Final = 10.0
-"""Heartbeats by unicast to peers without a link, over all of them: each takes 0.2 ms, and with as many forged
-peers as are accepted each still gets one a minute."""
+"""Heartbeats by unicast to peers that never had a link, over all of them: each takes 0.2 ms, and with 500 such peers
+each still gets one a minute."""
 UNICAST_HEARTBEATS_AT_ONCE: Final = 8
 """Unicast heartbeats, to linked and unlinked peers, in one run of the timer; each takes some 0.1 ms."""
 EVICTIONS_PER_SECOND: Final = 10.0
@@ -89,10 +109,15 @@ BEACONS_UNPROVED_PAUSE: Final = 0.05
 BEACONS_PER_SOURCE: Final = 200
 """Packets a second from one address; a host with twenty agents that all start at once stays below."""
 BEACONS_UNLINKED_PER_SECOND: Final = 200.0
-"""Beacons a second that are accepted from unlinked peers, over all addresses (they can be forged): 5 % of a core."""
-BEACONS_UNLINKED_BURST: Final = 1000
-"""Beacons of unlinked peers accepted at once: a hundred peers that start together send 400 and answer each other."""
-BEACON_SOURCES_MAX: Final = 1024
+"""Beacons a second that are accepted from peers that never had a link, over all addresses (they can be forged): 5 %
+of a core."""
+BEACONS_UNLINKED_BURST: Final = 4096
+"""Beacons of such peers accepted at once, which take 0.4 s: a thousand agents that start together announce themselves
+four times each. Data is handled between them."""
+RECEIVE_BUFFER_BYTES: Final = 1 << 20
+"""The kernel's buffer of each socket that receives beacons (SO_RCVBUF; net.core.rmem_max bounds it): 1,300 packets,
+so that the announcements of a thousand agents that start at once wait until they are read."""
+BEACON_SOURCES_MAX: Final = 4096
 """Source addresses whose packets are counted; the oldest is forgotten first."""
 BEACON_REPEATS: Final = 128
 """Packets remembered, so that one that arrives over two interfaces is read once."""
@@ -102,3 +127,78 @@ SEED_RETRY_FIRST: Final = 1.0
 """Delay before a failed look-up of a seed's name is repeated; it doubles each time (no name server yet)."""
 SEED_RETRY_MAX: Final = 30.0
 """The longest delay between two look-ups after failures."""
+
+# --- failure detection (SWIM) -----------------------------------------------------------------------------------
+SWIM_PACKET_MAX: Final = 1168
+"""Bytes of one packet of the failure detector: with a secured mesh's trailer it is as long as a beacon may be."""
+PROBE_INTERVAL: Final = 1.0
+"""Time between two probes of one agent (SWIM, section 3; memberlist has the same), whatever the number of members."""
+PROBE_TIMEOUT_MIN: Final = 0.2
+"""The shortest time for an answer to a probe: Wi-Fi with power saving delays packets by 100 ms and more."""
+PROBE_TIMEOUT_MAX: Final = 1.0
+"""The longest such time, however slow the answers are."""
+PROBE_RTT_FIRST: Final = 0.05
+"""Round trip that is assumed before the first answer."""
+INDIRECT_PROBES: Final = 3
+"""Members that are asked to probe one that did not answer (memberlist has the same)."""
+INDIRECT_TIMEOUT_FACTOR: Final = 2.0
+"""Time for their answers, in time-outs of a probe: a probe by way of another member takes two round trips."""
+RELAYS_MAX: Final = 128
+"""Probes for others that are under way at one time; further requests are not answered."""
+RELAYS_PER_SECOND: Final = 100.0
+"""Probes for others a second."""
+EXTRA_PROBES_PER_SECOND: Final = 40.0
+"""Probes a second beside the regular ones: of members that others suspect, or hold to have failed."""
+CONFIRMING_PROBES: Final = 8.0
+"""Members, in the mean, that at once probe one that is suspected: they confirm it, or let it be refuted."""
+CONFIRMATIONS_MAX: Final = 3
+"""Further members that suspect the same one, after which a suspicion is as short as it may be (Lifeguard)."""
+SUSPICION_TIME: Final = 0.5
+"""Shortest suspicion for each power of ten of the number of members: news takes O(log N) to reach all."""
+SUSPICION_FACTOR: Final = 3.0
+"""How much longer a suspicion is that nothing confirms."""
+SUSPICION_LINKED: Final = 1.0
+"""A suspected member that still has a link is judged again after this long: its link decides."""
+HEALTH_MAX: Final = 8
+"""The worst score of an agent's own health (Lifeguard): its intervals and time-outs are nine times as long then."""
+SWIM_LATE: Final = 0.15
+"""A timer that fires later than this means that this process was stopped, or had no CPU."""
+SWIM_LATE_GRACE: Final = 0.25
+"""All time-outs are prolonged by this beyond such a pause: packets that came meanwhile are read first."""
+SWIM_DEAF: Final = 5.0
+"""An agent that has heard no member for this long vouches for none of them."""
+GOSSIP_INTERVAL: Final = 0.2
+"""Time between two rounds of news while there is any (memberlist has the same)."""
+GOSSIP_FANOUT: Final = 3
+"""Members that get the news in one round."""
+NEWS_SENT_FACTOR: Final = 4
+"""How often news is sent, for each power of ten of the number of members (memberlist has the same): with 16 times at
+1,000 members one in ten million misses it."""
+NEWS_QUEUE_MAX: Final = 4096
+"""News that is spread at one time, one for each member; what was sent most often is dropped first."""
+MEMBERS_HEARSAY_MAX: Final = 1024
+"""Members that are known from the news alone; the oldest is forgotten first."""
+MEMBERS_GONE_MAX: Final = 4096
+"""Members that failed or left and are remembered, so that old news does not bring them back."""
+MEMBERS_GONE_KEPT: Final = 120.0
+"""How long they are remembered."""
+INCARNATION_LEAP: Final = 4096
+"""By how much news may raise a member's incarnation number at once: a forged one must not use all numbers up."""
+LEAVE_FANOUT: Final = 8
+"""Members that an agent tells that it leaves; they tell the others."""
+SYNC_BUCKETS: Final = 64
+"""Parts of the table of members whose hashes are compared when two tables differ."""
+SYNC_QUIET: Final = 3.0
+"""Tables are compared when the own one did not change for this long: before, news is still under way."""
+SYNC_INTERVAL: Final = 5.0
+"""Time between two comparisons that one agent asks for."""
+SYNC_OVERDUE: Final = 30.0
+"""A table that never rests is compared all the same after this long."""
+SYNC_PACKETS_MAX: Final = 32
+"""Packets of one answer to a comparison, 44 members each; the rest is compared the next time."""
+SYNCS_PER_SECOND: Final = 2.0
+"""Comparisons a second that an agent answers: each may be 35 KB."""
+SWIM_UNLINKED_PER_SECOND: Final = 400.0
+"""Packets of the failure detector a second that are accepted from agents without a link, over all addresses: 3 % of a
+core."""
+SWIM_UNLINKED_BURST: Final = 1000

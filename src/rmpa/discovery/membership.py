@@ -16,11 +16,10 @@ from rmpa.core.clock import earliest
 from rmpa.core.counters import Counters
 from rmpa.core.identity import Identity
 from rmpa.core.serial_number import serial_add
-from rmpa.core.token_bucket import TokenBucket
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Address, Beacon, BeaconKind
 from rmpa.discovery.endpoint import Endpoint, EndpointChange, PeerInstance
-from rmpa.discovery.endpoint_table import EndpointTable
+from rmpa.discovery.endpoint_table import EndpointTable, Eviction
 from rmpa.discovery.events import (
     ConflictCleared,
     ConflictKind,
@@ -37,6 +36,7 @@ from rmpa.discovery.events import (
     SendUnicast,
 )
 from rmpa.discovery.gossip import GossipCandidates, GossipSelector
+from rmpa.discovery.pacing import BeaconPace, LateAnswers, is_many
 from rmpa.discovery.unicast import AnswerLimit, UnicastHeartbeats
 
 if TYPE_CHECKING:
@@ -73,12 +73,12 @@ class MembershipProtocol:
         self._own = identity
         self._rng = rng
         self._multicast = multicast
-        self._lease_ms = round(lease * 1000)
+        self._pace = BeaconPace(lease)
         self._endpoints = EndpointTable()
-        self._evictions = TokenBucket(limits.EVICTIONS_PER_SECOND, limits.EVICTIONS_PER_SECOND)
-        self._no_eviction_until = _NEVER
+        self._eviction = Eviction(self._endpoints)
         self._reported_names: set[frozenset[bytes]] = set()
         self._answers = AnswerLimit()
+        self._late_answers = LateAnswers(rng)
         self._candidates = GossipCandidates(rng)
         self._seeds: tuple[Address, ...] = ()
         self._burst: list[float] = []
@@ -96,7 +96,8 @@ class MembershipProtocol:
 
     def start(self, now: float) -> None:
         """Announce this agent: a burst of beacons, then only heartbeats."""
-        own = PeerInstance(self._own, now, now, core_limits.PEER_LEASE, HeardBy.LINK, HeardBy.LINK, linked=True)
+        own = PeerInstance(self._own, now, now, core_limits.PEER_LEASE, HeardBy.LINK, HeardBy.LINK)
+        own.linked = own.verified = True
         self._endpoints.add(self._own.guid.place, Endpoint(own, own=True))
         self._burst = self._burst_times(now, limits.BURST_OFFSETS)
         self._heartbeat_at = self._next_heartbeat(now)
@@ -118,7 +119,7 @@ class MembershipProtocol:
         key = identity.guid.place
         endpoint = self._endpoints.get(key)
         if endpoint is None:
-            if len(self._endpoints) >= core_limits.PEERS_MAX and not self._evict_silent(now):
+            if len(self._endpoints) >= core_limits.PEERS_MAX and not self._evict(self._eviction.for_heard(now)):
                 self.counters.add("roster.full")
                 return
             endpoint = self._endpoints.add(key, Endpoint())
@@ -154,7 +155,7 @@ class MembershipProtocol:
         key = identity.guid.place
         endpoint = self._endpoints.get(key)
         if endpoint is None:
-            if len(self._endpoints) >= core_limits.PEERS_MAX and not self._evict():
+            if len(self._endpoints) >= core_limits.PEERS_MAX and not self._evict(self._eviction.for_linked()):
                 self.counters.add("roster.full")
                 return
             endpoint = self._endpoints.add(key, Endpoint())
@@ -167,6 +168,7 @@ class MembershipProtocol:
         if source is not None and endpoint.current is not None:
             endpoint.current.source = source
         self._candidates.answered(identity.guid.endpoint)
+        self._late_answers.discard(key)
         self._apply(endpoint, change, now, previous=previous, source=source)
         if not endpoint.present:
             self._peer_found(endpoint, now)
@@ -207,6 +209,13 @@ class MembershipProtocol:
         self._burst = self._burst_times(now, limits.BURST_AGAIN_OFFSETS)
         self.handle_timer(now)
 
+    def set_demand(self, now: float, *, on: bool) -> None:
+        """Take in whether this agent links on demand: its heartbeats then become rarer as the mesh grows."""
+        if self._pace.demand != on:
+            self._pace.demand = on
+            if self._heartbeat_at is not None:
+                self._heartbeat_at = min(self._heartbeat_at, now + limits.HEARTBEAT_INTERVAL)
+
     def set_seeds(self, seeds: Iterable[Address]) -> None:
         """Send announcements to these addresses, now and with each heartbeat; they replace the former seeds."""
         known = self._seeds
@@ -234,6 +243,7 @@ class MembershipProtocol:
         return earliest(
             self._heartbeat_at,
             self._disseminate_at,
+            self._late_answers.at,
             self._unicast_heartbeats.at,
             self._burst[0] if self._burst else None,
             self._candidates.next_timer(),
@@ -251,6 +261,7 @@ class MembershipProtocol:
             for address in self._seeds:
                 self._send(BeaconKind.ANNOUNCE, address)
         if self._heartbeat_at <= now:
+            self._pace.advance(len(self._endpoints.present()))
             self._heartbeat_at = self._next_heartbeat(now)
             self._send_multicast(BeaconKind.HEARTBEAT, now)
             self._plan_unicast_heartbeats(now)
@@ -260,6 +271,7 @@ class MembershipProtocol:
                     self._send(BeaconKind.ANNOUNCE, address)
         if self._disseminate_at is not None and self._disseminate_at <= now:
             self._disseminate(now)
+        self._send_late_answers(now)
         for peer in self._unicast_heartbeats.take_some():
             gossip = self._gossip(self._endpoints.present(), peer, now)
             for address in peer.addresses:
@@ -288,11 +300,11 @@ class MembershipProtocol:
         met = {host for peer in self._endpoints.present() for host, _ in peer.addresses}
         return [seed for seed in self._seeds if seed[0] not in met]
 
-    def is_linked(self, guid: Guid, instance: bytes) -> bool:
-        """Whether this run of a peer has a link; this agent itself counts as linked."""
+    def is_verified(self, guid: Guid, instance: bytes) -> bool:
+        """Whether this run of a peer has or had a link; this agent itself counts as linked."""
         endpoint = self._endpoints.get(guid.place)
         peer = endpoint.current if endpoint is not None else None
-        return peer is not None and peer.linked and peer.identity.instance == instance
+        return peer is not None and peer.verified and peer.identity.instance == instance
 
     @property
     def identity(self) -> Identity:
@@ -426,39 +438,21 @@ class MembershipProtocol:
         if endpoint is not None and endpoint.current is None and not endpoint.others:
             self._endpoints.remove(key)
 
-    def _evict(self) -> bool:
-        """Make room for a linked peer: remove the unlinked peer that has been silent for longest."""
-        oldest = self._endpoints.oldest_unlinked()
-        if oldest is not None:
-            self._remove(oldest[1])
-        return oldest is not None
-
-    def _evict_silent(self, now: float) -> bool:
-        """Make room for a newly heard peer: remove an unlinked one that missed a heartbeat, as it may be forged.
-
-        The rate is limited, because the newly heard peer may be forged too.
-        """
-        if now < self._no_eviction_until:
+    def _evict(self, place: int | None) -> bool:
+        """Remove the peer that gives way to another one; return whether there is one."""
+        endpoint = self._endpoints.get(place) if place is not None else None
+        if place is None or endpoint is None:
             return False
-        heard, key = self._endpoints.oldest_unlinked() or (now, 0)
-        self._no_eviction_until = heard + limits.HEARTBEAT_LATE
-        if now >= self._no_eviction_until and self._evictions.take(now):
-            self._remove(key)
-            return True
-        self._no_eviction_until = max(self._no_eviction_until, self._evictions.next(now))
-        return False
-
-    def _remove(self, key: int) -> None:
-        endpoint = self._endpoints.get(key)
-        if endpoint is not None:
-            self._peer_lost(endpoint, LossReason.SILENCE)
-            self._endpoints.remove(key)
+        self._peer_lost(endpoint, LossReason.SILENCE)
+        self._endpoints.remove(place)
+        return True
 
     # --- sending ----------------------------------------------------------------------------------------------
 
     def _beacon(self, kind: BeaconKind, gossip: tuple[Guid, ...] = ()) -> Beacon:
         self._sequence = serial_add(self._sequence, 1)
-        return Beacon(kind, self._own, self._lease_ms, self._sequence, gossip, self._observed_addresses(gossip))
+        lease = round(self._pace.lease * 1000)
+        return Beacon(kind, self._own, lease, self._sequence, gossip, self._observed_addresses(gossip))
 
     def _observed_addresses(self, gossip: tuple[Guid, ...]) -> tuple[Address, ...]:
         """Source addresses of gossiped peers that differ from the GUID's address, which may not be reachable."""
@@ -479,6 +473,7 @@ class MembershipProtocol:
         if self._multicast:
             gossip = self._gossip(self._unheard_by_multicast(now), None, now)
             self._outputs.append(SendMulticast(self._beacon(kind, gossip)))
+            self._late_answers.clear()
 
     def _plan_unicast_heartbeats(self, now: float) -> None:
         """Queue unicast heartbeats, with gossip about all peers, for the peers that multicast does not reach."""
@@ -495,8 +490,9 @@ class MembershipProtocol:
 
     def _schedule_dissemination(self, now: float) -> None:
         """Schedule gossip about a found peer for the peers that multicast does not reach."""
-        if self._disseminate_at is None and self._heartbeat_at is not None and len(self._endpoints.present()) > 1:
-            self._disseminate_at = max(now, self._disseminated_at + limits.DISSEMINATION_INTERVAL)
+        members = len(self._endpoints.present())
+        if self._disseminate_at is None and self._heartbeat_at is not None and members > 1:
+            self._disseminate_at = max(now, self._disseminated_at + self._pace.dissemination_interval(members))
 
     def _answer_if_unknown(
         self, endpoint: Endpoint, change: EndpointChange, beacon: Beacon, now: float, *, multicast: bool
@@ -508,12 +504,30 @@ class MembershipProtocol:
         unknown = change in {EndpointChange.NEW, EndpointChange.RESTARTED}
         # A unicast heartbeat means that its sender receives none of this agent's multicasts. If this agent receives
         # none of the sender's either, its own heartbeats go there by unicast anyway.
-        deaf = not multicast and now - peer.multicast_at <= limits.MULTICAST_SILENCE
-        if unknown or deaf or beacon.kind is BeaconKind.ANNOUNCE:
+        deaf = not multicast and now - peer.multicast_at <= peer.silence
+        if not (unknown or deaf or beacon.kind is BeaconKind.ANNOUNCE):
+            return
+        members = len(self._endpoints.present())
+        if not (multicast and self._multicast and is_many(members)):
             self._send_answer(peer, now)
+        elif self._burst:
+            self.counters.add("beacon.answer_spared")  # the next beacon of this agent's own burst tells the sender
+        else:
+            self._late_answers.add(peer.identity.guid.place, members, now)
 
-    def _send_answer(self, peer: PeerInstance, now: float) -> None:
-        gossip: tuple[Guid, ...] | None = None
+    def _send_late_answers(self, now: float) -> None:
+        """Answer the newcomers of a large mesh that got no link meanwhile."""
+        places = self._late_answers.take(now)
+        if len(places) >= limits.ANSWERS_TOGETHER:
+            self._send_multicast(BeaconKind.HEARTBEAT, now)
+            return
+        for place in places:
+            endpoint = self._endpoints.get(place)
+            if endpoint is not None and endpoint.current is not None:
+                peer = endpoint.current
+                self._send_answer(peer, now, self._gossip(self._unheard_by_multicast(now), peer, now))
+
+    def _send_answer(self, peer: PeerInstance, now: float, gossip: tuple[Guid, ...] | None = None) -> None:
         for address in peer.addresses:
             if self._answers.allows(address, now):
                 gossip = self._gossip(self._endpoints.present(), peer, now) if gossip is None else gossip
@@ -532,7 +546,7 @@ class MembershipProtocol:
         if was_candidate:
             peer.found_by = HeardBy.GOSSIP
         elif beacon.kind is BeaconKind.ANSWER and self._multicast and source not in self._seeds:
-            peer.multicast_at = now - limits.HEARTBEAT_INTERVAL
+            peer.multicast_at = now - self._pace.interval
 
     def _apply_gossip(self, beacon: Beacon, now: float) -> None:
         """Announce this agent to unknown peers of the sender; only their own beacon makes them members."""
@@ -565,11 +579,14 @@ class MembershipProtocol:
 
     def _unheard_by_multicast(self, now: float) -> list[PeerInstance]:
         """Members that get their heartbeats by unicast."""
-        silence = limits.MULTICAST_SILENCE
-        return [v for v in self._endpoints.present() if not self._multicast or now - v.multicast_at > silence]
+        members = self._endpoints.present()
+        if not self._multicast:
+            return list(members)
+        many = is_many(len(members))  # then a peer that a link brought has some time to be heard
+        return [v for v in members if now - max(v.multicast_at, v.since if many else _NEVER) > v.silence]
 
     def _burst_times(self, now: float, offsets: tuple[float, ...]) -> list[float]:
         return [now + offset + (limits.BURST_JITTER * self._rng() if offset else 0.0) for offset in offsets]
 
     def _next_heartbeat(self, now: float) -> float:
-        return now + limits.HEARTBEAT_INTERVAL * (1.0 - limits.HEARTBEAT_JITTER * self._rng())
+        return now + self._pace.interval * (1.0 - limits.HEARTBEAT_JITTER * self._rng())

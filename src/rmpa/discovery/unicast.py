@@ -41,7 +41,7 @@ class AnswerLimit:
 
 
 class UnicastHeartbeats:
-    """Selects the peers that get a unicast heartbeat: all linked ones, a few of the others (they may be forged)."""
+    """Selects the peers that get a unicast heartbeat: all verified ones, a few of the others (they may be forged)."""
 
     def __init__(self) -> None:
         self._turn = 0
@@ -52,9 +52,9 @@ class UnicastHeartbeats:
         """When ``take_some`` has peers to return; ``None``: the queue is empty."""
 
     def choose(self, peers: Sequence[PeerInstance], now: float) -> tuple[list[PeerInstance], bool]:
-        """The peers that get a heartbeat now, unlinked ones in turn from call to call; and whether these are all."""
-        chosen = [peer for peer in peers if peer.linked]
-        others = [peer for peer in peers if not peer.linked]
+        """The peers that get a heartbeat now, unverified ones in turn from call to call; whether they are all."""
+        chosen = [peer for peer in peers if peer.verified]
+        others = [peer for peer in peers if not peer.verified]
         start = self._turn % len(others) if others else 0
         for peer in others[start:] + others[:start]:
             if not self._allowed.take(now):

@@ -33,12 +33,15 @@ from rmpa.mesh.connection_events import (
     HandshakeDone,
     HelloReceived,
     MarkReceived,
+    Parted,
+    PartingEnded,
     PongReceived,
     Refused,
 )
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Feature, HandshakeError, Hello, Lane, Refuse, judge_welcome
 from rmpa.mesh.keepalive import Keepalive
+from rmpa.mesh.parting import Parting, PartingStep
 from rmpa.mesh.remote_clock import RemoteClock
 from rmpa.runtime import limits as runtime_limits
 from rmpa.trust.preface import is_preface
@@ -178,6 +181,7 @@ class ConnectionProtocol:
         self._label = label
         self._state = ConnectionState.HANDSHAKING
         self._keepalive = Keepalive(lease, now, acceptor=role is ConnectionRole.ACCEPTOR)
+        self._parting = Parting(self._keepalive, dialler=role is ConnectionRole.DIALLER)
         self._deadline = now + limits.HANDSHAKE_TIMEOUT
         self._reason = ""
         self._output = bytearray()
@@ -303,7 +307,7 @@ class ConnectionProtocol:
         if self._state in (ConnectionState.CLOSING, ConnectionState.CLOSED):
             return
         if self._state is ConnectionState.UP:
-            self._send(Frame(FrameKind.BYE, frames.text_payload(reason), stamp_ns=self._wall_ns()))
+            self._send(frames.bye(reason, stamp_ns=self._wall_ns()))
         self._close(_Step.LEAVING, reason, now)
 
     def lost(self, reason: str) -> None:
@@ -330,13 +334,15 @@ class ConnectionProtocol:
         keepalive = self._keepalive
         if self._state is not ConnectionState.UP or self.remote is None or not self.remote.features & Feature.PACE:
             return
-        parks = parks and not needed
+        parks = parks and not needed and bool(self.remote.features & Feature.PARK)
         if keepalive.needed is needed and keepalive.parks is parks:
             return
         keepalive.needed, keepalive.parks = needed, parks
-        if keepalive.agree() and needed:
+        self._parting.changed(now)
+        if (self._parting.holding or keepalive.agree()) and needed:
             keepalive.ask(now)
-        self._send_pace(now)
+        if not self._parting.holding:
+            self._send_pace(now)
 
     @property
     def rests(self) -> bool:
@@ -347,6 +353,11 @@ class ConnectionProtocol:
     def remote_parks(self) -> bool:
         """Whether the remote side would end the link for now, because nothing there needs it."""
         return self._keepalive.remote_parks
+
+    @property
+    def holding(self) -> bool:
+        """Whether this side has agreed to part, and sends nothing until ``Parted`` or ``PartingEnded``."""
+        return self._state is ConnectionState.UP and self._parting.holding
 
     @property
     def quiet_after(self) -> float:
@@ -375,6 +386,8 @@ class ConnectionProtocol:
             excused = keepalive.excused
             ours = f", our own pauses of {excused:.2g} s not counted" if excused else ""
             self._end(f"{self._name} was silent for its lease of {keepalive.awaited_lease:g} s{ours}")
+        elif self._parting.ask(now):
+            self._send_pace(now)
         else:
             self._ping(now)
 
@@ -428,12 +441,12 @@ class ConnectionProtocol:
             self.on_event(ControlReceived(bytes(payload)))
         elif kind is FrameKind.PACE:
             lease = min(max(sequence / 1000, limits.LINK_LEASE_MIN), limits.LINK_LEASE_MAX)
-            self._keepalive.remote_pace(lease, now, route)
-            if self._keepalive.agree():
-                self._send_pace(now)
+            self._paced(lease, route, now)
         elif kind in {FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED, FrameKind.LANE}:
             self.on_event(MarkReceived(kind, route, sequence))
         elif kind is FrameKind.BYE:
+            if route == frames.BYE_PARKED and self._parting.holding:
+                self.on_event(Parted())
             self._end(f"{self._name} left: {frames.parse_text(payload)}", orderly=True)
         elif kind is FrameKind.REFUSE:
             refuse = Refuse.parse(payload)
@@ -482,7 +495,7 @@ class ConnectionProtocol:
         self._send(
             Frame(FrameKind.REFUSE, refuse.serialize())
             if self.role is ConnectionRole.ACCEPTOR or self.prove is not None
-            else Frame(FrameKind.BYE, frames.text_payload(refuse.text))
+            else frames.bye(refuse.text)
         )
         self._close(_Step.LEAVING if up else _Step.REFUSING, f"refused: {refuse}", now)
         self.on_event(Refused(refuse, by_us=True))
@@ -508,10 +521,23 @@ class ConnectionProtocol:
         self._keepalive.pinged(now)
         return stamp
 
+    def _paced(self, lease: float, flags: int, now: float) -> None:
+        self._keepalive.remote_pace(lease, now, flags)
+        step = self._parting.paced(flags, now)
+        if step is PartingStep.PART:
+            self._send(frames.bye(f"{self._ours.name} parked the link", parked=True))
+            self._close(_Step.LEAVING, f"parked: nothing needs the link with {self._name}", now)
+            self.on_event(Parted())
+            return
+        if self._keepalive.agree() or step is not PartingStep.NOTHING:
+            self._send_pace(now)
+        if step is PartingStep.GO_ON:
+            self.on_event(PartingEnded())
+
     def _send_pace(self, now: float) -> None:
         """Promise the lease that holds from now on; the ping measures the path, and is the first sign of life."""
         keepalive = self._keepalive
-        self._send(Frame(FrameKind.PACE, route=int(keepalive.flags), sequence=round(keepalive.lease * 1000)))
+        self._send(Frame(FrameKind.PACE, route=int(self._parting.flags), sequence=round(keepalive.lease * 1000)))
         self._ping(now)
 
     def _send(self, frame: Frame) -> None:

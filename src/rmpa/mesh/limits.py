@@ -66,8 +66,9 @@ CONTROL_PAYLOAD_MAX: Final = 16 * MIB
 """Longest payload of a control frame: the graph of a peer with a few thousand topics and their definitions."""
 HELLO_PAYLOAD_MAX: Final = 4 * KIB
 """Longest payload of a frame that is accepted before the handshake is done."""
-PENDING_CONNECTIONS_MAX: Final = 64
-"""Accepted connections that may be without a finished handshake at one time."""
+PENDING_CONNECTIONS_MAX: Final = 256
+"""Accepted connections that may be without a finished handshake at one time, some 10 KB each. A member needs a few
+milliseconds for its handshake, so that a thousand that dial within some seconds find room."""
 LANE_QUEUE_BYTES: Final = 64 * MIB
 """Bytes of data that may wait for one lane of a slow link, over all topics; beyond it the oldest message is
 dropped."""
@@ -119,7 +120,7 @@ LINK_LEASE_MAX: Final = 60.0
 """The longest lease; a longer one that a peer claims is lowered to it."""
 GHOST_QUIET: Final = 0.5
 """A link that was silent for this long (two keepalive intervals) does not prevent a link to a new run of its peer."""
-LINKS_MAX: Final = 512
+LINKS_MAX: Final = 4096
 """Peers that may be linked at one time; as many as the membership holds."""
 LINK_STABLE: Final = 5.0
 """After the loss of a link that was up for at least this long, the back-off begins at the shortest delay."""
@@ -154,7 +155,7 @@ PATH_NO_HELP: Final = 60.0
 """How long smaller packets are not tried again for an address where they did not help."""
 PATH_PROVEN_SEGMENTS: Final = 2
 """Full segments of the smaller size that must be acknowledged before the packet size counts as the cause."""
-PATHS_MAX: Final = 512
+PATHS_MAX: Final = 4096
 """Addresses remembered as black holes, as many as there are links; the oldest is forgotten first."""
 EXPRESS_UNSENT_BYTES: Final = 64 * KIB
 """Unsent bytes of one link that the kernel may hold (TCP_NOTSENT_LOWAT): control frames cannot overtake them, and the
@@ -224,7 +225,7 @@ LOST_TOLD_MAX: Final = UINT32_MAX
 """The highest number of lost messages that one ``opened`` message can report."""
 LOSSES_REMEMBERED: Final = 8192
 """(peer, source) pairs of closed reliable routes whose losses are remembered."""
-ABSENT_PEERS_MAX: Final = 128
+ABSENT_PEERS_MAX: Final = 1024
 """Peers whose losses, in both directions, are remembered although they have had no link for longer than their routes
 wait. The peer that has been away longest is forgotten first."""
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, field
-from enum import Enum
 from typing import TYPE_CHECKING, Final, Literal
 
 from rmpa.core import limits as core_limits
@@ -22,6 +21,17 @@ from rmpa.core.timer_queue import TimerQueue
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.mesh import limits
 from rmpa.mesh.handshake import Hello, KnownLink, Refusal, Refuse, judge
+from rmpa.mesh.peering_events import (
+    CloseLink,
+    Dial,
+    LinkDown,
+    LinkDownCause,
+    LinkRefused,
+    LinkUp,
+    PeeringOutput,
+    PeerStatus,
+    SocketAddress,
+)
 from rmpa.trust.reasons import TrustReason
 
 if TYPE_CHECKING:
@@ -31,8 +41,6 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
 
 _log = logging.getLogger(__name__)
-
-SocketAddress = tuple[str, int]
 
 _SELDOM_MENDED: Final = frozenset(
     {
@@ -56,101 +64,6 @@ _OTHER_PEER: Final = frozenset({Refusal.MYSELF, Refusal.WRONG_PEER})
 """Refusals that concern one endpoint only, because another agent, or this agent itself, answered there."""
 
 
-@dataclass(frozen=True, slots=True)
-class Dial:
-    """Connect to this peer, at the endpoint that answers first.
-
-    Args:
-        guid: The peer.
-        endpoints: Its endpoints, best first; a peer with several addresses may be reachable at some of them only.
-    """
-
-    guid: Guid
-    endpoints: tuple[SocketAddress, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class CloseLink:
-    """Send a bye on this link and close it."""
-
-    link_id: int
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class LinkUp:
-    """This link is the one that is used with its peer."""
-
-    link_id: int
-    identity: Identity
-
-
-class LinkDownCause(Enum):
-    """Why a link is no longer used; the value is the text for users."""
-
-    REPLACED = "replaced by a newer link"
-    """The same run of the peer has another link from the same moment on."""
-    RESTARTED = "the peer restarted"
-    """Another run of the peer has taken its place."""
-    ENDED = "the connection ended"
-    """The connection of its express lane ended; ``LinkDown.reason`` says how."""
-
-
-@dataclass(frozen=True, slots=True)
-class LinkDown:
-    """The link that was used with this peer is no longer used.
-
-    Args:
-        link_id: Its number.
-        identity: The peer.
-        cause: The kind of its end.
-        reason: Why, for people.
-    """
-
-    link_id: int
-    identity: Identity
-    cause: LinkDownCause
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class LinkRefused:
-    """A peer refuses links for a reason that was not reported before; ``refuse`` says what to do."""
-
-    identity: Identity
-    refuse: Refuse
-
-
-PeeringOutput = Dial | CloseLink | LinkUp | LinkDown | LinkRefused
-
-
-@dataclass(frozen=True, slots=True)
-class PeerStatus:
-    """The state of one peer, for the snapshot.
-
-    Args:
-        identity: The peer.
-        state: ``refused``: waiting after a refusal for a reason that seldom passes by itself.
-        link_id: Its link, if linked.
-        lower: Whether this agent has the lower GUID of the two, and dials first.
-        since: When the link came up, or the last link fell, monotonic seconds; ``None`` before the first link.
-        attempts: Dials since the last link.
-        last_error: Why there is no link, as far as is known; for a linked peer, why its previous link ended.
-        next_attempt: When it is dialled next, monotonic seconds.
-        endpoint: The endpoint that is dialled, or was dialled last.
-    """
-
-    identity: Identity
-    state: Literal["linked", "dialling", "waiting", "refused"]
-    link_id: int | None
-    lower: bool
-    since: float | None
-    attempts: int
-    last_error: str
-    next_attempt: float | None
-    endpoint: SocketAddress | None
-
-
 @dataclass(slots=True)
 class _LinkInfo:
     id: int
@@ -168,6 +81,7 @@ class _Peer:
     verified: bool = False  # the peer was linked before
     token_taken: bool = False  # the present dial counts against the rate of unverified peers
     gone: bool = False  # the peer is forgotten when its link or dial ends
+    parked: bool = False  # the last link was ended by agreement, and nothing needs the peer
     source: str | None = None
     good: SocketAddress | None = None  # the endpoint where the peer was reached last
     link: _LinkInfo | None = None
@@ -243,6 +157,7 @@ class Peering:
             peer.lower = self._ours.guid < identity.guid
             self._restart(peer, now)
         if fresh and peer.link is None and not peer.dialling:
+            peer.parked = False
             self._dial_at(peer, now if peer.lower else now + limits.DIAL_FALLBACK)
         self._dial_due(peer, now)
 
@@ -253,6 +168,24 @@ class Peering:
             return
         peer.announced, peer.gone = False, True
         self._forget_if_idle(peer)
+
+    def want(self, guid: Guid, now: float) -> None:
+        """Dial a parked peer at once, or one that waits for its next dial, because something needs it."""
+        peer = self._peers.get(guid.place)
+        if peer is None or peer.link is not None or peer.dialling or peer.gone:
+            return
+        peer.parked = False
+        if peer.next_attempt is None or (peer.verified and not peer.refused):
+            peer.backoff.reset()
+            self._dial_at(peer, now)
+            self._dial_due(peer, now)
+
+    def unpark(self, now: float, spread: float) -> None:
+        """Dial all parked peers, in ``spread`` seconds, because every peer is to be linked again."""
+        for peer in self._peers.values():
+            if peer.parked:
+                peer.parked = False
+                self._dial_at(peer, now + spread * self._rng() + (0.0 if peer.lower else limits.DIAL_FALLBACK))
 
     # --- events of the driver -------------------------------------------------------------------------------
 
@@ -295,6 +228,7 @@ class Peering:
             peer.backoff.reset()
         peer.link = new
         peer.forget_at = peer.refused = None
+        peer.parked = False
         self._dial_at(peer, None)
         self._verify(peer, now)
         peer.attempts = 0
@@ -304,7 +238,7 @@ class Peering:
         self._by_link[link_id] = peer
         self._outputs.append(LinkUp(link_id, identity))
 
-    def link_down(self, link_id: int, reason: str, now: float, *, silent: bool = False) -> None:
+    def link_down(self, link_id: int, reason: str, now: float, *, silent: bool = False, parked: bool = False) -> None:
         """Handle the end of a link; without effect for a link that was replaced or never up.
 
         Args:
@@ -312,13 +246,19 @@ class Peering:
             reason: Why, for people.
             now: Monotonic seconds.
             silent: Whether the link ended by silence: the path to the peer failed, and may work again at once.
+            parked: Whether both sides ended it for now: an announced peer is not dialled until ``want``.
         """
         peer = self._by_link.get(link_id)
         if peer is None or peer.link is None:
             return
         link = peer.link
-        self._drop(peer, link, LinkDownCause.ENDED, reason)
+        parked = parked and peer.announced and not peer.gone
+        self._drop(peer, link, LinkDownCause.PARKED if parked else LinkDownCause.ENDED, reason)
         peer.fell = now
+        if parked:
+            peer.parked, peer.last_error = True, ""
+            peer.backoff.reset()
+            return
         peer.last_error = reason
         if silent or now - link.since >= limits.LINK_STABLE:
             peer.backoff.reset()
@@ -445,6 +385,7 @@ class Peering:
 
     def _restart(self, peer: _Peer, now: float) -> None:
         """Forget the errors and refusals of a peer's former run, because a new run announced itself."""
+        peer.parked = False
         peer.backoff.reset()
         peer.tried.clear()
         peer.reported.clear()
@@ -575,11 +516,13 @@ class Peering:
 
 
 def _status(peer: _Peer) -> PeerStatus:
-    state: Literal["linked", "dialling", "waiting", "refused"]
+    state: Literal["linked", "dialling", "waiting", "refused", "parked"]
     if peer.link is not None:
         state = "linked"
     elif peer.dialling:
         state = "dialling"
+    elif peer.parked:
+        state = "parked"
     else:
         state = "waiting" if peer.refused is None else "refused"
     link = peer.link

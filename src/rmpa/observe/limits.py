@@ -41,6 +41,8 @@ CPU_INTERVAL: Final = 1.0
 """The least time over which the agent's CPU share is measured; the kernel counts in ticks of 10 ms."""
 DIAGNOSTICS_INTERVAL: Final = 1.0
 """Interval of the messages on /diagnostics, as in diagnostic_updater; peers' clocks are recorded as often."""
+CLOCKS_IDLE_INTERVAL: Final = 5.0
+"""The same while all links rest and /diagnostics has no subscriber; a link in use is noticed by the next look."""
 DIAGNOSTICS_STALE: Final = 60.0
 """How long a peer that is gone, with its topics, is shown as stale on /diagnostics."""
 DIAGNOSTICS_QUEUE: Final = 10

@@ -34,7 +34,9 @@ THREAD_SWITCH: Final = 1e-4
 """The interpreter's switch interval (``sys.setswitchinterval``). While another thread parses XML, the loop is 3 ms
 late (p50) with Python's default of 5 ms, and 0.16 ms late with this value."""
 COLLECT_LOOK: Final = 0.25
-"""Interval of the checks for cyclic garbage while few objects survive."""
+"""Time from the moment at which many objects are noticed to the check for cyclic garbage."""
+COLLECT_LOOK_IDLE: Final = 5.0
+"""Period of these checks while few objects survive: only the growth of the heap is then to be noticed."""
 COLLECT_LOOK_AGAIN: Final = 0.02
 """Interval after a check that found many objects. Messages in transit are freed by then, and several small
 collections pause the loop less than one large collection."""

@@ -10,8 +10,8 @@ from typing import Final
 from rmpa.core.sizes import KIB, MIB
 
 # --- permissions ------------------------------------------------------------------------------------------------
-MODULES_REMEMBERED: Final = 256
-"""Modules whose rules are cached: as many as a large network has."""
+MODULES_REMEMBERED: Final = 4096
+"""Modules whose rules are cached: as many as a mesh can have (``PEERS_MAX``)."""
 SROS_FILE_MAX: Final = 4 * MIB
 """Bytes of an SROS 2 file of permissions; DDS's own files fail above 64 KB, and a large one has some 300 KB."""
 SROS_DEPTH_MAX: Final = 32
@@ -33,7 +33,7 @@ of all would make each later one of that run an old one."""
 REPLAY_LEAP_RATE: Final = 1024.0
 """Further such numbers for each second since the run was heard: an agent sends some 600 packets a second at most, so
 that one which was out of reach for days is heard again."""
-RUNS_MAX: Final = 1024
+RUNS_MAX: Final = 8192
 """Runs of agents whose numbers are remembered: two of each member of a full roster, as in a rotation of the group
 key. The one that was silent for longest is forgotten first."""
 CLOCK_TOLERANCE: Final = 30.0

@@ -39,7 +39,7 @@ class Door:
     def __init__(self) -> None:
         self.counters = Counters()
         self.intake = PacketFilter(
-            0, self.counters, is_linked=lambda guid, run: (guid, run) == (FRIEND.guid, FRIEND.instance)
+            0, self.counters, is_verified=lambda guid, run: (guid, run) == (FRIEND.guid, FRIEND.instance)
         )
 
     def flood(self, count: int, now: float, *, interface: int = 1) -> int:
@@ -52,15 +52,15 @@ class Door:
 
 def test_peers_without_a_link_share_what_an_interface_takes() -> None:
     door = Door()
-    assert door.flood(3000, 10.0) == limits.BEACONS_UNLINKED_BURST
-    assert door.counters["beacon.unlinked_limited"] == 3000 - limits.BEACONS_UNLINKED_BURST
+    assert door.flood(6000, 10.0) == limits.BEACONS_UNLINKED_BURST
+    assert door.counters["beacon.unlinked_limited"] == 6000 - limits.BEACONS_UNLINKED_BURST
     assert door.flood(3000, 11.0) == limits.BEACONS_UNLINKED_PER_SECOND
     assert door.flood(10, 11.0, interface=2) == 10, "a flood on one network leaves the others alone"
 
 
 def test_a_linked_peer_is_heard_through_a_flood() -> None:
     door = Door()
-    door.flood(3000, 10.0)
+    door.flood(6000, 10.0)
     heard = door.intake.parse(packet(FRIEND, 7), ("10.0.0.2", 4000), 10.0, multicast=True, interface=1)
     assert heard is not None
     assert heard.identity == FRIEND

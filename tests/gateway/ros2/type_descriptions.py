@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from rosbags.interfaces import Nodetype
 
 from rmpa.gateway.ros2 import type_description
+from rmpa.gateway.ros2.types import embedded
 
 if TYPE_CHECKING:
     from rmpa.gateway.ros2.types import Ros2Types
@@ -17,8 +18,7 @@ PACKAGE = "type_description_interfaces/msg/"
 
 def response(types: Ros2Types, name: str) -> bytes:
     """A true response: the type and all that it embeds."""
-    inner = [str(_inner(desc)[1]) for _, desc in types.store.fielddefs[name][1] if _inner(desc)[0] == Nodetype.NAME]
-    every = dict.fromkeys((name, *inner))
+    every = dict.fromkeys(embedded(types.store, name))
     return respond({each: [(key, *_numbers(desc)) for key, desc in types.store.fielddefs[each][1]] for each in every})
 
 

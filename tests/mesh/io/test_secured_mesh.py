@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rmpa.mesh.io.securing import MeshSecurity
-    from rmpa.mesh.peering import PeerStatus
+    from rmpa.mesh.peering_events import PeerStatus
     from rmpa.trust.preface import Preface
 
 DAY = 86_400.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
@@ -22,9 +21,11 @@ from rmpa.core.contract import Contracts
 from rmpa.core.counters import Counters
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.ros.node.slave_node import SlaveNode
+from rmpa.runtime.coarse_timer import call_at_tick
 from rmpa.runtime.event_loop import yield_to_data
 
 if TYPE_CHECKING:
+    import asyncio
     from collections.abc import Callable
 
     from rmpa.bridge.data.io.route_sender import RouteSender
@@ -178,7 +179,7 @@ class Bridge:
         return sum(part.param_update(key) for part in self._parts) > 0  # a sum, because every part must be called
 
     def _reconcile_later(self) -> None:
-        self._reconciler = asyncio.get_running_loop().call_later(limits.RECONCILE_INTERVAL, self._reconcile)
+        self._reconciler = call_at_tick(limits.RECONCILE_INTERVAL, self._reconcile)
 
     def _reconcile(self) -> None:
         self._reconcile_later()

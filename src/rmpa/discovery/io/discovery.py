@@ -81,13 +81,16 @@ class Discovery:
         self._identity = identity
         self._settings = settings
         self._udp = udp_socket
+        sockets.enlarge_buffer(udp_socket)
         self._on_event = on_event
         self._on_interfaces = on_interfaces
         self._clock: Clock = clock if clock is not None else SystemClock()
         self._membership = MembershipProtocol(
             identity, rng=random.random, multicast=settings.multicast.enabled, counters=self.counters
         )
-        self._filter = PacketFilter(settings.domain, self.counters, is_linked=self._membership.is_linked, trust=trust)
+        self._filter = PacketFilter(
+            settings.domain, self.counters, is_verified=self._membership.is_verified, trust=trust
+        )
         self._refusals = RefusalLog(_log, self.counters)
         self._group: Address = (settings.multicast.group, settings.discovery_port)
         self._sender = sockets.Sender(udp_socket, self._group, self.counters)
@@ -153,6 +156,11 @@ class Discovery:
     def link_down(self, guid: Guid, instance: bytes | None = None) -> None:
         """The link to this peer (to this run of it, if ``instance`` is given) fell."""
         self._membership.link_down(guid, self._clock.now(), instance)
+        self._flush()
+
+    def set_demand(self, *, on: bool) -> None:
+        """Take in whether this agent links on demand (``mesh.mode``): beacons then become rarer as the mesh grows."""
+        self._membership.set_demand(self._clock.now(), on=on)
         self._flush()
 
     def peers(self) -> tuple[PeerView, ...]:

@@ -42,8 +42,8 @@ class PacketFilter:
         domain: This agent's domain id.
         counters: ``beacon.in``, ``beacon.repeated``, ``beacon.flood``, ``beacon.unlinked_limited``,
             ``beacon.other_domain``, ``beacon.version``, ``beacon.malformed``.
-        is_linked: Whether there is a link with a run of a peer: beacons of linked peers, and echoes of
-            this agent's own, are not limited in rate.
+        is_verified: Whether a run of a peer has or had a link: beacons of such peers, and echoes of this agent's
+            own, are not limited in rate.
         trust: Of a secured mesh: only packets whose trailer is accepted are parsed; ``beacon.untagged``,
             ``beacon.forged`` and so on count the others.
     """
@@ -53,13 +53,13 @@ class PacketFilter:
         domain: int,
         counters: Counters,
         *,
-        is_linked: Callable[[Guid, bytes], bool] = lambda *_: False,
+        is_verified: Callable[[Guid, bytes], bool] = lambda *_: False,
         trust: PacketTrust | None = None,
     ) -> None:
         self._trust = trust
         self._domain = domain
         self._counters = counters
-        self._is_linked = is_linked
+        self._is_verified = is_verified
         self._unlinked: dict[int, TokenBucket] = {}
         self._unproved = TokenBucket(limits.BEACONS_UNPROVED_PER_SECOND, limits.BEACONS_UNPROVED_BURST)
         self.overrun = False
@@ -95,7 +95,7 @@ class PacketFilter:
         if self._trust is None and not self._is_new(data):
             return None
         try:
-            if not self._is_linked(*sender_of(data, self._domain)) and not self._within_limit(interface, now):
+            if not self._is_verified(*sender_of(data, self._domain)) and not self._within_limit(interface, now):
                 self._counters.add("beacon.unlinked_limited")
                 return None
             beacon = Beacon.parse(data, self._domain)

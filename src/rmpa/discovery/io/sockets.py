@@ -25,6 +25,7 @@ _ANY: Final = bytes(4)
 # Not in the socket module of every supported Python; the values are Linux's (linux/in.h).
 _IP_PKTINFO: Final = 8
 _IP_MULTICAST_ALL: Final = 49
+_SO_RCVBUFFORCE: Final = 33
 
 
 def open_receiver(host: str, port: int) -> socket.socket:
@@ -41,6 +42,7 @@ def open_receiver(host: str, port: int) -> socket.socket:
     try:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.setsockopt(socket.IPPROTO_IP, _IP_PKTINFO, 1)
+        enlarge_buffer(sock)
         # Without this, Linux also delivers the multicasts of groups that other programs of this machine joined.
         sock.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
         sock.bind((host, port))
@@ -48,6 +50,18 @@ def open_receiver(host: str, port: int) -> socket.socket:
         sock.close()
         raise
     return sock
+
+
+def enlarge_buffer(sock: socket.socket) -> int:
+    """Ask the kernel for room for the beacons of a large mesh; return the bytes that it grants.
+
+    ``net.core.rmem_max`` bounds it, except for programs with CAP_NET_ADMIN.
+    """
+    try:
+        sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, limits.RECEIVE_BUFFER_BYTES)
+    except OSError:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, limits.RECEIVE_BUFFER_BYTES)
+    return sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
 
 
 def receive(sock: socket.socket) -> tuple[bytes, Address, int]:

@@ -87,6 +87,8 @@ class ActionPair:
         """Converts goals, without the id."""
         self.feedback = Conversion(feedback, f"{rule.name}_Feedback", types, rule.feedback)
         """Converts feedback, without the id."""
+        self.result: Final = result
+        """ROS 1's result."""
         wrapped = f"{self.ros1}GetResultResponse"
         both = Specification.parse(wrapped, f"int8 status\n{result.name} result\n")
         paths = rule.result and {"status": "status", **{f"result.{a}": f"result.{b}" for a, b in rule.result.items()}}

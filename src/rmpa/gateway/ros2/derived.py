@@ -1,4 +1,4 @@
-"""The ROS 1 definition of a type that only ROS 2 defines: a subscriber of ROS 1 can ask for it by name."""
+"""The ROS 1 definition of a type that only ROS 2 defines: a node of ROS 1 can ask for it by name."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from rosbags.interfaces import Nodetype
 
 from rmpa.ros.types.definitions import SEPARATOR, known_text
 from rmpa.ros.types.messages import MessageType
+from rmpa.ros.types.service_types import ServiceType
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,22 +35,43 @@ def derive_ros1(store: Typestore, name: str, name1: Callable[[str], str]) -> Mes
         KeyError: An embedded type is not known.
         DefinitionError: It has a field that ROS 1 cannot have.
     """
-    texts: dict[str, str] = {}
-    todo = [name]
     own = name1(name)
+    texts = _texts(store, [name], name1)
+    blocks = [texts.pop(own), *(f"{SEPARATOR}\nMSG: {key}\n{text}" for key, text in texts.items())]
+    return MessageType.learn(own, "\n".join(blocks))
+
+
+def derive_service(store: Typestore, name: str, own: str, name1: Callable[[str], str]) -> ServiceType:
+    """Make the ROS 1 form of a service type of ROS 2; fields and errors as for ``derive_ros1``.
+
+    Args:
+        store: The types of ROS 2, with request and response of the service.
+        name: ``package/srv/Name``.
+        own: ``package/Name`` of ROS 1.
+        name1: The name of ROS 1 for one of ROS 2's message types.
+    """
+    halves = {f"{name}_Request": f"{own}Request", f"{name}_Response": f"{own}Response"}
+    texts = _texts(store, list(halves), lambda each: halves.get(each) or name1(each))
+    return ServiceType(own, "\n---\n".join(texts.pop(half) for half in halves.values()), texts.get)
+
+
+def _texts(store: Typestore, names: list[str], name1: Callable[[str], str]) -> dict[str, str]:
+    """The own texts of some types, and of all that they embed, by their names of ROS 1."""
+    texts: dict[str, str] = {}
+    todo = list(names)
+    roots = {name1(name) for name in names}
     while todo:
         each = todo.pop()
         key = name1(each)
         if key in texts:
             continue
-        text = known_text(key) if key != own else None
+        text = known_text(key) if key not in roots else None
         texts[key] = text if text is not None else _text(store, each, name1)
         if text is None:
             todo += [inner for inner in _embedded(store, each) if inner not in _TIMES]
         else:  # ROS 1's type may embed others, which rmpa brings too
             todo += [_back(inner) for inner in MessageType(key).specifications if inner != key]
-    blocks = [texts.pop(own), *(f"{SEPARATOR}\nMSG: {key}\n{text}" for key, text in texts.items())]
-    return MessageType.learn(own, "\n".join(blocks))
+    return texts
 
 
 def _back(name: str) -> str:

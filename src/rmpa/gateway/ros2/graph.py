@@ -39,6 +39,8 @@ class Ros2Graph:
         self._endpoints: dict[str, Ros2Endpoint] = {}
         self._by_name: dict[str, dict[str, Ros2Endpoint]] = {}
         self._rivals: dict[str, Ros2Node] = {}
+        self._rivals_named: dict[str, dict[str, str]] = {}
+        """By the name of a node the tokens and sessions of other gateways that show it."""
         self.ignored: Counter[str] = Counter()
         """Tokens that were ignored, by reason."""
 
@@ -63,7 +65,12 @@ class Ros2Graph:
         """
         if not alive:
             gone = self._rivals.pop(key, None)
-            return "" if gone is None else gone.name
+            if gone is None:
+                return ""
+            del self._rivals_named[gone.name][key]
+            if not self._rivals_named[gone.name]:
+                del self._rivals_named[gone.name]
+            return gone.name
         try:
             node = parse_token(key)
         except RemoteProtocolError:
@@ -73,6 +80,7 @@ class Ros2Graph:
         if not node.name.startswith(OWN_NAMESPACE) or len(self._rivals) >= limits.ROS2_NODES_MAX:
             return ""
         self._rivals[key] = node
+        self._rivals_named.setdefault(node.name, {})[key] = node.zid
         return node.name
 
     def led_by(self, node: str) -> str:
@@ -81,7 +89,7 @@ class Ros2Graph:
         Two gateways of one mesh would show each node twice, and each message would come twice. Of those that show a
         node the one with the least session id goes on.
         """
-        shown = (each.zid for each in self._rivals.values() if each.name == node)
+        shown = self._rivals_named.get(node, {}).values()
         return min((zid for zid in shown if _order(zid) < _order(self._own_zid)), key=_order, default="")
 
     def change(self, key: str, *, alive: bool) -> Ros2Node | Ros2Endpoint | None:

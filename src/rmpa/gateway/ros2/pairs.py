@@ -140,15 +140,7 @@ class Ros2Pairs:
         """
         if len(self._variants) >= limits.ROS2_TYPES_MAX:
             raise NoConversion(f"{limits.ROS2_TYPES_MAX} types of ROS 2 were learnt already; {name} is not")
-        if name not in fields:
-            raise NoConversion(f"the node that has {name} described other types")
-        try:
-            variant = self._types.variant(fields)
-            hashed = variant.type_hash(name)
-        except (KeyError, RecursionError, TypesysError) as error:
-            raise NoConversion(f"the description of {name} is not complete: {error}") from error
-        if hashed != type_hash:
-            raise NoConversion(f"the description of {name} has the type hash {hashed}, its publisher {type_hash}")
+        variant = described_types(self._types, name, type_hash, fields)
         self._variants[name, type_hash] = variant
         if name not in self._types:  # so the mesh's own topics can have the type too
             self._types.take(fields)
@@ -210,3 +202,17 @@ def _found(kept: Conversion | NoConversion) -> Conversion:
     if isinstance(kept, NoConversion):
         raise kept.with_traceback(None)
     return kept
+
+
+def described_types(types: Ros2Types, name: str, type_hash: str, fields: Mapping[str, Any]) -> Ros2Types:
+    """The types of ROS 2 with what one of its nodes says of one; arguments and errors are those of ``described``."""
+    if name not in fields:
+        raise NoConversion(f"the node that has {name} described other types")
+    try:
+        variant = types.variant(fields)
+        hashed = variant.type_hash(name)
+    except (KeyError, RecursionError, TypesysError) as error:
+        raise NoConversion(f"the description of {name} is not complete: {error}") from error
+    if hashed != type_hash:
+        raise NoConversion(f"the description of {name} has the type hash {hashed}, its endpoint {type_hash}")
+    return variant

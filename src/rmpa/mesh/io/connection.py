@@ -22,6 +22,8 @@ from rmpa.mesh.connection_events import (
     HandshakeDone,
     HelloReceived,
     MarkReceived,
+    Parted,
+    PartingEnded,
     PongReceived,
     Refused,
 )
@@ -99,6 +101,10 @@ class ConnectionOwner(Protocol):
         """The connection is up and its timer fired, about once in a keepalive interval."""
         ...
 
+    def connection_parted(self, connection: Connection) -> None:
+        """Both sides agreed to end the connection for now; ``connection_closing`` follows."""
+        ...
+
     def connection_closing(self, connection: Connection, reason: str) -> None:
         """The connection sends no more data; ``connection_ended`` follows. May be called more than once."""
         ...
@@ -159,6 +165,8 @@ class Connection:
         """Once ended: whether it ended by silence (lease expired, no route, reset) rather than by a bye."""
         self.orderly = False
         """Once ended: whether one side ended it by a frame (bye, refuse)."""
+        self.held: list[bytes] = []
+        """Payloads of control frames that were not sent, because this side has agreed to park the link."""
         self.stalls = StallWatch(segment, clock.now())
         """Judges whether sent data gets through."""
         self._owner = owner
@@ -271,6 +279,9 @@ class Connection:
         closed.
         """
         if self._machine.state is not ConnectionState.UP:
+            return
+        if self._machine.holding:
+            self.held.append(payload)
             return
         self.stream.send((self._machine.control(payload),), URGENT)
         self._check_urgent()
@@ -396,10 +407,7 @@ class Connection:
         if isinstance(event, ControlReceived):
             self._owner.connection_control(self, event.payload)
         elif isinstance(event, MarkReceived):
-            if event.kind is FrameKind.LANE:
-                self._owner.connection_lane(self, event.route)
-            else:
-                self._on_mark(event.kind, event.route, event.sequence)
+            self._marked(event)
         elif isinstance(event, PongReceived):
             self._ponged(event)
         elif isinstance(event, HelloReceived):
@@ -416,9 +424,25 @@ class Connection:
             self._owner.connection_opened(self)
         elif isinstance(event, Refused):
             self._owner.connection_refused(self, event.refuse, by_us=event.by_us)
+        elif isinstance(event, Parted):
+            self._owner.connection_parted(self)
+        elif isinstance(event, PartingEnded):
+            self._send_held()
         elif isinstance(event, ConnectionClosed):
             self.orderly = event.orderly
             self._finish(event.reason)
+
+    def _marked(self, event: MarkReceived) -> None:
+        if event.kind is FrameKind.LANE:
+            self._owner.connection_lane(self, event.route)
+        else:
+            self._on_mark(event.kind, event.route, event.sequence)
+
+    def _send_held(self) -> None:
+        self._send_output()
+        held, self.held = self.held, []
+        for payload in held:
+            self.send_control(payload)
 
     def _ponged(self, event: PongReceived) -> None:
         if event.stamp == self._probe:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from rmpa.config.settings import LaneSettings
     from rmpa.core.counters import Counters
-    from rmpa.mesh.peering import SocketAddress
+    from rmpa.mesh.peering_events import SocketAddress
 
 
 class Dialler:

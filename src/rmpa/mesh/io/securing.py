@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rmpa.core.counters import RefusalLog
     from rmpa.core.identity import Identity
     from rmpa.mesh.handshake import Hello
-    from rmpa.mesh.peering import SocketAddress
+    from rmpa.mesh.peering_events import SocketAddress
     from rmpa.trust.preface import Preface, PrefaceGuard
 
 _log = logging.getLogger(__name__)

@@ -5,7 +5,6 @@ The agent's own node publishes it, so it does not cross to other modules. Withou
 
 from __future__ import annotations
 
-import asyncio
 import logging
 from typing import TYPE_CHECKING, Final
 
@@ -14,10 +13,13 @@ from rmpa.observe.health import Health, diagnostic_status
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.types.diagnostic_array import ARRAY_DEFINITION, ARRAY_MD5, ARRAY_TYPE, frame_array
 from rmpa.ros.wire.tcpros import TopicDescription
+from rmpa.runtime.coarse_timer import call_at_tick
 from rmpa.runtime.event_loop import yield_to_data
 from rmpa.runtime.system_clock import SystemClock
 
 if TYPE_CHECKING:
+    import asyncio
+
     from rmpa.bridge.io.bridge import Bridge
     from rmpa.observe.io.peer_clocks import PeerClocks
     from rmpa.observe.io.snapshot_builder import SnapshotBuilder
@@ -30,7 +32,7 @@ TOPIC: Final = "/diagnostics"
 
 
 class Diagnostics:
-    """Publishes judged snapshots; follows the peers' clocks as often, with or without a subscriber.
+    """Publishes judged snapshots; follows the peers' clocks as often, and seldom while no link is in use.
 
     Args:
         core: The local core.
@@ -52,6 +54,7 @@ class Diagnostics:
             bridge.node.name,
             TopicDescription(ARRAY_TYPE, ARRAY_MD5, ARRAY_DEFINITION),
             queue_messages=limits.DIAGNOSTICS_QUEUE,
+            on_first_subscriber=self._subscribed,
         )
         self._timer: asyncio.TimerHandle | None = None
 
@@ -62,7 +65,6 @@ class Diagnostics:
         code, text, _ = self._core.call("registerPublisher", node.name, TOPIC, ARRAY_TYPE, node.uri)
         if code != 1:
             _log.error("! the local core does not take %s: %s", TOPIC, text)
-        self._loop = asyncio.get_running_loop()
         self._again()
 
     def close(self) -> None:
@@ -74,7 +76,13 @@ class Diagnostics:
         node.remove_publication(TOPIC)
 
     def _again(self) -> None:
-        self._timer = self._loop.call_later(limits.DIAGNOSTICS_INTERVAL, self._look)
+        used = self._publication.subscribers or any(not s.link.rests for s in self._bridge.sessions.linked())
+        self._timer = call_at_tick(limits.DIAGNOSTICS_INTERVAL if used else limits.CLOCKS_IDLE_INTERVAL, self._look)
+
+    def _subscribed(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._again()
 
     def _look(self) -> None:
         self._again()

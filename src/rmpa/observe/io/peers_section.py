@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.io.mesh import Mesh
     from rmpa.mesh.io.path_monitor import PathMonitor
-    from rmpa.mesh.peering import PeerStatus
+    from rmpa.mesh.peering_events import PeerStatus
     from rmpa.runtime.stream import Stream
 
 _DENY: Final = {"services": "services.deny"}

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import os
 import re
 from pathlib import Path
@@ -22,7 +23,9 @@ from rmpa.ros import limits
 from rmpa.ros.http.client import connect, is_own_name, split_uri
 from rmpa.ros.master.reachability import Reachability
 from rmpa.runtime import limits as runtime_limits
+from rmpa.runtime.coarse_timer import sleep_to_tick
 from rmpa.runtime.descriptors import Use, is_shortage
+from rmpa.runtime.event_loop import yielding_to_data
 from rmpa.runtime.tcp_connections import ask_listening_ports
 
 if TYPE_CHECKING:
@@ -34,6 +37,8 @@ _log = logging.getLogger(__name__)
 
 _TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
 _PIECE: Final = 4 * KIB
+_PORTIONS: Final = 10
+"""Wake-ups in one interval over which the connects to nodes are spread."""
 _LISTENING: Final = re.compile(rb"^ *\d+: [0-9A-F]+:([0-9A-F]{4}) [0-9A-F]+:[0-9A-F]{4} 0A ", re.MULTILINE)
 
 
@@ -90,6 +95,8 @@ class Liveness:
         self._ports: asyncio.Future[set[int] | None] | None = None
         """The latest call of ``listening_ports`` in a thread."""
         self._closed = False
+        self._local_ports: dict[str, int | None] = {}
+        """The port of each slave API on this machine; ``None`` of the others."""
         self._reachability = Reachability()
         self._slow = asyncio.Semaphore(limits.NODE_UNREACHABLE_CHECKS)
 
@@ -129,18 +136,29 @@ class Liveness:
     async def _check_all(self) -> None:
         while True:
             self._ports = asyncio.get_running_loop().run_in_executor(None, listening_ports)
-            ports = await asyncio.shield(self._ports)
-            nodes = self._nodes()
-            self._reachability.keep(nodes)
-            pause = self._interval / max(1, len(nodes))
-            for node, api in nodes.items():
-                await asyncio.sleep(pause)
-                if _listens(api, ports):
-                    self._reached(node)
-                else:
+            silent = self._not_listening(await asyncio.shield(self._ports))
+            # Connects are spread over the interval, in as few wake-ups as their number allows.
+            portion = max(1, math.ceil(len(silent) / _PORTIONS))
+            for first in range(0, max(1, len(silent)), portion):
+                for node in silent[first : first + portion]:
                     self.suspect(node)
-            if not nodes:
-                await asyncio.sleep(pause)
+                if first + portion < len(silent):
+                    await sleep_to_tick(self._interval / _PORTIONS)
+            await sleep_to_tick(self._interval)
+
+    def _not_listening(self, ports: set[int] | None) -> list[str]:
+        """The nodes that the kernel's table does not prove to live; the others are noted as reached."""
+        nodes = self._nodes()
+        self._reachability.keep(nodes)
+        before, self._local_ports = self._local_ports, {}
+        silent = []
+        for node, api in yielding_to_data(nodes.items()):
+            port = self._local_ports[api] = before[api] if api in before else _local_port(api)
+            if ports is not None and port in ports:
+                self._reached(node)
+            else:
+                silent.append(node)
+        return silent
 
     async def _check(self, node: str, api: str) -> None:
         try:
@@ -170,12 +188,13 @@ class Liveness:
             _log.warning("= node %s can be reached again", node)
 
 
-def _listens(api: str, ports: set[int] | None) -> bool:
+def _local_port(api: str) -> int | None:
+    """The port of a slave API that is on this machine by its name; ``None`` of another one."""
     try:
         host, port, _ = split_uri(api)
     except UnreachableError:
-        return False  # the attempt to connect reports the reason
-    return ports is not None and (is_own_name(host) or host.startswith("127.")) and port in ports
+        return None  # the attempt to connect reports the reason
+    return port if is_own_name(host) or host.startswith("127.") else None
 
 
 def is_gone(api: str, ports: set[int] | None, addresses: Container[str]) -> bool:

@@ -54,6 +54,8 @@ class StateWriter:
         """Why nothing is stored at present, or empty."""
         self._revisions: dict[str, int] = {}
         self._tree: Tree = {}
+        self._revision = -1
+        """Of the registrations when they were last compared with the file."""
         self._known: dict[Key, tuple[int, int]] = {}
         """Size and hash of each row that is in the file."""
         self._size = 0
@@ -117,7 +119,8 @@ class StateWriter:
 
     def schedule_write(self) -> None:
         """Write soon, if something has changed."""
-        if self._closed:
+        registrations, tree = self._api.registrations, self._api.parameters.tree
+        if self._closed or (registrations.revision == self._revision and tree is self._tree and not self.problem):
             return
         if self._writing is not None:
             self._again = True
@@ -175,8 +178,9 @@ class StateWriter:
     async def _write(self) -> bool:
         """Write what has changed; return whether that succeeded."""
         registrations, tree = self._api.registrations, self._api.parameters.tree
-        revisions = dict(registrations.revisions)
+        revisions, revision = dict(registrations.revisions), registrations.revision
         if revisions == self._revisions and tree is self._tree and not self._rewrite and not self.problem:
+            self._revision = revision
             return True
         try:
             if self._unread:
@@ -196,7 +200,7 @@ class StateWriter:
             self._set_problem(str(error))
             return False
         self._rewrite = False
-        self._revisions, self._tree = revisions, tree
+        self._revisions, self._tree, self._revision = revisions, tree, revision
         for key, (size, digest) in known.items():
             self._size += size - self._known.pop(key, _NONE)[0]
             if size:

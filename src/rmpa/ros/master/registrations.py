@@ -53,7 +53,8 @@ class Registrations:
         self._state: GraphState | None = None
         self.unverified = UnverifiedNodes()
         self._restored: set[str] = set()
-        self._revision = 0
+        self.revision = 0
+        """Another number after each change of a node's record."""
         self.revisions: dict[str, int] = {}
         """A number for each registered or unverified node, which differs after each change of the node."""
         self.effects: list[Effect] = []
@@ -301,9 +302,9 @@ class Registrations:
 
     def _mark_changed(self, node: str) -> None:
         """Give a node a new revision, because its record has changed; forget one that has no record left."""
+        self.revision += 1
         if node in self._nodes or self.unverified.get(node) is not None:
-            self._revision += 1
-            self.revisions[node] = self._revision
+            self.revisions[node] = self.revision
         else:
             self.revisions.pop(node, None)
             self._restored.discard(node)

@@ -17,7 +17,8 @@ DEFINITIONS = {"std_msgs/msg/String": "string data\n", "arm_msgs/msg/Grip": "flo
 
 
 def say(**fields: Any) -> None:
-    print(json.dumps(fields), flush=True)
+    sys.stdout.write(json.dumps(fields) + "\n")  # in one piece: print would write the end of the line by itself
+    sys.stdout.flush()
 
 
 def heard(topic: str, message: Any) -> None:

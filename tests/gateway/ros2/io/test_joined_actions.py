@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import struct
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -16,11 +17,14 @@ from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour
 from rmpa.gateway.ros2.mapping import ActionRule
 from rmpa.gateway.ros2.qos import Ros2Qos
 from rmpa.gateway.ros2.tokens import EntityKind, Ros2Endpoint, Ros2Node, data_key, parse_token
+from rmpa.gateway.ros2.type_description import SERVICE_TYPE
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.gateway.zenoh_api import ZenohQos
+from rmpa.ros.types.definitions import SEPARATOR, known_text
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_graph import MemoryGraph
 from tests.gateway.memory_zenoh import MemoryQuery, MemoryZenoh, eventually
+from tests.gateway.ros2.type_descriptions import response
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -34,6 +38,14 @@ ACTION = {part: MessageType(f"actionlib/TestAction{part.title()}") for part in (
 ACTION["status"] = MessageType("actionlib_msgs/GoalStatusArray")
 ACTION["cancel"] = MessageType("actionlib_msgs/GoalID")
 UUID = bytes(range(16))
+
+
+def blocks(*names: str) -> str:
+    """The blocks of embedded types in a definition."""
+    return "".join(f"{SEPARATOR}\nMSG: {name}\n{known_text(name)}\n" for name in names)
+
+
+POINT = blocks("geometry_msgs/Point")
 ATTACHMENT = Ros2Attachment(3, 1, bytes(16)).serialize()
 KINDS = {
     "send_goal": TYPES.send_goal, "get_result": TYPES.get_result, "cancel_goal": "action_msgs/srv/CancelGoal",
@@ -182,6 +194,81 @@ async def test_a_client_of_ros1_has_a_goal_done_by_a_server_of_ros2(bed: Bed) ->
     await eventually(lambda: result.messages)
     state, body = parse_outcome(result.messages[0])
     assert (state.goal.id, state.status, body) == ("g1", 2, b"\4\0\0\0")
+
+
+DOCK = [
+    MessageType.learn("dock_msgs/DockGoal", "geometry_msgs/Point place\nuint16 tries\n" + POINT),
+    MessageType.learn("dock_msgs/DockResult", "string where\n"),
+    MessageType.learn("dock_msgs/DockFeedback", "float32 left\n"),
+]
+
+
+async def test_an_action_of_a_type_that_ros1_lacks_is_learnt_from_its_server(bed: Bed) -> None:
+    theirs = Ros2Types("jazzy")
+    action = "dock_msgs/action/Dock"
+    pair = ActionPair(DOCK[0], DOCK[1], DOCK[2], ActionRule(action), theirs)
+    types, session = pair.types, bed.network.session()
+    node = Ros2Node(0, session.zid, 0, "/docker")
+    goals: list[MemoryQuery] = []
+    results: list[MemoryQuery] = []
+    numbers = iter(range(1, 100))
+
+    def declare(kind: EntityKind, name: str, type_name: str, type_hash: str) -> Ros2Endpoint:
+        endpoint = Ros2Endpoint(node, next(numbers), kind, name, type_name, type_hash, Ros2Qos())
+        session.token(endpoint.token())
+        return endpoint
+
+    def describe(query: MemoryQuery) -> None:
+        asked = [
+            name for name in (types.send_goal, types.get_result, types.feedback) if name.encode() in query.payload
+        ]
+        query.reply(query.key, response(theirs, asked[0]), query.attachment)
+        query.finish()
+
+    head = "/dock/_action"
+    send = declare(EntityKind.SERVICE, f"{head}/send_goal", types.send_goal, types.hashes[types.send_goal])
+    session.queryable(send.key(), goals.append)  # type: ignore[arg-type]
+    get = declare(EntityKind.SERVICE, f"{head}/get_result", types.get_result, types.hashes[types.get_result])
+    session.queryable(get.key(), results.append)  # type: ignore[arg-type]
+    told = declare(EntityKind.PUBLISHER, f"{head}/feedback", types.feedback, types.hashes[types.feedback])
+    service = "/docker/get_type_description"
+    describer = declare(EntityKind.SERVICE, service, SERVICE_TYPE, "RIHS01_" + "1" * 64)
+    session.queryable(describer.key(), describe)  # type: ignore[arg-type]
+
+    await eventually(lambda: len(bed.graph.topics) == 3)
+    status, feedback, result = (bed.graph.topics[f"/dock/{p}", "/docker"] for p in ("status", "feedback", "result"))
+    assert result.description is not None
+    assert result.description.type == "dock_msgs/DockActionResult"
+    own = MessageType.learn(result.description.type, result.description.definition, result.description.md5sum)
+    status.on_demand(True)
+    goal_type = MessageType.learn(
+        "dock_msgs/DockActionGoal",
+        "Header header\nactionlib_msgs/GoalID goal_id\ndock_msgs/DockGoal goal\n"
+        + blocks("std_msgs/Header", "actionlib_msgs/GoalID")
+        + f"{SEPARATOR}\nMSG: dock_msgs/DockGoal\n{DOCK[0].definition}",
+    )
+    client = bed.graph.publisher("/dock/goal", goal_type, "/client")
+    goal = goal_type.make({"goal_id": {"id": "g1"}, "goal": {"place": {"x": 2.0}, "tries": 9}})
+    bed.graph.send(client, goal_type.serialize(goal))
+    await eventually(lambda: goals)
+    request: Any = theirs.store.deserialize_cdr(goals[0].payload, f"{types.send_goal}_Request")
+    assert (request.goal.place.x, request.goal.tries) == (2.0, 9)
+    goals[0].reply(goals[0].key, b"\0\1\0\0\1" + bytes(11), goals[0].attachment)
+    goals[0].finish()
+    await eventually(lambda: results)
+    session.publisher(told.key(), ZenohQos(), lambda _: None).put(
+        b"\0\1\0\0" + goals[0].payload[4:20] + struct.pack("<f", 0.5)
+    )
+    await eventually(lambda: feedback.messages)
+    value: Any = theirs.store.types[f"{types.get_result}_Response"](4, theirs.store.types[f"{action}_Result"]("home"))
+    payload = bytes(theirs.store.serialize_cdr(value, f"{types.get_result}_Response"))
+    results[0].reply(results[0].key, payload, results[0].attachment)
+    results[0].finish()
+    await eventually(lambda: result.messages)
+    got = own.deserialize(result.messages[0])
+    assert (got.status.status, got.result.where) == (3, "home")
+    session.close()
+    await eventually(lambda: not bed.graph.topics)
 
 
 async def test_a_server_of_ros2_that_dies_aborts_the_goal_and_leaves(bed: Bed) -> None:

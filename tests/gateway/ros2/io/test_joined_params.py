@@ -15,7 +15,7 @@ from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour
 from rmpa.gateway.ros2.io.params import Ros2Params
 from rmpa.gateway.ros2.params import EVENT_TYPE, EVENTS, SERVICES, ParamTypes
 from rmpa.gateway.ros2.qos import Ros2Qos
-from rmpa.gateway.ros2.tokens import EntityKind, Ros2Endpoint, Ros2Node, data_key
+from rmpa.gateway.ros2.tokens import EntityKind, Ros2Endpoint, Ros2Node, data_key, parse_token
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.gateway.zenoh_api import ZenohQos
 from rmpa.ros.types.messages import MessageType
@@ -118,6 +118,29 @@ async def test_the_parameters_of_a_module_are_those_of_a_node_of_ros2(bed: Bed) 
     assert [each.type for each in (await bed.call("describe_parameters", names=["rate"])).descriptors] == [2]
     bed.graph.remove(source)
     assert not [key for key in bed.network.token_keys if "arm" in key]
+
+
+async def test_of_two_gateways_of_one_mesh_one_shows_the_parameters_of_a_module(bed: Bed) -> None:
+    part = Ros2Params(bed.ask, bed.tree)
+    other = Ros2Neighbour(bed.graph, bed.network.session(), GatewaySettings(), [part])
+    other.start()
+
+    def sessions() -> set[str]:
+        tokens = [parse_token(key) for key in bed.network.token_keys]
+        return {each.node.zid for each in tokens if isinstance(each, Ros2Endpoint) and each.node.name == "/rmpa/arm"}
+
+    try:
+        bed.graph.publisher("/scan", MessageType("std_msgs/String"))
+        await eventually(lambda: sessions() == {bed.neighbour.context.session.zid})
+        assert (bed.part.report()["params_out"], part.report()["params_out"]) == (["arm"], [])
+        later = bed.graph.publisher("/later", MessageType("std_msgs/String"), "/other")
+        assert part.report()["params_out"] == [], "the other gateway answers for all nodes of the module"
+        await bed.neighbour.close()
+        await eventually(lambda: sessions() == {other.context.session.zid})
+        assert list((await bed.call("list_parameters", prefixes=["gains"], depth=0)).result.names) == ["gains.p"]
+        bed.graph.remove(later)
+    finally:
+        await other.close()
 
 
 async def test_a_parameter_of_a_module_is_set_or_refused_by_the_module(bed: Bed) -> None:

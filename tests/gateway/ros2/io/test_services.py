@@ -16,10 +16,13 @@ from rmpa.gateway.ros2.io.own_nodes import gid_of
 from rmpa.gateway.ros2.io.services import Ros2Services
 from rmpa.gateway.ros2.qos import Ros2Qos
 from rmpa.gateway.ros2.tokens import EntityKind, Ros2Endpoint, Ros2Node, parse_token
+from rmpa.gateway.ros2.type_description import SERVICE_TYPE
 from rmpa.gateway.ros2.types import Ros2Types
+from rmpa.ros.types.definitions import known_text
 from rmpa.ros.types.service_types import ServiceType
 from tests.gateway.memory_graph import MemoryGraph
 from tests.gateway.memory_zenoh import MemoryQuery, MemorySession, MemoryZenoh, eventually
+from tests.gateway.ros2.type_descriptions import response
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -194,6 +197,84 @@ async def test_a_service_whose_definition_differs_is_reported_and_not_shown(bed:
     assert "definitions differ" in problems()["/sum"]
     assert "odd_msgs/Odd" in problems()["/odd"]
     assert not bed.graph.services
+
+
+GRIP = ServiceType(
+    "arm_msgs/Grip",
+    "arm_msgs/Finger[] fingers\nHeader header\n---\nbool ok\ntime at\n",
+    lambda name: "float32 force\nstring name\n" if name == "arm_msgs/Finger" else known_text(name),
+)
+GRIP_2 = "arm_msgs/srv/Grip"
+
+
+async def test_a_service_of_a_type_that_ros1_lacks_is_learnt_from_its_node_and_called(bed: Bed) -> None:
+    theirs = Ros2Types("jazzy")
+    type_hash = theirs.service_hash(GRIP)
+    node = Ros2Node(0, bed.ros2.zid, 0, "/gripper")
+    server = Ros2Endpoint(node, 1, EntityKind.SERVICE, "/grip", GRIP_2, type_hash, Ros2Qos())
+    names = "/gripper/get_type_description", SERVICE_TYPE, "RIHS01_" + "1" * 64
+    describer = Ros2Endpoint(node, 2, EntityKind.SERVICE, *names, Ros2Qos())
+    asked: list[bytes] = []
+
+    def describe(query: MemoryQuery) -> None:
+        asked.append(query.payload)
+        query.reply(query.key, response(theirs, GRIP_2), query.attachment)
+        query.finish()
+
+    def answer(query: MemoryQuery) -> None:
+        request: Any = theirs.store.deserialize_cdr(query.payload, f"{GRIP_2}_Request")
+        made: Any = theirs.store.types
+        at = made["builtin_interfaces/msg/Time"](int(request.fingers[0].force), len(request.fingers))
+        value = made[f"{GRIP_2}_Response"](request.fingers[1].name == "thumb", at)
+        query.reply(query.key, bytes(theirs.store.serialize_cdr(value, f"{GRIP_2}_Response")), query.attachment)
+        query.finish()
+
+    serve_ros2(bed.ros2, server, answer)
+    serve_ros2(bed.ros2, describer, describe)
+    await eventually(lambda: "/grip" in bed.graph.services)
+    service = bed.graph.services["/grip"]
+    description = await service.describe()
+    assert (description.type, description.md5sum) == ("arm_msgs/Grip", GRIP.md5sum), "a client's own definition fits"
+    fingers = [{"force": 7.0, "name": "index"}, {"force": 1.0, "name": "thumb"}]
+    response_1 = await service.serve(GRIP.request.serialize(GRIP.request.make({"fingers": fingers})))
+    got = GRIP.response.deserialize(response_1)
+    assert (got.ok, got.at.sec, got.at.nanosec) == (True, 7, 2)
+    assert len(asked) == 1
+
+
+async def test_a_service_that_differs_from_ros1s_is_called_by_the_fields_that_its_node_describes(bed: Bed) -> None:
+    theirs = Ros2Types("jazzy").variant({})
+    wider = ServiceType("std_srvs/SetBool", "bool data\nstring why\n---\nbool success\nstring message\n")
+    name = "std_srvs/srv/SetBool"
+    for part in ("", "_Request", "_Response", "_Event"):
+        theirs.store.fielddefs.pop(name + part, None)
+        theirs.store.types.pop(name + part, None)
+    node = Ros2Node(0, bed.ros2.zid, 0, "/motor")
+    server = Ros2Endpoint(node, 1, EntityKind.SERVICE, "/on", name, theirs.service_hash(wider), Ros2Qos())
+    names = "/motor/get_type_description", SERVICE_TYPE, "RIHS01_" + "1" * 64
+    describer = Ros2Endpoint(node, 2, EntityKind.SERVICE, *names, Ros2Qos())
+
+    def describe(query: MemoryQuery) -> None:
+        query.reply(query.key, response(theirs, name), query.attachment)
+        query.finish()
+
+    asked: list[bytes] = []
+
+    def answer(query: MemoryQuery) -> None:
+        asked.append(query.payload)
+        value = theirs.store.types[f"{name}_Response"](True, "on")
+        query.reply(query.key, bytes(theirs.store.serialize_cdr(value, f"{name}_Response")), query.attachment)
+        query.finish()
+
+    serve_ros2(bed.ros2, server, answer)
+    serve_ros2(bed.ros2, describer, describe)
+    await eventually(lambda: "/on" in bed.graph.services)
+    service = bed.graph.services["/on"]
+    assert (await service.describe()).md5sum == SET_BOOL.md5sum
+    got = await service.serve(SET_BOOL.request.serialize(SET_BOOL.request.make({"data": True})))
+    assert SET_BOOL.response.deserialize(got).message == "on"
+    request: Any = theirs.store.deserialize_cdr(asked[0], f"{name}_Request")
+    assert (request.data, request.why) == (True, "")
 
 
 async def test_rules_and_use_decide_what_crosses() -> None:

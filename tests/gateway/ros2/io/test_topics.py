@@ -81,6 +81,31 @@ async def test_a_late_node_of_ros2_gets_the_latched_message() -> None:
         assert bed.graph.taps, "the last message is followed, for later ones"
 
 
+async def test_a_latched_topic_is_transient_local_before_its_first_subscriber(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(limits, "LATCH_LOOK_AFTER", 0.0)
+    async with topic_bed() as bed:
+        source = bed.graph.publisher("/map", STRING, latching=True)
+        bed.graph.publisher("/chatter", STRING)
+        bed.graph.publisher("/camera", MessageType("sensor_msgs/Image"), latching=True)
+        bed.graph.publisher("/tf_static", MessageType("tf2_msgs/TFMessage"), latching=True)
+
+        def latched() -> list[str]:
+            return sorted(each.name for each in bed.own(EntityKind.PUBLISHER) if each.qos.latched)
+
+        assert latched() == ["/tf_static"], "that name says so"
+        await eventually(lambda: latched() == ["/map", "/tf_static"])
+        await eventually(lambda: not bed.graph.taps)
+        late: list[ZenohSample] = []
+        bed.subscribe("/map", late, qos=LATCHED)
+        await eventually(lambda: bed.graph.taps)
+        assert {tap.source.name for tap in bed.graph.taps} == {"/map"}, "a driver of a camera is not started by that"
+        bed.graph.send(source, string("map"))
+        await eventually(lambda: late)
+        assert len([each for each in bed.own(EntityKind.PUBLISHER) if each.name == "/map"]) == 1
+
+
 async def test_a_type_that_ros2_lacks_is_learnt_from_its_publisher() -> None:
     async with topic_bed() as bed:
         source = bed.graph.publisher("/grip", CUSTOM)

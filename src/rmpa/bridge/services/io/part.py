@@ -155,6 +155,7 @@ class Services(Part):
             advertisement=AdvertiseServices,
             apply=self._apply,
             do=self._do,
+            on_idle=self._settled,
         )
         self._act = self._driver.act
         self._serving = Serving(core, self.exports, sessions, self._budgets, self._act)
@@ -317,6 +318,9 @@ class Services(Part):
         """Have a service examined for which a node was registered or unregistered."""
         if change.kind is RegistrationKind.SERVICE:
             self._driver.look((change.name,))
+
+    def _settled(self) -> None:
+        self._serving.changed()
 
     def depends(self, session: PeerSession) -> bool:
         """Whether nodes of this module have direct connections to the peer's."""

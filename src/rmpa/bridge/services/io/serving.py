@@ -25,6 +25,7 @@ from rmpa.ros.core.liveness import listening_ports
 from rmpa.ros.http.client import is_own_name
 from rmpa.ros.node.local_addresses import local_addresses
 from rmpa.ros.wire.services import parse_service_uri
+from rmpa.runtime.coarse_timer import sleep_to_tick
 from rmpa.runtime.event_loop import yielding_to_data
 
 if TYPE_CHECKING:
@@ -66,6 +67,7 @@ class Serving:
         self._servers: dict[tuple[int, int], Server] = {}
         self._pools: dict[str, ServicePool] = {}
         self._tasks: set[asyncio.Task[None]] = set()
+        self._offering = asyncio.Event()
 
     def start(self) -> None:
         """Begin to check that servers live."""
@@ -81,8 +83,14 @@ class Serving:
             pool.close("the agent ends")
             await pool.closed()
 
+    def changed(self) -> None:
+        """Begin with the checks again, if services are offered now."""
+        if self._exports.offered:
+            self._offering.set()
+
     def do(self, action: ExportAction) -> None:
         """Carry out one action."""
+        self.changed()
         match action:
             case Probe():
                 self._spawn(self._ask_server(action), f"describe {action.service}")
@@ -165,14 +173,15 @@ class Serving:
     async def _look_after(self) -> None:
         """Find killed servers: a node with an offered service whose port has no listener is suspected."""
         while True:
+            if not self._exports.offered:
+                self._offering.clear()
+                await self._offering.wait()
             servers = dict(self._exports.offered)
-            cost = 0.0
-            if servers:
-                ports, here, cost = await asyncio.to_thread(_listening)
-                for service, server in yielding_to_data(list(servers.items())):
-                    if self._exports.offered.get(service) == server and _is_deaf(server, ports, here):
-                        self._core.suspect(server.node)
-            await asyncio.sleep(max(limits.SERVER_LOOK, _LOOK_SHARE * cost))
+            ports, here, cost = await asyncio.to_thread(_listening)
+            for service, server in yielding_to_data(list(servers.items())):
+                if self._exports.offered.get(service) == server and _is_deaf(server, ports, here):
+                    self._core.suspect(server.node)
+            await sleep_to_tick(max(limits.SERVER_LOOK, _LOOK_SHARE * cost))
 
 
 def _listening() -> tuple[set[int] | None, frozenset[str], float]:

@@ -14,6 +14,7 @@ from rmpa.gateway.ros2.crossing import SITE, Ros2Crossing
 from rmpa.gateway.ros2.graph import Ros2Graph
 from rmpa.gateway.ros2.io.own_nodes import OwnRos2Nodes
 from rmpa.gateway.ros2.io.part import Ros2Context
+from rmpa.gateway.ros2.io.type_asker import Ros2TypeAsker
 from rmpa.gateway.ros2.mapping import TypeMapping
 from rmpa.gateway.ros2.tokens import Ros2Endpoint, graph_key
 from rmpa.gateway.ros2.types import WITHOUT_HASH, Ros2Types
@@ -64,16 +65,19 @@ class Ros2Neighbour:
         self._sources: dict[str, set[MeshSource]] = {}
         self._standing_by: dict[str, str] = {}
         size = _GID_BYTES_BEFORE if ros2.distribution in WITHOUT_HASH else GID_BYTES
+        types, there = Ros2Types(ros2.distribution), Ros2Graph(ros2.domain, session.zid)
+        nodes = OwnRos2Nodes(session, ros2.domain, graph.name, size)
         self.context: Final = Ros2Context(
             graph,
             session,
             settings,
             contracts if contracts is not None else Contracts(),
-            Ros2Types(ros2.distribution),
+            types,
             mapping,
             Ros2Crossing(settings.rules),
-            OwnRos2Nodes(session, ros2.domain, graph.name, size),
-            Ros2Graph(ros2.domain, session.zid),
+            nodes,
+            there,
+            Ros2TypeAsker(session, nodes, there, types),
             self._spawn,
             self._say,
         )
@@ -140,10 +144,14 @@ class Ros2Neighbour:
             return
         if rival := self.context.ros2.rival(key, alive=alive):
             self._judge_again(rival)
+            for part in self._parts:
+                part.rival(rival)
         entity = self.context.ros2.change(key, alive=alive)
         if isinstance(entity, Ros2Endpoint):
             _log.debug("%s %s", "+" if alive else "-", entity.token())
             any(part.endpoint(entity, there=alive) for part in self._parts)
+            if alive:
+                self.context.asker.appeared()
 
     def _mesh_source(self, source: MeshSource, there: bool) -> None:
         if self._closed:

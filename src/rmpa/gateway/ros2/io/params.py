@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from rmpa.gateway.ros2.graph import OWN_NAMESPACE
 from rmpa.gateway.ros2.io.module_params import ModuleParams
 from rmpa.gateway.ros2.io.node_params import NodeParams
 from rmpa.gateway.ros2.params import PACKAGE, ParamTypes
@@ -43,15 +44,30 @@ class Ros2Params:
     def mesh_source(self, source: MeshSource, *, there: bool) -> bool:
         """Offer the parameters of a module while any source of it is there; the source is left to other parts."""
         count = self._sources.get(source.module, 0) + (1 if there else -1)
-        self._sources[source.module] = count
-        if count > 0 and source.module not in self._modules:
-            if self._context is not None and self._types is not None and _may_be_a_node(source.module):
-                self._modules[source.module] = ModuleParams(self._context, self._types, source.module, self._ask)
-        elif count <= 0:
-            del self._sources[source.module]
-            if (gone := self._modules.pop(source.module, None)) is not None:
-                gone.close()
+        if count > 0:
+            self._sources[source.module] = count
+        else:
+            self._sources.pop(source.module, None)
+        self._judge(source.module)
         return False
+
+    def rival(self, node: str) -> None:
+        """Of the gateways that show the node of a module one answers for its parameters."""
+        module = node.removeprefix(OWN_NAMESPACE)
+        if module in self._sources:
+            self._judge(module)
+
+    def _judge(self, module: str) -> None:
+        """Offer the parameters of a module, or take them back."""
+        context, types = self._context, self._types
+        if context is None or types is None:
+            return
+        wanted = module in self._sources and _may_be_a_node(module)
+        if wanted and not context.ros2.led_by(OWN_NAMESPACE + module):
+            if module not in self._modules:
+                self._modules[module] = ModuleParams(context, types, module, self._ask)
+        elif (gone := self._modules.pop(module, None)) is not None:
+            gone.close()
 
     def endpoint(self, endpoint: Ros2Endpoint, *, there: bool) -> bool:
         """Take the services of rcl_interfaces; *get_parameters* stands for all of a node."""

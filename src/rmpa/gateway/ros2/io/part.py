@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
+from rmpa.ros.types.definitions import known_types
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
 
@@ -14,6 +16,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.ros2.crossing import Ros2Crossing
     from rmpa.gateway.ros2.graph import Ros2Graph
     from rmpa.gateway.ros2.io.own_nodes import OwnRos2Nodes
+    from rmpa.gateway.ros2.io.type_asker import Ros2TypeAsker
     from rmpa.gateway.ros2.mapping import TypeMapping
     from rmpa.gateway.ros2.tokens import Ros2Endpoint
     from rmpa.gateway.ros2.types import Ros2Types
@@ -34,6 +37,7 @@ class Ros2Context:
         crossing: Which sources cross, and under which name.
         nodes: Declares our nodes and endpoints in ROS 2's graph, and gives their GIDs.
         ros2: ROS 2's graph; what this gateway declares is not in it.
+        asker: Asks nodes of ROS 2 for types that are not known here.
         spawn: Runs a coroutine in the background; it is cancelled when the neighbour closes.
         say: Logs a problem once, and keeps it for ``report``: what it is about, and the text. An empty text: solved.
     """
@@ -47,8 +51,13 @@ class Ros2Context:
     crossing: Ros2Crossing
     nodes: OwnRos2Nodes
     ros2: Ros2Graph
+    asker: Ros2TypeAsker
     spawn: Callable[[Coroutine[None, None, None]], None]
     say: Callable[[str, str], None]
+
+    def ros1_name(self, name: str) -> str:
+        """The name of ROS 1 for a message type of ROS 2, ``package/msg/Name``."""
+        return self.mapping.ros1_message(name, known_types())
 
 
 class Ros2Part(Protocol):
@@ -69,6 +78,12 @@ class Ros2Part(Protocol):
 
         Returns:
             Whether this part takes it: then no other part is told.
+        """
+
+    def rival(self, node: str) -> None:
+        """Another gateway shows a node below ``/rmpa/``, or does not any more.
+
+        ``Ros2Graph.led_by`` tells which of them leads. The node's sources were taken back or offered again already.
         """
 
     def close(self) -> None:

@@ -10,12 +10,12 @@ from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import ForeignSource, SourceKind
 from rmpa.gateway.ros2.action_messages import CancelCode, cancel_code, is_accepted
-from rmpa.gateway.ros2.action_pair import CANCEL_TYPE, PART, STATUS_TYPE
+from rmpa.gateway.ros2.action_pair import CANCEL_TYPE, PART, STATUS_TYPE, ActionPair
 from rmpa.gateway.ros2.attachment import Ros2Attachment
 from rmpa.gateway.ros2.conversion import NoConversion
 from rmpa.gateway.ros2.crossing import SITE
 from rmpa.gateway.ros2.goals_to_ros2 import AskServer, GoalsToRos2
-from rmpa.gateway.ros2.io.action_types import find_action, find_topics
+from rmpa.gateway.ros2.io.action_types import find_parts, find_topics, learn_action, learnt_topics
 from rmpa.gateway.ros2.mapping import ActionRule
 from rmpa.gateway.ros2.qos import Ros2Qos
 from rmpa.gateway.ros2.tokens import EntityKind
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from rmpa.gateway.ros2.io.part import Ros2Context
     from rmpa.gateway.ros2.tokens import Ros2Endpoint
     from rmpa.gateway.zenoh_api import Declared, ZenohSample
+    from rmpa.ros.types.messages import MessageType
+    from rmpa.ros.wire.tcpros import TopicDescription
 
 _STATUS: Final = "actionlib_msgs/GoalStatusArray"
 
@@ -112,15 +114,8 @@ class ShownAction:
 
     async def _show(self) -> None:
         context, server = self._context, self.server
-        ros2 = server.type.removesuffix("_SendGoal")
         try:
-            ros1 = context.mapping.ros1_action(ros2)
-            rule = context.mapping.action(ros1)
-            pair = await find_action(context, ros1, rule if rule.name == ros2 else ActionRule(ros2))
-            if pair.types.hashes[pair.types.send_goal] != server.type_hash:
-                raise NoConversion(f"{ros2} has another definition there than {ros1} here: its type hash differs")
-            _, result, feedback = pair.messages
-            headers = await find_topics((_STATUS, feedback, result))
+            pair, headers = await self._find_pair()
         except RmpaError as error:
             context.say(self.here, f"the action of ROS 2's node {server.node.name} is not shown: {error}")
             return
@@ -134,6 +129,42 @@ class ShownAction:
             topic.describe(header)
             self._topics[part] = topic
         self._listen()
+
+    async def _find_pair(self) -> tuple[ActionPair, list[TopicDescription]]:
+        """The types, and the headers of status, feedback and result; its node is asked for what is not known here.
+
+        Raises:
+            RmpaError: The types are no pair, or ROS 2's are not known.
+        """
+        context, server = self._context, self.server
+        ros2 = server.type.removesuffix("_SendGoal")
+        ros1 = context.mapping.ros1_action(ros2)
+        rule = context.mapping.action(ros1)
+        if rule.name != ros2:
+            rule = ActionRule(ros2)
+        known: list[MessageType] = []
+        try:
+            known = await find_parts(ros1)
+            pair = ActionPair(known[0], known[1], known[2], rule, context.types)
+            if pair.types.hashes[pair.types.send_goal] == server.type_hash:
+                return pair, await self._headers(pair)
+            problem = f"{ros2} has another definition there than {ros1} here: its type hash differs"
+        except RmpaError as error:
+            problem = str(error)
+        try:
+            pair = await learn_action(context, server, ros1, rule, known)
+        except RmpaError as error:
+            raise NoConversion(f"{problem}; {error}") from error
+        return pair, await self._headers(pair)
+
+    @staticmethod
+    async def _headers(pair: ActionPair) -> list[TopicDescription]:
+        _, result, feedback = pair.messages
+        (status,) = await find_topics((_STATUS,))
+        try:
+            return [status, *await find_topics((feedback, result))]
+        except RmpaError:
+            return [status, *learnt_topics(pair)]
 
     def _wanted(self, wanted: bool) -> None:
         if self._machine is not None and not self._closed:

@@ -12,6 +12,7 @@ from rmpa.gateway.neighbour import ForeignSource, SourceKind
 from rmpa.gateway.ros2.attachment import Ros2Attachment
 from rmpa.gateway.ros2.conversion import NoConversion
 from rmpa.gateway.ros2.crossing import SITE
+from rmpa.gateway.ros2.derived import derive_service
 from rmpa.gateway.ros2.mapping import TypePair
 from rmpa.gateway.ros2.qos import Ros2Qos
 from rmpa.gateway.ros2.service_pair import ServicePair
@@ -69,20 +70,46 @@ class ShownRos2Service:
         context, server = self._context, self.server
         name = context.mapping.ros1_service(server.type)
         try:
-            kind = await asyncio.to_thread(find_service_type, name)
-            rule = context.mapping.service(name)
-            self._pair = ServicePair(kind, rule if rule.name == server.type else TypePair(server.type), context.types)
-            if self._pair.type_hash != server.type_hash:
-                raise NoConversion(
-                    f"{server.type} has the hash {server.type_hash} there, and {self._pair.type_hash} is that of "
-                    f"{kind.name} here: the definitions differ"
-                )
+            self._pair = await self._find_pair(name)
         except RmpaError as error:
             context.say(self.here, f"the service of ROS 2's node {server.node.name} is not shown: {error}")
             return
         if not self._closed:
             source = ForeignSource(SourceKind.SERVICE, SITE, "", server.node.name, self.here, name)
             self._service = context.graph.show_service(source, self._serve, self._describe)
+
+    async def _find_pair(self, name: str) -> ServicePair:
+        """Pair the service's type with ROS 1's ``name``; what is not known here its node is asked for.
+
+        Raises:
+            RmpaError: The types are no pair, or ROS 2's is not known.
+        """
+        context, server = self._context, self.server
+        rule = context.mapping.service(name)
+        if rule.name != server.type:
+            rule = TypePair(server.type)
+        kind = None
+        try:
+            kind = await asyncio.to_thread(find_service_type, name)
+            pair = ServicePair(kind, rule, context.types)
+            if pair.type_hash == server.type_hash:
+                return pair
+            problem = (
+                f"{server.type} has the hash {server.type_hash} there, and {pair.type_hash} is that of "
+                f"{kind.name} here: the definitions differ"
+            )
+        except RmpaError as error:
+            problem = str(error)
+        try:
+            types = context.types.variant(await context.asker.learn(of=server))
+        except RmpaError as error:
+            raise NoConversion(f"{problem}; {error}") from error
+        try:
+            if kind is None:
+                kind = derive_service(types.store, server.type, name, context.ros1_name)
+            return ServicePair(kind, rule, types)
+        except KeyError as error:
+            raise NoConversion(f"{server.type} has no form in ROS 1: {error}") from error
 
     async def _describe(self) -> ServiceDescription:
         if self._pair is None:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RmpaError
+from rmpa.gateway import limits
 from rmpa.gateway.ros2.attachment import Ros2Attachment
 from rmpa.gateway.ros2.contract_qos import ros2_qos, zenoh_qos
 from rmpa.gateway.ros2.conversion import Conversion, ConversionError, NoConversion
 from rmpa.gateway.ros2.tokens import EntityKind
+from rmpa.gateway.sites.last_values import is_descriptor, may_be_latched
 from rmpa.gateway.sites.topic_limits import TopicLimits
 from rmpa.ros.types.header_types import type_of_header
 
@@ -25,19 +28,25 @@ if TYPE_CHECKING:
     from rmpa.gateway.zenoh_api import ZenohPublisher
     from rmpa.ros.wire.tcpros import TopicDescription
 
+_STATIC_TF: Final = "/tf_static"
+"""Its publishers latch, in ROS 1 and ROS 2 (tf2_ros)."""
+
 
 class Ros2TopicExport:
     """Declares the topic in ROS 2's graph, and sends its messages while a ROS 2 node subscribes.
 
     A type that ROS 2's distribution does not have is learnt first from the publisher's header: its hash is part of
-    the key. A topic that turns out to be latched becomes transient local, and stays subscribed to once it was wanted,
-    so that what is kept for late subscribers is the last message.
+    the key. Whether a topic is latched only its publisher's header tells too, so each is asked once, a while after it
+    appeared; those of images, scans and clouds are not, for a driver may start by that. A latched one becomes
+    transient local, and stays subscribed to once it was wanted, so that what is kept for late subscribers is the last
+    message.
 
     Args:
         context: What the parts share.
         pairs: The pairs of types.
         source: The topic.
         decision: The rule that lets it cross.
+        looks: Bounds how many publishers are asked at once whether they latch.
         on_declared: Called with this once it has another type or hash in ROS 2's graph.
     """
 
@@ -47,6 +56,7 @@ class Ros2TopicExport:
         pairs: Ros2Pairs,
         source: MeshSource,
         decision: CrossingDecision,
+        looks: asyncio.Semaphore,
         on_declared: Callable[[Ros2TopicExport], None],
     ) -> None:
         self._on_declared = on_declared
@@ -55,7 +65,9 @@ class Ros2TopicExport:
         self.source: Final = source
         self._why = decision.why
         self._limit = TopicLimits(decision.rate, decision.size)
-        self._latching = False
+        self._latching = source.name == _STATIC_TF or is_descriptor(source.name, source.type)
+        self._looks = looks
+        self._was_described = asyncio.Event()
         self._tap: Tap | None = None
         self._opening = False
         self._publisher: ZenohPublisher | None = None
@@ -86,6 +98,8 @@ class Ros2TopicExport:
             self._open_tap()
         else:
             self._declare(*found)
+            if self._endpoint is not None and not self._endpoint.endpoint.qos.latched:
+                self._context.spawn(self._look())
 
     def retry(self) -> None:
         """Types were learnt: try again if its own was missing."""
@@ -183,6 +197,21 @@ class Ros2TopicExport:
             self._tap = self._context.graph.tap(self.source, self._message, self._described, self._lost)
             self._opening = False
 
+    async def _look(self) -> None:
+        """Ask the publisher once for its header, unless a subscriber has it asked before."""
+        if not may_be_latched(self.source.type):
+            return
+        await asyncio.sleep(limits.LATCH_LOOK_AFTER)
+        async with self._looks:
+            if self._closed or self._was_described.is_set():
+                return
+            self._open_tap()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(limits.LATCH_LOOK_TIMEOUT):
+                    await self._was_described.wait()
+        if not self._closed:
+            self._close_unwanted()
+
     def _close_tap(self) -> None:
         tap, self._tap = self._tap, None
         if tap is not None:
@@ -198,6 +227,7 @@ class Ros2TopicExport:
         self.problem = f"the publisher in the mesh: {reason}"
 
     def _described(self, description: TopicDescription) -> None:
+        self._was_described.set()
         fields = {
             "type": description.type,
             "md5sum": description.md5sum,

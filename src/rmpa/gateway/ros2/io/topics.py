@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-import time
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
-from rmpa.gateway.ros2.attachment import Ros2Attachment
 from rmpa.gateway.ros2.conversion import NoConversion
 from rmpa.gateway.ros2.graph import valid_name
-from rmpa.gateway.ros2.io.own_nodes import gid_of
 from rmpa.gateway.ros2.io.topic_export import Ros2TopicExport
 from rmpa.gateway.ros2.io.topic_import import Ros2TopicImport
 from rmpa.gateway.ros2.mismatch import mismatch
 from rmpa.gateway.ros2.pairs import Ros2Pairs
 from rmpa.gateway.ros2.tokens import EntityKind
-from rmpa.gateway.ros2.type_description import SERVICE, parse_type_response, type_request
 from rmpa.ros.types.find import find_message_type
 
 if TYPE_CHECKING:
@@ -47,14 +43,15 @@ class Ros2Topics:
         self._exports_named: dict[str, dict[tuple[str, str], Ros2TopicExport]] = {}
         self._imports: dict[str, Ros2TopicImport] = {}
         self._refused: dict[str, str] = {}
-        self._service_appeared = asyncio.Event()
-        self._asked = 0
-        self._asking = 0
+        self._looks = asyncio.Semaphore(limits.LATCH_LOOKS_AT_ONCE)
 
     def start(self, context: Ros2Context) -> None:
         """Begin."""
         self._context = context
         self._pairs = Ros2Pairs(context.types, context.mapping, self._find)
+
+    def rival(self, node: str) -> None:
+        """Nothing is to be done: the neighbour takes back the sources of a node that another gateway shows."""
 
     def close(self) -> None:
         """Take back all topics of both sides."""
@@ -96,7 +93,9 @@ class Ros2Topics:
         elif not decision.allowed:
             self._refuse(refused, decision.why)
         else:
-            export = self._exports[key] = Ros2TopicExport(context, pairs, source, decision, self._declared)
+            export = self._exports[key] = Ros2TopicExport(
+                context, pairs, source, decision, self._looks, self._declared
+            )
             self._exports_named.setdefault(source.here, {})[key] = export
             export.start()
         return True
@@ -130,9 +129,6 @@ class Ros2Topics:
 
     def endpoint(self, endpoint: Ros2Endpoint, *, there: bool) -> bool:
         """Show a publisher of ROS 2 in the gateway's graph, or take it out; compare it with what is here."""
-        if endpoint.kind is EntityKind.SERVICE and endpoint.name == f"{endpoint.node.name}/{SERVICE}" and there:
-            self._service_appeared.set()
-            self._service_appeared = asyncio.Event()
         if endpoint.kind not in _TOPIC_ENDS or self._context is None:
             return False
         if not there:
@@ -190,10 +186,7 @@ class Ros2Topics:
             return
         if conversion is not None:
             imported.converted(conversion, "")
-        elif self._asking >= limits.ROS2_ASKS_MAX:
-            imported.converted(None, f"{self._asking} ROS 2 nodes are asked for types already; this one is not")
         else:
-            self._asking += 1
             context.spawn(self._ask_type(imported, endpoint))
 
     async def _ask_type(self, imported: Ros2TopicImport, endpoint: Ros2Endpoint) -> None:
@@ -202,50 +195,14 @@ class Ros2Topics:
         if context is None or pairs is None:
             return
         try:
-            pairs.described(endpoint.type, endpoint.type_hash, await self._describe(context, endpoint))
+            pairs.described(endpoint.type, endpoint.type_hash, await context.asker.learn(of=endpoint))
             imported.converted(pairs.incoming(endpoint.type, endpoint.type_hash), "")
         except (NoConversion, RemoteProtocolError) as error:
             if not imported.converts:
                 imported.converted(None, str(error))
             return
-        finally:
-            self._asking -= 1
         for export in self._exports.values():
             export.retry()
-
-    async def _describe(self, context: Ros2Context, endpoint: Ros2Endpoint) -> dict[str, Any]:
-        """The fields of a publisher's type, from its node."""
-        server = await self._type_service(endpoint.node.name)
-        if server is None:
-            raise NoConversion(_unknown(endpoint, context))
-        self._asked += 1
-        gid = gid_of(f"{context.nodes.own_name}/{SERVICE}")
-        replies = await context.session.get(
-            server.key(),
-            type_request(endpoint.type, endpoint.type_hash),
-            Ros2Attachment(self._asked, time.time_ns(), gid).serialize(),
-            timeout=limits.ROS2_SERVICE_WAIT,
-            all_complete=True,
-        )
-        answer = next((reply for reply in replies if reply.ok), None)
-        if answer is None:
-            raise NoConversion(f"{server.name} does not answer; {_unknown(endpoint, context)}")
-        return parse_type_response(answer.payload)
-
-    async def _type_service(self, node: str) -> Ros2Endpoint | None:
-        """The service of a node that describes its types, once it is there; ``None`` if it does not appear."""
-        name = f"{node}/{SERVICE}"
-        context = self._context
-        try:
-            async with asyncio.timeout(limits.ROS2_SERVICE_WAIT):
-                while context is not None:
-                    found = next(context.ros2.at(name, EntityKind.SERVICE), None)
-                    if found is not None and found.node.name == node:
-                        return found
-                    await self._service_appeared.wait()
-        except TimeoutError:
-            pass
-        return None
 
     def _refuse(self, what: str, why: str) -> None:
         if len(self._refused) >= limits.ROS2_PROBLEMS_MAX:
@@ -256,18 +213,3 @@ class Ros2Topics:
 def _hidden(name: str) -> bool:
     """Whether ROS 2's tools hide a topic: a part of its name begins with ``_``, as those of actions."""
     return "/_" in name
-
-
-def _unknown(endpoint: Ros2Endpoint, context: Ros2Context) -> str:
-    distribution = context.types.distribution
-    if endpoint.type in context.types:
-        return (
-            f"its type hash {endpoint.type_hash} is not that of {distribution}'s {endpoint.type}, and node "
-            f"{endpoint.node.name} offers no get_type_description: set gateway.ros2.distribution to the one of that "
-            "node, or start it with the parameter start_type_description_service"
-        )
-    return (
-        f"the fields of {endpoint.type} are not known, and node {endpoint.node.name} offers no get_type_description: "
-        "start the node with the parameter start_type_description_service, or source a ROS 1 workspace that has "
-        "the type, with the same fields, where the gateway runs"
-    )

@@ -1,0 +1,191 @@
+"""Membership among a thousand: no storm at a start, heartbeats that become rarer, and leases that cover them."""
+
+from __future__ import annotations
+
+import itertools
+import random
+from dataclasses import replace
+from ipaddress import IPv4Address
+
+import pytest
+
+from rmpa.core import limits as core_limits
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity
+from rmpa.discovery import limits
+from rmpa.discovery.beacon import Beacon, BeaconKind
+from rmpa.discovery.events import Output, PeerLost, SendMulticast, SendUnicast
+from rmpa.discovery.membership import MembershipProtocol
+
+MEMBERS = 1000
+
+
+def member(number: int) -> Identity:
+    guid = Guid.of(IPv4Address(0x0A010000 + number), 40000)
+    return Identity(guid, number.to_bytes(16, "big"), f"module{number}")
+
+
+class Agent:
+    """A started membership protocol among members that the test plays."""
+
+    def __init__(self, *, multicast: bool = True) -> None:
+        self.now = 1000.0
+        rng = random.Random(5).random
+        self.membership = MembershipProtocol(member(9999), rng=rng, multicast=multicast)
+        self.membership.start(self.now)
+        self.sequence = 0
+
+    def hear(self, number: int, kind: BeaconKind, *, multicast: bool = True, lease: float = 16.0) -> None:
+        self.sequence += 1
+        identity = member(number)
+        beacon = Beacon(kind, identity, round(1000 * lease), self.sequence)
+        self.membership.receive(beacon, identity.guid.endpoint, self.now, multicast=multicast)
+
+    def run(self, seconds: float) -> list[Output]:
+        sent = self.membership.outputs()
+        end = self.now + seconds
+        while (timer := self.membership.next_timer()) is not None and timer <= end:
+            self.now = max(self.now, timer)
+            self.membership.handle_timer(self.now)
+            sent += self.membership.outputs()
+        self.now = end
+        return sent
+
+    def meet(self, count: int, *, parked: bool = True) -> None:
+        """So many members have been there for long; all had a link, which is closed again if they are parked."""
+        for number in range(count):
+            self.hear(number, BeaconKind.HEARTBEAT)
+            self.membership.link_up(member(number), self.now)
+            if parked:
+                self.membership.link_down(member(number).guid, self.now)
+        self.membership.outputs()
+        self.membership.events()
+
+
+def answers(outputs: list[Output]) -> list[str]:
+    return [o.address[0] for o in outputs if isinstance(o, SendUnicast) and o.beacon.kind is BeaconKind.ANSWER]
+
+
+def multicasts(outputs: list[Output]) -> list[Beacon]:
+    return [o.beacon for o in outputs if isinstance(o, SendMulticast)]
+
+
+def test_a_thousand_agents_that_start_at_once_do_not_answer_each_other() -> None:
+    agent = Agent()
+    sent = []
+    for offset in limits.BURST_OFFSETS:
+        sent += agent.run(1000.0 + offset + 0.01 - agent.now)
+        for number in range(MEMBERS):
+            agent.hear(number, BeaconKind.ANNOUNCE)
+    sent += agent.run(3.0)
+    assert len(agent.membership.peers()) == MEMBERS
+    assert len(answers(sent)) <= (limits.MANY_MEMBERS + 1) * len(limits.BURST_OFFSETS)
+    assert len(multicasts(sent)) <= len(limits.BURST_OFFSETS) + 1
+
+
+def test_a_newcomer_gets_the_answers_of_a_large_mesh_spread_over_seconds() -> None:
+    times = []
+    for seed in range(8):
+        agent = Agent()
+        agent.run(1.0)
+        agent.membership._late_answers._rng = random.Random(seed).random
+        agent.meet(MEMBERS)
+        agent.run(9.2)
+        agent.hear(5000, BeaconKind.ANNOUNCE)
+        began = agent.now
+        agent.membership.outputs()
+        while not agent.run(0.05):  # its answer, or a multicast that comes before it
+            assert agent.now - began <= MEMBERS / limits.ANSWERS_PER_SECOND + 0.1
+        times.append(agent.now - began)
+    assert max(times) - min(times) > 1.0
+
+
+def test_a_newcomer_that_is_linked_meanwhile_is_not_answered() -> None:
+    agent = Agent()
+    agent.run(1.0)
+    agent.meet(MEMBERS)
+    agent.hear(5000, BeaconKind.ANNOUNCE)
+    agent.membership.link_up(member(5000), agent.now)
+    assert not answers(agent.run(3.0))
+
+
+def test_many_newcomers_are_answered_by_one_multicast() -> None:
+    agent = Agent()
+    agent.run(1.0)
+    agent.meet(MEMBERS)
+    agent.run(0.1)
+    for number in range(5000, 5300):
+        agent.hear(number, BeaconKind.ANNOUNCE)
+    sent = agent.run(MEMBERS / limits.ANSWERS_PER_SECOND + 0.7)
+    assert not answers(sent)
+    assert 1 <= len(multicasts(sent)) <= 2
+
+
+def test_heartbeats_become_rarer_and_each_lease_covers_three_of_them() -> None:
+    agent = Agent()
+    agent.run(1.0)
+    agent.meet(MEMBERS)
+    agent.membership.set_demand(agent.now, on=True)
+    beats: list[tuple[float, float]] = []
+    for turn in range(1500):
+        beats += [(agent.now, b.lease_ms / 1000) for b in multicasts(agent.run(0.1))]
+        if not turn % 100:
+            agent.meet(MEMBERS)  # they stay members
+    for (at, lease), (_, _), (third, _) in zip(beats, beats[1:], beats[2:], strict=False):
+        assert third - at < lease, "a peer that misses one beacon still counts this agent as there"
+    gaps = [later - at for (at, _), (later, _) in itertools.pairwise(beats)]
+    assert gaps[0] < 7
+    assert gaps[-1] == pytest.approx(MEMBERS / limits.HEARTBEATS_PER_SECOND, rel=0.15)
+    assert beats[-1][1] == pytest.approx(61.0, abs=1)
+    agent.membership.set_demand(agent.now, on=False)
+    last = multicasts(agent.run(12.0))
+    assert len(last) >= 2
+    assert last[-1].lease_ms == 1000 * core_limits.PEER_LEASE
+
+
+def test_in_a_full_mesh_of_any_size_heartbeats_stay_as_they_are() -> None:
+    agent = Agent()
+    agent.run(1.0)
+    agent.meet(MEMBERS, parked=False)
+    beats = [b for b in multicasts(agent.run(60.0)) if b.kind is BeaconKind.HEARTBEAT]
+    assert 12 <= len(beats) <= 14
+    assert {b.lease_ms for b in beats} == {1000 * core_limits.PEER_LEASE}
+
+
+def test_a_parked_peer_with_a_long_lease_stays_and_gets_no_unicasts_between_its_rare_beacons() -> None:
+    agent = Agent()
+    agent.run(1.0)
+    agent.meet(3)
+    sent = []
+    for _ in range(6):
+        for number in range(3):
+            agent.hear(number, BeaconKind.HEARTBEAT, lease=61.0)
+        sent += agent.run(20.0)
+    assert not [e for e in agent.membership.events() if isinstance(e, PeerLost)]
+    assert not [o for o in sent if isinstance(o, SendUnicast)]
+
+
+def test_without_multicast_every_parked_peer_gets_its_heartbeats() -> None:
+    agent = Agent(multicast=False)
+    agent.meet(300)
+    agent.membership.set_demand(agent.now, on=True)
+    sent = agent.run(8.0)
+    reached = {o.address[0] for o in sent if isinstance(o, SendUnicast) and o.beacon.kind is BeaconKind.HEARTBEAT}
+    assert len(reached) == 300
+
+
+def test_forged_peers_never_displace_a_parked_one() -> None:
+    agent = Agent()
+    agent.run(1.0)
+    agent.meet(1)
+    agent.membership.events()
+    for number in range(1, core_limits.PEERS_MAX + 100):
+        agent.hear(number, BeaconKind.ANNOUNCE, lease=120.0)
+    for _ in range(40):
+        agent.run(1.0)
+        agent.hear(0, BeaconKind.HEARTBEAT, lease=61.0)
+        for number in range(6000, 6020):
+            agent.hear(number + agent.sequence, BeaconKind.ANNOUNCE, lease=120.0)
+    lost = [event.identity.name for event in agent.membership.events() if isinstance(event, PeerLost)]
+    assert lost
+    assert replace(member(0)).name not in lost
