@@ -191,7 +191,7 @@ class Path:
 @pytest.mark.parametrize("seed", range(60))
 def test_no_message_is_lost_whatever_both_want_when(seed: int) -> None:
     path = Path(seed)
-    for _ in range(30):
+    for _ in range(15):
         for _ in range(path.rng.randrange(200)):
             path.step(0.05)
         for _ in range(path.rng.randrange(1400)):  # until the lane is about to leave, or has left

@@ -47,11 +47,13 @@ class Feature(IntFlag):
     """It takes pace frames: the link may rest."""
     PARK = 2
     """It takes a bye that says "parked": the link may be ended for now, by agreement."""
+    SWIM = 4
+    """It answers the probes of failure detectors."""
     LANES = 8
     """It takes lane frames: the bulk lane is dialled when it is first wanted, and ends when it is not used."""
 
 
-FEATURES: Final = Feature.PACE | Feature.PARK | Feature.LANES
+FEATURES: Final = Feature.PACE | Feature.PARK | Feature.SWIM | Feature.LANES
 """The features of this version."""
 
 
