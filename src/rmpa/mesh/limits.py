@@ -23,6 +23,11 @@ IDLE_LEASE: Final = 16.0
 costs a twentieth of the packets. Both ends agree on it; an earlier release never does."""
 IDLE_KEEPALIVE_INTERVAL: Final = 5.0
 """Interval of the keepalives of a link at rest: two of them may be late before the link falls."""
+WAKE_PINGS: Final = 5
+"""Pings that follow each other when a link's rest ends: the best of them gives the latency of the first messages an
+exact clock."""
+WAKE_PING_INTERVAL: Final = 0.02
+"""Interval of these pings."""
 REST_AFTER: Final = 5.0
 """A link rests when nothing has depended on it for this long, so that a short pause of use changes nothing."""
 PARK_AFTER: Final = 10.0
