@@ -21,6 +21,7 @@ from rmpa.discovery.io.interfaces import choose, further_addresses, list_interfa
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
+from rmpa.mesh.mode import MeshMode
 from rmpa.mesh.peering_events import LinkDown, LinkDownCause
 from rmpa.runtime.sockets import open_mesh_port
 from rmpa.runtime.system_clock import SystemClock
@@ -83,6 +84,10 @@ class NetworkEndpoint:
             further_addresses(usable, address),
         )
         bridge.place(self.identity)
+        self.mode: Final = MeshMode(settings.links, settings.full_mesh_up_to)
+        """Whether all peers stay linked, or those that something depends on."""
+        self._members: set[Guid] = set()
+        sessions.may_park, sessions.on_want = self._may_park, self._want
         self.mesh = Mesh(
             self.identity,
             tcp,
@@ -109,6 +114,7 @@ class NetworkEndpoint:
     async def start(self) -> None:
         """Accept links, then send beacons."""
         await self.mesh.start()
+        self.discovery.set_demand(on=self.mode.demand)
         await self.discovery.start()
         _log.info("= %s, domain %d, is on the air", self.identity, self.identity.domain)
 
@@ -116,22 +122,46 @@ class NetworkEndpoint:
         """Send the goodbye, and close the links in order."""
         await self.discovery.close()
         self._udp.close()
+        self._bridge.sessions.leave()
         await self.mesh.close()
+
+    def _count(self, guid: Guid, *, present: bool) -> None:
+        """Take in that a peer has become a member, or is none any more; the number decides on the mode."""
+        (self._members.add if present else self._members.discard)(guid)
+        if self.mode.count(1 + len(self._members)):
+            _log.info("= %s", self.mode)
+            self.discovery.set_demand(on=self.mode.demand)
+            if not self.mode.demand:
+                self.mesh.unpark(len(self._members) / mesh_limits.UNPARK_RATE)
+
+    def _may_park(self, link: PeerLink) -> bool:
+        """Whether this agent would do without a link that nothing needs; a relay must hear of changes at once."""
+        relays = self._settings.relay or self._settings.gateway.site != ""
+        return self.mode.demand and not relays and self.discovery.hears(link.guid)
+
+    def _want(self, guid: Guid) -> None:
+        self.mesh.want(guid)
 
     def _event(self, event: Event) -> None:
         match event:
             case PeerFound(identity=identity, source=source):
                 _log.info("+ %s found", identity)
+                self._count(identity.guid, present=True)
                 self.mesh.peer_found(identity, source[0] if source else None)
             case PeerChanged(identity=identity):
                 self.mesh.peer_found(identity)
             case PeerRestarted(identity=identity, previous=previous, source=source):
                 _log.info("+ %s restarted, it was %s", identity, previous.guid)
+                self._count(previous.guid, present=False)
+                self._count(identity.guid, present=True)
+                self._bridge.sessions.lost(previous)
                 self.mesh.peer_gone(previous.guid)
                 self.mesh.peer_found(identity, source[0] if source else None)
             case PeerLost(identity=identity, reason=reason):
                 _log.info("- %s %s", identity, reason.value)
+                self._count(identity.guid, present=False)
                 self.mesh.peer_gone(identity.guid)
+                self._bridge.sessions.lost(identity)
             case PeerConflict():
                 pass  # discovery has logged the error, at a bounded rate
 

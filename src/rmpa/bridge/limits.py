@@ -187,3 +187,7 @@ DIRECT_LOOK: Final = 0.02
 # --- permissions ----------------------------------------------------------------------------------------------
 REFUSALS_LOGGED: Final = 1024
 """Refusals (module, kind of access and rule) that are known to be logged; then all are forgotten and logged again."""
+
+# --- parked peers ---------------------------------------------------------------------------------------------
+UNSENT_MAX: Final = 64
+"""Notifications that wait for the link to a parked peer; it stands within a round trip, or the peer is away."""

@@ -306,6 +306,12 @@ class MembershipProtocol:
         peer = endpoint.current if endpoint is not None else None
         return peer is not None and peer.verified and peer.identity.instance == instance
 
+    def hears(self, guid: Guid, now: float) -> bool:
+        """Whether beacons of a member come in, so that without a link its end would be noticed."""
+        endpoint = self._endpoints.get(guid.place)
+        peer = endpoint.current if endpoint is not None and endpoint.present and not endpoint.own else None
+        return peer is not None and peer.identity.guid == guid and peer.sequence is not None and now < peer.deadline
+
     @property
     def identity(self) -> Identity:
         """This agent's own, as the next beacon will carry it."""

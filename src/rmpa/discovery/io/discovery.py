@@ -163,6 +163,10 @@ class Discovery:
         self._membership.set_demand(self._clock.now(), on=on)
         self._flush()
 
+    def hears(self, guid: Guid) -> bool:
+        """Whether beacons of a member come in, so that without a link its end would be noticed."""
+        return self._membership.hears(guid, self._clock.now())
+
     def peers(self) -> tuple[PeerView, ...]:
         """All known peers, in GUID order."""
         return self._membership.peers()
