@@ -81,8 +81,8 @@ class ParamOwner:
             self._forget_unfollowed()
 
     def follows(self, peer: int) -> bool:
-        """Whether a peer follows a parameter of this module, or transfers a large one."""
-        return peer in self._transfers or (peer in self._followers and bool(self._followers[peer][1]))
+        """Whether a peer follows a parameter of this module."""
+        return peer in self._followers and bool(self._followers[peer][1])
 
     def touched(self, key: str) -> bool:
         """Notify the followers of a parameter that has changed.

@@ -146,7 +146,9 @@ class WhyService:
         told, refusal = None, ""
         snapshot = self._snapshots.build(frozenset())
         found = find_peer(snapshot, name)
-        session = next((s for s in self._bridge.sessions.linked() if found and str(s.link.guid) == found.guid), None)
+        session = next(
+            (s for s in self._bridge.sessions.reachable() if found and str(s.link.guid) == found.guid), None
+        )
         if session is not None:
             try:
                 told = msgspec.convert(await self._bridge.rpc.request(session, AGENT_INFO, {}), PeerAgent)
@@ -172,7 +174,7 @@ class WhyService:
 
     def _carrier(self, peer: PeerInfo) -> PeerSession | None:
         """The link that carries what a peer publishes: its own, or that of the relay that passes it on."""
-        for session in self._bridge.sessions.linked():
+        for session in self._bridge.sessions.reachable():
             if str(session.link.guid) == peer.guid or (peer.via and session.link.name == peer.via):
                 return session
         return None
