@@ -54,7 +54,8 @@ async def test_idle_modules_park_and_their_graphs_stay(on_demand: Callable[[str]
         await until(lambda: all("/chatter" in agent.core.state().publishers for agent in agents))
         await parked(*agents)
         assert all("/chatter" in agent.core.state().publishers for agent in agents)
-        assert all(not agent.network.endpoint.mesh.connections() for agent in agents if agent.network.endpoint)
+        meshes = [agent.network.endpoint.mesh for agent in agents if agent.network.endpoint is not None]
+        await until(lambda: not any(mesh.connections() for mesh in meshes))
 
 
 async def test_a_subscriber_of_a_parked_peer_gets_messages_and_the_latched_one(
@@ -168,3 +169,21 @@ async def test_one_module_that_wants_all_links_keeps_them(
     async with running(on_demand("a"), settings("b")) as agents:
         await asyncio.sleep(2.0)
         assert states(*agents) == {PeerState.LINKED}
+
+
+async def test_what_a_parked_peer_offers_anew_appears_and_what_it_withdraws_goes(
+    on_demand: Callable[[str], Settings],
+) -> None:
+    async with running(*map(on_demand, "abc")) as agents, node("talker", agents[0]) as talker:
+        await parked(*agents)
+        publisher = await talker.advertise("/new", "std_msgs/String")
+        await until(lambda: all("/new" in agent.core.state().publishers for agent in agents))
+        async with serving(agents[0]):
+            await until(lambda: all(provider(agent) for agent in agents))
+            await parked(*agents)
+        await until(lambda: not any(provider(agent) for agent in agents))
+        await publisher.close()
+        await until(lambda: not any("/new" in agent.core.state().publishers for agent in agents))
+        await parked(*agents)
+        held = {session.offers_held for session in agents[1].bridge.sessions if session.link.name == "a"}
+        assert held == {agents[0].bridge.sessions.offers.version}

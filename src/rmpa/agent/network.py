@@ -18,7 +18,9 @@ from rmpa.core.identity import Identity
 from rmpa.discovery.events import PeerChanged, PeerConflict, PeerFound, PeerLost, PeerRestarted
 from rmpa.discovery.io.discovery import Discovery
 from rmpa.discovery.io.interfaces import choose, further_addresses, list_interfaces, pick_address
+from rmpa.discovery.swim_events import MemberOffers, MemberSuspected
 from rmpa.mesh import limits as mesh_limits
+from rmpa.mesh.handshake import Feature
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
 from rmpa.mesh.mode import MeshMode
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.discovery.events import Event
     from rmpa.discovery.io.interfaces import Interface
+    from rmpa.discovery.swim_events import SwimEvent
     from rmpa.mesh.io.link import PeerLink
 
 _log = logging.getLogger(__name__)
@@ -88,6 +91,7 @@ class NetworkEndpoint:
         """Whether all peers stay linked, or those that something depends on."""
         self._members: set[Guid] = set()
         sessions.may_park, sessions.on_want = self._may_park, self._want
+        sessions.offers.on_version = self._offers
         self.mesh = Mesh(
             self.identity,
             tcp,
@@ -105,6 +109,7 @@ class NetworkEndpoint:
             settings,
             udp,
             on_event=self._event,
+            on_member=self._member,
             on_interfaces=self._interfaces,
             clock=clock,
             trust=trust.membership.packets if trust is not None else None,
@@ -115,6 +120,7 @@ class NetworkEndpoint:
         """Accept links, then send beacons."""
         await self.mesh.start()
         self.discovery.set_demand(on=self.mode.demand)
+        self.discovery.set_version(self._bridge.sessions.offers.version)
         await self.discovery.start()
         _log.info("= %s, domain %d, is on the air", self.identity, self.identity.domain)
 
@@ -137,10 +143,14 @@ class NetworkEndpoint:
     def _may_park(self, link: PeerLink) -> bool:
         """Whether this agent would do without a link that nothing needs; a relay must hear of changes at once."""
         relays = self._settings.relay or self._settings.gateway.site != ""
-        return self.mode.demand and not relays and self.discovery.hears(link.guid)
+        watched = self.discovery.member(link.guid, link.identity.instance) is not None
+        return self.mode.demand and not relays and watched
 
     def _want(self, guid: Guid) -> None:
         self.mesh.want(guid)
+
+    def _offers(self, version: int) -> None:
+        self.discovery.set_version(version)
 
     def _event(self, event: Event) -> None:
         match event:
@@ -165,9 +175,26 @@ class NetworkEndpoint:
             case PeerConflict():
                 pass  # discovery has logged the error, at a bounded rate
 
+    def _member(self, event: SwimEvent) -> None:
+        """Take in what the failure detector has found; discovery itself acts on failures."""
+        match event:
+            case MemberSuspected(guid=guid):
+                link = self.mesh.link(guid)
+                if link is not None:
+                    link.touch()  # a link at rest would notice after many seconds whether the peer is there
+            case MemberOffers(guid=guid, instance=instance, version=version):
+                self._bridge.sessions.offers.heard(guid, instance, version, 1 + len(self._members))
+            case _:
+                pass
+
     def _link_up(self, link: PeerLink) -> None:
         # Its beacons come from its mesh port; an accepted connection may come from any port.
-        self.discovery.link_up(link.identity, (link.remote_endpoint[0], link.identity.guid.port))
+        remote = link.connection.remote
+        self.discovery.link_up(
+            link.identity,
+            (link.remote_endpoint[0], link.identity.guid.port),
+            answers_probes=remote is not None and bool(remote.features & Feature.SWIM),
+        )
         self._bridge.sessions.link_up(link)
 
     def _link_down(self, link: PeerLink, down: LinkDown) -> None:

@@ -183,8 +183,9 @@ ROS2_ASKS_MAX: Final = 200
 ROS2_SERVICE_WAIT: Final = 3.0
 """Seconds in which a ROS 2 node's get_type_description may appear after its first publisher, and in which it answers:
 a node declares one after the other."""
-CERTIFICATE_LOOK_PERIOD: Final = 60.0
-"""Seconds between two looks whether the certificate of a session that listens was renewed; it is each 3.5 days."""
+CERTIFICATE_LOOK_PERIOD: Final = 5.0
+"""Seconds between two looks whether a session that listens has to be opened anew: its certificate was renewed, which
+is each 3.5 days, or a module has joined that the table of access must name. Some 2 ms each."""
 OPEN_RETRY_FIRST: Final = 0.5
 """Seconds until a session is opened again, at first, whose router did not answer."""
 OPEN_RETRY_MAX: Final = 5.0

@@ -110,6 +110,8 @@ class Bridge:
             find=self.proxy_nodes.publication,
         )
         self.add(self.topics)
+        self.sessions.offers.listen(self.rpc)
+        self.sessions.offers.count(lambda: self.topics.exports.changes, lambda: self.topics.exports.pending)
         self._reconciler: asyncio.TimerHandle | None = None
 
     def add(self, part: Part) -> None:

@@ -51,6 +51,9 @@ class PeerSession:
         state: Whether it has a link.
         away_since: When its last link ended, monotonic seconds.
         wait: Seconds from ``away_since`` to ``due``; ``None`` while it has a link, or is parked.
+        offers_told: The version of this module's offers that the peer was told completely over its link.
+        offers_held: The version of the peer's offers that this module has completely.
+        offers_heard: The highest version of the peer's offers that this module heard of.
         unparked: Whether its link is the one after it was parked: nothing was interrupted.
     """
 
@@ -63,6 +66,9 @@ class PeerSession:
     away_since: float = 0.0
     wait: float | None = None
     unparked: bool = False
+    offers_told: int | None = None
+    offers_held: int | None = None
+    offers_heard: int = 0
 
     @property
     def reachable(self) -> bool:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from typing import TYPE_CHECKING
+import random
+from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
+from rmpa.bridge.session.offer_versions import OfferVersions
 from rmpa.bridge.session.peer_proxies import PeerProxies
 from rmpa.bridge.session.peer_session import PeerSession, PeerState
 from rmpa.bridge.session.proxy_namespaces import ProxyNamespaces
@@ -58,6 +60,8 @@ class PeerSessions:
         self._namespaces = ProxyNamespaces()
         self._closing: set[asyncio.Task[None]] = set()
         self._reaching: dict[int, set[asyncio.Future[None]]] = {}
+        self.offers: Final = OfferVersions(lambda: self, self.want, random.random)
+        """The versions of what this module and its peers offer."""
         self.on_want: Callable[[Guid], None] = lambda _: None
         """Called to have a parked peer dialled; set with the agent's place in the network, as the next one."""
         self.may_park: Callable[[PeerLink], bool] = lambda _: False
@@ -107,6 +111,7 @@ class PeerSessions:
             session = self._begin(link)
         session.time.resumed_at = lambda: link.resumed_at
         self._by_link[link] = session
+        self.offers.link_up(session)
         self._receiver.link_up(link, session.peer, session.handlers)
         for part in self._parts:
             part.link_up(session)
@@ -149,6 +154,7 @@ class PeerSessions:
             part.link_down(session)
         session.handlers.clear()
         if link.parked:
+            self.offers.parked(session)
             if link.held:
                 self.want(session)
         elif link.silent:
@@ -246,6 +252,7 @@ class PeerSessions:
             if not waiting.done():
                 waiting.set_exception(self._unreachable(session))
         self._by_number.pop(session.peer, None)
+        self.offers.gone(session)
         if self._by_link.pop(session.link, None) is not None:
             self._receiver.link_down(session.link)
             for part in self._parts:
@@ -260,6 +267,7 @@ class PeerSessions:
     async def close(self) -> None:
         """End every session, and wait until all proxies are closed."""
         self._timer.close()
+        self.offers.close()
         for session in self:
             self._end(session)
         if self._closing:
@@ -286,11 +294,14 @@ class PeerSessions:
 
     def _may_park(self, session: PeerSession) -> bool:
         """Whether this module would do without the link to a peer that nothing needs now."""
-        return self.may_park(session.link) and not any(part.holds(session) for part in self._parts)
+        if not self.may_park(session.link) or not self.offers.is_known(session):
+            return False
+        return not any(part.holds(session) for part in self._parts)
 
     def reconcile(self) -> None:
         """Try failed proxies again, let unused links rest, and forget unused namespaces of relayed modules."""
         now = asyncio.get_running_loop().time()
+        self.offers.settled(lambda session: self.may_park(session.link))
         for session in self.linked():
             if now - session.link.touched_at >= mesh_limits.REST_AFTER:
                 needed = self._depends(session)

@@ -93,10 +93,16 @@ class OpenSession:
         session: Zenoh's session.
         loop: The event loop in which all callbacks are called.
         listens_with: The file of the certificate that it listens with; ``None``: it does not, or has none.
+        changed: Whether its configuration would be another one now.
     """
 
     def __init__(
-        self, library: Any, session: Any, loop: asyncio.AbstractEventLoop, listens_with: Path | None = None
+        self,
+        library: Any,
+        session: Any,
+        loop: asyncio.AbstractEventLoop,
+        listens_with: Path | None = None,
+        changed: Callable[[], bool] = lambda: False,
     ) -> None:
         self._zenoh = library
         self._session = session
@@ -110,6 +116,7 @@ class OpenSession:
         self._kept: set[Declaration] = set()
         self._certificate = listens_with
         self._stamp = _stamp(listens_with)
+        self._changed = changed
         self._closing = False
         self._closed = False
         self._flushed = asyncio.Event()
@@ -128,11 +135,11 @@ class OpenSession:
 
     @property
     def stale(self) -> bool:
-        """Whether it has to be opened anew for others to connect to it: its certificate was renewed.
+        """Whether it has to be opened anew for others to connect: its certificate or table of access is another.
 
-        Zenoh reads the certificate of a listener once, and that of a connection each time.
+        Zenoh reads the table and the certificate of a listener once, and that of a connection each time.
         """
-        return _stamp(self._certificate) != self._stamp
+        return _stamp(self._certificate) != self._stamp or self._changed()
 
     def publisher(self, key: str, qos: ZenohQos, on_matching: Callable[[bool], None]) -> QueuedPublisher:
         """Declare a publisher; ``on_matching(there)`` tells whether there is a subscriber, also at the beginning."""
@@ -377,11 +384,12 @@ class OpenSession:
         )
 
 
-async def open_session(config: ZenohConfig) -> OpenSession:
+async def open_session(config: ZenohConfig, changed: Callable[[], bool] = lambda: False) -> OpenSession:
     """Open a session, in a thread.
 
     Args:
         config: Its mode, endpoints and certificates.
+        changed: Whether it would be another one now (``OpenSession.stale``).
 
     Raises:
         StartError: The library is missing, an address is taken, or the endpoints do not answer.
@@ -399,7 +407,7 @@ async def open_session(config: ZenohConfig) -> OpenSession:
         raise _start_error(config, _reason(error)) from None
     files = config.certificates if config.listen else None
     certificate = Path(files.certificate) if files is not None else None
-    return OpenSession(zenoh, session, asyncio.get_running_loop(), certificate)
+    return OpenSession(zenoh, session, asyncio.get_running_loop(), certificate, changed)
 
 
 def _stamp(file: Path | None) -> tuple[int, int] | None:

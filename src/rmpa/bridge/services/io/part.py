@@ -176,6 +176,7 @@ class Services(Part):
             gate=gate,
         )
         """Direct calls of local nodes to peers' servers."""
+        sessions.offers.count(lambda: self.exports.changes, lambda: self.exports.pending)
         rpc.on_notification(_MISMATCH, self._told_of_mismatch)
 
     def __iter__(self) -> Iterator[ShownService]:
@@ -321,6 +322,7 @@ class Services(Part):
 
     def _settled(self) -> None:
         self._serving.changed()
+        self._sessions.offers.changed()
 
     def depends(self, session: PeerSession) -> bool:
         """Whether nodes of this module have direct connections to the peer's."""

@@ -492,6 +492,7 @@ class Topics(Part):
         """Drops what belongs to sources that are gone, or that new rules keep home."""
         self._forget_mismatches()
         self.direct_exports.policy_changed()
+        self._sessions.offers.changed()
 
     def _forget_mismatches(self) -> None:
         """Forgets the mismatches of sources that are gone."""
