@@ -87,7 +87,7 @@ class NetworkEndpoint:
             further_addresses(usable, address),
         )
         bridge.place(self.identity)
-        self.mode: Final = MeshMode(settings.links, settings.full_mesh_up_to)
+        self.mode = MeshMode(settings.links, settings.full_mesh_up_to)
         """Whether all peers stay linked, or those that something depends on."""
         self._members: set[Guid] = set()
         sessions.may_park, sessions.on_want = self._may_park, self._want
