@@ -115,6 +115,8 @@ class NetworkEndpoint:
             trust=trust.membership.packets if trust is not None else None,
         )
         self._udp = udp
+        self._on_denied = trust.membership.on_denied if trust is not None else []
+        self._on_denied.append(self._denied)
 
     async def start(self) -> None:
         """Accept links, then send beacons."""
@@ -128,6 +130,7 @@ class NetworkEndpoint:
         """Send the goodbye, and close the links in order."""
         await self.discovery.close()
         self._udp.close()
+        self._on_denied.remove(self._denied)
         self._bridge.sessions.leave()
         await self.mesh.close()
 
@@ -145,6 +148,15 @@ class NetworkEndpoint:
         relays = self._settings.relay or self._settings.gateway.site != ""
         watched = self.discovery.member(link.guid, link.identity.instance) is not None
         return self.mode.demand and not relays and watched
+
+    def _denied(self) -> None:
+        """End the sessions of parked peers that are revoked; the mesh ends the links of the others."""
+        for session in list(self._bridge.sessions.reachable()):
+            last = session.link.connection
+            if session.linked or last.remote is None:
+                continue
+            if self.mesh.connection_prove(last, last.remote) is not None:
+                self._bridge.sessions.lost(session.link.identity)
 
     def _want(self, guid: Guid) -> None:
         self.mesh.want(guid)
