@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(420)]
 
 CONFIG = "[mesh]\nfull_mesh_up_to = 2\n"
 SOON = 90.0
-"""Seconds in which links that nothing needs are parked, also on a busy machine; the protocol takes 20 to 30 of them."""
+"""Seconds in which links that nothing needs are parked, on a busy machine too; the protocol takes 20 to 30."""
 
 
 def states(module: Module) -> dict[str, str]:
