@@ -110,6 +110,11 @@ SITE_MODULES_MAX: Final = 512
 """Modules of one other site that are shown, as many as the mesh has peers."""
 SITE_SOURCES_MAX: Final = 16_384
 """Topics (once for each publisher) and services of one other site that are shown, or of this one that are offered."""
+SITES_SOURCES_MAX: Final = 65_536
+"""Topics and services of all other sites together that are shown: some 5 KB each. Any program that reaches the router
+can announce more; they are counted as ``site.limit`` and left out."""
+SITE_NAMES_WAITING_MAX: Final = 64
+"""Sources that wait for one name here which another one holds; each is judged again whenever it is free."""
 SITE_SETTLE: Final = 0.05
 """Seconds from the end of a token to the end of what it stands for. The tokens of a gateway that was killed go one by
 one, within some milliseconds: its own may be the last, and then the others are lost and not withdrawn."""

@@ -56,7 +56,7 @@ class WhyQuestion(msgspec.Struct, kw_only=True, frozen=True):
             raise RemoteProtocolError(f"a question of rmpa why has {len(data)} bytes")
         try:
             found = msgspec.json.decode(data, type=cls)
-        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             raise RemoteProtocolError(f"not a question of rmpa why: {error}") from None
         if not is_global_name(found.name):
             raise RemoteProtocolError(f"{found.name[:80]!r} is not a topic, nor a service")
@@ -117,7 +117,7 @@ class WhyAnswer(msgspec.Struct, kw_only=True, frozen=True):
             raise RemoteProtocolError(f"an answer of rmpa why has {len(data)} bytes")
         try:
             return msgspec.json.decode(data, type=cls)
-        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             raise RemoteProtocolError(f"not an answer of rmpa why: {error}") from None
 
 

@@ -14,6 +14,7 @@ from rmpa.gateway.sites.attachment import AttachmentReader
 from rmpa.gateway.sites.io.exported_topic import ExportedTopic
 from rmpa.gateway.sites.io.imported_topic import ImportedTopic, InterruptedTopic
 from rmpa.gateway.sites.keys import ROOT
+from rmpa.gateway.sites.report import site_counts
 from rmpa.gateway.sites.topic_header import REFUSED
 
 if TYPE_CHECKING:
@@ -50,6 +51,8 @@ class SiteTopics:
         contracts: The contracts of topics, which become Zenoh's QoS.
         clock: Both clocks.
         on_latched: Called with each message of a latched topic of another site.
+        counters: ``site.message.malformed``, ``site.message.looped``, ``site.message.unwanted_node``, and
+            ``site.message.unkept``: a latched message of a node that no node here wants, and that found no room.
     """
 
     name = "topics"
@@ -63,6 +66,7 @@ class SiteTopics:
         contracts: Contracts,
         clock: Clock,
         on_latched: OnLatched = lambda *_: None,
+        counters: Counters | None = None,
     ) -> None:
         self._on_latched = on_latched
         self._site = site
@@ -81,8 +85,7 @@ class SiteTopics:
         self._questions: dict[SiteModule, tuple[Declared, Declared]] = {}
         self._reader = AttachmentReader()
         self._check_timer: asyncio.TimerHandle | None = None
-        self.counters = Counters()
-        """``site.message.malformed``, ``site.message.looped``, ``site.message.unwanted_node``."""
+        self.counters = counters if counters is not None else Counters()
 
     # --- SitePart -------------------------------------------------------------------------------------------------
 
@@ -165,7 +168,7 @@ class SiteTopics:
             "in": [topic.report() for topic in into if topic.used],
             "offered": len(out),
             "shown": len(into),
-            "counters": self.counters.as_dict(),
+            "counters": site_counts(self.counters),
         }
 
     async def close(self) -> None:
@@ -217,6 +220,10 @@ class SiteTopics:
         self.counters.add("site.message.unwanted_node")
         known = subscription.latched
         if source.latched and (source.node in known or len(known) < limits.LATCHED_NODES_MAX):
+            held = sum(len(each[0]) for node, each in known.items() if node != source.node)
+            if held + len(sample.payload) > limits.HELD_BYTES:
+                self.counters.add("site.message.unkept")
+                return
             known[source.node] = sample.payload, sequence, stamp, source
 
     def _check_later(self) -> None:
