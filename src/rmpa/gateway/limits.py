@@ -96,8 +96,18 @@ ROS2_PROBLEMS_MAX: Final = 500
 """Problems of the neighbour ROS 2 that are kept for ``rmpa site``; the oldest go first."""
 ROS2_TYPES_MAX: Final = 500
 """Types that are learnt from publishers and ROS 2 nodes, and pairs that are kept; ROS has some 160 of its own."""
-ROS2_DESCRIPTION_MAX: Final = 1024 * 1024
+ROS2_DESCRIPTION_MAX: Final = 256 * 1024
 """Bytes of a type's description from a ROS 2 node; the largest of ROS 2's own types has 30 KB."""
+ROS2_DESCRIBED_TYPES_MAX: Final = 128
+"""Types in one description; for each, rosbags makes a class. The most that one of ROS 2's own has are some 20."""
+ROS2_PARTS_MAX: Final = 20_000
+"""Fields of a type with those of all types within it, each time that it embeds them: conversions are made of these.
+Some bytes of a definition can embed billions. The largest type of ROS has some 200."""
+ROS2_LEARNT_FIELDS_MAX: Final = 100_000
+"""Fields and types in all descriptions that are kept: some 1 KB each."""
+ROS2_WORK_MAX: Final = 2_000_000
+"""Elements of the arrays of one message that are converted one by one, and each 64 bytes that are made up for fields
+that its sender lacks: a second of the gateway's time. Arrays of numbers are copied whole, and do not count."""
 ROS2_ARRAY_MAX: Final = 1_000_000
 """Elements of all arrays of fixed size in a type that a ROS 2 node describes: an empty message must have them all."""
 
