@@ -10,6 +10,7 @@ from tests.simulation.lanes_scenario import LanesScenario
 from tests.simulation.mesh_scenario import MeshScenario
 from tests.simulation.reliable_scenario import ReliableScenario
 from tests.simulation.scenario import Scenario
+from tests.simulation.swim_scenario import SwimScenario
 
 
 def main() -> int:
@@ -17,11 +18,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.simulation", description=__doc__)
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--peers", type=int, default=2, help="not with --kind reliable and direct")
-    parser.add_argument("--kind", choices=["rosters", "mesh", "lanes", "reliable", "direct"], default="rosters")
+    kinds = ["rosters", "mesh", "lanes", "reliable", "direct", "swim"]
+    parser.add_argument("--kind", choices=kinds, default="rosters")
     arguments = parser.parse_args()
-    scenario: Scenario | ReliableScenario | DirectScenario
+    scenario: Scenario | ReliableScenario | DirectScenario | SwimScenario
     if arguments.kind == "direct":
         scenario = DirectScenario(arguments.seed, keep=True)
+    elif arguments.kind == "swim":
+        scenario = SwimScenario(arguments.seed, arguments.peers, keep=True)
     elif arguments.kind == "reliable":
         scenario = ReliableScenario(arguments.seed, keep=True)
     else:

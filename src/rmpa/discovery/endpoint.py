@@ -58,6 +58,7 @@ class PeerInstance:
         verified: Whether it had a link: it is no forgery.
         leaving: Whether it said goodbye.
         superseded_at: When another run took its endpoint.
+        vouched_until: Until when the failure detector's word keeps it.
     """
 
     identity: Identity
@@ -73,11 +74,12 @@ class PeerInstance:
     verified: bool = False
     leaving: bool = False
     superseded_at: float = _NEVER
+    vouched_until: float = _NEVER
 
     @property
     def deadline(self) -> float:
         """When its lease is over, if it stays silent."""
-        return self.heard + self.lease
+        return max(self.heard + self.lease, self.vouched_until)
 
     @property
     def silence(self) -> float:

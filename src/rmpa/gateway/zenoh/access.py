@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 _MODULE: Final = "rmpa/1/*/*"
 _ADDRESSED: Final = f"{_MODULE}/to/*"
 _TOPIC: Final = (
-    *(key for head in (_MODULE, _ADDRESSED) for key in (f"{head}/t/*/{{}}", f"{head}/t/*/{{}}/@adv/**")),
+    *(f"{head}/t/*/{{}}{end}" for head in (_MODULE, _ADDRESSED) for end in ("", "/@batch", "/@adv/**")),
     f"{_MODULE}/d/t/{{}}",
     f"{_MODULE}/v/{{}}",
 )
