@@ -33,6 +33,11 @@ DESCRIBE_TIMEOUT: Final = 10.0
 """Seconds for the description of another site's service; its server may be probed for it over two meshes."""
 LAST_VALUE_MAX: Final = 32 * MIB
 """Bytes of a message that is kept as a last value: a map of 5,000 by 5,000 cells. Larger ones are not kept."""
+LAST_VALUE_DEFINITION_MAX: Final = 64 * KIB
+"""Characters of the definition that is kept with a last value, also in memory; a longer one is left out. The longest
+of ROS 1 has some 30 KB."""
+LAST_VALUES_ASKED_MAX: Final = 64
+"""Questions for last values that are answered at once; further ones are refused. Each may read 64 MiB."""
 LAST_VALUES_MAX: Final = 4096
 """Last values that are kept; the oldest go first. A module has some 20 latched topics."""
 LAST_VALUES_BYTES_MAX: Final = 256 * MIB

@@ -62,7 +62,7 @@ ARRIVED_QUERIES: Final = 1_000
 """Queries of one queryable that wait for the event loop; above it the oldest is finished without an answer."""
 ARRIVED_TOKENS: Final = 200_000
 """Changes of tokens of one watcher that wait for the event loop: a hundred sites of a thousand sources, twice."""
-MESSAGE_MAX: Final = 257 * 1024 * 1024
+ZENOH_MESSAGE_MAX: Final = 257 * 1024 * 1024
 """Bytes of one message of Zenoh that are put together from its fragments: the largest of ROS, and its head. Zenoh's
 own value is 1 GiB, which any program that connects could have this process hold."""
 ATTACHMENT_MAX: Final = 4096
