@@ -17,6 +17,7 @@ from lab.bench import (
     bookkeeping,
     crosstraffic,
     decision,
+    fleet,
     gateway,
     idle,
     joining,
@@ -97,6 +98,7 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
     "roscore": Measurement(
         "what it costs to follow a real roscore, and how soon changes are seen", roscore.measure, (why_no_ros,)
     ),
+    "fleet": Measurement("2 to 64 modules: start, rest, a stream beside classic ROS, losses", fleet.measure),
     "idle": Measurement("what an agent costs while nothing happens", idle.measure),
     "tasks": Measurement(
         "how evenly a resource's task runs, beside loops of rospy and roscpp",

@@ -31,6 +31,7 @@ from rmpa.bridge.policy import Policy, is_own
 from rmpa.bridge.relay import LinkedPeer
 from rmpa.bridge.session.graph_driver import GraphDriver
 from rmpa.bridge.session.part import Part
+from rmpa.bridge.session.unchanged_graph import UnchangedGraph
 from rmpa.bridge.topics.claims import ClaimDeadlines
 from rmpa.bridge.topics.exports import Exports
 from rmpa.bridge.topics.imports import Imports
@@ -153,6 +154,7 @@ class Topics(Part):
         self._act = self._driver.act
         self._absent = AbsentPeers(lambda peer: self._act(self.exports.unclaimed(peer)), self.outbound.forget, gate)
         self._claims = ClaimDeadlines()
+        self._unchanged = UnchangedGraph()
         self._claims_timer = MachineTimer(self._claims.next_timer, self._claims_over)
         self._mismatches = Mismatches()
         self.losses = LossReports(self.exports, sessions, self._peers, self._absent, rpc, counters, refusals)
@@ -435,9 +437,11 @@ class Topics(Part):
 
     def reconcile(self) -> None:
         """Registers missing publications again, and stops counting losses of topics without local subscribers."""
-        self._look_at_all()
         self._absent.expire(asyncio.get_running_loop().time())
         state = self._core.state()
+        compared = self._unchanged.is_due(state, steady=not self._core.unreachable())
+        if compared:
+            self._look_at_all()
 
         def subscribed(topic: str) -> bool:
             return any(not is_own(node) for node in state.subscribers.get(topic, ()))
@@ -446,7 +450,7 @@ class Topics(Part):
         for topics in list(self._peers.values()):
             topics.unheard(subscribed)
             yield_to_data()
-            if again := topics.reconcile(state.publishers):
+            if compared and (again := topics.reconcile(state.publishers)):
                 self._counters.add("proxy.registered_again", again)
 
     def _demand(self, peer: int, source: Source, *, wanted: bool) -> None:
