@@ -218,7 +218,8 @@ class PeerSessions:
         """Try failed proxies again, let unused links rest, and forget unused namespaces of relayed modules."""
         now = asyncio.get_running_loop().time()
         for session in self.linked():
-            if now - session.link.touched_at >= mesh_limits.REST_AFTER:
+            yield_to_data()
+            if session.linked and now - session.link.touched_at >= mesh_limits.REST_AFTER:
                 session.link.need(needed=self._depends(session))
         for session in self:
             yield_to_data()
