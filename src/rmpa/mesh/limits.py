@@ -23,6 +23,11 @@ IDLE_LEASE: Final = 16.0
 costs a twentieth of the packets. Both ends agree on it; an earlier release never does."""
 IDLE_KEEPALIVE_INTERVAL: Final = 5.0
 """Interval of the keepalives of a link at rest: two of them may be late before the link falls."""
+WAKE_PINGS: Final = 5
+"""Pings that follow each other when a link's rest ends: the best of them gives the latency of the first messages an
+exact clock."""
+WAKE_PING_INTERVAL: Final = 0.02
+"""Interval of these pings."""
 REST_AFTER: Final = 5.0
 """A link rests when nothing has depended on it for this long, so that a short pause of use changes nothing."""
 PARK_AFTER: Final = 10.0
@@ -87,6 +92,9 @@ STALE_HOLD: Final = 0.03
 """How long a stale message waits for a newer one; if none arrives, it is delivered after this time."""
 BULK_LEASE: Final = 4.0
 """A bulk lane on which no byte arrived for this long is dead; a dead peer shows much sooner by the express lane."""
+BULK_UNUSED: Final = 30.0
+"""A bulk lane ends when neither side has sent data on it for this long; the next message that wants it waits for two
+round trips, and two more in a secured mesh."""
 BULK_UNSENT_BYTES: Final = 16 * KIB
 """Unsent bytes of the bulk lane that the kernel may hold (TCP_NOTSENT_LOWAT). Together with SO_PRIORITY it holds the
 p99 latency of commands during image transfers at 0.4 ms instead of 79 ms on 100 Mbit/s."""

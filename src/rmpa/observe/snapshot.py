@@ -116,6 +116,7 @@ class LaneInfo(msgspec.Struct, kw_only=True, frozen=True):
     Attributes:
         name: ``express`` (control and small messages) or ``bulk`` (large ones).
         connected: Whether it has its TCP connection; messages for a lane without one wait.
+        unneeded: Whether it has none because nothing was sent on it for a while; the next message dials it.
         bytes_in: Bytes that its present connection has received.
         bytes_out: Bytes that its present connection has sent.
         queued: Bytes that wait in its send queue.
@@ -124,6 +125,7 @@ class LaneInfo(msgspec.Struct, kw_only=True, frozen=True):
 
     name: str
     connected: bool
+    unneeded: bool = False
     bytes_in: int = 0
     bytes_out: int = 0
     queued: int = 0
@@ -145,6 +147,8 @@ class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
         queued: Bytes in its send queues.
         dropped: Messages dropped because the link was too slow.
         heard_ago: Seconds since anything arrived.
+        rests: Whether the link is at rest: nothing depends on it, keepalives come every 5 s, silence is noticed after
+            16 s.
         packet: Bytes of the largest packets that are sent, headers included.
         path_problem: What is wrong with the network path, ready to read; empty if nothing is known.
         path_remedy: What to do about that.
@@ -162,6 +166,7 @@ class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
     queued: int = 0
     dropped: int = 0
     heard_ago: float | None = None
+    rests: bool = False
     packet: int | None = None
     path_problem: str = ""
     path_remedy: str = ""

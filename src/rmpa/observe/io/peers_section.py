@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import msgspec
 
+from rmpa.mesh.lane_demand import LaneState
 from rmpa.observe.io.direct_section import direct_counts
 from rmpa.observe.shared_address import mark_shared_addresses
 from rmpa.observe.snapshot import BoundInfo, DetectorInfo, LaneInfo, LinkInfo, PeerInfo, ProbesInfo
@@ -149,12 +150,16 @@ class PeersSection:
             queued=link.queue_bytes,
             dropped=link.dropped,
             heard_ago=now - link.heard_at,
+            rests=link.rests,
             packet=paths.packet_bytes(link),
             path_problem=problem.text if problem is not None else "",
             path_remedy=problem.remedy if problem is not None else "",
             lanes=(
                 _lane(link.express, link.connection.stream),
-                _lane(link.bulk, link.bulk_connection.stream if link.bulk_connection is not None else None),
+                msgspec.structs.replace(
+                    _lane(link.bulk, link.bulk_connection.stream if link.bulk_connection is not None else None),
+                    unneeded=link.lane_demand.state is LaneState.ABSENT,
+                ),
             ),
         )
 

@@ -104,7 +104,8 @@ def _linked(peer: PeerInfo) -> Check:
     text = f"linked by {link.remote} for {link.up_ago:.0f} s"
     if link.rtt is not None:
         text += f", round trip {link.rtt * 1e3:.1f} ms"
-    if link.heard_ago is not None and link.heard_ago > mesh_limits.EXPRESS_LEASE / 2:
+    lease = mesh_limits.IDLE_LEASE if link.rests else mesh_limits.EXPRESS_LEASE
+    if link.heard_ago is not None and link.heard_ago > lease / 2:
         text += f"; silent for {link.heard_ago:.1f} s"
         return Check("link", WARN, text, "if it stays so, the cable or the radio is the place to look at")
     if link.path_problem:
