@@ -99,7 +99,7 @@ class _Link:
     def send_control(self, payload: bytes) -> None:
         """Take a control message."""
 
-    def need(self, *, needed: bool) -> None:
+    def need(self, *, needed: bool, parks: bool = False) -> None:
         """Take what the bridge says of its use."""
 
 

@@ -191,3 +191,11 @@ DIRECT_LOOK: Final = 0.02
 # --- permissions ----------------------------------------------------------------------------------------------
 REFUSALS_LOGGED: Final = 1024
 """Refusals (module, kind of access and rule) that are known to be logged; then all are forgotten and logged again."""
+
+# --- parked peers ---------------------------------------------------------------------------------------------
+UNSENT_MAX: Final = 64
+"""Notifications that wait for the link to a parked peer; it stands within a round trip, or the peer is away."""
+REFRESH_RATE: Final = 100.0
+"""Links a second that all modules together make to a parked peer that offers something new."""
+REFRESH_MAX: Final = 5.0
+"""The longest delay of such a link, whatever the number of modules."""

@@ -21,7 +21,14 @@ from rmpa.observe.snapshot import PingReply
 if TYPE_CHECKING:
     from rmpa.observe.snapshot import LaneInfo, PeerInfo, ProbesInfo, RouteInfo, Snapshot, TopicInfo
 
-_COLOURS: Final = {"linked": "green", "relayed": "green", "linking": "yellow", "refused": "red", "conflict": "red"}
+_COLOURS: Final = {
+    "linked": "green",
+    "relayed": "green",
+    "parked": "green",
+    "linking": "yellow",
+    "refused": "red",
+    "conflict": "red",
+}
 _COLUMNS: Final = tuple(
     Column(title, right=title not in ("PEER", "STATE", "ADDRESS", "DIALLED"))
     for title in ("PEER", "STATE", "SINCE", "ADDRESS", "DIALLED", "RTT", "CLOCK", "IN", "OUT", "QUEUE", "DROPS")
@@ -60,6 +67,8 @@ def list_(as_json: bool, agent: str | None) -> None:
     else:
         colours = [_COLOURS.get(p.state, "") for p in snapshot.peers]
         print_table(_COLUMNS, [_row(p) for p in snapshot.peers], colours=colours)
+    if snapshot.agent.links.startswith("links on demand"):
+        click.echo(f"{snapshot.agent.name} keeps {snapshot.agent.links}")
     for trouble in _troubles(snapshot):
         warn(trouble)
 
@@ -93,7 +102,7 @@ def _troubles(snapshot: Snapshot) -> list[str]:
         found += [bound.text for bound in info.beyond]
         if info.link is not None and info.link.path_problem:
             found.append(f"{info.name}: {info.link.path_problem}; {info.link.path_remedy}")
-        if info.last_error and info.state not in {"linked", "relayed"}:
+        if info.last_error and info.state not in {"linked", "relayed", "parked"}:
             again = "" if info.next_attempt is None else f"; next attempt in {duration(info.next_attempt)}"
             found.append(f"{info.name}: {info.last_error}{again}")
     return found

@@ -36,6 +36,9 @@ takes one round trip and the exchange of both catalogues, so a function that is 
 WANT_GRACE: Final = 5.0
 """How long a parked peer may be dialled in vain, once something needs it, before it counts as lost: more than two
 rounds over all of its addresses (DIAL_TIMEOUT)."""
+UNPARK_RATE: Final = 100.0
+"""Parked peers that are dialled a second where the mesh has become small enough for all links, and where many peers
+have changed what they offer: each takes a millisecond at both sides."""
 FULL_MESH_AGAIN: Final = 0.75
 """The share of ``mesh.full_mesh_up_to`` below which all links are made again: a quarter of the modules may come and
 go without a change of the mode."""

@@ -73,6 +73,7 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
         rss: Resident memory, bytes.
         addresses: Its numeric IPv4 addresses, best first.
         interfaces: The interfaces that beacons go out on.
+        links: Whether all peers stay linked or those in use, and why, ready to read: ``full mesh (3 modules, …)``.
         config_file: Where its settings were read, or empty.
         realtime: The outcome of each request of ``--realtime``, ready to read; empty without it.
         files: Its file descriptors.
@@ -99,6 +100,7 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
     rss: int | None = None
     addresses: tuple[str, ...] = ()
     interfaces: tuple[str, ...] = ()
+    links: str = ""
     config_file: str = ""
     realtime: tuple[str, ...] = ()
     files: FilesInfo | None = None
@@ -219,7 +221,7 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
         addresses: Where it can be reached, best first.
         state: ``linked``; ``linking`` (dialling, or waiting to be dialled); ``refused`` (by either side);
             ``conflict`` (shares a GUID or a name with another); ``relayed`` (has no link; another peer relays its
-            topics).
+            topics); ``parked`` (both sides ended the link, as nothing needed it; it is made again on demand).
         since_ago: Seconds since it came into this state.
         found_ago: Seconds since it was found.
         beacon_ago: Seconds since its last beacon.

@@ -34,11 +34,11 @@ if TYPE_CHECKING:
     )
     from rmpa.web.monitor.resources import ResourceFacts
 
-_STATES = {"refused": "refused", "conflict": "refused", "relayed": "relayed"}
+_STATES = {"refused": "refused", "conflict": "refused", "relayed": "relayed", "parked": "parked"}
 
 
 def module_state(peer: PeerInfo) -> str:
-    """The word for a peer: ``up``, ``silent``, ``linking``, ``refused``, ``relayed`` or ``away``."""
+    """The word for a peer: ``up``, ``silent``, ``linking``, ``refused``, ``relayed``, ``parked`` or ``away``."""
     if peer.state == "linked":
         if peer.link is None or peer.link.heard_ago is None:
             return "up"

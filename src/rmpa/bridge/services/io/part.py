@@ -179,6 +179,7 @@ class Services(Part):
             gate=gate,
         )
         """Direct calls of local nodes to peers' servers."""
+        sessions.offers.count(lambda: self.exports.changes, lambda: self.exports.pending)
         rpc.on_notification(_MISMATCH, self._told_of_mismatch)
 
     def __iter__(self) -> Iterator[ShownService]:
@@ -324,10 +325,12 @@ class Services(Part):
 
     def _settled(self) -> None:
         self._serving.changed()
+        self._sessions.offers.changed()
 
     def depends(self, session: PeerSession) -> bool:
         """Whether nodes of this module have direct connections to the peer's."""
-        return any(key.peer == session.peer and each.grant for key, each in self.direct_imports.services)
+        granted = (key.peer == session.peer and each.grant for key, each in self.direct_imports.services)
+        return self._driver.waits(session) or any(granted)
 
     def lane_lost(self, session: PeerSession) -> None:
         """Report calls that the loss of the bulk lane's connection may have left without an answer."""
@@ -498,6 +501,8 @@ class Services(Part):
         elif session is not None and session.state is PeerState.AWAY:
             text = f"service [{shown.service}]: the agent of {shown.peer_name} has crashed, only direct calls work"
             self._fail_waiting(shown, text)
+        elif session is not None and not session.linked:
+            self._sessions.want(session)
         elif remote.state is ServiceRouteState.IDLE and not self.imports.is_away(shown.peer):
             self._act(self.imports.want(shown.peer, shown.service, asyncio.get_running_loop().time()))
 

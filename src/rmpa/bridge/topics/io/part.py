@@ -236,7 +236,8 @@ class Topics(Part):
         peer, identity = session.peer, session.link.identity
         now = asyncio.get_running_loop().time()
         if peer in self._peers:
-            _log.info("= %s is back: reliable topics go on", session.link.name)
+            if not session.unparked:
+                _log.info("= %s is back: reliable topics go on", session.link.name)
             self._claims.begin(peer, now)
         else:
             self._begin(session, now)
@@ -289,7 +290,7 @@ class Topics(Part):
         self._act(exports)
         if session.link.silent:
             # Most silences end soon with a new link, so nothing leaves the local graph yet.
-            imports, _ = self.imports.link_away(peer, briefly=True)
+            imports, _ = self.imports.link_away(peer, briefly=True, parked=session.link.parked)
             self._act(imports)
 
     def grace_over(self, session: PeerSession) -> bool:
@@ -337,7 +338,7 @@ class Topics(Part):
 
     def depends(self, session: PeerSession) -> bool:
         """Whether nodes of this module have direct connections to the peer's."""
-        return any(key.peer == session.peer for key, _ in self.direct_imports.routes)
+        return self._driver.waits(session) or any(key.peer == session.peer for key, _ in self.direct_imports.routes)
 
     def lane_lost(self, session: PeerSession) -> None:
         """Aborts messages that came in part over a lost bulk lane, and lets the senders repeat or drop theirs."""
@@ -454,6 +455,9 @@ class Topics(Part):
                 self._counters.add("proxy.registered_again", again)
 
     def _demand(self, peer: int, source: Source, *, wanted: bool) -> None:
+        session = self._sessions.get(peer)
+        if wanted and session is not None:
+            self._sessions.want(session)
         self._act(self.imports.demand(peer, source, asyncio.get_running_loop().time(), wanted=wanted))
 
     def _occurred(self, session: PeerSession, source: Source, occurred: QosEvent) -> None:
@@ -492,6 +496,7 @@ class Topics(Part):
         """Drops what belongs to sources that are gone, or that new rules keep home."""
         self._forget_mismatches()
         self.direct_exports.policy_changed()
+        self._sessions.offers.changed()
 
     def _forget_mismatches(self) -> None:
         """Forgets the mismatches of sources that are gone."""
