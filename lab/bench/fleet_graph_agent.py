@@ -79,7 +79,7 @@ class _Link:
 
     remote_endpoint = ("10.9.0.1", 1)
     local_address = "10.9.0.2"
-    silent = crashed = busy = False
+    silent = crashed = busy = parked = False
     rests = True
     clock_offset = clock_error = None
     resumed_at = touched_at = -1e9
