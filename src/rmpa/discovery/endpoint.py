@@ -232,7 +232,8 @@ class Endpoint:
             return self._new_run(peer, now)
         if self.current is None:
             return self._promote(peer, now, EndpointChange.NEW)
-        if self.conflict or now - peer.superseded_at < limits.CONFLICT_AFTER:
+        patience = limits.CONFLICT_LINKED_AFTER if self.current.linked else limits.CONFLICT_AFTER
+        if self.conflict or now - peer.superseded_at < patience:
             return EndpointChange.WAITING
         if self.current.linked or now - self.current.heard <= limits.HEARTBEAT_LATE:
             self.conflict = True

@@ -199,6 +199,18 @@ class MembershipProtocol:
             self._send_answer(endpoint.current, now)
         self._remove_if_empty(key)
 
+    def peer_failed(self, guid: Guid, instance: bytes, now: float) -> None:
+        """Remove a run that the failure detector holds to have failed, unless it has a link."""
+        endpoint = self._endpoints.get(guid.place)
+        peer = endpoint.current if endpoint is not None else None
+        if endpoint is None or peer is None or endpoint.own or peer.linked or peer.identity.instance != instance:
+            return
+        self._peer_lost(endpoint, LossReason.FAILED)
+        endpoint.remove_current()
+        self._clear_conflict(endpoint, now)
+        self._endpoints.changed(guid.place)
+        self._remove_if_empty(guid.place)
+
     def interfaces_changed(self, now: float, addresses: tuple[IPv4Address, ...] | None = None) -> None:
         """Announce this agent again after a change of interfaces, with its present addresses if they are given."""
         if self._closed:
@@ -294,6 +306,11 @@ class MembershipProtocol:
     def peers(self) -> tuple[PeerView, ...]:
         """All peers in GUID order, those included that a conflict keeps from being members."""
         return self._endpoints.views()
+
+    @property
+    def members(self) -> int:
+        """The number of peers that are there, without this agent."""
+        return len(self._endpoints.present())
 
     def silent_seeds(self) -> list[Address]:
         """The seeds at whose address there is no member."""
