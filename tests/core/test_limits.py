@@ -19,13 +19,20 @@ from rmpa.core import sizes
 from rmpa.core.sizes import KIB, MIB
 from rmpa.web.monitor import limits as monitor_limits
 
-LIMITS: Final = {
-    name: value
-    for file in Path(rmpa.__path__[0]).glob("*/limits.py")
-    for name, value in vars(import_module(f"rmpa.{file.parent.name}.limits")).items()
-    if name.isupper() and not hasattr(sizes, name)
-}
-"""Of all rooms."""
+
+def all_limits() -> dict[str, list[float]]:
+    """The bounds of all rooms, and of the rooms within the gateway; two rooms may have one of the same name."""
+    root = Path(rmpa.__path__[0])
+    found: dict[str, list[float]] = {}
+    for file in (*root.glob("*/limits.py"), *root.glob("gateway/*/limits.py")):
+        room = ".".join(file.parent.relative_to(root).parts)
+        for name, value in vars(import_module(f"rmpa.{room}.limits")).items():
+            if name.isupper() and not hasattr(sizes, name):
+                found.setdefault(name, []).append(value)
+    return found
+
+
+LIMITS: Final = all_limits()
 PAGES: Final = {name: value for name, value in vars(monitor_limits).items() if name.isupper()}
 """Of the monitor's pages; docs/design/monitor-protocol.md has all of them."""
 PAGE: Final = Path(__file__).parents[2] / "docs" / "limits.md"
@@ -40,6 +47,7 @@ INTERNAL: Final = {
     "BEACON_SOURCES_MAX",
     "BOUND_MAX",
     "COLLECT_GROWTH_MAX",
+    "CONFIRMATIONS_MAX",
     "CONTEXT_RULE_MAX",
     "CONTRACT_RATE_MAX",
     "CONTRACT_TIME_MAX",
@@ -58,6 +66,14 @@ INTERNAL: Final = {
     "DOCTOR_OUTPUT_MAX",
     "DOMAIN_MAX",
     "EXPRESS_MESSAGE_MAX",
+    "HEALTH_MAX",
+    "MEMBERS_GONE_MAX",
+    "MEMBERS_HEARSAY_MAX",
+    "NEWS_QUEUE_MAX",
+    "PROBE_TIMEOUT_MAX",
+    "RELAYS_MAX",
+    "SWIM_PACKET_MAX",
+    "SYNC_PACKETS_MAX",
     "CANDIDATES_MAX",
     "CANDIDATE_RETRY_MAX",
     "HEADER_MAX",
@@ -123,6 +139,11 @@ INTERNAL: Final = {
     "ROS2_PUBLISHERS_MAX",
     "SERVICE_DESCRIPTION_MAX",
     "VALUE_HEADER_MAX",
+    "BATCH_MAX",
+    "BLOCK_MAX",
+    "CLOSE_MAX",
+    "FLUSH_MAX",
+    "RECONNECT_MAX",
 }
 """Of parsers, packets, retries and caches: nothing that a user could notice or mend."""
 
@@ -166,8 +187,9 @@ def test_each_row_has_the_codes_figure(row: Row) -> None:
     assert names, f"line {row.line}: no name in the last column"
     for name in names:
         assert name in LIMITS or name in PAGES, f"line {row.line}: there is no {name} in any limits.py"
-        value = LIMITS[name] if name in LIMITS else PAGES[name]
-        assert row.default in figures(value), f"line {row.line}: {name} is {value}, not {row.default}"
+        values = LIMITS[name] if name in LIMITS else [PAGES[name]]
+        fits = any(row.default in figures(value) for value in values)
+        assert fits, f"line {row.line}: {name} is {values}, not {row.default}"
 
 
 @pytest.mark.parametrize("row", rows(), ids=lambda row: row.name)
@@ -186,6 +208,12 @@ def test_no_bound_is_missing() -> None:
     assert not missing, f"add a row to {PAGE.name}, or to INTERNAL here: {', '.join(sorted(missing))}"
     assert bounds >= INTERNAL, f"there is none of these any more: {', '.join(sorted(INTERNAL - bounds))}"
     assert not shown & INTERNAL, f"on the page and in INTERNAL: {', '.join(sorted(shown & INTERNAL))}"
+
+
+def test_a_bound_of_the_gateway_has_one_row() -> None:
+    section = PAGE.read_text(encoding="utf-8").partition("\n## The gateway\n")[2].partition("\n## ")[0]
+    names = re.findall(r"\| `([A-Z_0-9]+)` \|\n", section)
+    assert len(names) == len(set(names)), f"twice: {sorted({name for name in names if names.count(name) > 1})}"
 
 
 def test_the_settings_of_the_page_are_those_that_there_are() -> None:

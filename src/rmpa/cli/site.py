@@ -142,7 +142,8 @@ Examples:
 def info(site: str, as_json: bool, agent: str | None, name: str | None) -> int:
     """Show the modules of SITE, what they offer, its name here, and why something does not cross.
 
-    Of this module's own site the last values that its gateway keeps are shown too.
+    Of this module's own site the last values that its gateway keeps are shown too, and of a site that is unreachable
+    those that came of it.
     """
     with _connect(agent, name) as client:
         report = _ask(client, INFO, SitesReport, site=site)
@@ -238,7 +239,8 @@ def last(
     """Print the last value of TOPIC that the gateway of SITE keeps, of each publisher: MODULE may be off.
 
     Latched topics and descriptors of Smart Resources are kept, and those that a [[gateway.rule]] says. The age is
-    the time since the gateway received it, by both machines' clocks.
+    the time since the gateway received it, by both machines' clocks. If the whole site is off, this one's gateway
+    answers with what came of its latched topics.
     """
     site, of = read_site_module(module)
     if not is_legal_name(topic) or topic.startswith("~"):
@@ -289,6 +291,8 @@ def _print_value(
         print_json(facts | ({"message": plain} if body is not None else {}))
         return
     latched = ", latched" if value.latching else ""
+    if value.seen_at:
+        warn(f"site {site} does not give it now: this is what site {value.seen_at} saw of it last")
     print_line(
         f"# {value.topic} of {value.node} of {site}/{value.module}: {value.type}{latched}, "
         f"{size(value.size)}, {duration(_age(value))} old"

@@ -340,7 +340,7 @@ class GatewaySettings:
     store: str = setting(
         "",
         TEXT,
-        "The file of last values (SQLite).",
+        "The file of last values (SQLite); those of other sites are in one beside it, which ends in .seen.sqlite.",
         env="RMPA_GATEWAY_STORE",
         shown_default="in the state directory",
     )

@@ -81,6 +81,7 @@ class _Peer:
     verified: bool = False  # the peer was linked before
     token_taken: bool = False  # the present dial counts against the rate of unverified peers
     gone: bool = False  # the peer is forgotten when its link or dial ends
+    parked: bool = False  # the last link was ended by agreement, and nothing needs the peer
     source: str | None = None
     good: SocketAddress | None = None  # the endpoint where the peer was reached last
     link: _LinkInfo | None = None
@@ -156,6 +157,7 @@ class Peering:
             peer.lower = self._ours.guid < identity.guid
             self._restart(peer, now)
         if fresh and peer.link is None and not peer.dialling:
+            peer.parked = False
             self._dial_at(peer, now if peer.lower else now + limits.DIAL_FALLBACK)
         self._dial_due(peer, now)
 
@@ -166,6 +168,24 @@ class Peering:
             return
         peer.announced, peer.gone = False, True
         self._forget_if_idle(peer)
+
+    def want(self, guid: Guid, now: float) -> None:
+        """Dial a parked peer at once, or one that waits for its next dial, because something needs it."""
+        peer = self._peers.get(guid.place)
+        if peer is None or peer.link is not None or peer.dialling or peer.gone:
+            return
+        peer.parked = False
+        if peer.next_attempt is None or (peer.verified and not peer.refused):
+            peer.backoff.reset()
+            self._dial_at(peer, now)
+            self._dial_due(peer, now)
+
+    def unpark(self, now: float, spread: float) -> None:
+        """Dial all parked peers, in ``spread`` seconds, because every peer is to be linked again."""
+        for peer in self._peers.values():
+            if peer.parked:
+                peer.parked = False
+                self._dial_at(peer, now + spread * self._rng() + (0.0 if peer.lower else limits.DIAL_FALLBACK))
 
     # --- events of the driver -------------------------------------------------------------------------------
 
@@ -208,6 +228,7 @@ class Peering:
             peer.backoff.reset()
         peer.link = new
         peer.forget_at = peer.refused = None
+        peer.parked = False
         self._dial_at(peer, None)
         self._verify(peer, now)
         peer.attempts = 0
@@ -217,7 +238,7 @@ class Peering:
         self._by_link[link_id] = peer
         self._outputs.append(LinkUp(link_id, identity))
 
-    def link_down(self, link_id: int, reason: str, now: float, *, silent: bool = False) -> None:
+    def link_down(self, link_id: int, reason: str, now: float, *, silent: bool = False, parked: bool = False) -> None:
         """Handle the end of a link; without effect for a link that was replaced or never up.
 
         Args:
@@ -225,13 +246,19 @@ class Peering:
             reason: Why, for people.
             now: Monotonic seconds.
             silent: Whether the link ended by silence: the path to the peer failed, and may work again at once.
+            parked: Whether both sides ended it for now: an announced peer is not dialled until ``want``.
         """
         peer = self._by_link.get(link_id)
         if peer is None or peer.link is None:
             return
         link = peer.link
-        self._drop(peer, link, LinkDownCause.ENDED, reason)
+        parked = parked and peer.announced and not peer.gone
+        self._drop(peer, link, LinkDownCause.PARKED if parked else LinkDownCause.ENDED, reason)
         peer.fell = now
+        if parked:
+            peer.parked, peer.last_error = True, ""
+            peer.backoff.reset()
+            return
         peer.last_error = reason
         if silent or now - link.since >= limits.LINK_STABLE:
             peer.backoff.reset()
@@ -358,6 +385,7 @@ class Peering:
 
     def _restart(self, peer: _Peer, now: float) -> None:
         """Forget the errors and refusals of a peer's former run, because a new run announced itself."""
+        peer.parked = False
         peer.backoff.reset()
         peer.tried.clear()
         peer.reported.clear()
@@ -488,11 +516,13 @@ class Peering:
 
 
 def _status(peer: _Peer) -> PeerStatus:
-    state: Literal["linked", "dialling", "waiting", "refused"]
+    state: Literal["linked", "dialling", "waiting", "refused", "parked"]
     if peer.link is not None:
         state = "linked"
     elif peer.dialling:
         state = "dialling"
+    elif peer.parked:
+        state = "parked"
     else:
         state = "waiting" if peer.refused is None else "refused"
     link = peer.link

@@ -50,6 +50,8 @@ class LinkDownCause(Enum):
     """The same run of the peer has another link from the same moment on."""
     RESTARTED = "the peer restarted"
     """Another run of the peer has taken its place."""
+    PARKED = "parked: nothing needed it"
+    """Both sides ended it for now; it is made again when something needs the peer."""
     ENDED = "the connection ended"
     """The connection of its express lane ended; ``LinkDown.reason`` says how."""
 
@@ -88,7 +90,8 @@ class PeerStatus:
 
     Args:
         identity: The peer.
-        state: ``refused``: waiting after a refusal for a reason that seldom passes by itself.
+        state: ``refused``: waiting after a refusal for a reason that seldom passes by itself. ``parked``: the link
+            was ended by agreement, and is made again when something needs the peer.
         link_id: Its link, if linked.
         lower: Whether this agent has the lower GUID of the two, and dials first.
         since: When the link came up, or the last link fell, monotonic seconds; ``None`` before the first link.
@@ -99,7 +102,7 @@ class PeerStatus:
     """
 
     identity: Identity
-    state: Literal["linked", "dialling", "waiting", "refused"]
+    state: Literal["linked", "dialling", "waiting", "refused", "parked"]
     link_id: int | None
     lower: bool
     since: float | None

@@ -61,6 +61,7 @@ class LastValueInfo(msgspec.Struct, frozen=True, kw_only=True):
         latching: Whether the publisher is latched.
         stamp: When the gateway received it, seconds since 1970.
         size: Bytes.
+        seen_at: The site whose gateway kept what came of it, where its own was not asked, being off; else empty.
     """
 
     module: str
@@ -72,6 +73,7 @@ class LastValueInfo(msgspec.Struct, frozen=True, kw_only=True):
     latching: bool = False
     stamp: float = 0.0
     size: int = 0
+    seen_at: str = ""
 
 
 class SiteInfo(msgspec.Struct, frozen=True, kw_only=True):
@@ -87,7 +89,8 @@ class SiteInfo(msgspec.Struct, frozen=True, kw_only=True):
         sources: What it offers, in ``rmpa site info`` alone.
         not_shown: How many sources a rule or a conflict of names keeps out.
         beyond: Sources that were left out because there are too many.
-        values: Last values that this site's gateway keeps, without definitions; of this site alone.
+        values: Last values that this site's gateway keeps: of this site, without definitions; of another one that is
+            unreachable, what came of it.
     """
 
     name: str

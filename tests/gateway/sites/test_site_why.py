@@ -32,6 +32,8 @@ from tests.gateway.memory_zenoh import eventually as until
 from tests.gateway.sites.site_bed import site_bed
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from rmpa.observe.sites import SitesReport
     from rmpa.observe.why.diagnosis import Diagnosis
     from tests.gateway.sites.site_bed import Site, SiteBed
@@ -61,8 +63,8 @@ class Asked:
         return found
 
 
-async def asked(bed: SiteBed, name: str, rules: tuple[CrossingRule, ...] = ()) -> Asked:
-    site = await bed.site(name, rules=rules)
+async def asked(bed: SiteBed, name: str, rules: tuple[CrossingRule, ...] = (), seen: Path | None = None) -> Asked:
+    site = await bed.site(name, rules=rules, seen=seen)
     history = SiteHistory(time.monotonic)
     site.neighbour.on_sites = history.seen
     site.neighbour.on_site_source = lambda source, there: history.source(source, there=there)
@@ -79,6 +81,7 @@ async def asked(bed: SiteBed, name: str, rules: tuple[CrossingRule, ...] = ()) -
         site.session,
         site.neighbour,
         history,
+        site.seen,
         lambda: ("tcp/x:1",),
         ask_param,
         why,
@@ -173,6 +176,43 @@ async def test_a_site_that_left_is_unreachable_since_then_and_one_that_never_was
             await hall.answers.answer(LAST, {"site": "yard", "module": "arm", "topic": "/chatter"})
         with pytest.raises(UnreachableError, match="known are: none"):
             await hall.answers.answer(LAST, {"site": "moon", "module": "arm", "topic": "/chatter"})
+
+
+async def test_last_values_of_a_site_that_is_off_are_those_that_came_from_it_also_after_a_restart(
+    tmp_path: Path,
+) -> None:
+    path, question = tmp_path / "seen.sqlite", {"site": "yard", "module": "arm", "topic": "/map"}
+    latched = TopicDescription(TEXT.type, TEXT.md5sum, TEXT.definition, True)
+    async with site_bed() as bed:
+        yard, hall = await asked(bed, "yard"), await asked(bed, "hall", seen=path)
+        source, chat = yard.site.graph.add("/map", latched), yard.site.graph.add("/chatter", TEXT)
+        topic, other = await hall.site.subscribed("/map"), await hall.site.subscribed("/chatter")
+        for body in (b"old walls", b"walls"):
+            yard.site.graph.send(source, body)
+        yard.site.graph.send(chat, b"hello")
+        await until(lambda: b"walls" in topic.messages and other.messages)
+        await yard.site.neighbour.close()
+        await until(lambda: hall.history.away == ("yard",))
+        (value,) = await hall.answers.answer(LAST, question)
+        assert (value.node, value.type, value.latching, value.seen_at) == ("/talker", TEXT.type, True, "hall")
+        assert value.definition == TEXT.definition
+        assert abs(value.stamp - time.time()) < 60
+        with pytest.raises(RmpaError, match="site yard is unreachable since"):
+            await hall.answers.answer(LAST, {**question, "topic": "/chatter"})
+    async with site_bed() as bed:
+        hall = await asked(bed, "hall", seen=path)
+        (value,) = await hall.answers.answer(LAST, question)
+        portion = await hall.answers.answer(BODY, {**question, "node": value.node, "offset": 0})
+        assert (portion.size, portion.data) == (5, b"walls")
+        (site,) = (await hall.report(INFO, site="yard")).sites
+        assert (site.state, [(each.module, each.topic) for each in site.values]) == ("unreachable", [("arm", "/map")])
+        assert [site.name for site in (await hall.report()).sites] == ["hall"], "it may never come again"
+        yard = await asked(bed, "yard")
+        yard.site.graph.add("/other", TEXT)
+        await until(lambda: hall.site.shows("/other"))
+        assert (await hall.report(INFO, site="yard")).sites[0].values == ()
+        (value,) = await hall.answers.answer(LAST, question)
+        assert value.seen_at == "hall", "its own gateway keeps none"
 
 
 async def test_questions_are_checked_before_they_are_passed_on() -> None:

@@ -108,9 +108,9 @@ async def test_link_that_ends_during_its_redial_leaks_no_socket(
             return sock, endpoint
 
         monkeypatch.setattr(one.mesh.dialler, "redial", late)
-        monkeypatch.setattr(one.mesh, "_alive", lambda _: False)
+        monkeypatch.setattr(one.mesh._redials, "_alive", lambda _: False)
         one.mesh.connection_quiet(link.connection)
-        task = one.mesh._redials[link.id]
+        task = one.mesh._redials._tasks[link.id]
         await racing.wait()
         link.abort("the cable is out")
         await until(lambda: bool(one.downs) and link.connection.sock.fileno() < 0, "its end")

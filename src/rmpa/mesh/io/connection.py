@@ -22,6 +22,8 @@ from rmpa.mesh.connection_events import (
     HandshakeDone,
     HelloReceived,
     MarkReceived,
+    Parted,
+    PartingEnded,
     PongReceived,
     Refused,
 )
@@ -95,6 +97,10 @@ class ConnectionOwner(Protocol):
         """The connection is up and its timer fired, about once in a keepalive interval."""
         ...
 
+    def connection_parted(self, connection: Connection) -> None:
+        """Both sides agreed to end the connection for now; ``connection_closing`` follows."""
+        ...
+
     def connection_closing(self, connection: Connection, reason: str) -> None:
         """The connection sends no more data; ``connection_ended`` follows. May be called more than once."""
         ...
@@ -153,6 +159,8 @@ class Connection:
         """Whether the remote side broke the protocol."""
         self.silent = False
         """Once ended: whether it ended by silence (lease expired, no route, reset) rather than by a bye."""
+        self.held: list[bytes] = []
+        """Payloads of control frames that were not sent, because this side has agreed to park the link."""
         self.stalls = StallWatch(segment, clock.now())
         """Judges whether sent data gets through."""
         self._owner = owner
@@ -263,6 +271,9 @@ class Connection:
         closed.
         """
         if self._machine.state is not ConnectionState.UP:
+            return
+        if self._machine.holding:
+            self.held.append(payload)
             return
         self.stream.send((self._machine.control(payload),), URGENT)
         self._check_urgent()
@@ -396,6 +407,13 @@ class Connection:
             self._owner.connection_opened(self)
         elif isinstance(event, Refused):
             self._owner.connection_refused(self, event.refuse, by_us=event.by_us)
+        elif isinstance(event, Parted):
+            self._owner.connection_parted(self)
+        elif isinstance(event, PartingEnded):
+            self._send_output()
+            held, self.held = self.held, []
+            for payload in held:
+                self.send_control(payload)
         elif isinstance(event, ConnectionClosed):
             self._finish(event.reason)
 

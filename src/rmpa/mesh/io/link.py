@@ -70,6 +70,8 @@ class PeerLink:
         """Once the link is down: whether it ended without a bye, so that the peer may soon be linked again."""
         self.crashed = False
         """Once the link is down: whether the peer's agent died, or a better link took over; its nodes go on."""
+        self.parked = False
+        """Once the link is down: whether both sides ended it for now; it is made again when something needs it."""
         self.mark: Final = connection.send_mark
         """``(kind, route, sequence)``: acknowledges messages of a route, before all waiting data."""
         self.touched_at = clock.now()
@@ -160,15 +162,24 @@ class PeerLink:
         """Whether the link is at rest: keepalives are rare, and silence is noticed within ``limits.IDLE_LEASE``."""
         return self.connection.rests
 
-    def need(self, *, needed: bool) -> None:
+    @property
+    def held(self) -> list[bytes]:
+        """Once the link is parked: the payloads of control frames that were not sent, oldest first."""
+        return self.connection.held
+
+    def need(self, *, needed: bool, parks: bool = False) -> None:
         """Say whether something of this module depends on the link; it rests when neither side needs it.
 
         A control frame in either direction makes the link needed; only its user can say that it is not.
+
+        Args:
+            needed: Whether something depends on it.
+            parks: Whether this module would also do without the link for now (``mesh.parting``).
         """
         self._needed = needed
-        for connection in (self.connection, self.bulk_connection):
-            if connection is not None:
-                connection.need(needed=needed)
+        self.connection.need(needed=needed, parks=parks)
+        if self.bulk_connection is not None:
+            self.bulk_connection.need(needed=needed)
 
     def touch(self) -> None:
         """A control frame was sent or received: something begins."""

@@ -20,8 +20,9 @@ from rmpa.mesh.io.connection import Connection
 from rmpa.mesh.io.dialler import Dialler
 from rmpa.mesh.io.link import LinkHandlers, PeerLink
 from rmpa.mesh.io.path_monitor import PathMonitor
+from rmpa.mesh.io.redials import Redials, is_over
 from rmpa.mesh.io.securing import Securing, SecuringError, prove, secure_dialled
-from rmpa.mesh.io.sockets import tune_bulk, tune_express, unacknowledged
+from rmpa.mesh.io.sockets import tune_bulk, tune_express
 from rmpa.mesh.peering import Peering
 from rmpa.mesh.peering_events import (
     CloseLink,
@@ -127,7 +128,14 @@ class Mesh:
         self._dials: set[asyncio.Task[None]] = set()
         self._bulk_dials: dict[int, asyncio.Task[None]] = {}
         self._bulk_backoffs: dict[int, Backoff] = {}
-        self._redials: dict[int, asyncio.Task[None]] = {}
+        self._redials = Redials(
+            self.dialler,
+            start=self._start,
+            alive=self._alive,
+            endpoints=self._endpoints,
+            secure=self._secure_dialled,
+            opened=self._redialled,
+        )
         self._security = security
         self._securing: Securing | None = None
         if security is not None:
@@ -166,7 +174,7 @@ class Mesh:
             *securing,
             *self._dials,
             *self._bulk_dials.values(),
-            *self._redials.values(),
+            *self._redials.close(),
         ]
         for task in tasks:
             task.cancel()
@@ -195,6 +203,16 @@ class Mesh:
     def peer_gone(self, guid: Guid) -> None:
         """Stop dialling a peer that discovery has given up; a link that is up stays."""
         self._peering.peer_gone(guid, self._clock.now())
+        self._act()
+
+    def want(self, guid: Guid) -> None:
+        """Link with a parked peer again at once, because something needs it."""
+        self._peering.want(guid, self._clock.now())
+        self._act()
+
+    def unpark(self, spread: float) -> None:
+        """Link with all parked peers again, within some ``spread`` seconds."""
+        self._peering.unpark(self._clock.now(), spread)
         self._act()
 
     def peers(self) -> list[PeerStatus]:
@@ -286,15 +304,20 @@ class Mesh:
     def connection_quiet(self, connection: Connection) -> None:
         """Try a new connection to the peer of a silent link, because TCP retransmits more and more rarely."""
         link = self._used(connection)
-        if self._running and link is not None and link.dialled and link.id not in self._redials:
-            self._redials[link.id] = task = self._start(self._redial(link), f"redial {link.name}")
-            task.add_done_callback(lambda _: self._redials.pop(connection.id, None))
+        if self._running and link is not None and link.dialled:
+            self._redials.begin(link)
 
     def connection_tick(self, connection: Connection) -> None:
         """Check whether the data that a link sends gets through."""
         link = self._used(connection)
         if self._running and link is not None:
             self.paths.look(link)
+
+    def connection_parted(self, connection: Connection) -> None:
+        """Both sides ended a connection for now; it is not waited for its socket, since nothing more comes."""
+        if (link := self._used(connection)) is not None:
+            self._peering.link_down(link.id, LinkDownCause.PARKED.value, self._clock.now(), parked=True)
+            self._act()
 
     def connection_closing(self, connection: Connection, reason: str) -> None:
         """A connection sends no more data; that of the express lane ends its link."""
@@ -372,10 +395,12 @@ class Mesh:
             case LinkDown():
                 _log.info("= %s: link down: %s", output.identity, output.reason)
                 replaced = output.cause is LinkDownCause.REPLACED
-                self.counters.add("link.replaced" if replaced else "link.down")
+                parked = output.cause is LinkDownCause.PARKED
+                self.counters.add("link.replaced" if replaced else "link.parked" if parked else "link.down")
                 down = self._links.get(output.link_id, ended)
                 if down is not None:
-                    down.silent = down.silent or replaced
+                    down.parked = parked
+                    down.silent = down.silent or replaced or parked
                     # The link of a peer that restarted within its lease: its agent died, the host is there.
                     down.crashed = down.crashed or replaced or output.cause is LinkDownCause.RESTARTED
                     down.use(None)
@@ -413,7 +438,7 @@ class Mesh:
                 _log.debug("! %s: no bulk lane: %s", link.name, error)
                 await asyncio.sleep(backoff.delay())
                 continue
-            if _is_over(link):
+            if is_over(link):
                 sock.close()  # the link ended meanwhile
                 return
             self._open(sock, ConnectionRole.DIALLER, link.remote_endpoint, link.guid, Lane.BULK, secured=secured)
@@ -481,34 +506,10 @@ class Mesh:
             sock.close()
             raise
 
-    async def _redial(self, link: PeerLink) -> None:
-        """Replace a link without acknowledgements as soon as the peer can be reached again, on any path."""
-        while link.used and not self._alive(link.id):
-            try:
-                sock, endpoint = await self.dialler.redial(self._endpoints(link))
-            except OSError as error:
-                _log.debug("! %s: silent, and not to be reached: %s", link.name, str(error) or "no answer")
-                await asyncio.sleep(limits.REDIAL_PAUSE)
-                continue
-            if _is_over(link):
-                # The link and its socket ended meanwhile: the peering machine decides on the next dial.
-                sock.close()
-                return
-            if self._alive(link.id) or not unacknowledged(link.connection.sock):
-                _log.debug("= %s: silent, but not for want of a way to it", link.name)
-                sock.close()
-                return
-            try:
-                secured = await self._secure_dialled(sock)
-            except OSError as error:
-                _log.debug("! %s: silent, and no TLS handshake: %s", link.name, str(error) or "no answer")
-                await asyncio.sleep(limits.REDIAL_PAUSE)
-                continue
-            if _is_over(link):
-                sock.close()
-                return
-            self._open(sock, ConnectionRole.DIALLER, endpoint, link.guid, secured=secured)
-            return
+    def _redialled(
+        self, link: PeerLink, sock: socket.socket, endpoint: SocketAddress, secured: SecuredSocket | None
+    ) -> None:
+        self._open(sock, ConnectionRole.DIALLER, endpoint, link.guid, secured=secured)
 
     async def _reachable(self, link: PeerLink) -> bool:
         """Whether the peer of a link accepts a new connection on the path of this one; it is closed at once."""
@@ -587,11 +588,6 @@ class Mesh:
         task = asyncio.get_running_loop().create_task(work, name=name)
         task.add_done_callback(_report)
         return task
-
-
-def _is_over(link: PeerLink) -> bool:
-    """Whether a link was replaced or has ended; to be checked after an ``await``."""
-    return not link.used
 
 
 def _report(task: asyncio.Task[None]) -> None:

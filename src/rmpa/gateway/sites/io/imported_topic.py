@@ -24,9 +24,13 @@ if TYPE_CHECKING:
     from rmpa.core.clock import Clock
     from rmpa.gateway.neighbour import OwnGraph
     from rmpa.gateway.sites.attachment import MessageSource
+    from rmpa.gateway.sites.keys import SiteModule
     from rmpa.gateway.sites.part import SiteImport
     from rmpa.gateway.zenoh_api import ZenohSession
     from rmpa.ros.wire.tcpros import TopicDescription
+
+    OnLatched = Callable[[SiteModule, str, str, TopicDescription, int, bytes], None]
+    """Module, topic and node there, the publisher's header, the stamp in nanoseconds since 1970, the message."""
 
 _log = logging.getLogger(__name__)
 
@@ -57,6 +61,7 @@ class ImportedTopic:
         session: The Zenoh session.
         clock: Both clocks.
         on_demand: ``(topic, wanted)``: its key is to be subscribed to, or no longer.
+        on_latched: Called with each message of a latched topic that is understood here.
         interrupted: What ``close`` returned before, if the same topic was there and went.
     """
 
@@ -68,6 +73,7 @@ class ImportedTopic:
         session: ZenohSession,
         clock: Clock,
         on_demand: Callable[[ImportedTopic, bool], None],
+        on_latched: OnLatched,
         interrupted: InterruptedTopic | None = None,
     ) -> None:
         self.entry = entry
@@ -75,6 +81,7 @@ class ImportedTopic:
         self._session = session
         self._clock = clock
         self._on_demand = on_demand
+        self._on_latched = on_latched
         self.wanted = False
         """Whether its key is subscribed to for it."""
         self._description: TopicDescription | None = None
@@ -93,6 +100,7 @@ class ImportedTopic:
         self._fresh = False
         self._run = 0
         self._last_latched: bytes | None = None
+        self._latched_stamp = 0
         self._held_dropped = self._mismatched = self._dropped = 0
         self._task: asyncio.Task[None] | None = None
         self._linger: asyncio.TimerHandle | None = None
@@ -122,11 +130,13 @@ class ImportedTopic:
             renewed, self._run = source.run != self._run, source.run
             if renewed and payload == self._last_latched:
                 return  # another gateway of that site has taken over, and had it from the publisher again
-            self._last_latched = payload
+            self._last_latched, self._latched_stamp = payload, stamp
         if self._description is None or source.md5 != self._description.md5sum:
             self._hold(payload, source.md5)
         else:
             self._dropped += self._topic.publish(payload)
+            if source.latched:
+                self._keep(self._description)
 
     def renew(self, entry: SiteImport) -> None:
         """Its module has started anew, or the way to it was interrupted: ask for the header again."""
@@ -306,6 +316,15 @@ class ImportedTopic:
                 self._dropped += self._topic.publish(payload)
             else:
                 self._mismatched += 1
+        if held and held[-1][1] == header.description.md5sum and header.description.latching:
+            self._keep(header.description)
+
+    def _keep(self, description: TopicDescription) -> None:
+        """Tell of the last message of a latched topic."""
+        announced = self.entry.announced
+        if self._last_latched is not None:
+            place = announced.module, announced.name, announced.node
+            self._on_latched(*place, description, self._latched_stamp, self._last_latched)
 
     def _hold(self, payload: bytes, md5: str) -> None:
         """Keep a message until the header is known, or known anew: its publisher has another definition."""

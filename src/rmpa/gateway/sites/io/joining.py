@@ -24,6 +24,7 @@ from rmpa.gateway.sites.io.neighbour import SiteNeighbour
 from rmpa.gateway.sites.io.param_exports import SiteParamExports
 from rmpa.gateway.sites.io.param_imports import SiteParamImports
 from rmpa.gateway.sites.io.param_part import SiteParams
+from rmpa.gateway.sites.io.seen_values import SiteSeenValues
 from rmpa.gateway.sites.io.service_part import SiteServices
 from rmpa.gateway.sites.io.site_answers import SiteAnswers
 from rmpa.gateway.sites.io.site_why import SiteWhy
@@ -72,11 +73,12 @@ def make_site_neighbour(
         return rules.refusal(site, source.module, source.name, Access.CALL)
 
     history = SiteHistory(clock.now)
+    store = _store_file(settings)
+    seen = SiteSeenValues(LastValueStore(store.with_suffix(".seen.sqlite") if store is not None else None))
     parts: list[SitePart] = [
-        SiteLastValues(
-            gateway.site, session, graph, LastValueStore(_store_file(settings)), rules.kept, refusal, clock.wall_ns
-        ),
-        SiteTopics(gateway.site, graph, session, rules, settings.make_contracts(), clock),
+        SiteLastValues(gateway.site, session, graph, LastValueStore(store), rules.kept, refusal, clock.wall_ns),
+        seen,
+        SiteTopics(gateway.site, graph, session, rules, settings.make_contracts(), clock, seen.keep),
         SiteServices(gateway.site, session, graph, services.timeout, why_not, clock.wall_ns),
     ]
     own = SiteGateway(gateway.site, gateway.rank, secrets.token_hex(16))
@@ -86,7 +88,7 @@ def make_site_neighbour(
     if isinstance(graph, AgentGraph):
         neighbour.add(SiteActions(graph.attend))
     if agent is not None:
-        _add_questions(neighbour, agent, session, own, rules, history, clock, settings.name)
+        _add_questions(neighbour, agent, session, own, rules, history, seen, clock, settings.name)
     return neighbour
 
 
@@ -97,6 +99,7 @@ def _add_questions(
     own: SiteGateway,
     rules: CrossingRules,
     history: SiteHistory,
+    seen: SiteSeenValues,
     clock: SystemClock,
     name: str,
 ) -> None:
@@ -119,7 +122,7 @@ def _add_questions(
     neighbour.on_leads = params.lead
     why = SiteWhy(own.site, name, session, neighbour, history, rules)
     answers = SiteAnswers(
-        name, own, session, neighbour, history, lambda: session.endpoints, imports.ask, why, clock.wall_ns
+        name, own, session, neighbour, history, seen, lambda: session.endpoints, imports.ask, why, clock.wall_ns
     )
     neighbour.add(answers)
     agent.sites.serve(answers)

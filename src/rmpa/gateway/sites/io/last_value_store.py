@@ -73,6 +73,8 @@ class LastValueStore:
         self._bytes_max = bytes_max
         self._pending_max = limits.LAST_VALUES_PENDING_MAX if path is not None else bytes_max
         self._index: dict[ValueKey, ValueHeader] = {}
+        self._size = 0
+        """Bytes of all that is in the index."""
         self._pending: dict[ValueKey, LastValue | None] = {}
         """To write; ``None``: to delete. Newest at the end."""
         self._connection: sqlite3.Connection | None = None
@@ -96,7 +98,7 @@ class LastValueStore:
         except TimeoutError:
             self._set_problem("the disk does not answer")
             return
-        self._index = {**(found or {}), **self._index}
+        self._set_index({**(found or {}), **self._index})
 
     def put(self, key: ValueKey, value: LastValue) -> bool:
         """Keep a value in place of the one before; ``False``: it is too large, and the one before is forgotten."""
@@ -106,15 +108,16 @@ class LastValueStore:
             return False
         self._pending.pop(key, None)
         self._pending[key] = value
-        self._index.pop(key, None)
-        self._index[key] = header_of(key, value)
+        self._drop(key)
+        self._index[key] = header = header_of(key, value)
+        self._size += header.size
         self._bound()
         self._write_soon()
         return True
 
     def forget(self, key: ValueKey) -> None:
         """Drop a value."""
-        if self._index.pop(key, None) is not None:
+        if self._drop(key):
             self._pending.pop(key, None)
             self._pending[key] = None
             self._write_soon()
@@ -148,20 +151,31 @@ class LastValueStore:
 
     # --- the event loop -------------------------------------------------------------------------------------------
 
+    def _drop(self, key: ValueKey) -> bool:
+        """Take a value out of the index; return whether it was there."""
+        header = self._index.pop(key, None)
+        if header is not None:
+            self._size -= header.size
+        return header is not None
+
+    def _set_index(self, index: dict[ValueKey, ValueHeader]) -> None:
+        self._index = index
+        self._size = sum(header.size for header in index.values())
+
     def _bound(self) -> None:
-        total = sum(header.size for header in self._index.values())
-        for key in sorted(self._index, key=lambda each: self._index[each].stamp):
-            if total <= self._bytes_max and len(self._index) <= self._values_max:
-                break
-            total -= self._index[key].size
-            self.forget(key)
+        if self._size > self._bytes_max or len(self._index) > self._values_max:
+            for key in sorted(self._index, key=lambda each: self._index[each].stamp):
+                if self._size <= self._bytes_max and len(self._index) <= self._values_max:
+                    break
+                self.forget(key)
         waiting = sum(len(value.body) for value in self._pending.values() if value is not None)
-        for key, value in list(self._pending.items()):
+        for key, value in list(self._pending.items()) if waiting > self._pending_max else ():
             if waiting <= self._pending_max:
                 break
             if value is not None:
                 waiting -= len(value.body)
-                del self._pending[key], self._index[key]
+                del self._pending[key]
+                self._drop(key)
                 self.dropped += 1
 
     def _write_soon(self) -> None:
@@ -196,7 +210,7 @@ class LastValueStore:
                 found = await in_thread(work, "last values")
             if self._begun_anew:
                 self._begun_anew = False
-                self._index = {key: header for key, header in self._index.items() if key in self._pending}
+                self._set_index({key: header for key, header in self._index.items() if key in self._pending})
             return found
 
         job = asyncio.get_running_loop().create_task(run(), name="last values")

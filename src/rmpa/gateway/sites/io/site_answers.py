@@ -5,22 +5,25 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any, Final
 
+import msgspec
+
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.core.identity import peer_name_problem
 from rmpa.core.names import is_global_name
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.sites.attachment import SiteAttachment
-from rmpa.gateway.sites.last_values import HEADER, ValueHeader, value_key
+from rmpa.gateway.sites.last_values import HEADER, ValueHeader, ValueKey, value_key
 from rmpa.gateway.sites.part import PassivePart
 from rmpa.gateway.sites.services import NO_MD5
 from rmpa.observe.io.site_requests import BODY, INFO, LAST, PARAM, REPORT, WHY
 from rmpa.observe.sites import LastValueInfo, SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport, ValuePortion
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable, Callable, Iterable
 
     from rmpa.gateway.sites.history import SiteHistory
+    from rmpa.gateway.sites.io.seen_values import SiteSeenValues
     from rmpa.gateway.sites.io.site_why import SiteWhy
     from rmpa.gateway.sites.keys import SiteGateway, SiteModule
     from rmpa.gateway.sites.known_sites import Sites
@@ -38,6 +41,7 @@ class SiteAnswers(PassivePart):
         session: The Zenoh session.
         sites: What is known of sites.
         history: Since when sites are there or away.
+        seen: What came of other sites' latched topics, which answers for a site that is off as a whole.
         endpoints: The Zenoh endpoints that the session is connected to.
         ask_param: Asks a module of another site about a parameter: site, module, question, arguments.
         why: Tells the ways of a topic or a service through this gateway; closed here.
@@ -53,6 +57,7 @@ class SiteAnswers(PassivePart):
         session: ZenohSession,
         sites: Sites,
         history: SiteHistory,
+        seen: SiteSeenValues,
         endpoints: Callable[[], tuple[str, ...]],
         ask_param: Callable[[str, str, str, dict[str, Any]], Awaitable[object]],
         why: SiteWhy,
@@ -63,6 +68,7 @@ class SiteAnswers(PassivePart):
         self._session = session
         self._sites = sites
         self._history = history
+        self._seen = seen
         self._endpoints = endpoints
         self._ask_param = ask_param
         self._why = why
@@ -86,24 +92,37 @@ class SiteAnswers(PassivePart):
             return await self._why.ways(name, site, module, asker, service=args.get("service") is True)
         site = str(args.get("site", ""))
         if what == INFO:
-            known = self._site_names()
-            # Only the one is asked for; where it is not known, the names of all are the answer.
-            return self._report([site] if site in known else known, sources=site in known)
+            return await self._info(site)
         module = str(args.get("module", ""))
         for name in (site, module):
             if peer_name_problem(name) is not None:
                 raise RemoteProtocolError(f"{name[:80]!r} is not the name of a site or a module")
-        self._require(site)
         if what == LAST:
             return await self._last(site, module, _topic(args))
         if what == BODY:
             return await self._portion(site, module, _topic(args), args)
+        self._require(site)
         if what == PARAM:
             inner = args.get("args")
             if not isinstance(inner, dict):
                 raise RemoteProtocolError("a question about a parameter has no arguments")
             return await self._ask_param(site, module, str(args.get("what", "")), inner)
         raise RemoteProtocolError(f"{what[:80]!r} is no question about sites")
+
+    async def _info(self, site: str) -> SitesReport:
+        known = self._site_names()
+        seen = await self._seen.of_site(site)
+        if site not in known and not seen:
+            return self._report(known, sources=False)  # the names of all are the answer
+        report = self._report([site], sources=True)
+        away = self._is_away(site)
+        values = [_info(key, header, self._own.site, text=False) for key, header in seen.items()] if away else []
+        found = msgspec.structs.replace(report.sites[0], values=(*report.sites[0].values, *_sorted(values)))
+        return msgspec.structs.replace(report, sites=(found,))
+
+    def _is_away(self, site: str) -> bool:
+        """Whether a site is another one that is not there now."""
+        return site != self._own.site and site not in self._sites.catalogue.sites
 
     # --- what is there ----------------------------------------------------------------------------------------------
 
@@ -220,22 +239,19 @@ class SiteAnswers(PassivePart):
     # --- last values ------------------------------------------------------------------------------------------------
 
     async def _last(self, site: str, module: str, topic: str) -> list[LastValueInfo]:
+        """The last values of a topic, from its site; from what was seen of it here if it is away or has none."""
         found: dict[str, LastValueInfo] = {}
-        for reply in await self._get(value_key(site, module, topic) + f"?{HEADER}"):
+        for reply in () if self._is_away(site) else await self._get(value_key(site, module, topic) + f"?{HEADER}"):
             header = ValueHeader.parse(reply.payload)
-            value = LastValueInfo(
-                module=module,
-                topic=topic,
-                node=header.node,
-                type=header.type,
-                md5sum=header.md5sum,
-                definition=header.definition,
-                latching=header.latching,
-                stamp=header.stamp / 1e9,
-                size=header.size,
-            )
+            value = _info(ValueKey(module, topic, header.node), header)
             if header.node not in found or found[header.node].stamp < value.stamp:  # two gateways may have one
                 found[header.node] = value
+        if not found:
+            for key, header in (await self._seen.of_site(site)).items():
+                if (key.module, key.topic) == (module, topic):
+                    found[key.node] = _info(key, header, self._own.site)
+        if not found:
+            self._require(site)
         return [found[node] for node in sorted(found)]
 
     async def _portion(self, site: str, module: str, topic: str, args: dict[str, Any]) -> ValuePortion:
@@ -254,13 +270,17 @@ class SiteAnswers(PassivePart):
 
     async def _body(self, site: str, module: str, topic: str, node: str) -> bytes:
         newest: tuple[int, bytes] | None = None
-        for reply in await self._get(value_key(site, module, topic)):
+        for reply in () if self._is_away(site) else await self._get(value_key(site, module, topic)):
             attachment = SiteAttachment.parse(reply.attachment)
             if attachment.node == node and (newest is None or attachment.stamp > newest[0]):
                 newest = attachment.stamp, reply.payload
-        if newest is None:
+        if newest is not None:
+            return newest[1]
+        seen = await self._seen.body(site, ValueKey(module, topic, node))
+        if seen is None:
+            self._require(site)
             raise UnreachableError("value", f"{topic} of {node} of {site}/{module}")
-        return newest[1]
+        return seen
 
     async def _get(self, selector: str) -> list[ZenohReply]:
         asker = SiteAttachment(1, self._stamp(), NO_MD5, "/rmpa", (self._own.site,))
@@ -294,7 +314,7 @@ def _values(parts: object) -> tuple[LastValueInfo, ...]:
     """The values in the report of ``SiteLastValues``."""
     part = parts.get("last_values") if isinstance(parts, dict) else None
     values = part.get("values", ()) if isinstance(part, dict) else ()
-    return tuple(
+    return _sorted(
         LastValueInfo(
             module=value["module"],
             topic=value["topic"],
@@ -304,7 +324,26 @@ def _values(parts: object) -> tuple[LastValueInfo, ...]:
             stamp=value["stamp"] / 1e9,
             size=value["size"],
         )
-        for value in sorted(values, key=lambda each: (str(each["topic"]), str(each["module"])))
+        for value in values
+    )
+
+
+def _sorted(values: Iterable[LastValueInfo]) -> tuple[LastValueInfo, ...]:
+    return tuple(sorted(values, key=lambda each: (each.topic, each.module, each.node)))
+
+
+def _info(key: ValueKey, header: ValueHeader, seen_at: str = "", *, text: bool = True) -> LastValueInfo:
+    return LastValueInfo(
+        module=key.module,
+        topic=key.topic,
+        node=key.node,
+        type=header.type,
+        md5sum=header.md5sum,
+        definition=header.definition if text else "",
+        latching=header.latching,
+        stamp=header.stamp / 1e9,
+        size=header.size,
+        seen_at=seen_at,
     )
 
 

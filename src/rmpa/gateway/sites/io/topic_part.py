@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from rmpa.core.contract import Contracts
     from rmpa.gateway.neighbour import OwnGraph
     from rmpa.gateway.sites.attachment import MessageSource
+    from rmpa.gateway.sites.io.imported_topic import OnLatched
     from rmpa.gateway.sites.keys import SiteModule
     from rmpa.gateway.sites.part import SiteExport, SiteImport
     from rmpa.gateway.sites.rules import CrossingRules
@@ -48,6 +49,7 @@ class SiteTopics:
         rules: Tell which site may have which topic.
         contracts: The contracts of topics, which become Zenoh's QoS.
         clock: Both clocks.
+        on_latched: Called with each message of a latched topic of another site.
     """
 
     name = "topics"
@@ -60,7 +62,9 @@ class SiteTopics:
         rules: CrossingRules,
         contracts: Contracts,
         clock: Clock,
+        on_latched: OnLatched = lambda *_: None,
     ) -> None:
+        self._on_latched = on_latched
         self._site = site
         self._graph = graph
         self._session = session
@@ -111,7 +115,14 @@ class SiteTopics:
             ident = _ident(entry)
             interrupted = self._interrupted.pop(ident, None)
             self._imported[ident] = ImportedTopic(
-                entry, self._site, self._graph, self._session, self._clock, self._on_demand, interrupted
+                entry,
+                self._site,
+                self._graph,
+                self._session,
+                self._clock,
+                self._on_demand,
+                self._on_latched,
+                interrupted,
             )
 
     def renew(self, old: SiteImport, new: SiteImport) -> None:
