@@ -30,6 +30,7 @@ from lab.bench import (
     startup,
     storm,
     tasks,
+    thousand,
     throughput,
     trust,
     web,
@@ -98,6 +99,7 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
         "what it costs to follow a real roscore, and how soon changes are seen", roscore.measure, (why_no_ros,)
     ),
     "idle": Measurement("what an agent costs while nothing happens", idle.measure),
+    "thousand": Measurement("a mesh of up to a thousand modules, simulated", thousand.measure, needs=()),
     "tasks": Measurement(
         "how evenly a resource's task runs, beside loops of rospy and roscpp",
         tasks.measure,
