@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := venv
-.PHONY: venv demo demo-sites demo-kill demo-start test test-bare tests style format types imports reference fuzz soak soak-web bench experiment wheel ros chromium clients clean
+.PHONY: venv demo demo-sites demo-kill demo-start test test-bare tests style format types imports reference fuzz soak soak-web swim bench experiment wheel ros chromium clients clean
 
 $(STAMP): pyproject.toml constraints.txt scripts/bootstrap
 	scripts/bootstrap $(PYTHON) $(VENV)
@@ -64,6 +64,9 @@ soak: $(STAMP) ros  ## disturb three modules for long and see that nothing leaks
 
 soak-web: $(STAMP) chromium  ## modules, topics, clients and pages of rmpa web come and go for an hour; nothing may leak: make soak-web [SECONDS=3600] [SEED=N]
 	$(BIN)/python -m tests.soak.web --seconds $(or $(SECONDS),3600) $(if $(SEED),--seed $(SEED))
+
+swim: $(STAMP)  ## figures of the failure detector at 1,000 simulated members, and 24 simulated hours at 1 % loss: make swim [ARGS="--members 200"]
+	$(BIN)/python -m tests.simulation.swim_figures $(ARGS)
 
 bench: $(STAMP) ros  ## the measurements, as ratios in one run; results in lab/results
 	-$(BIN)/pip install -q -c constraints.txt -e '.[lab-peers,web-peers]'  # a peer that cannot be installed is left out

@@ -14,7 +14,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from lab.bed.agents import Agent
+from lab.bed.agents import RMPA, Agent
+from lab.bed.processes import CommandFailed, Process
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
 ROUTER_PORT: Final = 7447
 """Zenoh's usual port."""
+AUTHORITY_PORT: Final = 40001
+"""The mesh port of the router of secured sites, which lets modules of all sites join."""
 SUBNET: Final = 1
 """The third byte of the addresses at every site."""
 
@@ -102,6 +105,9 @@ class JoinedSites:
         modules: The module of each site by the site's name.
         log_level: Of every agent and gateway.
         config: Text of every gateway's ``rmpa.toml``.
+        secured: The ``rmpa.toml`` of each site, which its module and its gateway share, and of the router, by the
+            name ``fleet``: the router is the authority of a secured mesh, and all others join it by a token from
+            behind NAT. ``None``: without trust, by ``--insecure``.
     """
 
     def __init__(
@@ -113,28 +119,49 @@ class JoinedSites:
         *,
         log_level: str = "debug",
         config: str = "",
+        secured: Mapping[str, str] | None = None,
     ) -> None:
         self._lab, self._home, self._stack, self._level = lab, home, stack, log_level
-        self._config = config
+        self._config, self._secured = config, secured
         self.fleet, networks = site_networks(lab, *modules)
-        self.router = GatewayProcess(
-            self.fleet, home, name="fleet", log_level=log_level, flags=["--router", *self._listen, "--insecure"]
-        )
+        flags = ["--router", "--listen", f"{self._protocol}/0.0.0.0:{ROUTER_PORT}"]
+        flags += ["--insecure"] if secured is None else ["--port", str(AUTHORITY_PORT)]
+        text = secured["fleet"] if secured is not None else ""
+        self.router = GatewayProcess(self.fleet, home, name="fleet", log_level=log_level, flags=flags, config=text)
         started: list[Agent] = [self.router]
         self.sites: list[Site] = []
         for network, module in zip(networks, modules.values(), strict=True):
-            agent = Agent(network.host(lab, module), home, name=module, log_level=log_level)
+            text = secured[network.name] if secured is not None else ""
+            agent = Agent(network.host(lab, module), home, name=module, log_level=log_level, config=text)
             gateway = self._gateway(network, f"{network.name}_gateway")
             self.sites.append(Site(network, agent, gateway))
             started += [agent, gateway]
+        if secured is not None:
+            command(self.router, "trust", "init", "--name", self.router.name)
         for agent in started:
+            if secured is not None and agent is not self.router:
+                self.join(agent)
             self._start(agent)
-        for agent in started:
+            if agent is self.router:
+                agent.wait_ready()  # others join at it
+        for agent in started[1:]:
             agent.wait_ready()
 
     @property
-    def _listen(self) -> list[str]:
-        return ["--listen", f"tcp/0.0.0.0:{ROUTER_PORT}"]
+    def endpoint(self) -> str:
+        """Where gateways connect to the router."""
+        return f"{self._protocol}/{self.fleet.address}:{ROUTER_PORT}"
+
+    @property
+    def _protocol(self) -> str:
+        return "tcp" if self._secured is None else "tls"
+
+    def join(self, agent: Agent) -> None:
+        """Make an agent that does not run a member of the secured mesh, by a token of the router, as a user does."""
+        place = f"{self.fleet.address}:{AUTHORITY_PORT}"
+        invite = ("--no-wait", "--name", self.router.name, "--module", agent.name, "--address", place)
+        token = next(word for word in command(self.router, "trust", "invite", *invite).split() if "rmpa1-" in word)
+        command(agent, "trust", "join", "--yes", "--name", agent.name, token)
 
     def second_gateway(self, site: Site, rank: int = 200) -> GatewayProcess:
         """One more gateway at a site; ready when this returns."""
@@ -143,11 +170,36 @@ class JoinedSites:
         made.wait_ready()
         return made
 
-    def _gateway(self, network: SiteNetwork, name: str, flags: Sequence[str] = ()) -> GatewayProcess:
-        flags = ["--site", network.name, "--connect", f"tcp/{self.fleet.address}:{ROUTER_PORT}", "--insecure", *flags]
+    def gateway_of(self, site: str, network: SiteNetwork, name: str, config: str = "") -> GatewayProcess:
+        """A gateway of any site on a host of its own in a site's network; it does not run, and has not joined."""
+        flags = ["--site", site, "--connect", self.endpoint]
         host = network.host(self._lab, name)
-        return GatewayProcess(host, self._home, name=name, log_level=self._level, flags=flags, config=self._config)
+        made = GatewayProcess(host, self._home, name=name, log_level=self._level, flags=flags, config=config)
+        self._stack.enter_context(made)
+        return made
+
+    def _gateway(self, network: SiteNetwork, name: str, flags: Sequence[str] = ()) -> GatewayProcess:
+        flags = ["--site", network.name, "--connect", self.endpoint, *flags]
+        text = self._config
+        if self._secured is None:
+            flags.append("--insecure")
+        else:
+            text += self._secured[network.name]
+        host = network.host(self._lab, name)
+        return GatewayProcess(host, self._home, name=name, log_level=self._level, flags=flags, config=text)
 
     def _start(self, agent: Agent) -> None:
         self._stack.enter_context(agent)
         agent.start()
+
+
+def command(agent: Agent, *words: str) -> str:
+    """Run an ``rmpa`` command on an agent's host; return what it prints.
+
+    Raises:
+        CommandFailed: Its exit code is not 0.
+    """
+    with Process(agent.host.command([RMPA, *words]), env=agent.env, name=f"rmpa {words[0]}") as process:
+        if code := process.wait():
+            raise CommandFailed(f"rmpa {' '.join(words)} on {agent.host.name}: {code}\n{process.output}")
+        return process.output

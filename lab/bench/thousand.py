@@ -1,8 +1,8 @@
 """A thousand modules in one process: the real machines of every agent, on a simulated clock and network.
 
-What it shows: how long until all know all after a flash start, what an agent sends, receives and computes at rest, and
-how soon changed offers and killed modules are known everywhere. ``tests.simulation`` plays it; links are simulated by
-their handshakes and sizes, so the bytes of links that something uses are not in the figures.
+It shows how long all take to know all after a flash start, what an agent sends, receives and computes at rest, and
+how soon changed offers and killed modules are known everywhere. ``tests.simulation`` plays it; of links only the
+handshakes and sizes are simulated, so the bytes of links that something uses are not in the figures.
 """
 
 from __future__ import annotations

@@ -72,6 +72,8 @@ def test_info(place: Place, agent: Agent) -> None:
     assert "Round trip:   432 µs" in out
     assert "Clock:        -1.25 ms ± 216 µs (its clock less ours)" in out
     assert "Direct:       1 of the subscribers here to its nodes, 2 of its subscribers to nodes here" in out
+    probes = "suspect, heard 2.5 s ago, round trip 800 µs, refuted 1 suspicions, version 12 of its offers"
+    assert f"Probes:       {probes}" in out
     assert "Topics that it publishes:" in out
     (row,) = (line for line in out.splitlines() if "/cmd" in line)
     assert " ".join(row.split()) == "/cmd sensor_msgs/Joy /joy_node open 600 10.0 Hz 412 µs ±216 µs 790 µs 9"

@@ -238,7 +238,7 @@ def test_a_member_that_is_heard_of_alone_is_reported_and_not_probed() -> None:
     packet = SwimPacket(SwimKind.NEWS, accuser.guid, accuser.instance, 0, 1, active=True, news=(news,))
     mesh.detectors[1].receive(packet, accuser.guid.endpoint, mesh.now)
     mesh.run(3)
-    assert of(mesh.events[1], MemberHeardOf) == [MemberHeardOf(stranger.guid)]
+    assert of(mesh.events[1], MemberHeardOf) == [MemberHeardOf(stranger.guid, stranger.instance[:8])]
     assert mesh.detectors[1].knows(stranger.instance)
     assert stranger.guid.endpoint not in {output.address for _, output in mesh.sent}
     mesh.detectors[1].add(stranger, mesh.now)

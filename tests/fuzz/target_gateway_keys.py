@@ -28,6 +28,8 @@ SEEDS: list[bytes] = [
     f"rmpa/1/warehouse/arm/up/{_RUN}".encode(),
     f"rmpa/1/warehouse/arm/up/{_RUN}/t/sensor_msgs%LaserScan/%lidar%driver/%base%scan".encode(),
     f"rmpa/1/warehouse/arm/up/{_RUN}/s/-/%node/%stop".encode(),
+    f"rmpa/1/warehouse/arm/to/{_RUN}/yard/t/sensor_msgs%LaserScan/%lidar%driver/%base%scan".encode(),
+    b"rmpa/1/warehouse/arm/to/yard/s/std_srvs%Trigger/stop",
     f"rmpa/1/warehouse/-gateway/010/{_RUN}".encode(),
     b"rmpa/1/warehouse/arm/s/std_srvs%Trigger/stop",
     b"rmpa/1/warehouse/arm/v/map",

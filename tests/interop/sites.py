@@ -10,7 +10,7 @@ from lab.bed.processes import DEADLINE, Process, eventually
 from tests.interop.modules import Module
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
     from contextlib import ExitStack
     from pathlib import Path
 
@@ -45,9 +45,19 @@ class JoinedModules:
         return traffic["rx_bytes"] + traffic["tx_bytes"]
 
 
-def join(lab: Lab, home: Path, shell: Callable[[Host], Ros], stack: ExitStack, config: str = "") -> JoinedModules:
-    """Start all, the gateways with this ``rmpa.toml``; return when each module's agent is linked with its gateway."""
-    net = JoinedSites(lab, home, stack, MODULES, config=config)
+def join(
+    lab: Lab,
+    home: Path,
+    shell: Callable[[Host], Ros],
+    stack: ExitStack,
+    config: str = "",
+    secured: Mapping[str, str] | None = None,
+) -> JoinedModules:
+    """Start all, the gateways with this ``rmpa.toml``; return when each module's agent is linked with its gateway.
+
+    ``secured`` is as of ``JoinedSites``.
+    """
+    net = JoinedSites(lab, home, stack, MODULES, config=config, secured=secured)
     made = [Module(site.module.host, site.module, shell(site.module.host)) for site in net.sites]
     for site in net.sites:
         site.module.wait_peer(site.gateway.name)

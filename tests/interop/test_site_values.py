@@ -132,6 +132,30 @@ def test_a_last_value_is_there_when_its_module_is_off(joined: JoinedModules) -> 
         arm.wait_peer(joined.warehouse.gateway.name)
 
 
+def test_a_last_value_of_a_site_that_is_off_as_a_whole_is_what_came_of_it(joined: JoinedModules) -> None:
+    base, gateway = joined.base.agent, joined.warehouse.gateway
+    with joined.arm.ros.rospy("stranger", topic="/seen_gripper", name="seen_stranger") as stranger:
+        stranger.wait_event("up")
+        eventually(lambda: "/seen_gripper" in does(base, "topic", "list"), LONG, what="the topic", every=0.5)
+        assert "force: 1.5" in does(base, "topic", "echo", "/seen_gripper", "-n", "1")
+    gateway.kill()
+    try:
+        eventually(lambda: "unreachable" in fails(base, "site", "info", "warehouse"), LONG, what="its end", every=0.5)
+        value: dict[str, Any] = json.loads(does(base, "site", "last", "warehouse/arm", "/seen_gripper", "--json"))
+        assert (value["node"], value["seen_at"]) == ("/seen_stranger", "yard")
+        assert '"force":1.5' in json.dumps(value["message"], separators=(",", ":"))
+        assert "this is what site yard saw of it last" in does(
+            base, "site", "last", "warehouse/arm", "/seen_gripper", "--header"
+        )
+        assert "/seen_gripper" in fails(base, "site", "info", "warehouse")
+        assert "unreachable since" in fails(base, "site", "last", "warehouse/arm", "/none")
+    finally:
+        gateway.restart()
+        eventually(
+            lambda: "joined" in base.rmpa("site", "info", "warehouse")[1], LONG, what="the site again", every=0.5
+        )
+
+
 def test_smart_resources_of_another_site_are_listed_and_set(joined: JoinedModules) -> None:
     arm, base = joined.arm.agent, joined.base.agent
     arm.kill()

@@ -5,12 +5,14 @@ from __future__ import annotations
 from rmpa.observe.snapshot import (
     AgentInfo,
     BoundInfo,
+    DetectorInfo,
     DirectFigures,
     EventInfo,
     FilesInfo,
     LatencyInfo,
     LinkInfo,
     PeerInfo,
+    ProbesInfo,
     RouteInfo,
     SampleSpread,
     Snapshot,
@@ -41,6 +43,7 @@ SNAPSHOT = Snapshot(
         proxies=17,
         proxy_sockets=2,
         proxy_listening="two for all, ports 40011 and 40012, and an address 127.a.b.c for each",
+        detector=DetectorInfo(members=99, suspects=1, health=2, refuted=1, news=3),
     ),
     taken=1_700_003_725.0,
     peers=(
@@ -71,6 +74,7 @@ SNAPSHOT = Snapshot(
             topics_out=1,
             direct_in=1,
             direct_out=2,
+            probes=ProbesInfo(state="suspect", heard_ago=2.5, rtt=0.0008, refuted=1, version=12),
         ),
         PeerInfo(
             name="pc",

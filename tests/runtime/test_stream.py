@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import URGENT, Outbox
 from rmpa.core.sizes import KIB, MIB
-from rmpa.runtime.stream import Stream, collected_sends
+from rmpa.runtime.corking import CollectedSends
+from rmpa.runtime.stream import Stream
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -299,10 +300,10 @@ async def test_messages_of_one_read_leave_in_one_call(sockets: Sockets) -> None:
 async def test_messages_that_are_collected_leave_in_one_call(sockets: Sockets) -> None:
     target = counted(sockets[0])
     one, end = End(target), End(sockets[1])
-    with collected_sends():
+    with CollectedSends():
         for i in range(50):
             one.send(b"%d" % i)
-        with collected_sends():
+        with CollectedSends():
             one.send(b"inner")
     one.send(b"after")
     await until(lambda: len(end.got) == 52)

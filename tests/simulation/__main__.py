@@ -14,6 +14,7 @@ from tests.simulation.large_scenario import LargeScenario
 from tests.simulation.mesh_scenario import MeshScenario
 from tests.simulation.reliable_scenario import ReliableScenario
 from tests.simulation.scenario import Scenario
+from tests.simulation.swim_scenario import SwimScenario
 
 
 def main() -> int:
@@ -21,7 +22,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.simulation", description=__doc__)
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--peers", type=int, default=2, help="not with --kind reliable and direct")
-    kinds = ["rosters", "mesh", "lanes", "reliable", "direct", "thousand"]
+    kinds = ["rosters", "mesh", "lanes", "reliable", "direct", "swim", "thousand"]
     parser.add_argument("--kind", choices=kinds, default="rosters")
     parser.add_argument("--loss", type=float, default=0.01, help="thousand: share of datagrams that are lost")
     parser.add_argument("--parts", default="", help="thousand: also churn, partition; comma-separated")
@@ -29,9 +30,11 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.kind == "thousand":
         return _play_large(arguments)
-    scenario: Scenario | ReliableScenario | DirectScenario
+    scenario: Scenario | ReliableScenario | DirectScenario | SwimScenario
     if arguments.kind == "direct":
         scenario = DirectScenario(arguments.seed, keep=True)
+    elif arguments.kind == "swim":
+        scenario = SwimScenario(arguments.seed, arguments.peers, keep=True)
     elif arguments.kind == "reliable":
         scenario = ReliableScenario(arguments.seed, keep=True)
     else:

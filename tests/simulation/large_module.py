@@ -14,8 +14,9 @@ from rmpa.core.identity import Identity
 from rmpa.discovery.beacon import Beacon
 from rmpa.discovery.events import PeerChanged, PeerFound, PeerLost, PeerRestarted, SendMulticast
 from rmpa.discovery.failure_detector import FailureDetector
+from rmpa.discovery.member_watch import MemberWatch
 from rmpa.discovery.membership import MembershipProtocol
-from rmpa.discovery.swim_events import MemberFailed, MemberLeft, MemberOffers, MemberSuspected, SwimEvent
+from rmpa.discovery.swim_events import MemberOffers, MemberSuspected, SwimEvent
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.handshake import Hello
 from rmpa.mesh.mode import MeshMode
@@ -100,8 +101,9 @@ class Module:
         rng = random.Random(self.network.world.rng.getrandbits(64))
         now = self.network.now
         self.identity = Identity(Guid.of(*self.address, self.run), rng.randbytes(16), self.name)
-        self.membership = MembershipProtocol(self.identity, rng=rng.random)
         self.detector = FailureDetector(self.identity, rng=rng.random)
+        self.membership = MembershipProtocol(self.identity, rng=rng.random, vouches=self.detector.vouches)
+        self.member_watch = MemberWatch(self.detector, self.membership)
         self.peering = Peering(self.identity, rng=rng.random, alive=self._is_alive)
         self.mode = MeshMode()
         self.rng = rng
@@ -200,7 +202,7 @@ class Module:
             for event in self.membership.events():
                 busy = True
                 self._on_event(event)
-            for heard in self.detector.events():
+            for heard in self.member_watch.events(self.network.now):
                 busy = True
                 self._on_swim(heard)
             for order in self.peering.take():
@@ -233,6 +235,7 @@ class Module:
 
     def _on_event(self, event: Event) -> None:
         now = self.network.now
+        self.member_watch.membership_changed(event, now)
         match event:
             case PeerFound(identity=identity, source=source):
                 self.tally.members += 1
@@ -266,7 +269,6 @@ class Module:
 
     def _forget(self, identity: Identity) -> None:
         place = identity.guid.place
-        self.detector.remove(identity.guid, identity.instance, self.network.now)
         known = self.known.get(place)
         if known is not None and known[0] == identity.instance:
             del self.known[place]
@@ -277,10 +279,7 @@ class Module:
             self.detector.set_active(self.network.now, active=self.mode.demand)
 
     def _on_swim(self, event: SwimEvent) -> None:
-        now = self.network.now
         match event:
-            case MemberFailed(guid=guid, instance=instance) | MemberLeft(guid=guid, instance=instance):
-                self.membership.peer_failed(guid, instance, now)
             case MemberSuspected(guid=guid, instance=instance):
                 self.tally.suspected += 1
                 module = self.network.modules.get(guid.endpoint)
@@ -311,7 +310,7 @@ class Module:
             case LinkUp(link_id=link_id, identity=identity):
                 self._linked(self.links[link_id], identity)
             case LinkDown(identity=identity):
-                self.detector.set_linked(identity.guid, identity.instance, linked=False)
+                self.member_watch.link_down(identity.guid, identity.instance)
                 self.membership.link_down(identity.guid, self.network.now, identity.instance)
             case CloseLink(link_id=link_id, reason=reason) if link_id in self.links:
                 self._end(self.links[link_id], reason, parked=False)
@@ -356,7 +355,7 @@ class Module:
     def _linked(self, link: Link, identity: Identity) -> None:
         now = self.network.now
         self.membership.link_up(identity, now, identity.guid.endpoint)
-        self.detector.add(identity, now, linked=True)
+        self.member_watch.link_up(identity, now, answers_probes=True)
         other = link.other(self)
         self.network.later(lambda: self.learn(other))
         link.used = link.used or other.identity.guid.place in self.wants

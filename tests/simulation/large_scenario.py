@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import resource
 import time
@@ -213,7 +214,7 @@ class LargeScenario:
         for module in back:
             self.world.after(10.0 * self.world.rng.random(), module.start)
         for module in self.world.rng.sample([m for m in self.modules if m.alive], len(back) // 3):
-            self.world.after(10.0 * self.world.rng.random(), lambda module=module: self._restart(module))
+            self.world.after(10.0 * self.world.rng.random(), functools.partial(self._restart, module))
         self.world.run(self.world.now + 10.0)
         agreed = self._until(lambda: self._members_agree() and self._graphs_agree(), began, 120.0)
         self.figures.churn_after = agreed

@@ -18,7 +18,9 @@ from rmpa.core.identity import Identity
 from rmpa.discovery.events import PeerChanged, PeerConflict, PeerFound, PeerLost, PeerRestarted
 from rmpa.discovery.io.discovery import Discovery
 from rmpa.discovery.io.interfaces import choose, further_addresses, list_interfaces, pick_address
+from rmpa.discovery.swim_events import MemberSuspected
 from rmpa.mesh import limits as mesh_limits
+from rmpa.mesh.handshake import Feature
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
 from rmpa.mesh.peering_events import LinkDown, LinkDownCause
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.discovery.events import Event
     from rmpa.discovery.io.interfaces import Interface
+    from rmpa.discovery.swim_events import SwimEvent
     from rmpa.mesh.io.link import PeerLink
 
 _log = logging.getLogger(__name__)
@@ -100,6 +103,7 @@ class NetworkEndpoint:
             settings,
             udp,
             on_event=self._event,
+            on_member=self._member,
             on_interfaces=self._interfaces,
             clock=clock,
             trust=trust.membership.packets if trust is not None else None,
@@ -135,9 +139,24 @@ class NetworkEndpoint:
             case PeerConflict():
                 pass  # discovery has logged the error, at a bounded rate
 
+    def _member(self, event: SwimEvent) -> None:
+        """Take in what the failure detector has found; discovery itself acts on failures."""
+        match event:
+            case MemberSuspected(guid=guid):
+                link = self.mesh.link(guid)
+                if link is not None:
+                    link.touch()  # a link at rest would notice after many seconds whether the peer is there
+            case _:
+                pass
+
     def _link_up(self, link: PeerLink) -> None:
         # Its beacons come from its mesh port; an accepted connection may come from any port.
-        self.discovery.link_up(link.identity, (link.remote_endpoint[0], link.identity.guid.port))
+        remote = link.connection.remote
+        self.discovery.link_up(
+            link.identity,
+            (link.remote_endpoint[0], link.identity.guid.port),
+            answers_probes=remote is not None and bool(remote.features & Feature.SWIM),
+        )
         self._bridge.sessions.link_up(link)
 
     def _link_down(self, link: PeerLink, down: LinkDown) -> None:

@@ -22,7 +22,7 @@ from rmpa.observe.snapshot import PingReply
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rmpa.observe.snapshot import PeerInfo, RouteInfo, Snapshot, TopicInfo
+    from rmpa.observe.snapshot import PeerInfo, ProbesInfo, RouteInfo, Snapshot, TopicInfo
 
 _COLOURS: Final = {"linked": "green", "relayed": "green", "linking": "yellow", "refused": "red", "conflict": "red"}
 _USUAL: Final = frozenset({"linked", "relayed", "parked"})
@@ -206,6 +206,8 @@ def _facts(info: PeerInfo) -> list[tuple[str, str]]:
         ("Found", f"{duration(info.found_ago)} ago by {info.source or 'a link'}"),
         ("Last beacon", f"{duration(info.beacon_ago)} ago" if info.beacon_ago is not None else "-"),
     ]
+    if info.probes is not None:
+        facts.append(("Probes", _probes_text(info.probes)))
     link = info.link
     if link is not None:
         who = "dialled by us" if link.dialled else "dialled by it"
@@ -230,6 +232,15 @@ def _facts(info: PeerInfo) -> list[tuple[str, str]]:
         facts.append(("Next attempt", f"in {duration(info.next_attempt)}"))
     facts += [("Limit", bound.text) for bound in info.beyond]
     return facts + [("Conflict", conflict) for conflict in info.conflicts]
+
+
+def _probes_text(probes: ProbesInfo) -> str:
+    """``alive, heard 0.4 s ago, round trip 0.8 ms, refuted 0 suspicions, version 3 of its offers``."""
+    heard = f"heard {duration(probes.heard_ago)} ago" if probes.heard_ago is not None else "not heard yet"
+    trip = f", round trip {duration(probes.rtt)}" if probes.rtt is not None else ""
+    return (
+        f"{probes.state}, {heard}{trip}, refuted {probes.refuted} suspicions, version {probes.version} of its offers"
+    )
 
 
 @click.command(epilog="\b\nExamples:\n  rmpa peer ping base\n  rmpa peer ping base -c 10 -i 0.1\n")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -15,6 +16,7 @@ from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.core.names import is_legal_name
 from rmpa.observe import limits
+from rmpa.observe.control import GATEWAY_REPORT
 from rmpa.observe.io.control_client import ControlClient, choose_agent
 from rmpa.observe.io.site_requests import BODY, INFO, LAST, REPORT
 from rmpa.observe.sites import LastValueInfo, SitesReport, ValuePortion, read_site_module
@@ -79,10 +81,11 @@ def list_(as_json: bool, agent: str | None, name: str | None) -> int:
     """
     with _connect(agent, name) as client:
         reports = _ask(client, REPORT, tuple[SitesReport, ...])
+        absent = "" if reports else _why_none(client)
     if as_json:
         print_json(reports)
     elif not reports:
-        _no_gateway(client.name)
+        warn(absent)
     else:
         rows = [(report, site) for report in reports for site in report.sites]
         print_table(
@@ -99,8 +102,12 @@ def list_(as_json: bool, agent: str | None, name: str | None) -> int:
     return 0 if reports and well and not any(report.problem for report in reports) else 1
 
 
-def _no_gateway(agent: str) -> None:
-    warn(f"{agent} is no gateway, and is linked to none: start one with `rmpa gateway --site NAME`")
+def _why_none(client: ControlClient) -> str:
+    """Why no gateway answers: this agent is a gateway whose session is not open, or it knows none."""
+    with contextlib.suppress(RmpaError):  # no gateway: it has no such operation
+        problem = str(client.call(GATEWAY_REPORT, dict[str, object]).get("problem", ""))
+        return f"{client.name} joins no site: {problem or 'it is a gateway without --site'}"
+    return f"{client.name} is no gateway, and is linked to none: start one with `rmpa gateway --site NAME`"
 
 
 def _where(report: SitesReport) -> str:

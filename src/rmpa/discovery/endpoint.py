@@ -58,6 +58,7 @@ class PeerInstance:
         verified: Whether it had a link: it is no forgery.
         leaving: Whether it said goodbye.
         superseded_at: When another run took its endpoint.
+        vouched_until: Until when the failure detector's word keeps it.
     """
 
     identity: Identity
@@ -73,11 +74,12 @@ class PeerInstance:
     verified: bool = False
     leaving: bool = False
     superseded_at: float = _NEVER
+    vouched_until: float = _NEVER
 
     @property
     def deadline(self) -> float:
         """When its lease is over, if it stays silent."""
-        return self.heard + self.lease
+        return max(self.heard + self.lease, self.vouched_until)
 
     @property
     def silence(self) -> float:
@@ -232,8 +234,7 @@ class Endpoint:
             return self._new_run(peer, now)
         if self.current is None:
             return self._promote(peer, now, EndpointChange.NEW)
-        patience = limits.CONFLICT_LINKED_AFTER if self.current.linked else limits.CONFLICT_AFTER
-        if self.conflict or now - peer.superseded_at < patience:
+        if self.conflict or now - peer.superseded_at < limits.CONFLICT_AFTER:
             return EndpointChange.WAITING
         if self.current.linked or now - self.current.heard <= limits.HEARTBEAT_LATE:
             self.conflict = True

@@ -13,6 +13,9 @@ from rmpa.discovery.events import ConflictKind, HeardBy, PeerConflict, PeerView
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from rmpa.core.guid import Guid
+    from rmpa.core.identity import Identity
+    from rmpa.discovery.beacon import Address
     from rmpa.discovery.endpoint import Endpoint, PeerInstance
 
 
@@ -44,6 +47,13 @@ class EndpointTable:
     def get(self, place: int) -> Endpoint | None:
         """The endpoint at a place, or ``None``."""
         return self._all.get(place)
+
+    def current(self, guid: Guid, run: bytes) -> PeerInstance | None:
+        """The run at a GUID's place, if it is a member and its instance id begins so; not this agent itself."""
+        endpoint = self._all.get(guid.place)
+        if endpoint is None or endpoint.current is None or not endpoint.present:
+            return None
+        return endpoint.current if endpoint.current.identity.instance.startswith(run) else None
 
     def add(self, place: int, endpoint: Endpoint) -> Endpoint:
         """Add an endpoint at a place that has none; return it."""
@@ -107,6 +117,26 @@ class EndpointTable:
     def present(self) -> list[PeerInstance]:
         """The peers that are members, without this agent, by GUID; not to be changed or kept by the caller."""
         return self._present
+
+    def observed_addresses(self, gossip: tuple[Guid, ...]) -> tuple[Address, ...]:
+        """Source addresses of gossiped peers that differ from the GUID's address, which may not be reachable."""
+        found = []
+        for guid in gossip:
+            endpoint = self._all.get(guid.place)
+            source = endpoint.current.source if endpoint is not None and endpoint.current is not None else None
+            if source is not None and source != guid.endpoint and not source[0].startswith("127."):
+                found.append(source)
+        return tuple(found)
+
+    def unknown_addresses(self, addresses: tuple[Address, ...], own: Identity) -> list[Address]:
+        """Those of the addresses that belong neither to a member nor to this agent, whose identity is given."""
+        if not addresses:
+            return []
+        met = {*own.endpoints}
+        for peer in self.present():
+            met.update(peer.identity.endpoints, peer.addresses)
+        loopback = own.guid.is_loopback
+        return [a for a in addresses if a not in met and (loopback or not a[0].startswith("127."))]
 
     def with_name(self, name: str) -> list[Endpoint]:
         """The endpoints whose peer has this name, in order; peers in conflict and this agent itself included."""

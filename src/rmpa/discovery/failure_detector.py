@@ -137,6 +137,8 @@ class FailureDetector:
             news = News(guid, member.run, MemberState.LEFT, member.incarnation, member.version)
             self._gone.add(news, now)
             self._news.spread(news, now)
+        else:
+            self._hearsay.add(member.news(), now)
 
     def set_linked(self, guid: Guid, instance: bytes, *, linked: bool) -> None:
         """A link with a member is up, or has fallen: while it is up, the member is not held to have failed."""
@@ -441,7 +443,7 @@ class FailureDetector:
             self._gone.pop(news.run)
             self._hearsay.add(news, now)
             self._news.spread(news, now)
-            self._events.append(MemberHeardOf(news.guid))
+            self._events.append(MemberHeardOf(news.guid, news.run))
 
     def _stranger(self, packet: SwimPacket, now: float) -> None:
         """A packet of a run that is no member here shows that it answers probes."""
@@ -455,7 +457,7 @@ class FailureDetector:
             news = News(packet.guid, packet.run, MemberState.ALIVE, packet.incarnation, packet.version)
             self._hearsay.add(news, now)
             self._gone.pop(packet.run)
-            self._events.append(MemberHeardOf(packet.guid))
+            self._events.append(MemberHeardOf(packet.guid, packet.run))
 
     def _refute(self, news: News, now: float) -> None:
         """What others hold of this agent is wrong, such as that it has failed: tell them how it is."""

@@ -37,9 +37,6 @@ HEARTBEAT_GROWTH: Final = 1.25
 the longer lease still count by the shorter one."""
 CONFLICT_AFTER: Final = 2.0
 """A packet of a replaced instance after this long is not a late one: two live peers share one GUID."""
-CONFLICT_LINKED_AFTER: Final = 17.0
-"""The same while the other peer has a link: one at rest may be up for ``mesh.limits.IDLE_LEASE`` seconds and a bit
-although its peer lost its power and started again."""
 ADDRESS_SHARED_AFTER: Final = 5.0
 """Seconds without a link, although its beacons arrive, after which a peer with another's address is shown as in
 conflict."""

@@ -58,6 +58,8 @@ class MembershipProtocol:
         multicast: Whether to send to the group at all.
         lease: Seconds of silence after which peers may count this agent as gone.
         counters: Where refusals are counted.
+        vouches: ``(guid, instance, now)``: whether the failure detector holds a run to be alive, which renews its
+            lease.
     """
 
     def __init__(
@@ -68,7 +70,9 @@ class MembershipProtocol:
         multicast: bool = True,
         lease: float = core_limits.PEER_LEASE,
         counters: Counters | None = None,
+        vouches: Callable[[Guid, bytes, float], bool] = lambda *_: False,
     ) -> None:
+        self._vouches = vouches
         self.counters = counters if counters is not None else Counters()
         self._own = identity
         self._rng = rng
@@ -199,13 +203,12 @@ class MembershipProtocol:
             self._send_answer(endpoint.current, now)
         self._remove_if_empty(key)
 
-    def peer_failed(self, guid: Guid, instance: bytes, now: float) -> None:
-        """Remove a run that the failure detector holds to have failed, unless it has a link."""
-        endpoint = self._endpoints.get(guid.place)
-        peer = endpoint.current if endpoint is not None else None
-        if endpoint is None or peer is None or endpoint.own or peer.linked or peer.identity.instance != instance:
+    def peer_failed(self, guid: Guid, instance: bytes, now: float, reason: LossReason = LossReason.FAILED) -> None:
+        """Remove a run that the failure detector has given up, unless it has a link; a beacon brings it back."""
+        endpoint, peer = self._endpoints.get(guid.place), self._endpoints.current(guid, instance)
+        if endpoint is None or peer is None or peer.linked:
             return
-        self._peer_lost(endpoint, LossReason.FAILED)
+        self._peer_lost(endpoint, reason)
         endpoint.remove_current()
         self._clear_conflict(endpoint, now)
         self._endpoints.changed(guid.place)
@@ -223,10 +226,9 @@ class MembershipProtocol:
 
     def set_demand(self, now: float, *, on: bool) -> None:
         """Take in whether this agent links on demand: its heartbeats then become rarer as the mesh grows."""
-        if self._pace.demand != on:
-            self._pace.demand = on
-            if self._heartbeat_at is not None:
-                self._heartbeat_at = min(self._heartbeat_at, now + limits.HEARTBEAT_INTERVAL)
+        if self._pace.demand != on and self._heartbeat_at is not None:
+            self._heartbeat_at = min(self._heartbeat_at, now + limits.HEARTBEAT_INTERVAL)
+        self._pace.demand = on
 
     def set_seeds(self, seeds: Iterable[Address]) -> None:
         """Send announcements to these addresses, now and with each heartbeat; they replace the former seeds."""
@@ -309,7 +311,7 @@ class MembershipProtocol:
 
     @property
     def members(self) -> int:
-        """The number of peers that are there, without this agent."""
+        """The number of peers that are present."""
         return len(self._endpoints.present())
 
     def silent_seeds(self) -> list[Address]:
@@ -322,6 +324,10 @@ class MembershipProtocol:
         endpoint = self._endpoints.get(guid.place)
         peer = endpoint.current if endpoint is not None else None
         return peer is not None and peer.verified and peer.identity.instance == instance
+
+    def member(self, guid: Guid, run: bytes) -> PeerInstance | None:
+        """This run of a peer, if it is a member; ``run`` may be only the beginning of its instance id."""
+        return self._endpoints.current(guid, run)
 
     @property
     def identity(self) -> Identity:
@@ -441,6 +447,10 @@ class MembershipProtocol:
                 continue
             peer = endpoint.current
             if peer is not None and not peer.linked and peer.deadline <= now:
+                if self._vouches(peer.identity.guid, peer.identity.instance, now):
+                    peer.vouched_until = now + peer.lease
+                    self._endpoints.heard(key)
+                    continue
                 self._peer_lost(endpoint, LossReason.SILENCE)
                 endpoint.remove_current()
                 if peer.multicast_at + limits.MULTICAST_SILENCE < now:
@@ -469,17 +479,7 @@ class MembershipProtocol:
     def _beacon(self, kind: BeaconKind, gossip: tuple[Guid, ...] = ()) -> Beacon:
         self._sequence = serial_add(self._sequence, 1)
         lease = round(self._pace.lease * 1000)
-        return Beacon(kind, self._own, lease, self._sequence, gossip, self._observed_addresses(gossip))
-
-    def _observed_addresses(self, gossip: tuple[Guid, ...]) -> tuple[Address, ...]:
-        """Source addresses of gossiped peers that differ from the GUID's address, which may not be reachable."""
-        found = []
-        for guid in gossip:
-            endpoint = self._endpoints.get(guid.place)
-            source = endpoint.current.source if endpoint is not None and endpoint.current is not None else None
-            if source is not None and source != guid.endpoint and not source[0].startswith("127."):
-                found.append(source)
-        return tuple(found)
+        return Beacon(kind, self._own, lease, self._sequence, gossip, self._endpoints.observed_addresses(gossip))
 
     def _send(self, kind: BeaconKind, address: Address, gossip: tuple[Guid, ...] = ()) -> None:
         if not self._closed:
@@ -539,9 +539,7 @@ class MembershipProtocol:
             self._send_multicast(BeaconKind.HEARTBEAT, now)
             return
         for place in places:
-            endpoint = self._endpoints.get(place)
-            if endpoint is not None and endpoint.current is not None:
-                peer = endpoint.current
+            if (endpoint := self._endpoints.get(place)) is not None and (peer := endpoint.current) is not None:
                 self._send_answer(peer, now, self._gossip(self._unheard_by_multicast(now), peer, now))
 
     def _send_answer(self, peer: PeerInstance, now: float, gossip: tuple[Guid, ...] | None = None) -> None:
@@ -566,27 +564,21 @@ class MembershipProtocol:
             peer.multicast_at = now - self._pace.interval
 
     def _apply_gossip(self, beacon: Beacon, now: float) -> None:
-        """Announce this agent to unknown peers of the sender; only their own beacon makes them members."""
-        for guid in beacon.gossip:
+        """Announce this agent to unknown peers of the sender."""
+        for address in self._endpoints.unknown_addresses(beacon.observed, self._own):
+            if not self._candidates.add(address, now):
+                self.counters.add("gossip.full")
+        self.hear_of(beacon.gossip, now)
+
+    def hear_of(self, guids: tuple[Guid, ...], now: float) -> None:
+        """Announce this agent to unknown ones of these peers; only their own beacon makes them members."""
+        for guid in guids:
             if guid.place in self._endpoints or (guid.is_loopback and not self._own.guid.is_loopback):
                 continue
             if not self._candidates.add(guid.endpoint, now):
                 self.counters.add("gossip.full")
-        for address in self._unknown_addresses(beacon.observed):
-            if not self._candidates.add(address, now):
-                self.counters.add("gossip.full")
         for address in self._candidates.take_due(now):
             self._send(BeaconKind.ANNOUNCE, address)
-
-    def _unknown_addresses(self, addresses: tuple[Address, ...]) -> list[Address]:
-        """Those of the addresses that belong neither to a member nor to this agent."""
-        if not addresses:
-            return []
-        met = {*self._own.endpoints}
-        for peer in self._endpoints.present():
-            met.update(peer.identity.endpoints, peer.addresses)
-        loopback = self._own.guid.is_loopback
-        return [a for a in addresses if a not in met and (loopback or not a[0].startswith("127."))]
 
     def _gossip(self, peers: list[PeerInstance], to: PeerInstance | None, now: float) -> tuple[Guid, ...]:
         identity = to.identity if to is not None else self._own

@@ -54,9 +54,15 @@ class MemberOffers:
 
 @dataclass(frozen=True, slots=True)
 class MemberHeardOf:
-    """Others know a member that is not one here: it is worth an announcement."""
+    """A run answers probes that is not watched here: it is worth an announcement, if it is no member yet.
+
+    Args:
+        guid: Its GUID.
+        run: The first ``RUN_BYTES`` of its instance id.
+    """
 
     guid: Guid
+    run: bytes
 
 
 SwimEvent = MemberSuspected | MemberRefuted | MemberFailed | MemberLeft | MemberOffers | MemberHeardOf

@@ -7,7 +7,7 @@ import contextlib
 import logging
 import random
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from rmpa.agent import Agent
 from rmpa.agent.process import run_process, serve
@@ -16,7 +16,7 @@ from rmpa.core.errors import RmpaError, StartError
 from rmpa.gateway import limits
 from rmpa.gateway.graph.own_graph import AgentGraph
 from rmpa.gateway.joining import make_neighbours, open_gateway_session
-from rmpa.observe.control import GATEWAY_ROLE, ROLE
+from rmpa.observe.control import GATEWAY_REPORT, GATEWAY_ROLE, ROLE
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator, Mapping
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from rmpa.runtime.realtime import SchedulingRequest
 
 _log = logging.getLogger(__name__)
-REPORT: Final = "gateway"
-"""The operation of the control socket that returns ``Gateway.report``."""
 
 
 class Gateway:
@@ -58,7 +56,7 @@ class Gateway:
         self.agent = Agent(self._settings, requests, load)
         self.graph = AgentGraph(self.agent, self._settings)
         self.agent.bridge.add(self.graph)
-        self.agent.add_operations({REPORT: lambda _: self.report(), ROLE: lambda _: GATEWAY_ROLE})
+        self.agent.add_operations({GATEWAY_REPORT: lambda _: self.report(), ROLE: lambda _: GATEWAY_ROLE})
         self.agent.other_notes.append(self._notes)
         self.session: OwnedSession | None = None
         """The session; ``None`` until it is open."""
@@ -70,6 +68,8 @@ class Gateway:
         self._rejoining: asyncio.Task[None] | None = None
         self._changed = self._reopen = False
         self._looking: asyncio.Task[None] | None = None
+        if self.agent.trust is not None:
+            self.agent.trust.membership.on_denied.append(self._denied)
 
     async def start(self) -> None:
         """Start the agent and the neighbours; where only ``connect`` is set, a router may come later.
@@ -102,6 +102,7 @@ class Gateway:
             self._opening = asyncio.get_running_loop().create_task(self._open_later(), name="open the zenoh session")
         else:
             self._join(session)
+            self._reopen_if_asked()
         self._looking = asyncio.get_running_loop().create_task(self._look(), name="look whether the session is stale")
 
     async def close(self) -> None:
@@ -136,6 +137,12 @@ class Gateway:
         if self._reopen or _rules(before) != _rules(settings):
             self._begin_rejoin()
 
+    def _denied(self) -> None:
+        """Have the router refuse what was revoked: its session is opened anew with another table of access."""
+        if self._settings.gateway.listen:
+            self._reopen = True
+            self._begin_rejoin()
+
     def _begin_rejoin(self) -> None:
         self._changed = True
         if self._rejoining is None or self._rejoining.done():
@@ -152,7 +159,7 @@ class Gateway:
             self._reopen = False
             session, self.session = self.session, None
             await session.close()
-            _log.info("= the zenoh session is opened anew: its certificate or the permissions have changed")
+            _log.info("= the zenoh session is opened anew: certificate, permissions or deny list have changed")
             self._opening = asyncio.get_running_loop().create_task(self._open_later(), name="open the zenoh session")
 
     async def _look(self) -> None:
@@ -200,12 +207,19 @@ class Gateway:
         backoff = Backoff(limits.OPEN_RETRY_FIRST, limits.OPEN_RETRY_MAX, random.random)
         while self.session is None:
             await asyncio.sleep(backoff.delay())
+            self._reopen = False  # what it was asked for is read now
             try:
                 session = await self._open_session(self._settings)
             except StartError as error:
                 self._failed(error)
             else:
                 self._try_to_join(session)
+                self._reopen_if_asked()
+
+    def _reopen_if_asked(self) -> None:
+        """Open the session once more if its table of access has changed while it was opened."""
+        if self._reopen:
+            self._begin_rejoin()
 
     def _try_to_join(self, session: OwnedSession) -> None:
         """Makes the neighbours while the gateway runs: what is wrong with them is told, and ends nothing else."""

@@ -150,6 +150,17 @@ RELIABLE_BYTES: Final = 64 * 1024 * 1024
 LARGE_MESSAGE: Final = 8 * 1024
 """Bytes from which on a topic's messages yield to those of others, if its contract has no priority: on a line of
 1 Mbit/s one such message takes 65 ms, for which all others of its priority wait."""
+COLLECTED_MESSAGES: Final = 256
+"""Messages of one read that are collected before they are queued for other sites; the read may go on for longer."""
+BATCH_READ_MAX: Final = 1024
+"""Messages in a batch of another gateway; ours have at most 64. A larger one would hold the event loop for longer."""
+BATCH_RATE: Final = 500.0
+"""Messages a second of one publisher of another site from which on they are wanted in batches."""
+BATCH_MESSAGE_BYTES: Final = 4096
+"""Bytes of a message on average, up to which they are wanted in batches: a larger one costs more by its size."""
+BATCH_SETTLE: Final = 1.0
+"""Seconds after the first batch during which single messages are still subscribed to: by then all publishers of the
+topic send batches."""
 IDLE_CHECK: Final = 1.0
 """Seconds without a message after which a receiver asks for the last sequence number: losses at the end of a burst
 leave no gap."""
@@ -183,8 +194,9 @@ ROS2_ASKS_MAX: Final = 200
 ROS2_SERVICE_WAIT: Final = 3.0
 """Seconds in which a ROS 2 node's get_type_description may appear after its first publisher, and in which it answers:
 a node declares one after the other."""
-CERTIFICATE_LOOK_PERIOD: Final = 60.0
-"""Seconds between two looks whether the certificate of a session that listens was renewed; it is each 3.5 days."""
+CERTIFICATE_LOOK_PERIOD: Final = 5.0
+"""Seconds between two looks whether a session that listens has to be opened anew: its certificate was renewed, which
+is each 3.5 days, or a module has joined that the table of access must name. Some 2 ms each."""
 OPEN_RETRY_FIRST: Final = 0.5
 """Seconds until a session is opened again, at first, whose router did not answer."""
 OPEN_RETRY_MAX: Final = 5.0

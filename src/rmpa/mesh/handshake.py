@@ -47,9 +47,11 @@ class Feature(IntFlag):
     """It takes pace frames: the link may rest."""
     PARK = 2
     """It takes a bye that says "parked": the link may be ended for now, by agreement."""
+    SWIM = 4
+    """It answers the probes of failure detectors."""
 
 
-FEATURES: Final = Feature.PACE | Feature.PARK
+FEATURES: Final = Feature.PACE | Feature.PARK | Feature.SWIM
 """The features of this version."""
 
 

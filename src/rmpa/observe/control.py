@@ -25,6 +25,8 @@ ROLE: Final = "role"
 """The operation that only an agent with another role than a module's serves; its value names that."""
 GATEWAY_ROLE: Final = "gateway"
 """The role of the agent in ``rmpa gateway``."""
+GATEWAY_REPORT: Final = "gateway"
+"""The operation of a gateway that says what it joins; its ``problem`` is why it joins nothing."""
 
 
 def _parse(line: bytes, type_: type[_T], what: str, most: int) -> _T:

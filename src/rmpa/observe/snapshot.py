@@ -38,6 +38,24 @@ class FilesInfo(msgspec.Struct, kw_only=True, frozen=True):
     problem: str = ""
 
 
+class DetectorInfo(msgspec.Struct, kw_only=True, frozen=True):
+    """The failure detector, which probes the members while links stand on demand.
+
+    Attributes:
+        members: The members that it watches.
+        suspects: Those of them that are suspected now.
+        health: Its own health: 0 is well; above it this process or its network was slow, and it judges more slowly.
+        refuted: How often others suspected this agent and it refuted that.
+        news: News of members that is being spread.
+    """
+
+    members: int
+    suspects: int = 0
+    health: int = 0
+    refuted: int = 0
+    news: int = 0
+
+
 class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
     """The agent itself.
 
@@ -65,6 +83,7 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
             ready to read; empty for a core that stores nothing.
         end_connections: Why it may not end the TCP connections of other processes whose host has vanished, with the
             remedy after the first ``"; "``; empty if it may; ``None`` from an agent that does not report it.
+        detector: The failure detector, while it probes.
     """
 
     name: str
@@ -88,6 +107,7 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
     proxy_listening: str = ""
     core_memory: str = ""
     end_connections: str | None = None
+    detector: DetectorInfo | None = None
 
 
 class LaneInfo(msgspec.Struct, kw_only=True, frozen=True):
@@ -166,6 +186,24 @@ class BoundInfo(msgspec.Struct, kw_only=True, frozen=True):
     text: str
 
 
+class ProbesInfo(msgspec.Struct, kw_only=True, frozen=True):
+    """What the failure detector holds of a peer.
+
+    Attributes:
+        state: ``alive``, or ``suspect``: it did not answer probes, and may refute that it has failed.
+        heard_ago: Seconds since its last packet; ``None`` if none came.
+        rtt: The last round trip of a probe in seconds; ``None`` before the first.
+        refuted: How often it was suspected and refuted that.
+        version: The version of what it offers.
+    """
+
+    state: str
+    heard_ago: float | None = None
+    rtt: float | None = None
+    refuted: int = 0
+    version: int = 0
+
+
 class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
     """One peer of the roster.
 
@@ -191,6 +229,7 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
         beyond: What either side hides of the other by its limits.
         direct_in: Subscribers here that are connected to its nodes directly.
         direct_out: Its subscribers that may connect to nodes here directly.
+        probes: What the failure detector holds of it, while it probes.
     """
 
     name: str
@@ -212,6 +251,7 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
     beyond: tuple[BoundInfo, ...] = ()
     direct_in: int = 0
     direct_out: int = 0
+    probes: ProbesInfo | None = None
 
 
 class SampleSpread(msgspec.Struct, kw_only=True, frozen=True):

@@ -15,14 +15,14 @@ import math
 import socket
 import sys
 import termios
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Final, cast
 
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST, URGENT, Framer, Outbox, QueuedMessage
 from rmpa.core.sizes import KIB, MIB
-from rmpa.runtime import limits
+from rmpa.runtime import corking, limits
 from rmpa.runtime.buffers import Buffer, unsent
 from rmpa.runtime.record_layer import RecordIncomplete, SecureSocket
 from rmpa.runtime.segments import SegmentedSocket
@@ -38,26 +38,10 @@ _CORK_ABOVE: Final = 512
 _CORK_MESSAGES: Final = 128
 _CORK_BYTES: Final = 512 * KIB
 _PART: Final = MIB
+_NOTHING_COLLECTED: Final = contextlib.nullcontext()
 
 OnBytes = Callable[[memoryview], tuple[int, int]]
 OnClose = Callable[[Exception | None], None]
-
-_corked: list[Stream] | None = None
-"""The streams that collect messages for one write while the bytes of a read are handled; see ``Stream.send``."""
-
-
-@contextlib.contextmanager
-def collected_sends() -> Iterator[None]:
-    """Collect the messages that are sent within, whose parts must not change until the end: one write a stream."""
-    global _corked  # noqa: PLW0603 - one loop, one thread
-    outer, corked = _corked, list[Stream]()
-    _corked = corked
-    try:
-        yield
-    finally:
-        for stream in corked:
-            stream._uncork()  # noqa: SLF001 - of this module
-        _corked = outer
 
 
 class Stream:
@@ -109,6 +93,8 @@ class Stream:
         self._finishing = False
         self._kept: list[tuple[Sequence[Buffer], int, bool]] = []
         self._kept_bytes = 0
+        self._collection: object = None
+        """The read for which messages are kept."""
         self._closed = False
         self._reading_held = False
         self._drained: asyncio.Future[None] | None = None
@@ -185,7 +171,7 @@ class Stream:
             return 0
         if self._writing:
             return self._queue(b"".join(parts), key)
-        if _corked is not None:
+        if corking.collected is not None:
             self._cork(parts, key)
             return 0
         return self._send_now(parts, key)
@@ -303,7 +289,7 @@ class Stream:
             return dropped
         parts: list[Buffer] = self._framed(parcel, view) if self._frame is not None else [view]
         parcel.sent += len(view)
-        if _corked is not None:
+        if corking.collected is not None:
             self._cork(parts, parcel.key, part=True)
             return 0
         return self._send_now(parts, parcel.key, part=True)
@@ -351,7 +337,11 @@ class Stream:
 
     def _cork(self, parts: Sequence[Buffer], key: int, *, part: bool = False) -> None:
         """Keep a message until the present read is handled; all kept messages are then sent in one system call."""
-        cast("list[Stream]", _corked).append(self)
+        collected = corking.collected
+        if self._collection is not collected:
+            # Each read has its own: its views end with it.
+            self._collection = collected
+            corking.after_read(self._uncork)
         self._kept.append((parts, key, part))
         for buffer in parts:
             self._kept_bytes += len(buffer)
@@ -361,6 +351,7 @@ class Stream:
     def _uncork(self) -> None:
         kept, self._kept = self._kept, []
         size, self._kept_bytes = self._kept_bytes, 0
+        self._collection = None
         if self._closed or not kept:
             return
         if self._writing or self._outbox:
@@ -529,22 +520,17 @@ class Stream:
         self.last_in = now
 
     def _deliver(self) -> None:
-        global _corked  # noqa: PLW0603 - one loop, one thread: one read at a time
-        outer, corked = _corked, list[Stream]()
-        # A few bytes are one or two messages, sent at once unless an outer read collects.
-        _corked = corked if self._filled > _CORK_ABOVE or outer is not None else None
+        # A few bytes are one or two messages, sent at once unless an outer read collects. What is collected is sent
+        # before anything moves in the buffer, because it is views of it.
+        collects = self._filled > _CORK_ABOVE or corking.collected is not None
         try:
-            consumed, wanted = self._on_bytes(self._view[: self._filled])
+            with corking.CollectedSends() if collects else _NOTHING_COLLECTED:
+                consumed, wanted = self._on_bytes(self._view[: self._filled])
         except Exception as error:  # noqa: BLE001 - a callback's top: else the same bytes would be offered for ever
             if not isinstance(error, RemoteProtocolError):
                 _log.error("! a reader of bytes failed; its connection is closed", exc_info=error)
             self._lost(error)
             return
-        finally:
-            # Sent before anything moves in the buffer, because the collected messages are views of it.
-            for stream in corked:
-                stream._uncork()  # noqa: SLF001 - its own class
-            _corked = outer
         if self._closed:
             return
         rest = self._filled - consumed

@@ -11,6 +11,7 @@ from rmpa.core.identity import Identity
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.io.packet_filter import PacketFilter
+from rmpa.discovery.swim_packets import SwimKind, SwimPacket
 from rmpa.trust.keyring import GroupKey, KeyPurpose, KeyRing
 from rmpa.trust.packets import PacketSigner, PacketTrust, PacketVerifier
 
@@ -62,7 +63,7 @@ def test_a_linked_peer_is_heard_through_a_flood() -> None:
     door = Door()
     door.flood(6000, 10.0)
     heard = door.intake.parse(packet(FRIEND, 7), ("10.0.0.2", 4000), 10.0, multicast=True, interface=1)
-    assert heard is not None
+    assert isinstance(heard, Beacon)
     assert heard.identity == FRIEND
     again = Identity(FRIEND.guid, b"g" * 16, "friend")
     assert door.intake.parse(packet(again, 8), ("10.0.0.2", 4000), 10.0, multicast=True, interface=1) is None
@@ -86,6 +87,27 @@ def test_flooding_address_is_ignored_for_the_rest_of_the_second() -> None:
     ]
     assert sum(beacon is not None for beacon in taken) == limits.BEACONS_PER_SOURCE
     assert door.intake.parse(packet(FRIEND, 501), ("10.0.0.2", 4000), 11.0, multicast=True, interface=1) is not None
+
+
+def probe(identity: Identity, sequence: int) -> bytes:
+    subject = (Guid.of("10.0.0.1", 4000), bytes(8))
+    return SwimPacket(SwimKind.PROBE, identity.guid, identity.instance, 0, sequence, subject=subject).serialize()
+
+
+def test_a_flood_of_probes_leaves_room_for_beacons() -> None:
+    door = Door()
+    heard = 0
+    for n in range(3000):
+        guid = Guid.of(f"10.1.{n // 250}.{1 + n % 250}", 4000)
+        data = probe(Identity(guid, os.urandom(16), "forged"), 1)
+        heard += door.intake.parse(data, source(n), 10.0, multicast=False, interface=1) is not None
+    assert heard == limits.SWIM_UNLINKED_BURST == door.counters["swim.in"]
+    assert door.counters["swim.unlinked_limited"] == 3000 - heard
+    assert door.flood(100, 10.0) == 100
+    known = door.intake.parse(probe(FRIEND, 9), ("10.0.0.2", 4000), 10.0, multicast=False, interface=1)
+    assert isinstance(known, SwimPacket)
+    assert door.intake.parse(probe(FRIEND, 9)[:50], ("10.0.0.2", 4000), 10.0, multicast=False, interface=1) is None
+    assert door.counters["swim.malformed"] == 1
 
 
 WALL = 1_790_000_000.0
@@ -135,6 +157,25 @@ def test_a_secured_mesh_hears_nothing_else() -> None:
         assert not door.hears(data)
         assert door.counters[f"beacon.{reason}"] == 1
     assert door.counters["beacon.in"] == 0
+
+
+def test_packets_of_the_failure_detector_have_a_key_of_their_own() -> None:
+    ring = KeyRing([GroupKey(1, b"k" * 32), GroupKey(2, b"n" * 32)], 0.0)
+    counters = Counters()
+    door = PacketFilter(0, counters, trust=PacketTrust(PacketSigner(ring), PacketVerifier(ring), lambda: WALL))
+    signer = PacketSigner(ring)
+    old = PacketSigner(KeyRing([GroupKey(1, b"k" * 32)], 0.0))
+
+    def hears(data: bytes) -> bool:
+        return door.parse(data, ("10.0.0.2", 4000), 10.0, multicast=False, interface=1) is not None
+
+    body = probe(FRIEND, 1)
+    assert hears(signer.sign(body, KeyPurpose.SWIM, 10.0, WALL))
+    assert not hears(body)
+    assert not hears(signer.sign(body, KeyPurpose.BEACON, 10.0, WALL))
+    assert not hears(old.sign(body, KeyPurpose.SWIM, 10.0, WALL)), "a module without the present key says nothing"
+    assert counters["swim.in"] == 1
+    assert (counters["beacon.untagged"], counters["beacon.forged"], counters["swim.old_key"]) == (1, 1, 1)
 
 
 def test_a_flood_under_the_address_of_a_member_does_not_silence_it() -> None:

@@ -71,6 +71,7 @@ def test_types_have_two_names() -> None:
         "@ros2_lv/²/ff/3/3/NN/%/%/talker",
         "@ros2_lv/0/ff/99999999999999999999999/3/NN/%/%/talker",
         "@ros2_lv/0/ff/3/3/NN/%/%/%",
+        "@ros2_lv/0/ff/3/3/NN/%/%/a%b",
         "@ros2_lv/0/ff/3/3/NN//%/talker",
         "@ros2_lv/0/*/3/3/NN/%/%/talker",
         "@ros2_lv/0/ff/3/3/MP/%/%/talker",

@@ -108,6 +108,7 @@ class Site:
     neighbour: SiteNeighbour
     graph: SiteGraph
     session: OpenSession
+    topic_part: SiteTopics
     seen: SiteSeenValues
 
     def topic(self, name: str, node: str = "/talker") -> MemoryTopic:
@@ -158,7 +159,7 @@ class SiteBed:
         crossing = CrossingRules(rules)
         kept = SiteSeenValues(LastValueStore(seen))
         topics = SiteTopics(name, graph, session, crossing, Contracts(contracts), SystemClock(), kept.keep)
-        site = Site(SiteNeighbour(graph, session, own, crossing, [kept, topics]), graph, session, kept)
+        site = Site(SiteNeighbour(graph, session, own, crossing, [kept, topics]), graph, session, topics, kept)
         self.opened.append(site)
         site.neighbour.start()
         return site

@@ -75,3 +75,21 @@ def test_the_name_of_the_module_itself_makes_a_rule_for_each_module() -> None:
     assert len({each["id"] for each in rules}) == len(rules), "Zenoh wants unique ids"
     arm = next(each for each in rules if each["id"] == "permission 1: publish of arm (ingress)")
     assert "rmpa/1/*/*/t/*/arm/**" in arm["key_exprs"]
+
+
+def test_where_not_all_names_are_known_a_denial_of_one_beside_rules_for_all_is_for_all() -> None:
+    trust = TrustSettings(rules=(rule("*", publish="/a"), rule("arm", effect=Effect.DENY, publish="/a")))
+    assert None in subjects(access_table(trust))
+    assert "[[permission]] 2 denies it to all modules" in access_table(trust).notes[0]
+    known = access_table(trust, ["arm", "base"])
+    assert sorted(map(sorted, subjects(known))) == [["arm"], ["arm", "base"]]
+    assert known.notes == ()
+
+
+def test_a_revoked_name_is_denied_everything_or_it_is_told() -> None:
+    named = TrustSettings(rules=(rule("arm", publish="/a"),))
+    assert ["base"] in subjects(access_table(named, revoked=["base"]))
+    for_all = TrustSettings(rules=(rule("*", publish="/a"),))
+    assert "let in base, which were revoked" in access_table(for_all, revoked=["base"]).notes[0]
+    assert access_table(for_all, ["arm", "base"], revoked=["base"]).notes == ()
+    assert None not in subjects(access_table(for_all, ["arm", "base"], revoked=["base"]))

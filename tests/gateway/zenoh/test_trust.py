@@ -14,10 +14,12 @@ import pytest
 from rmpa.config.gateway_rules import GatewaySettings
 from rmpa.config.settings import Settings, TrustSettings
 from rmpa.core.errors import StartError
+from rmpa.gateway.zenoh import trust
 from rmpa.gateway.zenoh.config import ZenohConfig
 from rmpa.gateway.zenoh.session import open_session
-from rmpa.gateway.zenoh.trust import open_trusted_session, zenohd_config
+from rmpa.gateway.zenoh.trust import open_trusted_session, revoked_modules, zenohd_config
 from rmpa.gateway.zenoh_api import ZenohQos
+from rmpa.trust.documents import DenyList
 from tests.gateway.zenoh_bed import until
 from tests.gateway.zenoh_fleet import Fleet, allow, deny
 from tests.trust.io.member_files import SecuredMesh
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
+    from rmpa.config.permission_rules import PermissionRule
     from rmpa.gateway.zenoh.session import OpenSession
     from rmpa.gateway.zenoh_api import ZenohQuery
 
@@ -141,6 +144,41 @@ async def test_with_everything_allowed_a_denial_still_holds(fleet: Fleet) -> Non
     assert got == [SCAN]
 
 
+@pytest.mark.parametrize("authority", [True, False])
+@pytest.mark.parametrize(
+    ("default", "rules"),
+    [
+        ("deny", (allow("a", "b", publish="/**", subscribe="/**"), deny("b", subscribe="/secret/**"))),
+        ("deny", (allow("*", publish="/**", subscribe="/**"), deny("b", subscribe="/secret/**"))),
+        ("deny", (allow("a", "b", publish="/**", subscribe="/**"), deny("*", subscribe="/secret/**"))),
+        ("allow", (deny("a", "b", publish="/other"), deny("b", subscribe="/secret/**"))),
+        ("allow", (deny("*", publish="/other"), deny("b", subscribe="/secret/**"))),
+        ("allow", (allow("*", subscribe="/**"), deny("b", subscribe="/secret/**"))),
+    ],
+)
+async def test_a_denial_wins_whichever_rules_allow_it(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch, default: str, rules: tuple[PermissionRule, ...], authority: bool
+) -> None:
+    """Zenoh allows a certificate what it allows to everybody, so the table must not have both."""
+    monkeypatch.setattr(trust, "known_modules", lambda _: ("a", "b", "fleet") if authority else ())
+    await fleet.router(*rules, default=default)
+    a, b = await fleet.gateway("a"), await fleet.gateway("b")
+    got: list[str] = []
+    matching: list[bool] = []
+    for key in ("rmpa/1/home/arm/t/**", SCAN, SECRET):
+        b.subscribe(key, lambda sample: got.append(sample.key))
+    secret = a.publisher(SECRET, ZenohQos(), lambda _: None)
+    scan = a.publisher(SCAN, ZenohQos(), matching.append)
+    await until(lambda: matching and matching[-1])
+    for _ in range(3):
+        secret.put(b"x")
+        await until(lambda: secret.sent)
+        got.clear()
+        scan.put(b"x")
+        await until(lambda: SCAN in got)
+        assert SECRET not in got
+
+
 async def test_a_program_without_a_certificate_of_the_mesh_is_not_let_in(fleet: Fleet, tmp_path: Path) -> None:
     await fleet.router(default="allow")
     settings = Settings(
@@ -171,8 +209,8 @@ async def test_a_renewed_certificate_makes_a_listening_session_stale_and_a_conne
 
 async def test_the_file_for_zenohd_opens_a_router_that_enforces_the_same(fleet: Fleet, tmp_path: Path) -> None:
     gateway = GatewaySettings(listen=(fleet.endpoint,))
-    trust = TrustSettings(rules=(allow("a", publish="/scan"), allow("b", subscribe="/**")))
-    text = zenohd_config(fleet.settings("fleet", gateway, trust))
+    rules = TrustSettings(rules=(allow("a", publish="/scan"), allow("b", subscribe="/**")))
+    text = zenohd_config(fleet.settings("fleet", gateway, rules))
     file = tmp_path / "zenohd.json5"
     file.write_text(text)
     router = await asyncio.to_thread(lambda: zenoh.open(zenoh.Config.from_file(str(file))))
@@ -201,3 +239,38 @@ def test_the_file_for_zenohd_needs_certificates_or_says_that_it_is_insecure(tmp_
     text = zenohd_config(replace(settings, gateway=GatewaySettings(insecure=True, listen=("tcp/0.0.0.0:7447",))))
     assert "// INSECURE" in text
     assert json.loads(text[text.index("{") :])["listen"]["endpoints"] == ["tcp/0.0.0.0:7447"]
+
+
+async def test_a_revoked_module_may_do_nothing_at_the_router_and_others_go_on(fleet: Fleet) -> None:
+    """Zenoh itself checks no deny list: the table of access keeps it out, also where everything is allowed."""
+    fleet.mesh.deny = DenyList().with_name("a", time.time())
+    await fleet.router(allow("a", "b", "c", publish="/**", subscribe="/**"), default="allow")
+    a, b, c = await fleet.gateway("a"), await fleet.gateway("b"), await fleet.gateway("c")
+    tokens: list[str] = []
+    got: dict[str, list[bytes]] = {"a": [], "b": []}
+    matching: dict[str, list[bool]] = {"a": [], "c": []}
+    b.watch_tokens("rmpa/1/**", lambda key, _: tokens.append(key))
+    a.token("rmpa/1/home/arm/up/00")
+    c.token("rmpa/1/home/arm/up/11")
+    a.subscribe(SCAN, lambda sample: got["a"].append(sample.payload))
+    b.subscribe(SCAN, lambda sample: got["b"].append(sample.payload))
+    forged = a.publisher(SCAN, ZenohQos(), matching["a"].append)
+    scan = c.publisher(SCAN, ZenohQos(), matching["c"].append)
+    await until(lambda: matching["c"] and matching["c"][-1])
+    forged.put(b"forged")
+    await until(lambda: forged.sent)
+    scan.put(b"scan")
+    await until(lambda: got["b"] and tokens)
+    assert (got, tokens) == ({"a": [], "b": [b"scan"]}, ["rmpa/1/home/arm/up/11"])
+    assert not any(matching["a"])
+
+
+def test_a_revoked_name_stays_out_of_the_table_of_access_while_its_certificates_may_be_valid(tmp_path: Path) -> None:
+    mesh = SecuredMesh(tmp_path)
+    settings = Settings(name="fleet", state_dir=str(tmp_path), gateway=GatewaySettings(listen=("tls/0.0.0.0:7447",)))
+    mesh.deny = DenyList().with_name("old", time.time() - 8 * 86_400).with_name("stolen", time.time() - 6 * 86_400)
+    mesh.save("fleet", time.time())
+    assert revoked_modules(settings) == ("stolen",)
+    text = zenohd_config(settings)
+    assert '"stolen"' in text
+    assert '"old"' not in text

@@ -11,6 +11,7 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import RUN_AT, Beacon, BeaconOtherDomain, BeaconOtherVersion, sender_of
+from rmpa.discovery.swim_packets import SwimPacket, is_swim
 from rmpa.trust.keyring import KeyPurpose
 from rmpa.trust.packets import Verdict
 
@@ -41,7 +42,9 @@ class PacketFilter:
     Args:
         domain: This agent's domain id.
         counters: ``beacon.in``, ``beacon.repeated``, ``beacon.flood``, ``beacon.unlinked_limited``,
-            ``beacon.other_domain``, ``beacon.version``, ``beacon.malformed``.
+            ``beacon.other_domain``, ``beacon.version``, ``beacon.malformed``; ``swim.in``,
+            ``swim.unlinked_limited`` and ``swim.malformed`` of packets of the failure detector, which have a limit
+            of their own.
         is_verified: Whether a run of a peer has or had a link: beacons of such peers, and echoes of this agent's
             own, are not limited in rate.
         trust: Of a secured mesh: only packets whose trailer is accepted are parsed; ``beacon.untagged``,
@@ -60,7 +63,7 @@ class PacketFilter:
         self._domain = domain
         self._counters = counters
         self._is_verified = is_verified
-        self._unlinked: dict[int, TokenBucket] = {}
+        self._unlinked: dict[tuple[int, bool], TokenBucket] = {}
         self._unproved = TokenBucket(limits.BEACONS_UNPROVED_PER_SECOND, limits.BEACONS_UNPROVED_BURST)
         self.overrun = False
         """Whether packets without a valid proof come faster than they can be looked at: pause the reading."""
@@ -70,8 +73,8 @@ class PacketFilter:
 
     def parse(
         self, data: bytes, source: Address, now: float, *, multicast: bool, interface: int = 0
-    ) -> Beacon | None:
-        """The beacon in a packet; ``None`` if it is dropped, which is counted and, where it helps, logged.
+    ) -> Beacon | SwimPacket | None:
+        """What a packet contains; ``None`` if it is dropped, which is counted and, where it helps, logged.
 
         Other domains have other ports, so their multicasts are ignored silently. A unicast of another domain is
         logged: its sender was given this address by a user, and waits for an answer.
@@ -94,11 +97,14 @@ class PacketFilter:
             return None
         if self._trust is None and not self._is_new(data):
             return None
+        swim = is_swim(data)
+        name = "swim" if swim else "beacon"
         try:
-            if not self._is_verified(*sender_of(data, self._domain)) and not self._within_limit(interface, now):
-                self._counters.add("beacon.unlinked_limited")
+            verified = self._is_verified(*sender_of(data, self._domain))
+            if not verified and not self._within_limit(interface, now, swim=swim):
+                self._counters.add(f"{name}.unlinked_limited")
                 return None
-            beacon = Beacon.parse(data, self._domain)
+            packet = SwimPacket.parse(data, self._domain) if swim else Beacon.parse(data, self._domain)
         except BeaconOtherDomain as error:
             if multicast:
                 self._counters.add("beacon.other_domain")
@@ -108,10 +114,10 @@ class PacketFilter:
         except BeaconOtherVersion as error:
             self._refusals.refuse(now, "beacon.version", host, f"the peer at {host} {error}")
         except RemoteProtocolError as error:
-            self._refusals.refuse(now, "beacon.malformed", host, f"from {host}: {error}; is another program there?")
+            self._refusals.refuse(now, f"{name}.malformed", host, f"from {host}: {error}; is another program there?")
         else:
-            self._counters.add("beacon.in")
-            return beacon
+            self._counters.add(f"{name}.in")
+            return packet
         return None
 
     def _is_new(self, data: bytes) -> bool:
@@ -133,7 +139,12 @@ class PacketFilter:
         if len(data) > limits.BEACON_MAX_BYTES:
             self._counters.add("beacon.malformed")
             return False
-        found = trust.verifier.verify(data, KeyPurpose.BEACON, RUN_AT, now, trust.wall())
+        swim = is_swim(data)
+        purpose = KeyPurpose.SWIM if swim else KeyPurpose.BEACON
+        found = trust.verifier.verify(data, purpose, RUN_AT, now, trust.wall())
+        if swim and found.verdict is Verdict.OLD_KEY:
+            self._counters.add("swim.old_key")  # who has an older key may be dialled, and says nothing of others
+            return False
         if found.verdict in _USABLE:
             trust.heard(host, found)
             return True
@@ -145,15 +156,15 @@ class PacketFilter:
             self._counters.add(f"beacon.{found.verdict}")
         return False
 
-    def _within_limit(self, interface: int, now: float) -> bool:
-        """Whether one more beacon of an unlinked peer is within the limit of this interface."""
-        bucket = self._unlinked.get(interface)
+    def _within_limit(self, interface: int, now: float, *, swim: bool) -> bool:
+        """Whether one more packet of an unlinked peer is within the limit of this interface."""
+        bucket = self._unlinked.get((interface, swim))
         if bucket is None:
             if len(self._unlinked) >= _INTERFACES:
                 self._unlinked.clear()  # interfaces of containers come and go, each with a new index
-            bucket = self._unlinked[interface] = TokenBucket(
-                limits.BEACONS_UNLINKED_PER_SECOND, limits.BEACONS_UNLINKED_BURST
-            )
+            rate = limits.SWIM_UNLINKED_PER_SECOND if swim else limits.BEACONS_UNLINKED_PER_SECOND
+            burst = limits.SWIM_UNLINKED_BURST if swim else limits.BEACONS_UNLINKED_BURST
+            bucket = self._unlinked[interface, swim] = TokenBucket(rate, burst)
         return bucket.take(now)
 
     def _is_flood(self, host: str, now: float) -> bool:

@@ -154,15 +154,15 @@ class Sender:
         self._counters.add("beacon.out_multicast", sent)
         return sent
 
-    def unicast(self, data: bytes, address: Address) -> None:
-        """Send to one address; a failure is only counted: the next heartbeat tries again."""
+    def unicast(self, data: bytes, address: Address, *, count: str = "beacon.out_unicast") -> None:
+        """Send to one address; a failure is only counted: the next packet tries again."""
         try:
             self._sock.sendto(data, address)
         except (OSError, OverflowError) as error:
             self._counters.add("beacon.send_failed")
             _log.debug("> %s:%d: %s", *address, error)
         else:
-            self._counters.add("beacon.out_unicast")
+            self._counters.add(count)
 
     def failed(self, name: str, error: OSError, what: str) -> None:
         """Say once that an interface refuses."""

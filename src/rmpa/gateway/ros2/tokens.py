@@ -138,7 +138,7 @@ def parse_token(key: str) -> Ros2Node | Ros2Endpoint:
         raise RemoteProtocolError(f"{_short(key)}: {parts[5][:20]!r} is no kind of entity") from None
     domain = _number(parts[1], limits.DOMAIN_MAX, key)
     enclave, namespace, name = (_demangle(part) for part in parts[6:9])
-    if not name:
+    if not name or "/" in name:
         raise RemoteProtocolError(f"{_short(key)} has no name of a node")
     full = f"{_absolute(namespace)}/{name}" if namespace else f"/{name}"
     node = Ros2Node(domain, parts[2], _number(parts[3], limits.ENTITY_ID_MAX, key), full, enclave)

@@ -102,7 +102,7 @@ class ValueHeader(msgspec.Struct, frozen=True, kw_only=True):
             raise RemoteProtocolError(f"the header of a last value has {len(data)} bytes")
         try:
             found = msgspec.json.decode(data, type=cls)
-        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             raise RemoteProtocolError(f"not the header of a last value: {error}") from None
         if not is_global_name(found.node) or not is_type_name(found.type):
             raise RemoteProtocolError(f"the last value of {found.node[:80]!r} is a {found.type[:80]!r}")

@@ -54,7 +54,7 @@ def read_description(data: Buffer) -> ServiceDescription:
         raise RemoteProtocolError(f"a description of a service has {len(data)} bytes")
     try:
         told = msgspec.json.decode(data, type=_Described)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise RemoteProtocolError(f"not a description of a service: {error}") from None
     hexadecimal = len(told.md5sum) == _MD5_LENGTH and not told.md5sum.strip("0123456789abcdef")
     if not is_type_name(told.type) or not hexadecimal:

@@ -23,9 +23,9 @@ class SiteTraffic:
         """Bytes a second between the last two readings."""
         self._at, self._messages_at, self._bytes_at = now, 0, 0
 
-    def add(self, size: int) -> None:
-        """Count one message of ``size`` bytes."""
-        self.messages += 1
+    def add(self, size: int, messages: int = 1) -> None:
+        """Count messages of ``size`` bytes together."""
+        self.messages += messages
         self.bytes += size
 
     def read(self, now: float) -> None:

@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.tcpros import Buffer
 
 _RULES: Final = "change [[gateway.rule]] in the rmpa.toml of the gateway of {}, and run rmpa reload there"
+_PERMISSIONS: Final = (
+    "change [[permission]] in the rmpa.toml of the gateway of {} and of its modules, and reload them"
+)
+_ROUTER: Final = "allow it by [[permission]] of the router, for the names of both gateways (zenohd: access_control)"
 _NO_DEMAND: Final = "that is no fault; to try it: rmpa topic echo"
 
 
@@ -52,7 +56,7 @@ class WhyQuestion(msgspec.Struct, kw_only=True, frozen=True):
             raise RemoteProtocolError(f"a question of rmpa why has {len(data)} bytes")
         try:
             found = msgspec.json.decode(data, type=cls)
-        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             raise RemoteProtocolError(f"not a question of rmpa why: {error}") from None
         if not is_global_name(found.name):
             raise RemoteProtocolError(f"{found.name[:80]!r} is not a topic, nor a service")
@@ -113,7 +117,7 @@ class WhyAnswer(msgspec.Struct, kw_only=True, frozen=True):
             raise RemoteProtocolError(f"an answer of rmpa why has {len(data)} bytes")
         try:
             return msgspec.json.decode(data, type=cls)
-        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             raise RemoteProtocolError(f"not an answer of rmpa why: {error}") from None
 
 
@@ -170,7 +174,9 @@ def site_stage(site: str, gateways: int, away: float | None, *, known: bool) -> 
     return Check("site", OK, f"site {site} is joined by {gateways} gateway{'s' if gateways > 1 else ''}")
 
 
-def there_stages(site: str, module: str, name: str, found: SourceThere | None, refusal: str) -> list[Check]:
+def there_stages(
+    site: str, module: str, name: str, found: SourceThere | None, refusal: str, *, wanted_here: bool = False
+) -> list[Check]:
     """The stages of the exporting site.
 
     Args:
@@ -179,6 +185,7 @@ def there_stages(site: str, module: str, name: str, found: SourceThere | None, r
         name: The topic or service there.
         found: What its gateway answered; ``None``: it has none of that name, or did not answer.
         refusal: Why it did not answer; empty if it did.
+        wanted_here: Whether a node of the site that asks subscribes.
     """
     whose = f"{module} at {site}" if module else f"a module at {site}"
     if refusal:
@@ -189,12 +196,15 @@ def there_stages(site: str, module: str, name: str, found: SourceThere | None, r
         return [Check("source there", FAIL, text, remedy)]
     stages = [Check("source there", OK, f"{found.node} of {found.module} at {site} has it: {found.type}")]
     if found.refused:
-        return [*stages, Check("rule there", FAIL, found.refused, _RULES.format(site))]
+        return [*stages, refused_stage("there", found.refused, site)]
     stages.append(Check("rule there", OK, found.rule or "it may go out"))
     if found.problem:
         return [*stages, Check("publisher there", FAIL, found.problem, f"`rmpa why {name}` at {site}")]
     if found.kind == SourceKind.SERVICE.value:
         return stages
+    if wanted_here and not found.wanted:
+        text = f"a node here subscribes, and the gateway of {site} hears of none: a router between them keeps it back"
+        return [*stages, Check("router", FAIL, text, _ROUTER)]
     return [*stages, *sent_stages(site, found)]
 
 
@@ -226,7 +236,7 @@ def sent_stages(site: str, found: SourceThere, no_demand: CheckLevel = WARN) -> 
 def here_stages(own: str, found: SourceHere) -> list[Check]:
     """The stages of the importing site, whose name is ``own``."""
     if found.refused:
-        return [Check("rule here", FAIL, found.refused, _RULES.format(own))]
+        return [refused_stage("here", found.refused, own)]
     stages = [Check("rule here", OK, found.rule or "it may come in")]
     was = f" (its {found.name})" if found.here != found.name else ""
     stages.append(
@@ -236,7 +246,8 @@ def here_stages(own: str, found: SourceHere) -> list[Check]:
     if problem := report.get("problem"):
         name = "md5" if "md5" in str(problem) else "header" if found.kind is SourceKind.TOPIC else "calls"
         level = FAIL if found.kind is SourceKind.TOPIC else WARN
-        return [*stages, Check(name, level, str(problem))]
+        remedy = _ROUTER if name == "header" else ""
+        return [*stages, Check(name, level, str(problem), remedy)]
     if found.kind is SourceKind.SERVICE:
         calls, failed = int(report.get("calls", 0)), int(report.get("failed", 0))
         return [*stages, Check("calls", OK, f"{calls} calls from here, {failed} failed")]
@@ -244,6 +255,19 @@ def here_stages(own: str, found: SourceHere) -> list[Check]:
         text = "no node of this site subscribes: it crosses once one does"
         return [*stages, Check("demand here", FAIL, text, _NO_DEMAND)]
     return [*stages, Check("demand here", OK, "a node of this site subscribes"), _arrived(report)]
+
+
+def refused_stage(where: str, refused: str, site: str) -> Check:
+    """The stage of a source that may not cross.
+
+    Args:
+        where: ``here`` or ``there``.
+        refused: The rule or permission that decided, as text.
+        site: The site whose gateway has refused it.
+    """
+    if "[[permission]]" in refused or refused.startswith("the permissions"):
+        return Check(f"permission {where}", FAIL, refused, _PERMISSIONS.format(site))
+    return Check(f"rule {where}", FAIL, refused, _RULES.format(site))
 
 
 def _arrived(report: Mapping[str, Any]) -> Check:

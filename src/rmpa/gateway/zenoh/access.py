@@ -4,6 +4,9 @@ A rule of ours is about modules, by their names; the common name of a certificat
 with the certificate of its own module. In the keys of sites stand the names of topics, services and parameters.
 Zenoh's rules allow what one of them allows and none denies, as ours do.
 
+Zenoh merges the rules of one common name, of which a denial wins; but of a name's and everybody's an allowance wins.
+So where something is denied to some names, the table has names alone (``_Table._policy``).
+
 What Zenoh cannot say: it compares common names as they are, so a glob over them becomes the names that are known. A
 denial whose glob cannot be resolved is one for all; an allowance is left out. Both are told.
 """
@@ -29,7 +32,7 @@ if TYPE_CHECKING:
 _MODULE: Final = "rmpa/1/*/*"
 _ADDRESSED: Final = f"{_MODULE}/to/*"
 _TOPIC: Final = (
-    *(key for head in (_MODULE, _ADDRESSED) for key in (f"{head}/t/*/{{}}", f"{head}/t/*/{{}}/@adv/**")),
+    *(f"{head}/t/*/{{}}{end}" for head in (_MODULE, _ADDRESSED) for end in ("", "/@batch", "/@adv/**")),
     f"{_MODULE}/d/t/{{}}",
     f"{_MODULE}/v/{{}}",
 )
@@ -43,6 +46,7 @@ _ANSWERS: Final = {_IN: ("declare_queryable", "reply"), _OUT: ("query",)}
 _OFFERS: Final = {_IN: ("declare_queryable",), _OUT: ("declare_queryable",)}
 _TOKENS: Final = ("liveliness_token", "liveliness_query", "declare_liveliness_subscriber")
 _EVERYTHING: Final = ("put", "delete", "declare_subscriber", "query", "reply", "declare_queryable", *_TOKENS)
+_BOTH: Final = {_IN: _EVERYTHING, _OUT: _EVERYTHING}
 _FLOWS: Final[dict[Access, tuple[tuple[str, ...], dict[str, tuple[str, ...]]]]] = {
     # A cache of latched messages (@adv) is asked by the subscriber, and announced by a token of the publisher.
     Access.PUBLISH: (
@@ -64,6 +68,10 @@ _FLOWS: Final[dict[Access, tuple[tuple[str, ...], dict[str, tuple[str, ...]]]]] 
     Access.PARAM: (_PARAM, _ASKS),
 }
 """By access: the keys, and the messages from and to the subject that it needs."""
+_ALL_KEYS: Final = ("**", "**/@adv/**", "@ros2_lv/**")
+"""All keys in use: ``**`` alone fits no chunk that begins with ``@``."""
+_JudgedRule = tuple[int, "PermissionRule", tuple[tuple[str, ...], ...]]
+"""Its number, the rule, and the subjects that it is about, each as common names; no names: everybody."""
 _GLOB: Final = re.compile(r"[*?]")
 
 
@@ -80,15 +88,18 @@ class AccessTable:
     notes: tuple[str, ...]
 
 
-def access_table(trust: TrustSettings, known: Sequence[str] = (), foreign: Sequence[str] = ()) -> AccessTable:
+def access_table(
+    trust: TrustSettings, known: Sequence[str] = (), foreign: Sequence[str] = (), revoked: Sequence[str] = ()
+) -> AccessTable:
     """Make the table.
 
     Args:
         trust: The rules, groups and the default.
         known: Names of modules that have certificates, for globs over them.
         foreign: Key expressions that every member may use, such as those of ROS 2.
+        revoked: Names of modules that may do nothing: Zenoh checks no revocation list, so it still lets them connect.
     """
-    return _Table(trust, known, foreign).made()
+    return _Table(trust, known, foreign).made(revoked)
 
 
 class _Table:
@@ -101,15 +112,37 @@ class _Table:
         self._policies: list[dict[str, object]] = []
         self._notes: dict[str, None] = {}
         self._foreign = tuple(foreign)
+        self._members: tuple[str, ...] = ()
+        """All modules that are known or named, but for those that were revoked."""
+        self._by_name = False
+        """Whether everybody is ``_members``: others get nothing."""
 
-    def made(self) -> AccessTable:
-        if self._trust.default != Effect.ALLOW:
+    def made(self, revoked: Sequence[str]) -> AccessTable:
+        default = self._trust.default
+        rules = [(number, rule, tuple(self._subject_names(number, rule))) for number, rule in self._numbered()]
+        named = {name for _, _, subjects in rules for names in subjects for name in names}
+        self._members = tuple(sorted({*named, *self._known} - set(revoked)))
+        everybody = [rule.effect for _, rule, names in rules if () in names]
+        named_deny = bool(revoked) or any(rule.effect is Effect.DENY and any(names) for _, rule, names in rules)
+        overlap = Effect.DENY in everybody if default == Effect.ALLOW else True
+        if named_deny and overlap and everybody and not self._known:
+            rules = self._widened(rules)
+            revoked = self._not_enforced(revoked)
+        else:
+            self._by_name = named_deny and overlap
+        if revoked:
+            self._policy(tuple(revoked), self._rule("revoked", Effect.DENY, _ALL_KEYS, _BOTH))
+        if default != Effect.ALLOW:
             self._base()
-        for number, rule in enumerate(self._trust.rules, 1):
-            self._add(number, rule)
+        elif self._by_name:
+            default = Effect.DENY
+            self._policy((), self._rule("all", Effect.ALLOW, (*_ALL_KEYS, *self._foreign), _BOTH))
+        for number, rule, subjects in rules:
+            if rule.effect is Effect.DENY or self._trust.default != Effect.ALLOW:
+                self._add(number, rule, subjects)
         entries: dict[str, object] = {
             "enabled": True,
-            "default_permission": str(self._trust.default),
+            "default_permission": str(default),
             "rules": self._rules,
             "subjects": [
                 {"id": name, "cert_common_names": list(names)} if names else {"id": name}
@@ -119,13 +152,29 @@ class _Table:
         }
         return AccessTable(entries, tuple(self._notes))
 
+    def _widened(self, rules: Sequence[_JudgedRule]) -> list[_JudgedRule]:
+        """What is denied to some modules is denied to all: Zenoh would allow it to them as to everybody."""
+        found: list[_JudgedRule] = []
+        for number, rule, subjects in rules:
+            wider = rule.effect is Effect.DENY and any(subjects)
+            if wider:
+                self._note(number, "denies it to all modules: rules are for all, and only the authority knows them")
+            found.append((number, rule, ((),) if wider else subjects))
+        return found
+
+    def _not_enforced(self, revoked: Sequence[str]) -> tuple[str, ...]:
+        if revoked:
+            text = "which were revoked, until their certificates end; let the authority be the router"
+            self._notes[f"rules for all modules let in {', '.join(revoked)}, {text}"] = None
+        return ()
+
+    def _numbered(self) -> Iterator[tuple[int, PermissionRule]]:
+        return iter(enumerate(self._trust.rules, 1))
+
     def _base(self) -> None:
         """What each member needs: presence, definitions, and to offer answers; names are judged in queries."""
         both = {_IN: _TOKENS, _OUT: _TOKENS}
         asked = dict.fromkeys((_IN, _OUT), ("query", "reply", "declare_queryable"))
-        everything = dict.fromkeys(
-            (_IN, _OUT), ("put", "delete", "declare_subscriber", "query", "reply", "declare_queryable", *_TOKENS)
-        )
         rules = [
             *self._rule("presence", Effect.ALLOW, ("rmpa/1/**",), both),
             *self._rule("definitions", Effect.ALLOW, (f"{_MODULE}/d/m/*",), asked),
@@ -134,11 +183,11 @@ class _Table:
             *self._rule("own parameters", Effect.ALLOW, (f"{_MODULE}/p/**",), _ANSWERS),
         ]
         if self._foreign:
-            rules += self._rule("foreign", Effect.ALLOW, self._foreign, everything)
+            rules += self._rule("foreign", Effect.ALLOW, self._foreign, _BOTH)
         self._policy((), rules)
 
-    def _add(self, number: int, rule: PermissionRule) -> None:
-        for name in self._subject_names(number, rule):
+    def _add(self, number: int, rule: PermissionRule, subjects: Sequence[tuple[str, ...]]) -> None:
+        for name in subjects:
             rules: list[str] = []
             for access, globs in self._names(rule, name).items():
                 found = _FLOWS.get(access)
@@ -158,6 +207,8 @@ class _Table:
                 rules += self._rule(label, rule.effect, keys, found[1])
             if rules:
                 self._policy(name, rules)
+                if not name and rule.effect is Effect.DENY and not self._by_name:
+                    self._policy(self._members, rules)  # what else allows it to them holds beside everybody's denial
 
     def _subject_names(self, number: int, rule: PermissionRule) -> Iterator[tuple[str, ...]]:
         """The subjects of a rule, each as its common names; no names: everybody."""
@@ -224,6 +275,15 @@ class _Table:
         return made
 
     def _policy(self, names: tuple[str, ...], rules: list[str]) -> None:
+        """Have rules hold for these common names; for everybody, if there are none.
+
+        Zenoh allows what one of a certificate's subjects allows: what is denied to a name and allowed to everybody
+        would be allowed. So with such a denial everybody is those that are known, each a subject of its own.
+        """
+        if not names and self._by_name:
+            names = self._members
+            if not names:
+                return
         if names not in self._subjects:
             self._subjects[names] = f"subject {len(self._subjects) + 1}" if names else "everybody"
         self._policies.append({"rules": rules, "subjects": [self._subjects[names]]})

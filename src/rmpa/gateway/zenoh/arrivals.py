@@ -16,7 +16,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from rmpa.gateway.zenoh import limits
-from rmpa.runtime.stream import collected_sends
+from rmpa.runtime.corking import CollectedSends
 
 if TYPE_CHECKING:
     import asyncio
@@ -63,22 +63,31 @@ class ArrivalQueue(Generic[_T]):
         self._messages = messages
         self._bytes = size
         self._discard = discard
-        self._items: deque[tuple[_T, int]] = deque()
+        self._items: deque[tuple[_T, int, int]] = deque()
+        """Each with its size, and the messages that it counts as."""
         self._waiting_bytes = 0
         self._scheduled = False
         self._closed = False
         self.dropped = 0
         """Items that found no room."""
+        self.users = 0
+        """Declarations that it is for; counted there."""
 
-    def add(self, item: _T, size: int = 0) -> None:
-        """Queue one item, from any thread."""
+    def add(self, item: _T, size: int = 0, messages: int = 1) -> None:
+        """Queue one item, from any thread.
+
+        Args:
+            item: The item.
+            size: Its bytes.
+            messages: How many of the messages that the loop takes before its other work it counts as.
+        """
         with self._arrivals.lock:
             if self._closed:
                 return
-            self._items.append((item, size))
+            self._items.append((item, size, messages))
             self._waiting_bytes += size
             while len(self._items) > self._messages or (self._waiting_bytes > self._bytes and len(self._items) > 1):
-                old, old_size = self._items.popleft()
+                old, old_size, _ = self._items.popleft()
                 self._waiting_bytes -= old_size
                 self.dropped += 1
                 if self._discard is not None:
@@ -92,13 +101,13 @@ class ArrivalQueue(Generic[_T]):
         with self._arrivals.lock:
             self._closed = True
             if self._discard is not None:
-                self._arrivals.discarded.extend((self._discard, item) for item, _ in self._items)
+                self._arrivals.discarded.extend((self._discard, item) for item, _, _ in self._items)
                 self._arrivals.wake()
             self._items.clear()
             self._waiting_bytes = 0
 
-    def take(self) -> tuple[_T, int] | None:
-        """Take the oldest item and its size; ``None`` if none waits. The caller has the lock."""
+    def take(self) -> tuple[_T, int, int] | None:
+        """Take the oldest item, its size and its messages; ``None`` if none waits. The caller has the lock."""
         if not self._items:
             return None
         item = self._items.popleft()
@@ -193,23 +202,24 @@ class Arrivals:
                 if not self._ready:
                     break
                 queue = self._ready.popleft()
-                taken, taken_bytes = self._take_turn(queue, min(messages, limits.TURN_MESSAGES))
+                taken, taken_messages, taken_bytes = self._take_turn(queue, min(messages, limits.TURN_MESSAGES))
                 queue.reschedule()
-            with collected_sends():  # one system call for what goes to one peer
+            with CollectedSends():  # one system call for what goes to one peer
                 for item in taken:
                     queue.deliver(item)
-            messages -= len(taken)
+            messages -= taken_messages
             size -= taken_bytes
         return limits.DRAIN_MESSAGES - messages
 
     @staticmethod
-    def _take_turn(queue: ArrivalQueue[object], messages: int) -> tuple[list[object], int]:
+    def _take_turn(queue: ArrivalQueue[object], messages: int) -> tuple[list[object], int, int]:
         taken: list[object] = []
-        taken_bytes = 0
-        while len(taken) < messages and taken_bytes < limits.TURN_BYTES:
+        taken_messages = taken_bytes = 0
+        while taken_messages < messages and taken_bytes < limits.TURN_BYTES:
             entry = queue.take()
             if entry is None:
                 break
             taken.append(entry[0])
             taken_bytes += entry[1]
-        return taken, taken_bytes
+            taken_messages += entry[2]
+        return taken, taken_messages, taken_bytes

@@ -12,13 +12,13 @@ import contextlib
 import json
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from rmpa.core.errors import StartError
 from rmpa.gateway.zenoh import limits
 from rmpa.gateway.zenoh.arrivals import ArrivalQueue, Arrivals, keep_thread_state
 from rmpa.gateway.zenoh.queries import ArrivedQuery, PendingGet, content
-from rmpa.gateway.zenoh.sending import QueuedPublisher, SendingLane
+from rmpa.gateway.zenoh.sending import NumberedPublisher, QueuedPublisher, SendingLane
 from rmpa.gateway.zenoh.socket_tuning import SocketTuning
 from rmpa.gateway.zenoh.worker import SerialWorker
 from rmpa.gateway.zenoh_api import ZenohPriority, ZenohSample
@@ -28,11 +28,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.gateway.zenoh.config import ZenohConfig
-    from rmpa.gateway.zenoh_api import ZenohQos, ZenohQuery, ZenohReply
+    from rmpa.gateway.zenoh_api import Declared, ZenohQos, ZenohQuery, ZenohReply
     from rmpa.ros.wire.tcpros import Buffer
 
 _log = logging.getLogger(__name__)
 _WILD: Final = frozenset("*$")
+_Publisher = TypeVar("_Publisher", QueuedPublisher, NumberedPublisher)
 
 
 class Declaration:
@@ -42,7 +43,7 @@ class Declaration:
         worker: The thread that declares.
         kept: The open declarations of the session: Zenoh undeclares what is not referred to.
         declare: Makes Zenoh's object, or several that are undeclared together.
-        queue: Its arrivals; ``None`` if it has none.
+        queue: Its arrivals, which other declarations may share; ``None`` if it has none.
     """
 
     def __init__(
@@ -54,25 +55,29 @@ class Declaration:
     ) -> None:
         self._worker = worker
         self._kept = kept
-        self._queue = queue
+        self.queue = queue
         self._declare = declare
         self._objects: list[Any] = []
         self._closed = False
         kept.add(self)
+        if queue is not None:
+            queue.users += 1
         worker.submit(self._begin)
 
     @property
     def dropped(self) -> int:
         """Arrivals that found no room."""
-        return self._queue.dropped if self._queue is not None else 0
+        return self.queue.dropped if self.queue is not None else 0
 
     def close(self) -> None:
-        """Undeclare it; no callback is called afterwards."""
+        """Undeclare it; no callback is called afterwards, once all that share its queue are closed."""
         if not self._closed:
             self._closed = True
             self._kept.discard(self)
-            if self._queue is not None:
-                self._queue.close()
+            if self.queue is not None:
+                self.queue.users -= 1
+                if not self.queue.users:
+                    self.queue.close()
             self._worker.submit(self._end)
 
     def _begin(self) -> None:
@@ -93,10 +98,16 @@ class OpenSession:
         session: Zenoh's session.
         loop: The event loop in which all callbacks are called.
         listens_with: The file of the certificate that it listens with; ``None``: it does not, or has none.
+        changed: Whether its configuration would be another one now.
     """
 
     def __init__(
-        self, library: Any, session: Any, loop: asyncio.AbstractEventLoop, listens_with: Path | None = None
+        self,
+        library: Any,
+        session: Any,
+        loop: asyncio.AbstractEventLoop,
+        listens_with: Path | None = None,
+        changed: Callable[[], bool] = lambda: False,
     ) -> None:
         self._zenoh = library
         self._session = session
@@ -106,10 +117,11 @@ class OpenSession:
         self._declarations = SerialWorker("zenoh declarations")
         self._queries = SerialWorker("zenoh queries")
         self._lanes: dict[ZenohPriority, SendingLane] = {}
-        self._publishers: set[QueuedPublisher] = set()
+        self._publishers: set[QueuedPublisher | NumberedPublisher] = set()
         self._kept: set[Declaration] = set()
         self._certificate = listens_with
         self._stamp = _stamp(listens_with)
+        self._changed = changed
         self._closing = False
         self._closed = False
         self._flushed = asyncio.Event()
@@ -128,23 +140,52 @@ class OpenSession:
 
     @property
     def stale(self) -> bool:
-        """Whether it has to be opened anew for others to connect to it: its certificate was renewed.
+        """Whether it has to be opened anew for others to connect: its certificate or table of access is another.
 
-        Zenoh reads the certificate of a listener once, and that of a connection each time.
+        Zenoh reads the table and the certificate of a listener once, and that of a connection each time.
         """
-        return _stamp(self._certificate) != self._stamp
+        return _stamp(self._certificate) != self._stamp or self._changed()
 
     def publisher(self, key: str, qos: ZenohQos, on_matching: Callable[[bool], None]) -> QueuedPublisher:
         """Declare a publisher; ``on_matching(there)`` tells whether there is a subscriber, also at the beginning."""
+        return self._publish(
+            key, qos, on_matching, lambda undeclare: QueuedPublisher(self._lane(qos.priority), key, qos, undeclare)
+        )
+
+    def numbered_publisher(self, key: str, qos: ZenohQos, on_matching: Callable[[bool], None]) -> NumberedPublisher:
+        """Declare a publisher of messages that are numbered; the rest is as of ``publisher``."""
+
+        def made(undeclare: Callable[[], None]) -> NumberedPublisher:
+            return NumberedPublisher(self._lane(qos.priority), key, qos, undeclare, declare_batches)
+
+        def declare_batches(
+            publisher: NumberedPublisher, batch_key: str, on_batch_matching: Callable[[bool], None]
+        ) -> Declaration:
+            terms = self._terms(qos)
+            queue = self._matching_queue(on_batch_matching)
+
+            def wanted(there: bool) -> None:
+                publisher.batches_wanted = there
+                queue.add(there)
+
+            def declare() -> list[Any]:
+                declared, listener = self._declare_publisher(batch_key, terms, wanted)
+                publisher.batch_handle = declared
+                return [listener, declared]
+
+            return Declaration(self._declarations, self._kept, declare, queue)
+
+        return self._publish(key, qos, on_matching, made)
+
+    def _publish(
+        self,
+        key: str,
+        qos: ZenohQos,
+        on_matching: Callable[[bool], None],
+        make: Callable[[Callable[[], None]], _Publisher],
+    ) -> _Publisher:
         self._check(key)
-        last: list[bool] = []
-
-        def matched(there: bool) -> None:
-            if last != [there]:
-                last[:] = [there]
-                on_matching(there)
-
-        queue = ArrivalQueue(self._arrivals, matched, 1, 0)
+        queue = self._matching_queue(on_matching)
         holder: list[Declaration] = []
 
         def undeclare() -> None:
@@ -153,13 +194,15 @@ class OpenSession:
                 self._flushed.set()
             holder[0].close()
 
-        publisher = QueuedPublisher(self._lane(qos.priority), key, qos, undeclare)
+        publisher: _Publisher = make(undeclare)
+
+        def wanted(there: bool) -> None:
+            publisher.wanted = there
+            queue.add(there)
 
         def declare() -> list[Any]:
             terms = self._terms(qos)
-            plain = self._session.declare_publisher(key, **terms)
-            listener = plain.declare_matching_listener(self._direct(lambda status: queue.add(bool(status.matching))))
-            queue.add(bool(plain.matching_status.matching))
+            plain, listener = self._declare_publisher(key, terms, wanted)
             objects = [listener, plain]
             if qos.cache:
                 objects.append(self._cached(key, qos, terms))
@@ -170,18 +213,48 @@ class OpenSession:
         self._publishers.add(publisher)
         return publisher
 
-    def subscribe(self, key: str, on_sample: Callable[[ZenohSample], None], *, history: bool = False) -> Declaration:
-        """Subscribe to a key expression; ``history`` asks publishers with a cache for what they keep."""
+    def _matching_queue(self, on_matching: Callable[[bool], None]) -> ArrivalQueue[bool]:
+        last: list[bool] = []
+
+        def matched(there: bool) -> None:
+            if last != [there]:
+                last[:] = [there]
+                on_matching(there)
+
+        return ArrivalQueue(self._arrivals, matched, 1, 0)
+
+    def _declare_publisher(self, key: str, terms: dict[str, Any], wanted: Callable[[bool], None]) -> tuple[Any, Any]:
+        """Declare a publisher and what tells of its subscribers, from Zenoh's threads."""
+        declared = self._session.declare_publisher(key, **terms)
+        listener = declared.declare_matching_listener(self._direct(lambda status: wanted(bool(status.matching))))
+        wanted(bool(declared.matching_status.matching))
+        return declared, listener
+
+    def subscribe(
+        self,
+        key: str,
+        on_sample: Callable[[ZenohSample], None],
+        *,
+        history: bool = False,
+        beside: Declared | None = None,
+        batches: bool = False,
+    ) -> Declaration:
+        """Subscribe to a key expression; see ``zenoh_api``."""
         self._check(key)
         fixed = None if _WILD.intersection(key) else key
-        queue = ArrivalQueue(self._arrivals, on_sample, limits.ARRIVED_MESSAGES, limits.ARRIVED_BYTES)
+        queue: ArrivalQueue[ZenohSample] | None = beside.queue if isinstance(beside, Declaration) else None
+        if queue is None:
+            queue = ArrivalQueue(self._arrivals, on_sample, limits.ARRIVED_MESSAGES, limits.ARRIVED_BYTES)
         put = self._zenoh.SampleKind.PUT
 
         def arrived(sample: Any) -> None:
             if sample.kind == put:
                 payload = content(sample.payload)
+                size = len(payload)
                 queue.add(
-                    ZenohSample(fixed or str(sample.key_expr), payload, content(sample.attachment)), len(payload)
+                    ZenohSample(fixed or str(sample.key_expr), payload, content(sample.attachment)),
+                    size,
+                    1 + size // limits.BATCH_MESSAGE if batches else 1,
                 )
 
         def declare() -> list[Any]:
@@ -377,11 +450,12 @@ class OpenSession:
         )
 
 
-async def open_session(config: ZenohConfig) -> OpenSession:
+async def open_session(config: ZenohConfig, changed: Callable[[], bool] = lambda: False) -> OpenSession:
     """Open a session, in a thread.
 
     Args:
         config: Its mode, endpoints and certificates.
+        changed: Whether it would be another one now (``OpenSession.stale``).
 
     Raises:
         StartError: The library is missing, an address is taken, or the endpoints do not answer.
@@ -399,7 +473,7 @@ async def open_session(config: ZenohConfig) -> OpenSession:
         raise _start_error(config, _reason(error)) from None
     files = config.certificates if config.listen else None
     certificate = Path(files.certificate) if files is not None else None
-    return OpenSession(zenoh, session, asyncio.get_running_loop(), certificate)
+    return OpenSession(zenoh, session, asyncio.get_running_loop(), certificate, changed)
 
 
 def _stamp(file: Path | None) -> tuple[int, int] | None:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import json
 import logging
+import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from rmpa.agent.trust import trust_store
-from rmpa.core.errors import StartError
+from rmpa.core.errors import RemoteProtocolError, StartError
 from rmpa.gateway.zenoh.access import access_table
 from rmpa.gateway.zenoh.config import MeshCertificates, gateway_config, zenohd_entries
 from rmpa.gateway.zenoh.session import open_session
-from rmpa.trust.io.store import CA, CERTIFICATE, KEY
+from rmpa.trust.io.store import CA, CERTIFICATE, DENY, KEY
 from rmpa.trust.limits import CERTIFICATE_LIFETIME, RENEWAL_SHARE
 
 if TYPE_CHECKING:
@@ -27,7 +28,8 @@ _LISTEN: Final = ("tls/0.0.0.0:7447",)
 _HEAD: Final = """\
 // For zenohd 1.10 or later; made by rmpa gateway zenoh-config from [gateway], [trust] and [[permission]].
 // Both sides show a certificate of the mesh. zenohd reads this file and the certificates once, at its start: start
-// it again when the certificate is renewed (each {days:g} days) or a permission has changed.
+// it again when the certificate is renewed (each {days:g} days), a permission has changed, or a module has joined or
+// was revoked.
 """
 
 
@@ -56,7 +58,9 @@ def session_config(settings: Settings) -> tuple[ZenohConfig, tuple[str, ...]]:
     config = gateway_config(settings.gateway, certificates)
     if certificates is None or not config.listen:
         return config, ()
-    table = access_table(settings.trust, known_modules(settings), foreign_keys(settings.gateway))
+    table = access_table(
+        settings.trust, known_modules(settings), foreign_keys(settings.gateway), revoked_modules(settings)
+    )
     return replace(config, access_control=table.entries), table.notes
 
 
@@ -69,7 +73,15 @@ async def open_trusted_session(settings: Settings) -> OpenSession:
     config, notes = session_config(settings)
     for note in notes:
         _log.warning("! zenoh: %s", note)
-    return await open_session(config)
+    return await open_session(config, lambda: _changed(settings, config))
+
+
+def _changed(settings: Settings, opened: ZenohConfig) -> bool:
+    """Whether the table of access would be another one now: a module has joined, or was revoked."""
+    try:
+        return session_config(settings)[0].access_control != opened.access_control
+    except StartError:
+        return False  # files are being written
 
 
 def zenohd_config(settings: Settings) -> str:
@@ -96,6 +108,31 @@ def known_modules(settings: Settings) -> tuple[str, ...]:
         return tuple(sorted(store.load_issued()))
     except StartError:
         return ()
+
+
+def revoked_modules(settings: Settings) -> tuple[str, ...]:
+    """The modules on the deny list whose certificates from before may still be valid.
+
+    Zenoh knows a certificate by its name alone. So a name that was invited again stays out until those have ended.
+
+    Raises:
+        StartError: The files of trust are not whole, or the deny list is broken.
+    """
+    store = trust_store(settings)
+    if store is None or not store.exists:
+        return ()
+    files = store.load()
+    if not files.deny:
+        return ()
+    from rmpa.trust.certificates import ca_public_key  # noqa: PLC0415 - they need the extra rmpa[trust]
+    from rmpa.trust.documents import read_deny_list  # noqa: PLC0415
+
+    try:
+        deny = read_deny_list(files.deny, ca_public_key(files.ca))
+    except RemoteProtocolError as error:
+        raise StartError(str(store.path(DENY)), f"is broken: {error}", "see rmpa trust status") from None
+    ended = time.time() - CERTIFICATE_LIFETIME
+    return tuple(sorted(entry.name for entry in deny.entries if entry.before > ended))
 
 
 def foreign_keys(settings: GatewaySettings) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ import msgspec
 
 from rmpa.observe.io.direct_section import direct_counts
 from rmpa.observe.shared_address import mark_shared_addresses
-from rmpa.observe.snapshot import BoundInfo, LaneInfo, LinkInfo, PeerInfo
+from rmpa.observe.snapshot import BoundInfo, DetectorInfo, LaneInfo, LinkInfo, PeerInfo, ProbesInfo
 from rmpa.runtime.event_loop import yield_to_data
 from rmpa.runtime.system_clock import SystemClock
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
     from rmpa.discovery.events import PeerView
     from rmpa.discovery.io.discovery import Discovery
+    from rmpa.discovery.swim_events import DetectorView, MemberView
     from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.io.mesh import Mesh
@@ -62,6 +63,7 @@ class PeersSection:
         roster = {view.identity.guid: view for view in endpoint.discovery.peers()}
         yield_to_data()
         statuses = {status.identity.guid: status for status in endpoint.mesh.peers()}
+        detecting = endpoint.discovery.detector.active
         infos = []
         for guid in {*roster, *statuses, *links}:
             yield_to_data()
@@ -77,6 +79,9 @@ class PeersSection:
                 info = msgspec.structs.replace(
                     info, topics_in=theirs, topics_out=ours, beyond=beyond, direct_in=to_it, direct_out=from_it
                 )
+            probed = endpoint.discovery.member(guid, bytes.fromhex(info.instance)) if detecting else None
+            if probed is not None:
+                info = msgspec.structs.replace(info, probes=_probes(probed, now))
             infos.append(info)
         relayed = self._relayed({info.instance: info for info in infos})
         infos = [info for info in infos if info.instance not in {one.instance for one in relayed}]
@@ -152,6 +157,29 @@ class PeersSection:
                 _lane(link.bulk, link.bulk_connection.stream if link.bulk_connection is not None else None),
             ),
         )
+
+
+def _probes(member: MemberView, now: float) -> ProbesInfo:
+    return ProbesInfo(
+        state=member.state.name.lower(),
+        heard_ago=now - member.heard if member.heard is not None else None,
+        rtt=member.rtt,
+        refuted=member.incarnation,
+        version=member.version,
+    )
+
+
+def detector_info(view: DetectorView) -> DetectorInfo | None:
+    """The failure detector, while it probes."""
+    if not view.active:
+        return None
+    return DetectorInfo(
+        members=view.members,
+        suspects=view.suspects,
+        health=view.health,
+        refuted=view.incarnation,
+        news=view.news,
+    )
 
 
 def _lane(lane: LaneSender, stream: Stream | None) -> LaneInfo:

@@ -14,7 +14,7 @@ import psutil
 import rmpa
 from rmpa.observe import limits
 from rmpa.observe.io.direct_section import DirectSection
-from rmpa.observe.io.peers_section import PeersSection, own_text
+from rmpa.observe.io.peers_section import PeersSection, detector_info, own_text
 from rmpa.observe.io.services_section import ServicesSection
 from rmpa.observe.io.topics_section import TopicsSection, unreachable_infos
 from rmpa.observe.peer_agent import PeerAgent
@@ -191,6 +191,7 @@ class SnapshotBuilder:
             proxy_listening=bridge.proxy_nodes.listening,
             core_memory=core.restored(),
             end_connections=may_end_connections(),
+            detector=detector_info(endpoint.discovery.detector) if endpoint is not None else None,
         )
 
     def _cpu_share(self) -> float | None:

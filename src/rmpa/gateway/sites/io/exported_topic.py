@@ -12,13 +12,14 @@ from rmpa.gateway.sites.topic_header import TopicHeader
 from rmpa.gateway.sites.topic_limits import TopicLimits
 from rmpa.gateway.sites.topic_qos import qos_of
 from rmpa.gateway.sites.traffic import SiteTraffic
+from rmpa.runtime.corking import after_read
 
 if TYPE_CHECKING:
     from rmpa.core.clock import Clock
     from rmpa.core.contract import Contract
     from rmpa.gateway.neighbour import OwnGraph, Tap
     from rmpa.gateway.sites.part import SiteExport
-    from rmpa.gateway.zenoh_api import ZenohPublisher, ZenohQuery, ZenohSession
+    from rmpa.gateway.zenoh_api import ZenohNumberedPublisher, ZenohQuery, ZenohSession
     from rmpa.ros.wire.tcpros import TopicDescription
 
 
@@ -28,12 +29,15 @@ class ExportedTopic:
     The Zenoh publisher is declared all the time, since it tells of demand. It is declared anew where its QoS changes:
     with a cache once the topic is known to be latched, and with a lower priority once its messages are large.
 
+    Messages that come by one read are numbered, stamped and queued together.
+
     Args:
         entry: The source.
         graph: The gateway's graph.
         session: The Zenoh session.
         contract: The topic's contract.
         clock: Both clocks.
+        batches: Whether another site has asked for the topic in batches.
     """
 
     def __init__(
@@ -43,6 +47,8 @@ class ExportedTopic:
         session: ZenohSession,
         contract: Contract,
         clock: Clock,
+        *,
+        batches: bool = False,
     ) -> None:
         self.entry = entry
         self._graph = graph
@@ -59,7 +65,12 @@ class ExportedTopic:
         self.description: TopicDescription | None = None
         """The publisher's last header; ``None`` before the first."""
         self._writer: AttachmentWriter | None = None
+        self._collected: list[bytes] = []
+        """The messages of the present read."""
         self._matched = False
+        """Whether single messages are subscribed to."""
+        self._batches_matched = False
+        self._batches = batches
         self._linger: asyncio.TimerHandle | None = None
         self._queries: list[tuple[ZenohQuery, asyncio.TimerHandle]] = []
         self._large = self._cached = False
@@ -67,19 +78,30 @@ class ExportedTopic:
         self._repeated = False
         self._held: bytes | None = None
         self._held_timer: asyncio.TimerHandle | None = None
-        self._retired: list[ZenohPublisher] = []
+        self._retired: list[ZenohNumberedPublisher] = []
         self._retire_timer: asyncio.TimerHandle | None = None
         self._publisher = self._declare()
 
     @property
     def wanted(self) -> bool:
         """Whether another site subscribes."""
-        return self._matched
+        return self._matched or self._batches_matched
 
     @property
     def dropped(self) -> int:
         """Messages that the queues to Zenoh dropped."""
         return self._dropped_before + sum(each.dropped for each in (self._publisher, *self._retired))
+
+    @property
+    def offers_batches(self) -> bool:
+        """Whether another site has asked for the topic in batches."""
+        return self._batches
+
+    def offer_batches(self) -> None:
+        """Put messages together as batches under a key of their own too, while a gateway subscribes to it."""
+        if not self._batches:
+            self._batches = True
+            self._publisher.batch(self.entry.announced.batch_key(), self._on_batches_matching)
 
     def ask(self, query: ZenohQuery) -> None:
         """Answer a question for the publisher's header, once it is connected."""
@@ -105,7 +127,7 @@ class ExportedTopic:
             "type": entry.announced.type,
             "md5sum": self.description.md5sum if self.description is not None else "",
             "latching": self.description is not None and self.description.latching,
-            "wanted": self._matched,
+            "wanted": self.wanted,
             "messages": traffic.messages,
             "bytes": traffic.bytes,
             "rate": round(traffic.rate, 2),
@@ -119,7 +141,7 @@ class ExportedTopic:
     @property
     def used(self) -> bool:
         """Whether there is anything to tell of it."""
-        return self._matched or bool(self._traffic.messages or self._problem or self._limits.dropped)
+        return self.wanted or bool(self._traffic.messages or self._problem or self._limits.dropped)
 
     def close(self) -> None:
         """Disconnect and undeclare; what waits for Zenoh is still sent for a moment."""
@@ -129,6 +151,7 @@ class ExportedTopic:
             timer.cancel()
             query.reply_error(f"{self.entry.source.name} of {self.entry.source.module} is not offered any more")
         self._queries.clear()
+        self._flush()
         self._close_tap()
         if self._retire_timer is not None:
             self._retire_timer.cancel()
@@ -138,12 +161,17 @@ class ExportedTopic:
 
     # --- demand ---------------------------------------------------------------------------------------------------
 
-    def _declare(self) -> ZenohPublisher:
+    def _declare(self) -> ZenohNumberedPublisher:
         qos = qos_of(self._contract, latching=self._cached, large=self._large)
-        return self._session.publisher(self.entry.announced.key(), qos, self._on_matching)
+        announced = self.entry.announced
+        made = self._session.numbered_publisher(announced.key(), qos, self._on_matching)
+        if self._batches:
+            made.batch(announced.batch_key(), self._on_batches_matching)
+        return made
 
     def _declare_anew(self) -> None:
         """Declare with another QoS; the old one ends when nothing waits in it."""
+        self._flush()
         self._retired.append(self._publisher)
         self._publisher = self._declare()
         self._close_retired()
@@ -156,7 +184,7 @@ class ExportedTopic:
         if self._retired:
             self._retire_timer = asyncio.get_running_loop().call_later(limits.IDLE_CHECK, self._close_retired)
 
-    def _retire(self, publisher: ZenohPublisher) -> bool:
+    def _retire(self, publisher: ZenohNumberedPublisher) -> bool:
         """Close a publisher if nothing waits in it; return whether that was done."""
         if publisher.waiting:
             return False
@@ -168,9 +196,13 @@ class ExportedTopic:
         self._matched = there
         self._judge()
 
+    def _on_batches_matching(self, there: bool) -> None:
+        self._batches_matched = there
+        self._judge()
+
     def _judge(self) -> None:
         """Connect to the publisher, or disconnect after a while."""
-        if self._matched or self._queries:
+        if self.wanted or self._queries:
             self._stop_lingering()
             if self._tap is None:
                 self._tap = self._graph.tap(self.entry.source, self._on_message, self._on_described, self._on_lost)
@@ -204,6 +236,7 @@ class ExportedTopic:
     # --- the publisher --------------------------------------------------------------------------------------------
 
     def _on_described(self, description: TopicDescription) -> None:
+        self._flush()
         self.description = description
         self._problem = ""
         announced = self.entry.announced
@@ -249,19 +282,30 @@ class ExportedTopic:
         if self._limits and not self._limits.admit(self._clock.now(), size):
             self._limit(message)
             return
-        self._drop_held()
+        if self._held is not None:
+            self._drop_held()
         self._send(message)
 
     def _send(self, message: bytes | memoryview) -> None:
-        size = len(message)
-        if size >= limits.LARGE_MESSAGE and not self._large:
+        if len(message) >= limits.LARGE_MESSAGE and not self._large:
             self._large = True
             if self._contract.priority is Priority.NORMAL:
                 self._declare_anew()
-        if self._writer is not None:
-            self._sequence += 1
-            self._traffic.add(size)
-            self._publisher.put(message, self._writer.write(self._sequence, self._clock.wall_ns()))
+        collected = self._collected
+        collected.append(bytes(message))
+        if len(collected) == 1:
+            after_read(self._flush)
+        elif len(collected) >= limits.COLLECTED_MESSAGES:
+            self._flush()
+
+    def _flush(self) -> None:
+        """Queue what has come by the present read."""
+        messages, self._collected = self._collected, []
+        if messages and self._writer is not None:
+            first = self._sequence + 1
+            self._sequence += len(messages)
+            self._traffic.add(sum(map(len, messages)), len(messages))
+            self._publisher.put_all(messages, first, self._clock.wall_ns(), self._writer)
 
     # --- the limits of a rule -------------------------------------------------------------------------------------
 
@@ -304,6 +348,7 @@ class ExportedTopic:
             self.dropped,
             self._limits.dropped,
             self._clock.wall_ns(),
+            self._batches,
         )
         query.reply(query.key, header.serialize())
         query.finish()

@@ -16,6 +16,7 @@ from rmpa.gateway.sites.why import (
     WhyAnswer,
     WhyQuestion,
     here_stages,
+    refused_stage,
     sent_stages,
     site_stage,
     there_stages,
@@ -142,7 +143,14 @@ class SiteWhy:
         )
         stages = [
             self._site_stage(here.site),
-            *there_stages(here.site, here.module, here.name, there, refusal),
+            *there_stages(
+                here.site,
+                here.module,
+                here.name,
+                there,
+                refusal,
+                wanted_here=bool(here.report and here.report.get("wanted")),
+            ),
             *here_stages(self._site, here),
         ]
         return self._diagnosis(here.here or here.name, f"{here.site}/{here.module}", here.node, here.kind, stages)
@@ -186,8 +194,7 @@ class SiteWhy:
                 continue
             stages = [Check("gateway", OK, f"{self._gateway} of site {self._site} sees it, as {source.here}")]
             if there.refused:
-                remedy = "change [[gateway.rule]] of the gateway, if it should cross"
-                stages.append(Check("rule here", FAIL, there.refused, remedy))
+                stages.append(refused_stage("here", there.refused, self._site))
             else:
                 stages.append(Check("rule here", OK, there.rule))
                 if there.kind == SourceKind.TOPIC.value:

@@ -1,0 +1,78 @@
+"""Fuzz target: questions and answers about parameters between sites, and their values as JSON."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from rmpa.core.errors import RemoteProtocolError, RmpaError
+from rmpa.gateway.sites.params import (
+    GATEWAYS,
+    ParamAnswer,
+    ParamNews,
+    ParamQuestion,
+    followed_of,
+    from_json,
+    param_key,
+    parse_param_key,
+    refused_leaf,
+    to_json,
+)
+from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
+
+_TEXT: Final = serialize_response({"p": 1.5, "names": ["a", True], "blob": b"\0\1"}).decode()
+SEEDS: list[bytes] = [
+    b"",
+    ParamQuestion(op="get", key="/gains").serialize(),
+    ParamQuestion(op="names").serialize(),
+    ParamQuestion(op="set", key="/gains/p", text=_TEXT).serialize(),
+    ParamQuestion(op="delete", key="/gains").serialize(),
+    ParamQuestion(op="values", last={"/gains": "-", "/rate": "0" * 32}).serialize(),
+    ParamAnswer(text=_TEXT, names=["/a", "/b"], count=2).serialize(),
+    ParamAnswer(values={"/a": ParamNews(text=_TEXT), "/b": ParamNews(problem="no")}).serialize(),
+    b'{"p": 1, "i": [2, 3.5, "x", true], "deep": {"er": {}}}',
+    b"[" * 300 + b"]" * 300,
+    b"123456789012345678901234567890",
+    b'{"": "\\u0000", "a/b": -1e999}',
+    param_key("hall", "arm", "/gains/p").encode(),
+    param_key("hall", "arm", GATEWAYS).encode(),
+    b"/hall/arm/speed",
+]
+
+
+def fuzz(data: bytes) -> None:
+    """Each text is read as it will be written again, or refused with a text that is safe to log."""
+    for kind in (ParamQuestion, ParamAnswer):
+        try:
+            read = kind.parse(data)
+        except RemoteProtocolError as error:
+            _check_text(error)
+            continue
+        if kind.parse(read.serialize()) != read:
+            raise AssertionError(f"{read} does not survive its text")
+    _fuzz_value(data)
+    key = data.decode("utf-8", "replace")
+    followed_of(key)
+    try:
+        module, name = parse_param_key(key)
+    except RemoteProtocolError as error:
+        _check_text(error)
+    else:
+        if parse_param_key(param_key("hall", module, name)) != (module, name) and name.strip("/") == name[1:]:
+            raise AssertionError(f"{key!r} names another parameter once it is written")
+
+
+def _fuzz_value(data: bytes) -> None:
+    """What a program sets: JSON that becomes the text of XML-RPC, is judged, and is told again."""
+    try:
+        text = serialize_response(from_json(data))
+        value = parse_response(text)
+    except RmpaError as error:
+        _check_text(error)
+        return
+    refused_leaf("/a", value, lambda name: "" if name.startswith("/a") else f"{name} is not below /a")
+    to_json(value)
+
+
+def _check_text(error: RmpaError) -> None:
+    if not str(error).isprintable():
+        raise AssertionError(f"an error's text is not safe to log: {str(error)!r}")

@@ -1,0 +1,222 @@
+"""Two sites behind NAT, each a secured mesh, by a router with mTLS: what crosses, what is kept back, and intruders.
+
+The router's machine is the authority; modules and gateways of both sites join by ``rmpa trust``, as in docs/sites.md.
+All tests share one set of processes; each leaves it as it was.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any, Final
+
+import pytest
+
+from lab.bed.gateways import command
+from lab.bed.namespaces import Lab
+from lab.bed.processes import Process, eventually
+from tests.interop.modules import flows, whole
+from tests.interop.ros import Ros
+from tests.interop.sites import JoinedModules, join, nodes
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from lab.bed.agents import Agent
+    from lab.bed.namespaces import Host
+
+pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")
+pytestmark = [pytest.mark.ros, pytest.mark.nat, pytest.mark.timeout(180)]
+
+LONG: Final = 40.0
+_AT_HOME: Final = """
+[trust]
+relays = ["{gateway}"]
+
+[[permission]]                          # among each other
+modules = ["{module}", "{gateway}"]
+publish = ["/**"]
+subscribe = ["/**"]
+call = ["/**"]
+serve = ["/**"]
+"""
+WAREHOUSE: Final = (
+    _AT_HOME.format(module="arm", gateway="warehouse_gateway")
+    + """
+[[permission]]
+modules = ["yard"]
+subscribe = ["/**"]
+call = ["/work"]
+
+[[permission]]
+modules = ["yard"]
+effect = "deny"
+subscribe = ["/secret"]
+"""
+)
+YARD: Final = (
+    _AT_HOME.format(module="base", gateway="yard_gateway")
+    + """
+[[permission]]
+modules = ["warehouse"]
+publish = ["/**"]
+serve = ["/**"]
+"""
+)
+FLEET: Final = """
+[[permission]]
+modules = ["warehouse_gateway", "yard_gateway", "stolen_gateway"]
+publish = ["/**"]
+subscribe = ["/**"]
+call = ["/**"]
+serve = ["/**"]
+
+[[permission]]
+modules = ["yard_gateway"]
+effect = "deny"
+subscribe = ["/walled"]
+"""
+CLIENT: Final = """
+import sys, zenoh
+config = zenoh.Config()
+config.insert_json5("mode", '"client"')
+config.insert_json5("connect/endpoints", '["' + sys.argv[1] + '"]')
+if sys.argv[2:]:
+    config.insert_json5("transport/link/tls/root_ca_certificate", '"' + sys.argv[2] + '"')
+try:
+    zenoh.open(config).close()
+except zenoh.ZError:
+    sys.exit(3)
+"""
+
+
+@pytest.fixture(scope="module")
+def joined(tmp_path_factory: pytest.TempPathFactory) -> Iterator[JoinedModules]:
+    """Both sites with their modules, gateways and shells."""
+    with ExitStack() as stack:
+        lab = stack.enter_context(Lab())
+        home = tmp_path_factory.mktemp("secured")
+
+        def shell(host: Host) -> Ros:
+            return stack.enter_context(Ros(host, home, 11311))
+
+        yield join(lab, home, shell, stack, secured={"fleet": FLEET, "warehouse": WAREHOUSE, "yard": YARD})
+
+
+def sites(agent: Agent) -> dict[str, dict[str, Any]]:
+    """What ``rmpa site list`` says of each other site there."""
+    lines = agent.rmpa("site", "list", "--json")[1].splitlines()
+    reports: list[Any] = next((json.loads(line) for line in lines if line.startswith("[")), [])
+    return {str(row["name"]): row for report in reports for row in report["sites"]}
+
+
+def wait_state(agent: Agent, site: str, state: str) -> None:
+    eventually(
+        lambda: sites(agent).get(site, {}).get("state") == state,
+        LONG,
+        what=f"{site} {state} at {agent.name}",
+        every=0.3,
+    )
+
+
+def test_topics_and_a_service_cross(joined: JoinedModules) -> None:
+    arm, base = joined.arm, joined.base
+    with (
+        base.ros.node("rospy", "listener", topic="/out", count=100) as listener,
+        arm.ros.node("roscpp", "talker", "__name:=talker", topic="/out", rate=100, count=100, size=3000, wait=1),
+    ):
+        whole(listener.wait_event("done", LONG), 100)
+        assert "/rmpa/warehouse/arm/talker" in nodes(base)
+    with (
+        arm.ros.rospy("worker", service="/work", name="worker") as worker,
+        base.ros.rospy("caller", service="/work", wait=True, commands=True) as caller,
+    ):
+        worker.wait_event("up")
+        caller.wait_event("there", LONG)
+        since = caller.mark_events()
+        caller.tell("echo 0 20000 5 once")
+        done = caller.wait_event("done", LONG, since=since)
+        assert (done["ok"], done["same"], done["errors"]) == (5, 5, []), done
+
+
+def test_what_a_permission_of_the_site_denies_stays_there_and_why_says_so(joined: JoinedModules) -> None:
+    arm, base = joined.arm, joined.base
+    with (
+        arm.ros.roscpp("talker", "__name:=spy", topic="/secret", rate=50),
+        arm.ros.roscpp("talker", "__name:=open", topic="/open", rate=50),
+        base.ros.roscpp("listener", topic="/secret") as secret,
+        base.ros.roscpp("listener", topic="/open") as open_,
+    ):
+        flows(open_, 100, LONG)
+        assert all(report["count"] == 0 for report in secret.events("report"))
+        _, output = base.agent.rmpa("why", "warehouse:/secret", timeout=LONG)
+        assert "it stops at: permission there" in output, output
+        assert "change [[permission]]" in output, output
+        code, output = base.agent.rmpa("why", "warehouse:/open", timeout=LONG)
+        assert (code, "it flows" in output) == (0, True), output
+        counters = joined.warehouse.gateway.snapshot().counters
+        assert counters.get("permission.subscribe", 0) > 0, counters
+
+
+def test_what_the_router_denies_a_gateway_does_not_pass_it_and_why_says_where_to_look(joined: JoinedModules) -> None:
+    arm, base = joined.arm, joined.base
+    with (
+        arm.ros.roscpp("talker", "__name:=wall", topic="/walled", rate=50),
+        arm.ros.roscpp("talker", "__name:=open", topic="/open", rate=50),
+        base.ros.roscpp("listener", topic="/walled") as walled,
+        base.ros.roscpp("listener", topic="/open") as open_,
+    ):
+        flows(open_, 100, LONG)
+        assert all(report["count"] == 0 for report in walled.events("report"))
+        _, output = base.agent.rmpa("why", "warehouse:/walled", timeout=LONG)
+        assert "it stops at: router" in output, output
+
+
+@pytest.mark.parametrize("how", ["plain", "tls", "tls and the CA"])
+def test_a_program_without_a_certificate_gets_no_session(joined: JoinedModules, how: str) -> None:
+    endpoint = joined.net.endpoint
+    words = [endpoint.replace("tls/", "tcp/") if how == "plain" else endpoint]
+    if how == "tls and the CA":
+        words.append(str(joined.net.router.home / "state" / "fleet" / "fleet" / "trust" / "ca.crt"))
+    with Process(joined.arm.host.command([sys.executable, "-c", CLIENT, *words]), name="client") as client:
+        assert client.wait(LONG) == 3, client.output
+
+
+def test_a_gateway_with_a_certificate_of_another_mesh_is_refused_and_told(joined: JoinedModules) -> None:
+    eve = joined.net.gateway_of("eve", joined.yard.network, "eve_gateway")
+    command(eve, "trust", "init", "--name", eve.name)
+    eve.start()
+    eve.wait_ready()
+    eventually(
+        lambda: "certificates of the same mesh" in eve.process.output, LONG, what="the refusal in the log", every=0.3
+    )
+    assert "certificates of the same mesh" in eve.rmpa("site", "list")[1]
+    assert "eve" not in sites(joined.warehouse.gateway)
+    eve.terminate()
+
+
+def test_a_revoked_gateway_is_out_at_once_and_does_not_come_back(joined: JoinedModules) -> None:
+    """The router opens its session anew with another table of access; the other sites are back by themselves."""
+    stolen = joined.net.gateway_of("stolen", joined.yard.network, "stolen_gateway", YARD)
+    joined.net.join(stolen)
+    stolen.start()
+    stolen.wait_ready()
+    watcher = joined.warehouse.gateway
+    wait_state(watcher, "stolen", "joined")
+    wait_state(stolen, "warehouse", "joined")
+    with (
+        joined.base.ros.roscpp("listener", topic="/after") as listener,
+        joined.arm.ros.roscpp("talker", "__name:=after", topic="/after", rate=50),
+    ):
+        flows(listener, 20, LONG)
+        command(joined.net.router, "trust", "revoke", "stolen_gateway", "--name", "fleet")
+        wait_state(watcher, "stolen", "unreachable")
+        wait_state(stolen, "warehouse", "unreachable")
+        flows(listener, 20, LONG)
+        stolen.terminate()
+        stolen.restart()
+        wait_state(watcher, "yard", "joined")
+        assert sites(watcher)["stolen"]["state"] == "unreachable"
+        assert "warehouse" not in sites(stolen)
+    stolen.terminate()
