@@ -17,6 +17,7 @@ from lab.bench import (
     bookkeeping,
     crosstraffic,
     decision,
+    fleet,
     gateway,
     idle,
     joining,
@@ -98,6 +99,7 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
     "roscore": Measurement(
         "what it costs to follow a real roscore, and how soon changes are seen", roscore.measure, (why_no_ros,)
     ),
+    "fleet": Measurement("2 to 64 modules: start, rest, a stream beside classic ROS, losses", fleet.measure),
     "idle": Measurement("what an agent costs while nothing happens", idle.measure),
     "thousand": Measurement("a mesh of up to a thousand modules, simulated", thousand.measure, needs=()),
     "tasks": Measurement(

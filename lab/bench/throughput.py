@@ -49,7 +49,7 @@ _CORES: Final = 2
 _LOSSLESS: Final = 0.001
 """The share that may be lost for a rate to count as carried."""
 _SETTLE: Final = 1.0
-"""Seconds from the first message to the begin of a window: queues are as full as they get."""
+"""Seconds from the first message to the begin of a window, usually: queues are as full as they get."""
 _FIRST_DEADLINE: Final = 30.0
 _QUIET: Final = 20.0
 """Percent of a core that the rest of the machine may use, soft interrupts included, which count for no process."""
@@ -130,12 +130,14 @@ class FloodWay:
         there: The receiver's.
         agents: Those between them.
         transport: How messages cross where there are agents, which each window makes sure of.
+        settle: Seconds from the first message to the begin of a window.
     """
 
     here: Ros
     there: Ros
     agents: list[Agent] = field(default_factory=list)
     transport: Transport | None = None
+    settle: float = _SETTLE
 
     def window(self, bytes_each: int, seconds: float, rate: float = 0.0) -> Window:
         """Publish at ``rate`` Hz, or flat out; measure when that has settled."""
@@ -147,7 +149,7 @@ class FloodWay:
             sink.wait_event("window", _FIRST_DEADLINE, where=lambda event: int(str(event["count"])) > 0)
             if self.transport:
                 require(self.transport, [(flood, sink)])
-            time.sleep(_SETTLE)
+            time.sleep(self.settle)
             between = {f"agent {number}": agent.pid for number, agent in enumerate(self.agents, 1)}
             meter = Meter({"publisher": flood.pid, **between, "receiver": sink.pid})
             busy = _busy()

@@ -298,3 +298,42 @@ def test_the_queue_sends_news_about_four_times_log_n_times_in_all() -> None:
     sent = sum(1 for n, o in mesh.sent if n == 0 and any(x.version == 7 for x in o.packet.news))
     assert 0 < sent <= limits.NEWS_SENT_FACTOR * 2
     assert all(detector.view().news == 0 for detector in mesh.detectors)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_whatever_a_member_says_the_tables_stay_bounded(seed: int) -> None:
+    rng = random.Random(seed)
+    mesh = Mesh(6)
+    mesh.run(1)
+    detector, liar = mesh.detectors[0], mesh.identities[1]
+    for number in range(400):
+        entries = []
+        for _ in range(rng.randint(0, 20)):
+            one = rng.choice(mesh.identities)
+            known = rng.random() < 0.5
+            guid = one.guid if known else Guid.of("10.5.0.1", rng.randint(1, 65535))
+            run = one.instance[:8] if known else rng.randbytes(8)
+            state = rng.choice(list(MemberState))
+            accuser = rng.randbytes(8) if state is MemberState.SUSPECT else b""
+            entries.append(News(guid, run, state, rng.randint(0, 9), rng.randint(0, 9), accuser))
+        kind = rng.choice([SwimKind.NEWS, SwimKind.TABLE, SwimKind.SYNC])
+        packet = SwimPacket(
+            kind,
+            liar.guid,
+            liar.instance,
+            0,
+            number,
+            rng.getrandbits(64),
+            active=True,
+            news=tuple(entries),
+            buckets=tuple(rng.getrandbits(32) for _ in range(64)) if kind is SwimKind.SYNC else (),
+            wanted=rng.getrandbits(64) if kind is SwimKind.TABLE else 0,
+        )
+        detector.receive(packet, liar.guid.endpoint, mesh.now)
+        detector.events()
+        assert sum(len(o.packet.serialize()) for o in detector.outputs()) < 40_000
+        mesh.now += 0.05
+        detector.handle_timer(mesh.now)
+    assert detector.view().members <= 5
+    assert len(detector._hearsay) <= limits.MEMBERS_HEARSAY_MAX
+    assert detector.view().news <= limits.NEWS_QUEUE_MAX

@@ -87,7 +87,7 @@ def test_header_alone_limits_the_length_by_kind(kind: FrameKind) -> None:
         Frame.parse(header)
 
 
-@pytest.mark.parametrize("kind", [0, 13, 0x7F, 0xFF])
+@pytest.mark.parametrize("kind", [0, 14, 0x7F, 0xFF])
 def test_unknown_kinds(kind: int) -> None:
     with pytest.raises(RemoteProtocolError, match="unknown kind"):
         Frame.parse(bytes([0, 0, 0, 0, kind, 3]) + bytes(18))

@@ -10,7 +10,7 @@ import pytest
 
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionRole, ConnectionState
-from rmpa.mesh.connection_events import ConnectionClosed
+from rmpa.mesh.connection_events import ConnectionClosed, PongReceived
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Feature, Hello
 from tests.mesh.worlds import HIGH, LOW, Side, Time, deliver, exchange, pair, pass_time, side
@@ -70,6 +70,25 @@ def test_silence_at_rest_ends_the_link_by_the_longer_lease() -> None:
     assert dialler.link.state is ConnectionState.UP
     pass_time(dialler.link, time, 0.02)
     assert dialler.last() == ConnectionClosed("high was silent for its lease of 16 s", orderly=False)
+
+
+@pytest.mark.parametrize("who", [0, 1])
+def test_the_clock_is_measured_anew_as_soon_as_a_rest_ends(who: int) -> None:
+    time = Time()
+    both = pair(time)
+    rest(*both, time)
+    run(*both, time, 604.0)
+    heard = {each.link: len(each.events) for each in both}
+    stale = [each.link.clock.estimate(time.now) for each in both]
+    both[who].link.need(time.now, needed=True)
+    run(*both, time, 0.2)
+    for each, before in zip(both, stale, strict=True):
+        now = each.link.clock.estimate(time.now)
+        assert now is not None
+        assert before is not None
+        assert now[1] < before[1] / 3, "the old one is of seconds ago"
+        pongs = [event for event in each.events[heard[each.link] :] if isinstance(event, PongReceived)]
+        assert len(pongs) >= limits.WAKE_PINGS, "one of several is quick even on a busy path"
 
 
 @pytest.mark.parametrize("who", [0, 1])

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import URGENT, Outbox
 from rmpa.core.sizes import KIB, MIB
-from rmpa.runtime.corking import CollectedSends
+from rmpa.runtime.corking import CollectedSends, after_read
 from rmpa.runtime.stream import Stream
 
 if TYPE_CHECKING:
@@ -311,6 +311,18 @@ async def test_messages_that_are_collected_leave_in_one_call(sockets: Sockets) -
     assert len(target.calls) == 2
     one.stream.close()
     end.stream.close()
+
+
+def test_what_is_left_for_the_end_of_a_read_is_called_once_there_also_of_one_within_another() -> None:
+    called: list[str] = []
+    after_read(lambda: called.append("no read"))
+    assert called == ["no read"]
+    with CollectedSends():
+        after_read(lambda: called.append("outer"))
+        with CollectedSends():
+            after_read(lambda: called.append("inner"))
+        assert called == ["no read", "inner"]
+    assert called == ["no read", "inner", "outer"]
 
 
 async def test_batches_keep_order_and_bytes_through_full_buffers(sockets: Sockets) -> None:

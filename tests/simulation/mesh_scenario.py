@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rmpa.mesh.io.connection import Connection
+    from rmpa.mesh.io.link import PeerLink
     from tests.simulation.sockets import SimSocket
 
 _MANY = 10
@@ -35,6 +36,8 @@ class MeshScenario(Scenario):
     """
 
     kind = "mesh"
+    bulk_unused = 3600.0
+    """Seconds after which an unused bulk lane ends; every link wants one when it comes up."""
 
     def __init__(
         self, seed: int, count: int, *, keep: bool = False, calm: bool = False, make_peer: type[MeshPeer] = MeshPeer
@@ -58,6 +61,7 @@ class MeshScenario(Scenario):
         slower = _SLOWER if self.count > _MANY else 1
         with (
             mock.patch("rmpa.mesh.io.mesh.unacknowledged", lambda sock: sock.in_flight),
+            mock.patch("rmpa.mesh.io.link.unacknowledged", lambda sock: sock.in_flight),
             mock.patch("rmpa.runtime.acceptor.Acceptor._has_room", return_value=True),
             mock.patch.multiple(
                 limits,
@@ -66,6 +70,7 @@ class MeshScenario(Scenario):
                 CLOCK_INTERVAL=slower * limits.CLOCK_INTERVAL,
                 BULK_LEASE=slower * limits.BULK_LEASE,
                 GHOST_QUIET=slower * limits.GHOST_QUIET,
+                BULK_UNUSED=self.bulk_unused,
             ),
         ):
             yield
@@ -102,14 +107,17 @@ class MeshScenario(Scenario):
         for peer in living.values():
             assert not any(process.failures for process in peer.processes), [p.failures for p in peer.processes]
             others = sorted(living.keys() - {peer.identity.instance})
-            for bulk in (False, True):
-                up = [c for c in peer.mesh.connections() if c.up and (c.lane == Lane.BULK) == bulk]
-                found = sorted(connection.identity.instance for connection in up)
-                assert found == others, f"{peer.name}, bulk {bulk}: {self._names(found)}"
-            assert len(peer.mesh.connections()) == 2 * len(others), f"{peer.name} has connections that are not up"
+            self._check_connections(peer, others)
             for other in (living[instance] for instance in others):
                 self._check_pair(peer, other)
             assert all(view.linked for view in peer.roster.peers()), f"{peer.name}'s roster does not know its links"
+
+    def _check_connections(self, peer: MeshPeer, others: list[bytes]) -> None:
+        for bulk in (False, True):
+            up = [c for c in peer.mesh.connections() if c.up and (c.lane == Lane.BULK) == bulk]
+            found = sorted(connection.identity.instance for connection in up)
+            assert found == others, f"{peer.name}, bulk {bulk}: {self._names(found)}"
+        assert len(peer.mesh.connections()) == 2 * len(others), f"{peer.name} has connections that are not up"
 
     def _check_pair(self, peer: MeshPeer, other: MeshPeer) -> None:
         link, twin = peer.mesh.link(other.identity.guid), other.mesh.link(peer.identity.guid)
@@ -118,6 +126,9 @@ class MeshScenario(Scenario):
         assert socket_of(link.connection).other is socket_of(twin.connection), (
             f"{peer.name} and {other.name} mean different links"
         )
+        self._check_bulk(peer, other, link, twin)
+
+    def _check_bulk(self, peer: MeshPeer, other: MeshPeer, link: PeerLink, twin: PeerLink) -> None:
         bulk, bulk_twin = link.bulk_connection, twin.bulk_connection
         assert bulk is not None, f"{peer.name} has no bulk lane to {other.name}"
         assert bulk_twin is not None, f"{other.name} has no bulk lane to {peer.name}"

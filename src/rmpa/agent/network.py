@@ -18,11 +18,12 @@ from rmpa.core.identity import Identity
 from rmpa.discovery.events import PeerChanged, PeerConflict, PeerFound, PeerLost, PeerRestarted
 from rmpa.discovery.io.discovery import Discovery
 from rmpa.discovery.io.interfaces import choose, further_addresses, list_interfaces, pick_address
-from rmpa.discovery.swim_events import MemberSuspected
+from rmpa.discovery.swim_events import MemberOffers, MemberSuspected
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.handshake import Feature
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
+from rmpa.mesh.mode import MeshMode
 from rmpa.mesh.peering_events import LinkDown, LinkDownCause
 from rmpa.runtime.sockets import open_mesh_port
 from rmpa.runtime.system_clock import SystemClock
@@ -86,6 +87,11 @@ class NetworkEndpoint:
             further_addresses(usable, address),
         )
         bridge.place(self.identity)
+        self.mode = MeshMode(settings.links, settings.full_mesh_up_to)
+        """Whether all peers stay linked, or those that something depends on."""
+        self._members: set[Guid] = set()
+        sessions.may_park, sessions.on_want = self._may_park, self._want
+        sessions.offers.on_version = self._offers
         self.mesh = Mesh(
             self.identity,
             tcp,
@@ -109,10 +115,14 @@ class NetworkEndpoint:
             trust=trust.membership.packets if trust is not None else None,
         )
         self._udp = udp
+        self._on_denied = trust.membership.on_denied if trust is not None else []
+        self._on_denied.append(self._denied)
 
     async def start(self) -> None:
         """Accept links, then send beacons."""
         await self.mesh.start()
+        self.discovery.set_demand(on=self.mode.demand)
+        self.discovery.set_version(self._bridge.sessions.offers.version)
         await self.discovery.start()
         _log.info("= %s, domain %d, is on the air", self.identity, self.identity.domain)
 
@@ -120,22 +130,60 @@ class NetworkEndpoint:
         """Send the goodbye, and close the links in order."""
         await self.discovery.close()
         self._udp.close()
+        self._on_denied.remove(self._denied)
+        self._bridge.sessions.leave()
         await self.mesh.close()
+
+    def _count(self, guid: Guid, *, present: bool) -> None:
+        """Take in that a peer has become a member, or is none any more; the number decides on the mode."""
+        (self._members.add if present else self._members.discard)(guid)
+        if self.mode.count(1 + len(self._members)):
+            _log.info("= %s", self.mode)
+            self.discovery.set_demand(on=self.mode.demand)
+            if not self.mode.demand:
+                self.mesh.unpark(len(self._members) / mesh_limits.UNPARK_RATE)
+
+    def _may_park(self, link: PeerLink) -> bool:
+        """Whether this agent would do without a link that nothing needs; a relay must hear of changes at once."""
+        relays = self._settings.relay or self._settings.gateway.site != ""
+        watched = self.discovery.member(link.guid, link.identity.instance) is not None
+        return self.mode.demand and not relays and watched
+
+    def _denied(self) -> None:
+        """End the sessions of parked peers that are revoked; the mesh ends the links of the others."""
+        for session in list(self._bridge.sessions.reachable()):
+            last = session.link.connection
+            if session.linked or last.remote is None:
+                continue
+            if self.mesh.connection_prove(last, last.remote) is not None:
+                self._bridge.sessions.lost(session.link.identity)
+
+    def _want(self, guid: Guid) -> None:
+        self.mesh.want(guid)
+
+    def _offers(self, version: int) -> None:
+        self.discovery.set_version(version)
 
     def _event(self, event: Event) -> None:
         match event:
             case PeerFound(identity=identity, source=source):
                 _log.info("+ %s found", identity)
+                self._count(identity.guid, present=True)
                 self.mesh.peer_found(identity, source[0] if source else None)
             case PeerChanged(identity=identity):
                 self.mesh.peer_found(identity)
             case PeerRestarted(identity=identity, previous=previous, source=source):
                 _log.info("+ %s restarted, it was %s", identity, previous.guid)
+                self._count(previous.guid, present=False)
+                self._count(identity.guid, present=True)
+                self._bridge.sessions.lost(previous)
                 self.mesh.peer_gone(previous.guid)
                 self.mesh.peer_found(identity, source[0] if source else None)
             case PeerLost(identity=identity, reason=reason):
                 _log.info("- %s %s", identity, reason.value)
+                self._count(identity.guid, present=False)
                 self.mesh.peer_gone(identity.guid)
+                self._bridge.sessions.lost(identity)
             case PeerConflict():
                 pass  # discovery has logged the error, at a bounded rate
 
@@ -146,6 +194,8 @@ class NetworkEndpoint:
                 link = self.mesh.link(guid)
                 if link is not None:
                     link.touch()  # a link at rest would notice after many seconds whether the peer is there
+            case MemberOffers(guid=guid, instance=instance, version=version):
+                self._bridge.sessions.offers.heard(guid, instance, version, 1 + len(self._members))
             case _:
                 pass
 

@@ -6,6 +6,7 @@ import asyncio
 import base64
 import logging
 import os
+import random
 import time
 from typing import TYPE_CHECKING, Any, Final
 
@@ -175,7 +176,7 @@ class AgentTrust(Part):
         """The state, as ``rmpa trust status`` and the snapshot show it."""
         from rmpa.trust.io.status import status_of  # noqa: PLC0415
 
-        linked = {session.link.name for session in self._bridge.sessions.linked()}
+        linked = {session.link.name for session in self._bridge.sessions.reachable()}
         return status_of(
             self.membership, self.authority, agent="secured", linked=linked, authority_name=self.authority_name()
         )
@@ -191,6 +192,11 @@ class AgentTrust(Part):
     def link_down(self, session: PeerSession) -> None:
         """Forget what the peer has."""
         self._spreading.link_down(session.peer)
+        if self._authority_peer is session and not session.reachable:
+            self._authority_peer = None
+
+    def gone(self, session: PeerSession) -> None:
+        """Forget that the peer was the authority's module."""
         if self._authority_peer is session:
             self._authority_peer = None
 
@@ -220,7 +226,10 @@ class AgentTrust(Part):
             self.spread()
 
     def spread(self) -> None:
-        """Send newer documents to all that lack them."""
+        """Send newer documents to all that lack them; some of the parked peers are linked, which do the same."""
+        parked = [session for session in self._bridge.sessions.reachable() if not session.linked]
+        for session in random.sample(parked, min(len(parked), limits.SPREAD_PARKED)):
+            self._bridge.sessions.want(session)
         sessions = {session.peer: session for session in self._bridge.sessions.linked()}
         for peer, kinds in self._spreading.changed():
             if peer in sessions:
@@ -285,7 +294,7 @@ class AgentTrust(Part):
         """
         if self.authority is not None:
             self.authority.renew_own()
-        elif self._authority_peer is not None and self._authority_peer.linked:
+        elif self._authority_peer is not None and self._authority_peer.reachable:
             await self._renew_by_link(self._authority_peer)
         else:
             await self._renew_by_dial()
@@ -335,7 +344,7 @@ class AgentTrust(Part):
         return self._authority_peer.link.name if self._authority_peer is not None else ""
 
     def _is_linked(self, name: str) -> bool:
-        names = (self.membership.name, *(session.link.name for session in self._bridge.sessions.linked()))
+        names = (self.membership.name, *(session.link.name for session in self._bridge.sessions.reachable()))
         return name.casefold() in {each.casefold() for each in names}
 
 

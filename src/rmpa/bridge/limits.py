@@ -39,6 +39,8 @@ as soon as there is room. Further ones are only counted, and can be shown after 
 ADVERTISED_MAX: Final = 16_384
 """Topics or services in one advertisement of a peer, else it is refused; this module's have at most
 ``ADVERTISED_AT_ONCE``."""
+SHARED_STRINGS: Final = 8192
+"""Names of nodes and types of peers that are remembered to keep each once: 1,000 modules have a few kinds of both."""
 MISMATCHES_MAX: Final = 16
 """Refused subscribers of one source that are remembered, to show them to the user."""
 RELAY_HOPS_MAX: Final = 4
@@ -112,6 +114,8 @@ CALL_BACK_DELAYS: Final = (0.05, 1.0)
 slow subscribers."""
 RECONCILE_INTERVAL: Final = 5.0
 """Seconds between two comparisons of the plan with what is really open, so that nothing stays stuck."""
+RECONCILE_SKIPS: Final = 11
+"""Comparisons in a row that leave out names while the local graph has not changed: all are compared once a minute."""
 WATCH_RECENT: Final = 16
 """The latest events of a topic's contract that are remembered, to show them to the user; the counts include all
 others."""
@@ -187,3 +191,11 @@ DIRECT_LOOK: Final = 0.02
 # --- permissions ----------------------------------------------------------------------------------------------
 REFUSALS_LOGGED: Final = 1024
 """Refusals (module, kind of access and rule) that are known to be logged; then all are forgotten and logged again."""
+
+# --- parked peers ---------------------------------------------------------------------------------------------
+UNSENT_MAX: Final = 64
+"""Notifications that wait for the link to a parked peer; it stands within a round trip, or the peer is away."""
+REFRESH_RATE: Final = 100.0
+"""Links a second that all modules together make to a parked peer that offers something new."""
+REFRESH_MAX: Final = 5.0
+"""The longest delay of such a link, whatever the number of modules."""

@@ -22,9 +22,16 @@ from rmpa.observe.snapshot import PingReply
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rmpa.observe.snapshot import PeerInfo, ProbesInfo, RouteInfo, Snapshot, TopicInfo
+    from rmpa.observe.snapshot import LaneInfo, PeerInfo, ProbesInfo, RouteInfo, Snapshot, TopicInfo
 
-_COLOURS: Final = {"linked": "green", "relayed": "green", "linking": "yellow", "refused": "red", "conflict": "red"}
+_COLOURS: Final = {
+    "linked": "green",
+    "relayed": "green",
+    "parked": "green",
+    "linking": "yellow",
+    "refused": "red",
+    "conflict": "red",
+}
 _USUAL: Final = frozenset({"linked", "relayed", "parked"})
 """States that are no problem."""
 _COLUMNS: Final = tuple(
@@ -35,6 +42,8 @@ _ROUTES: Final = (
     *map(Column, ("  TOPIC", "TYPE", "NODE", "ROUTE")),
     *(Column(title, right=True) for title in ("MESSAGES", "RATE", "LATENCY", "P99", "LOST")),
 )
+
+_AT_REST = "at rest: nothing depends on the link, and its silence is noticed after 16 s"
 
 
 def connect(agent: str | None) -> ControlClient:
@@ -63,6 +72,8 @@ def list_(
 ) -> None:
     """List the peers, all or those with names like PATTERN, and how their links are.
 
+    A link is "at rest" while nothing depends on it: its silence is then noticed after 16 s in place of 1 s.
+
     CLOCK is the peer's wall clock less ours, with the bound of its error. Of very many peers a terminal shows a
     summary and the first ones: those with a problem, then those with most traffic.
     """
@@ -86,6 +97,8 @@ def list_(
         shown = selection.shown(peers)
         print_table(_COLUMNS, [_row(p) for p in shown], colours=[_COLOURS.get(p.state, "") for p in shown])
         selection.print_rest(peers, "peers", "rmpa peer list 'arm*', --state linked")
+    if snapshot.agent.links.startswith("links on demand"):
+        click.echo(f"{snapshot.agent.name} keeps {snapshot.agent.links}")
     troubles = _troubles(snapshot, peers)
     told = selection.shown(troubles)
     for trouble in told:
@@ -111,7 +124,7 @@ def _row(info: PeerInfo) -> list[str]:
     clock = "-" if link.clock_offset is None else f"{duration(link.clock_offset)} ±{duration(link.clock_error)}"
     return [
         info.name,
-        info.state,
+        f"{info.state}, at rest" if link.rests else info.state,
         duration(info.since_ago),
         link.remote,
         "by us" if link.dialled else "by it",
@@ -131,7 +144,7 @@ def _troubles(snapshot: Snapshot, peers: Sequence[PeerInfo]) -> list[str]:
         found += [bound.text for bound in info.beyond]
         if info.link is not None and info.link.path_problem:
             found.append(f"{info.name}: {info.link.path_problem}; {info.link.path_remedy}")
-        if info.last_error and info.state not in {"linked", "relayed"}:
+        if info.last_error and info.state not in {"linked", "relayed", "parked"}:
             again = "" if info.next_attempt is None else f"; next attempt in {duration(info.next_attempt)}"
             found.append(f"{info.name}: {info.last_error}{again}")
     return found
@@ -194,6 +207,12 @@ def _route_row(topic: TopicInfo, route: RouteInfo) -> list[str]:
     ]
 
 
+def _lane_state(lane: LaneInfo) -> str:
+    if lane.connected:
+        return "connected"
+    return "connected when a message wants it" if lane.unneeded else "no connection"
+
+
 def _facts(info: PeerInfo) -> list[tuple[str, str]]:
     if info.via:
         topics = f"{info.topics_in} topics that it publishes"
@@ -214,6 +233,8 @@ def _facts(info: PeerInfo) -> list[tuple[str, str]]:
         clock = "-" if link.clock_offset is None else f"{duration(link.clock_offset)} ± {duration(link.clock_error)}"
         facts += [
             ("Link", f"{link.remote}, {who}, up for {duration(link.up_ago)}, heard {duration(link.heard_ago)} ago"),
+            ("Pace", _AT_REST if link.rests else "in use: its silence is noticed within 1 s"),
+            *(("Lane", f"{lane.name}: {_lane_state(lane)}") for lane in link.lanes),
             ("Round trip", duration(link.rtt)),
             ("Clock", f"{clock} (its clock less ours)"),
             ("Traffic", f"{size(link.bytes_in)} in, {size(link.bytes_out)} out, {size(link.queued)} queued"),

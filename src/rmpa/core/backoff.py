@@ -17,6 +17,8 @@ class Backoff:
         rng: Uniform numbers in [0, 1); seeded by simulations.
     """
 
+    __slots__ = ("_first", "_next", "_rng", "cap")
+
     def __init__(self, first: float, cap: float, rng: Callable[[], float]) -> None:
         self._first = first
         self.cap = cap

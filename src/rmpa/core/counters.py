@@ -29,6 +29,17 @@ class Counters:
         return dict(sorted(self._counts.items()))
 
 
+class _RefusalMemory:
+    """When a refusal of each kind was logged last, and the lines of each name."""
+
+    __slots__ = ("last", "lines")
+
+    def __init__(self) -> None:
+        self.last: OrderedDict[tuple[str, str], tuple[float, int]] = OrderedDict()
+        # By name: the start of the interval, the lines written in it, and the lines suppressed in it.
+        self.lines: dict[str, tuple[float, int, int]] = {}
+
+
 class RefusalLog:
     """Counts each refusal, and logs each kind (name and address) at most once in ``limits.LOG_INTERVAL`` seconds.
 
@@ -39,12 +50,12 @@ class RefusalLog:
         counters: Counts every refusal, logged or not.
     """
 
+    __slots__ = ("_counters", "_logger", "_memory")
+
     def __init__(self, logger: logging.Logger, counters: Counters) -> None:
         self._logger = logger
         self._counters = counters
-        self._last: OrderedDict[tuple[str, str], tuple[float, int]] = OrderedDict()
-        # By name: the start of the interval, the lines written in it, and the lines suppressed in it.
-        self._lines: dict[str, tuple[float, int, int]] = {}
+        self._memory: _RefusalMemory | None = None
 
     def count(self, name: str) -> None:
         """Count ``name`` without a line in the log."""
@@ -60,23 +71,25 @@ class RefusalLog:
             text: What happened and what to do, for the user.
         """
         self._counters.add(name)
-        kind = (name, who)
-        last, suppressed = self._last.get(kind, (float("-inf"), 0))
+        if self._memory is None:  # most logs of an agent with thousands of proxies never have a line
+            self._memory = _RefusalMemory()
+        memory, kind = self._memory, (name, who)
+        last, suppressed = memory.last.get(kind, (float("-inf"), 0))
         if now - last < limits.LOG_INTERVAL:
-            self._last[kind] = (last, suppressed + 1)
+            memory.last[kind] = (last, suppressed + 1)
             return
-        since, lines, hidden = self._lines.get(name, (now, 0, 0))
+        since, lines, hidden = memory.lines.get(name, (now, 0, 0))
         if now - since >= limits.LOG_INTERVAL:
             since, lines = now, 0
         if lines >= limits.LOG_LINES_MAX:
-            self._lines[name] = (since, lines, hidden + 1)
+            memory.lines[name] = (since, lines, hidden + 1)
             return
-        self._lines[name] = (since, lines + 1, 0)
+        memory.lines[name] = (since, lines + 1, 0)
         suppressed += hidden
-        self._last[kind] = (now, 0)
-        self._last.move_to_end(kind)
-        if len(self._last) > limits.LOG_KINDS_MAX:
-            self._last.popitem(last=False)
+        memory.last[kind] = (now, 0)
+        memory.last.move_to_end(kind)
+        if len(memory.last) > limits.LOG_KINDS_MAX:
+            memory.last.popitem(last=False)
         if suppressed:
             self._logger.warning("! %s (%d more like this since the last line)", text, suppressed)
         else:

@@ -524,13 +524,12 @@ class MembershipProtocol:
         deaf = not multicast and now - peer.multicast_at <= peer.silence
         if not (unknown or deaf or beacon.kind is BeaconKind.ANNOUNCE):
             return
-        members = len(self._endpoints.present())
-        if not (multicast and self._multicast and is_many(members)):
+        if not (multicast and self._multicast and is_many(self.members)):
             self._send_answer(peer, now)
         elif self._burst:
             self.counters.add("beacon.answer_spared")  # the next beacon of this agent's own burst tells the sender
         else:
-            self._late_answers.add(peer.identity.guid.place, members, now)
+            self._late_answers.add(peer.identity.guid.place, self.members, now)
 
     def _send_late_answers(self, now: float) -> None:
         """Answer the newcomers of a large mesh that got no link meanwhile."""

@@ -33,15 +33,16 @@ class NewsQueue:
         member = (news.guid.place, news.run)
         if news.state is MemberState.SUSPECT:
             self._remove((*member, b""))
-            self._accused.setdefault(member, set()).add(news.accuser)
         else:
-            for accuser in self._accused.pop(member, ()):
+            for accuser in tuple(self._accused.get(member, ())):
                 self._remove((*member, accuser))
         key = (*member, news.accuser)
         self._remove(key)
         if len(self._news) >= limits.NEWS_QUEUE_MAX:
             most = next(keys for keys in reversed(self._by_sent) if keys)
             self._remove(next(iter(most)))
+        if news.accuser:
+            self._accused.setdefault(member, set()).add(news.accuser)
         self._news[key] = news
         self._sent[key] = 0
         self._by_sent[0][key] = None

@@ -106,6 +106,7 @@ _WHEN_UP: Final[frozenset[int]] = frozenset(
         FrameKind.FENCE,
         FrameKind.FENCED,
         FrameKind.PACE,
+        FrameKind.LANE,
     }
 )
 _ALLOWED: Final[Mapping[tuple[ConnectionRole, ConnectionState], frozenset[int]]] = MappingProxyType(
@@ -441,7 +442,7 @@ class ConnectionProtocol:
         elif kind is FrameKind.PACE:
             lease = min(max(sequence / 1000, limits.LINK_LEASE_MIN), limits.LINK_LEASE_MAX)
             self._paced(lease, route, now)
-        elif kind in {FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED}:
+        elif kind in {FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED, FrameKind.LANE}:
             self.on_event(MarkReceived(kind, route, sequence))
         elif kind is FrameKind.BYE:
             if route == frames.BYE_PARKED and self._parting.holding:

@@ -86,11 +86,11 @@ class ConnectionClosed:
 
 @dataclass(frozen=True, slots=True)
 class MarkReceived:
-    """An acknowledgement, a fence or the answer to a fence was received.
+    """An acknowledgement, a fence, the answer to a fence, or a word about the bulk lane was received.
 
     Args:
-        kind: ``ACK``, ``FENCE`` or ``FENCED``.
-        route: The id of the route.
+        kind: ``ACK``, ``FENCE``, ``FENCED`` or ``LANE``.
+        route: The id of the route; for ``LANE`` a ``LaneWord``.
         sequence: For ``ACK`` the last message that arrived; otherwise the fence's number.
     """
 

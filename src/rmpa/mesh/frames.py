@@ -51,6 +51,7 @@ class FrameKind(IntEnum):
     FENCE = 10
     FENCED = 11
     PACE = 12
+    LANE = 13
 
 
 BYE_PARKED: Final = 1
@@ -68,6 +69,17 @@ class PaceFlag(IntFlag):
     """The dialler asks to end the link for now; the acceptor agrees, and holds back what it would send."""
 
 
+class LaneWord(IntEnum):
+    """What the route field of a lane frame says about the link's bulk lane; see ``mesh.lane_demand``."""
+
+    WANT = 1
+    """Acceptor: dial it."""
+    LEAVE = 2
+    """Dialler: it is not used here; end its connection, or answer KEEP."""
+    KEEP = 3
+    """Acceptor: it is used here."""
+
+
 PAYLOAD_MAX: Final[Mapping[int, int]] = MappingProxyType(
     {
         FrameKind.HELLO: limits.HELLO_PAYLOAD_MAX,
@@ -82,6 +94,7 @@ PAYLOAD_MAX: Final[Mapping[int, int]] = MappingProxyType(
         FrameKind.FENCE: 0,
         FrameKind.FENCED: 0,
         FrameKind.PACE: 0,
+        FrameKind.LANE: 0,
     }
 )
 """The most bytes of payload that a frame of each kind may claim."""

@@ -26,6 +26,7 @@ class Keepalive:
     __slots__ = (
         "_acceptor",
         "_asked",
+        "_burst",
         "_excused",
         "_excused_at",
         "_interval",
@@ -56,6 +57,8 @@ class Keepalive:
         self._pinged = self._up_at = now
         self._remote_lease = limits.EXPRESS_LEASE
         self._excused = self._excused_at = 0.0
+        self._burst = 0
+        """Pings that still follow each other closely."""
         self._asked: float | None = None
         """When this side began to need a link at rest, while the remote side's promise has not come."""
 
@@ -76,6 +79,8 @@ class Keepalive:
             self._hold(self._short, self._short * limits.KEEPALIVE_INTERVAL / limits.EXPRESS_LEASE)
         else:
             self._hold(limits.IDLE_LEASE, limits.IDLE_KEEPALIVE_INTERVAL)
+        if self.lease < before:
+            self._burst = limits.WAKE_PINGS  # the estimate of the remote clock is as old as the rest
         return self.lease != before
 
     def ask(self, now: float) -> None:
@@ -110,6 +115,7 @@ class Keepalive:
     def pinged(self, now: float) -> None:
         """Record that a ping was sent."""
         self.sent = self._pinged = now
+        self._burst = max(0, self._burst - 1)
 
     @property
     def due(self) -> float:
@@ -120,7 +126,9 @@ class Keepalive:
         peer is gone, so its interval stays below ``quiet_after``.
         """
         next_ping = self.sent + self._interval
-        if not self.rests:
+        if self._burst:
+            next_ping = self._pinged + limits.WAKE_PING_INTERVAL
+        elif not self.rests:
             next_ping = min(next_ping, self._pinged + limits.CLOCK_INTERVAL)
         return min(self.lease_end, next_ping)
 

@@ -23,6 +23,11 @@ IDLE_LEASE: Final = 16.0
 costs a twentieth of the packets. Both ends agree on it; an earlier release never does."""
 IDLE_KEEPALIVE_INTERVAL: Final = 5.0
 """Interval of the keepalives of a link at rest: two of them may be late before the link falls."""
+WAKE_PINGS: Final = 5
+"""Pings that follow each other when a link's rest ends: the best of them gives the latency of the first messages an
+exact clock."""
+WAKE_PING_INTERVAL: Final = 0.02
+"""Interval of these pings."""
 REST_AFTER: Final = 5.0
 """A link rests when nothing has depended on it for this long, so that a short pause of use changes nothing."""
 PARK_AFTER: Final = 10.0
@@ -31,6 +36,9 @@ takes one round trip and the exchange of both catalogues, so a function that is 
 WANT_GRACE: Final = 5.0
 """How long a parked peer may be dialled in vain, once something needs it, before it counts as lost: more than two
 rounds over all of its addresses (DIAL_TIMEOUT)."""
+UNPARK_RATE: Final = 100.0
+"""Parked peers that are dialled a second where the mesh has become small enough for all links, and where many peers
+have changed what they offer: each takes a millisecond at both sides."""
 FULL_MESH_AGAIN: Final = 0.75
 """The share of ``mesh.full_mesh_up_to`` below which all links are made again: a quarter of the modules may come and
 go without a change of the mode."""
@@ -87,6 +95,9 @@ STALE_HOLD: Final = 0.03
 """How long a stale message waits for a newer one; if none arrives, it is delivered after this time."""
 BULK_LEASE: Final = 4.0
 """A bulk lane on which no byte arrived for this long is dead; a dead peer shows much sooner by the express lane."""
+BULK_UNUSED: Final = 30.0
+"""A bulk lane ends when neither side has sent data on it for this long; the next message that wants it waits for two
+round trips, and two more in a secured mesh."""
 BULK_UNSENT_BYTES: Final = 16 * KIB
 """Unsent bytes of the bulk lane that the kernel may hold (TCP_NOTSENT_LOWAT). Together with SO_PRIORITY it holds the
 p99 latency of commands during image transfers at 0.4 ms instead of 79 ms on 100 Mbit/s."""

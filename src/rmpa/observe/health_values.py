@@ -48,6 +48,7 @@ def link_values(info: PeerInfo) -> dict[str, str]:
         known |= {
             "up (s)": number(link.up_ago),
             "heard (ms ago)": number(link.heard_ago, 1e3),
+            "pace": "at rest" if link.rests else "in use",
             "round trip (ms)": number(link.rtt, 1e3),
             "clock offset (ms)": number(link.clock_offset, 1e3),
             "clock error (± ms)": number(link.clock_error, 1e3),

@@ -73,6 +73,7 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
         rss: Resident memory, bytes.
         addresses: Its numeric IPv4 addresses, best first.
         interfaces: The interfaces that beacons go out on.
+        links: Whether all peers stay linked or those in use, and why, ready to read: ``full mesh (3 modules, …)``.
         config_file: Where its settings were read, or empty.
         realtime: The outcome of each request of ``--realtime``, ready to read; empty without it.
         files: Its file descriptors.
@@ -99,6 +100,7 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
     rss: int | None = None
     addresses: tuple[str, ...] = ()
     interfaces: tuple[str, ...] = ()
+    links: str = ""
     config_file: str = ""
     realtime: tuple[str, ...] = ()
     files: FilesInfo | None = None
@@ -116,6 +118,7 @@ class LaneInfo(msgspec.Struct, kw_only=True, frozen=True):
     Attributes:
         name: ``express`` (control and small messages) or ``bulk`` (large ones).
         connected: Whether it has its TCP connection; messages for a lane without one wait.
+        unneeded: Whether it has none because nothing was sent on it for a while; the next message dials it.
         bytes_in: Bytes that its present connection has received.
         bytes_out: Bytes that its present connection has sent.
         queued: Bytes that wait in its send queue.
@@ -124,6 +127,7 @@ class LaneInfo(msgspec.Struct, kw_only=True, frozen=True):
 
     name: str
     connected: bool
+    unneeded: bool = False
     bytes_in: int = 0
     bytes_out: int = 0
     queued: int = 0
@@ -145,6 +149,8 @@ class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
         queued: Bytes in its send queues.
         dropped: Messages dropped because the link was too slow.
         heard_ago: Seconds since anything arrived.
+        rests: Whether the link is at rest: nothing depends on it, keepalives come every 5 s, silence is noticed after
+            16 s.
         packet: Bytes of the largest packets that are sent, headers included.
         path_problem: What is wrong with the network path, ready to read; empty if nothing is known.
         path_remedy: What to do about that.
@@ -162,6 +168,7 @@ class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
     queued: int = 0
     dropped: int = 0
     heard_ago: float | None = None
+    rests: bool = False
     packet: int | None = None
     path_problem: str = ""
     path_remedy: str = ""
@@ -214,7 +221,7 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
         addresses: Where it can be reached, best first.
         state: ``linked``; ``linking`` (dialling, or waiting to be dialled); ``refused`` (by either side);
             ``conflict`` (shares a GUID or a name with another); ``relayed`` (has no link; another peer relays its
-            topics).
+            topics); ``parked`` (both sides ended the link, as nothing needed it; it is made again on demand).
         since_ago: Seconds since it came into this state.
         found_ago: Seconds since it was found.
         beacon_ago: Seconds since its last beacon.

@@ -11,8 +11,9 @@ Two alternatives were measured and rejected. If collection waits until the loop 
 leave garbage for a pause of 6 ms. If only the timer collects, a thousand topics that register at once leave, within
 20 ms, garbage for a pause of 10 ms; therefore the check also runs at the yields of long work.
 
-Old objects that become garbage are only found by a full collection, which scans all objects made since the start. It
-waits until no data flows, unless the heap has grown too much.
+Old objects that become garbage are only found by a full collection. It waits until no data flows, unless the heap has
+grown too much. What survives it is frozen too, so that its time depends on what came since and not on the size of the
+graph: to scan all objects of 1,000 peers takes 0.25 s. Only when the heap has doubled all objects are scanned once.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import logging
 import sys
 import time
 from enum import Enum, auto
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rmpa.runtime import limits
 from rmpa.runtime.coarse_timer import call_at_tick
@@ -35,6 +36,9 @@ if TYPE_CHECKING:
     from rmpa.core.counters import Counters
 
 _log = logging.getLogger(__name__)
+
+_THOROUGH_GROWTH: Final = 2
+"""The heap grows by this factor between two full collections that scan all objects."""
 
 
 class Collection(Enum):
@@ -73,6 +77,7 @@ class GarbageCollector:
         self._timer: asyncio.TimerHandle | None = None
         self._enabled = False
         self._heap_blocks = 0
+        self._thorough_at = 0
         self._young = 0
         self._rests = False
         """Whether the next check is a rare one."""
@@ -89,6 +94,7 @@ class GarbageCollector:
         gc.disable()
         gc.freeze()
         self._heap_blocks = sys.getallocatedblocks()
+        self._thorough_at = _THOROUGH_GROWTH * self._heap_blocks
         self._last_check = self._now()
         self._loop = asyncio.get_running_loop()
         if isinstance(self._loop, AgentLoop):
@@ -150,7 +156,12 @@ class GarbageCollector:
 
     def _collect(self, collection: Collection) -> None:
         begin = time.perf_counter()
+        thorough = collection is Collection.FULL and sys.getallocatedblocks() >= self._thorough_at
+        if thorough:
+            gc.unfreeze()
         found = gc.collect(0 if collection is Collection.YOUNG else 2)
+        if collection is Collection.FULL:
+            gc.freeze()
         pause = time.perf_counter() - begin
         self.longest_pause = max(self.longest_pause, pause)
         if collection is Collection.YOUNG:
@@ -159,6 +170,8 @@ class GarbageCollector:
             return
         self._counters.add("collector.full")
         before, self._heap_blocks = self._heap_blocks, sys.getallocatedblocks()
+        if thorough:
+            self._thorough_at = _THOROUGH_GROWTH * self._heap_blocks
         _log.info(
             "= collected %d objects of all ages in %.1f ms; the heap has %d blocks, %+d since the last time",
             found,

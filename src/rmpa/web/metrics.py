@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from rmpa.observe.snapshot import LinkInfo, PeerInfo, RouteInfo, SampleSpread, ServiceInfo, Snapshot
 
-PEER_STATES: Final = ("linked", "linking", "refused", "conflict", "relayed")
+PEER_STATES: Final = ("linked", "linking", "refused", "conflict", "relayed", "parked")
 """The values of ``PeerInfo.state``."""
 EVENT_KINDS: Final = (
     "deadline_missed",

@@ -99,7 +99,8 @@ class LinkEnd:
         self.guid = other.identity.guid
         self.name = other.name
         self.silent = False
-        self.crashed = False
+        self.crashed = self.parked = False
+        self.held: list[bytes] = []
         self.clock_offset: float | None = None
         self.clock_error: float | None = None
         self.gone = False

@@ -6,7 +6,7 @@ import asyncio
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
-from rmpa.bridge.session.peer_proxies import PeerProxies
+from rmpa.bridge.session.peer_proxies import PeerProxies, ProxyCallbacks
 
 if TYPE_CHECKING:
     from rmpa.ros.node.slave_node import SlaveNode
@@ -44,8 +44,10 @@ class World:
         self.proxies.hold(
             node,
             key,
-            lambda proxy: self.happened.append(f"{key} at {proxy.name}"),
-            lambda proxy: self.happened.append(f"{key} left"),
+            ProxyCallbacks(
+                lambda proxy: self.happened.append(f"{key} at {proxy.name}"),
+                lambda proxy: self.happened.append(f"{key} left"),
+            ),
         )
 
     async def settled(self) -> list[str]:

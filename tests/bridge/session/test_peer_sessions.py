@@ -62,6 +62,8 @@ class Link:
         self.identity = Identity(Guid.of("10.0.0.1", 1000), bytes([run_number]) * 16, self.name)
         self.guid = self.identity.guid
         self.silent = silent
+        self.parked = False
+        self.held: list[bytes] = []
 
 
 class Scene:

@@ -120,8 +120,12 @@ class Peer:
         return link
 
     def both_lanes(self, *others: Peer) -> bool:
-        """Whether the links with these have their bulk lanes too."""
-        return self.linked(*others) and all(self.link(other).bulk_connection is not None for other in others)
+        """Want bulk lanes with these; return whether all links and lanes are up."""
+        if not self.linked(*others):
+            return False
+        for other in others:
+            self.link(other).want_bulk()
+        return all(self.link(other).bulk_connection is not None for other in others)
 
     def kill(self) -> None:
         """As kill -9: the kernel closes the sockets, and no bye is sent."""

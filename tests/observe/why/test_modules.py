@@ -40,6 +40,14 @@ def test_a_healthy_module_passes_every_stage() -> None:
     assert stages(found) == [(name, "ok") for name in ("peer", "link", "lanes", "answer", "clock", "load", "offers")]
 
 
+def test_a_bulk_lane_that_nothing_wants_is_no_trouble() -> None:
+    lanes = (LANES[0], LaneInfo(name="bulk", connected=False, unneeded=True))
+    found = diagnose_module(snapshot(peer({"lanes": lanes})), "joystick", TOLD)
+    assert {stage.level.value for stage in found.stages} == {"ok"}
+    (text,) = [stage.text for stage in found.stages if stage.name == "lanes"]
+    assert "the bulk lane is connected when a message wants it" in text
+
+
 @pytest.mark.parametrize(
     ("changed", "told", "stage", "text"),
     [

@@ -400,6 +400,11 @@ WARNINGS: dict[str, tuple[Case, str, str]] = {
         "link",
         "silent for 0.8 s",
     ),
+    "a link at rest that is silent": (
+        Case(peer=msgspec.structs.replace(PEER, link=msgspec.structs.replace(LINK, heard_ago=8.2, rests=True))),
+        "link",
+        "silent for 8.2 s",
+    ),
     "one was refused": (Case(mismatches=("/old: wants 1234",)), "md5", "/old: wants 1234"),
     "dropped there": (
         Case(source_later=msgspec.structs.replace(SOURCE, messages=120, dropped=2)),

@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import socket
 import struct
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
@@ -575,7 +576,9 @@ async def test_a_held_subscriber_counts_as_connected_while_others_are_served(hel
     links = [await held.subscriber(callerid=name) for name in ("/one", "/two")]
     assert held.publication.callers == {"/one", "/two"}
     seen: list[frozenset[str]] = []
-    held.publication._on_listeners = lambda: seen.append(held.publication.callers)
+    held.publication.events = replace(
+        cast("Any", held.publication.events), listeners_changed=lambda: seen.append(held.publication.callers)
+    )
     held.publication.describe(STRING)
     assert set(seen) == {frozenset({"/one", "/two"})}, "not one of them seems to have left meanwhile"
     assert held.publication.listeners == ("/one", "/two")

@@ -130,6 +130,8 @@ def test_patches_of_the_recorded_demo_are_small() -> None:
     [
         (peer(), "up"),
         (peer(link=msgspec.structs.replace(LINK, heard_ago=1.5)), "silent"),
+        (peer(link=msgspec.structs.replace(LINK, heard_ago=6.5, rests=True)), "up"),
+        (peer(link=msgspec.structs.replace(LINK, heard_ago=8.5, rests=True)), "silent"),
         (peer(state="linking", link=None, beacon_ago=0.5), "linking"),
         (peer(state="linking", link=None, beacon_ago=8.0), "away"),
         (peer(state="linking", link=None), "away"),

@@ -106,6 +106,10 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
         self._offered: dict[KeyT, LocalT] = {}
         self._beyond: OrderedDict[KeyT, LocalT] = OrderedDict()
         self._peers: dict[int, CataloguePeer[KeyT, LocalT, OfferT, WireT]] = {}
+        self.changes = 0
+        """Counts the changes that any peer may have to be sent."""
+        self._with_news: dict[int, None] = {}
+        """The peers that have, or had when last looked at, entries to examine."""
 
     # --- entries -----------------------------------------------------------------------------------------------
 
@@ -172,11 +176,13 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
             judged: Whether each entry is judged or renamed for this peer.
         """
         self._peers[peer] = CataloguePeer(name, instance, judged, dict.fromkeys(self._offered))
+        self._with_news[peer] = None
         return self._portion(self._peers[peer])
 
     def link_down(self, peer: int) -> None:
         """Forget a peer and what it has been sent."""
         self._peers.pop(peer, None)
+        self._with_news.pop(peer, None)
 
     def peer(self, peer: int) -> CataloguePeer[KeyT, LocalT, OfferT, WireT] | None:
         """The state of a linked peer; ``None`` if it is not linked."""
@@ -193,17 +199,20 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
 
     def note(self, key: KeyT) -> None:
         """Have an entry examined for every peer: it was put, changed or removed."""
-        for known in self._peers.values():
+        self.changes += 1
+        for number, known in self._peers.items():
             known.news.setdefault(key)
+            self._with_news[number] = None
 
     def note_all(self, known: CataloguePeer[KeyT, LocalT, OfferT, WireT]) -> None:
         """Have all entries examined for one peer: its rules have changed."""
         known.news.update(dict.fromkeys(self._offered))
+        self._with_news = dict.fromkeys(self._peers)
 
     @property
     def pending(self) -> bool:
         """Whether entries are to be examined for any peer; ``portions`` does it."""
-        return any(known.news for known in self._peers.values())
+        return any(self._peers[number].news for number in self._with_news)
 
     def beginning(self, peer: int) -> bool:
         """Whether a linked peer has not been sent the complete catalogue yet."""
@@ -219,12 +228,17 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
             ready: ``(peer)``: whether a portion may be sent to this peer now.
         """
         judged = False
-        for number, known in list(self._peers.items()):
-            if not known.news or (known.judged and judged) or not ready(number):
+        for number in list(self._with_news):
+            known = self._peers.get(number)
+            if known is None or not known.news:
+                self._with_news.pop(number, None)
+                continue
+            if (known.judged and judged) or not ready(number):
                 continue
             if known.judged:
                 judged = True
-                self._peers[number] = self._peers.pop(number)
+                del self._with_news[number]
+                self._with_news[number] = None
             yield number, self._portion(known)
 
     def _portion(self, known: CataloguePeer[KeyT, LocalT, OfferT, WireT]) -> Portion[KeyT, OfferT, WireT]:

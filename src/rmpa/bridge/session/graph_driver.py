@@ -159,6 +159,10 @@ class GraphDriver(Generic[ActionT, AdvertisementT]):
         self._advertisements = deque(one for one in self._advertisements if one[0] is not session)
         self._unread_bytes = sum(len(waiting) for _, waiting in self._advertisements if isinstance(waiting, bytes))
 
+    def waits(self, session: PeerSession) -> bool:
+        """Whether an advertisement of a peer is not applied yet."""
+        return any(one is session for one, _ in self._advertisements)
+
     def gone(self, session: PeerSession) -> None:
         """Forget the pacing of a session that has ended."""
         self._pacing.forget(session.peer)

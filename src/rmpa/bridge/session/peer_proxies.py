@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+from collections import deque
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from rmpa.bridge.proxy_names import proxy_name
 from rmpa.core.errors import RmpaError
@@ -16,7 +17,7 @@ from rmpa.runtime.descriptors import is_shortage
 from rmpa.runtime.event_loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator
+    from collections.abc import Awaitable, Callable, Hashable, Iterator
 
     from rmpa.bridge.session.proxy_nodes import ProxyNodes
     from rmpa.ros.node.slave_node import SlaveNode
@@ -29,7 +30,27 @@ async def _refuse_to_end(node: str, _caller: str, _reason: str) -> RosReply:
 
 
 def _nothing(_node: SlaveNode) -> None:
-    """Does nothing: the holder has nothing to remove from the proxy."""
+    """Does nothing: the user has nothing to remove from the proxy."""
+
+
+class ProxyUser(Protocol):
+    """What a topic or service does with its proxy."""
+
+    __slots__ = ()
+
+    def ready(self, node: SlaveNode) -> None:
+        """The proxy exists: register the topic or service there."""
+
+    def left(self, node: SlaveNode) -> None:
+        """Remove the topic or service from the proxy, which may be closed afterwards."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProxyCallbacks:
+    """A user of a proxy by functions, which get the proxy; see ``ProxyUser``."""
+
+    ready: Callable[[SlaveNode], None]
+    left: Callable[[SlaveNode], None] = _nothing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,14 +60,12 @@ class _Hold:
     Args:
         node: The peer's node.
         key: Identifies the topic or service among those of its node.
-        ready: Gets the proxy when it exists, and registers the topic or service there.
-        left: Removes the topic or service, before the proxy is closed.
+        user: The topic or service.
     """
 
     node: str
-    key: str
-    ready: Callable[[SlaveNode], None]
-    left: Callable[[SlaveNode], None]
+    key: Hashable
+    user: ProxyUser
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +73,7 @@ class _Release:
     """A request to remove a topic or service from its proxy."""
 
     node: str
-    key: str
+    key: Hashable
 
 
 @dataclass(slots=True)
@@ -67,7 +86,7 @@ class Proxy:
     """
 
     node: SlaveNode
-    held: dict[str, _Hold] = field(default_factory=dict)
+    held: dict[Hashable, _Hold] = field(default_factory=dict)
 
 
 class PeerProxies:
@@ -92,13 +111,16 @@ class PeerProxies:
         self._nodes = nodes
         self._on_kill = on_kill
         self._proxies: dict[str, Proxy] = {}
-        self._holds: dict[tuple[str, str], _Hold] = {}
-        self._jobs: asyncio.Queue[_Hold | _Release | None] = asyncio.Queue()
+        self._holds: dict[tuple[str, Hashable], _Hold] = {}
+        self._jobs: deque[_Hold | _Release] | None = None
+        self._incomplete = False
+        """Whether a change of the graph failed, so that ``reconcile`` has something to mend."""
         self.problems: dict[str, str] = {}
         """Why the proxy of a node could not be made, as text by node; ``reconcile`` tries again."""
         self.names: dict[str, str] = {}
         """Names of the proxies of relayed nodes, by the peer's node; all others are named with ``prefix``."""
-        self._task = asyncio.create_task(self._work(), name=f"proxies {prefix}")
+        self._task: asyncio.Task[None] | None = None
+        """Carries out the queued changes; ``None`` while there are none."""
 
     def __len__(self) -> int:
         return len(self._proxies)
@@ -119,55 +141,66 @@ class PeerProxies:
     def hold(
         self,
         node: str,
-        key: str,
-        ready: Callable[[SlaveNode], None],
-        left: Callable[[SlaveNode], None] = _nothing,
+        key: Hashable,
+        user: ProxyUser,
     ) -> None:
         """Keep a proxy for a node because of one topic or service, until ``release``.
 
         Args:
             node: In the peer's graph.
             key: Identifies the topic or service for ``release``.
-            ready: Called with the proxy in a later turn of the loop, to register the topic or service there.
-            left: Called with the proxy, after ``ready``, to remove the topic or service from it.
+            user: Its ``ready`` is called in a later turn of the loop, and after that its ``left``.
         """
-        job = self._holds[node, key] = _Hold(node, key, ready, left)
-        self._jobs.put_nowait(job)
+        job = self._holds[node, key] = _Hold(node, key, user)
+        self._do(job)
 
-    def release(self, node: str, key: str) -> None:
+    def release(self, node: str, key: Hashable) -> None:
         """Remove a topic or service from its proxy in a later turn of the loop; the last one closes the proxy."""
         self._holds.pop((node, key), None)
-        self._jobs.put_nowait(_Release(node, key))
+        self._do(_Release(node, key))
 
     def reconcile(self) -> None:
         """Try failed proxies again, and forget names and problems of nodes that have gone."""
-        if not self._jobs.empty():
+        if self._jobs:
             return
         if self.names or self.problems:
             there = set(self._proxies)
             there.update(node for node, _ in yielding_to_data(list(self._holds)))
             self.names = {node: name for node, name in self.names.items() if node in there}
             self.problems = {node: text for node, text in self.problems.items() if node in there}
+        if not self._incomplete:
+            return
+        self._incomplete = False
         for hold in yielding_to_data(list(self._holds.values())):
             proxy = self._proxies.get(hold.node)
             if proxy is None or proxy.held.get(hold.key) is not hold:
-                self._jobs.put_nowait(hold)
+                self._do(hold)
 
     async def close(self) -> None:
         """Carry out the queued changes, then close all proxies."""
-        self._jobs.put_nowait(None)
-        await self._task
+        while self._task is not None:
+            await self._task
+        for node in list(self._proxies):
+            await self._close_proxy(node)
+
+    def _do(self, job: _Hold | _Release) -> None:
+        if self._jobs is None:
+            self._jobs = deque()
+        self._jobs.append(job)
+        if self._task is None:
+            self._task = asyncio.create_task(self._work(), name=f"proxies {self.prefix}")
 
     async def _work(self) -> None:
-        while (job := await self._jobs.get()) is not None:
+        while self._jobs:
+            job = self._jobs.popleft()
             try:
                 await (self._hold(job) if isinstance(job, _Hold) else self._release(job))
             except (RmpaError, OSError) as error:
                 self._failed(job.node, error)
             except Exception:  # noqa: BLE001 - the task's top: one thing that fails must not stop the others
                 _log.exception("! %s: %s failed; the others go on", self.prefix, job)
-        for node in list(self._proxies):
-            await self._close_proxy(node)
+                self._incomplete = True
+        self._jobs = self._task = None
 
     async def _hold(self, hold: _Hold) -> None:
         if self._holds.get((hold.node, hold.key)) is not hold:
@@ -179,8 +212,8 @@ class PeerProxies:
                 await self._close_proxy(hold.node)
         elif (before := proxy.held.get(hold.key)) is not hold:
             if before is not None:
-                before.left(proxy.node)
-            hold.ready(proxy.node)
+                before.user.left(proxy.node)
+            hold.user.ready(proxy.node)
             proxy.held[hold.key] = hold
 
     async def _release(self, job: _Release) -> None:
@@ -189,7 +222,7 @@ class PeerProxies:
             return
         hold = proxy.held.pop(job.key, None)
         if hold is not None:
-            hold.left(proxy.node)
+            hold.user.left(proxy.node)
         if not proxy.held:
             await self._close_proxy(job.node)
 
@@ -206,11 +239,12 @@ class PeerProxies:
     async def _close_proxy(self, node: str) -> None:
         proxy = self._proxies.pop(node)
         for hold in proxy.held.values():
-            hold.left(proxy.node)
+            hold.user.left(proxy.node)
         await proxy.node.close()
 
     def _failed(self, node: str, error: Exception) -> None:
         """Log why a proxy could not be made, once for each reason; ``reconcile`` tries again."""
+        self._incomplete = True
         text = (
             f"no file descriptor is left for its proxy; {remedy(os.getpid())}" if is_shortage(error) else str(error)
         )

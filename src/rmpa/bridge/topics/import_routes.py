@@ -11,6 +11,8 @@ from rmpa.bridge import limits
 from rmpa.bridge.actions import Action, Describe, Detach, Send, Warn
 from rmpa.bridge.messages import CloseRoute, OpenRoute, RouteClosed, RouteOpened, Source
 from rmpa.bridge.topics.remote_topic import RemoteTopic, RouteState
+from rmpa.core.backoff import Backoff
+from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
@@ -32,10 +34,12 @@ class ImportRoutes:
         find: Callable[[int, Source], RemoteTopic | None],
         contracts: Contracts,
         position: Callable[[int, Source], tuple[int, int] | None],
+        rng: Callable[[], float],
     ) -> None:
         self._find = find
         self.contracts = contracts
         self._position = position
+        self._rng = rng
         self._routes: dict[int, dict[int, Source]] = {}
         """The requested and open sources by route id, for each linked peer."""
         self._last_route: dict[int, int] = {}
@@ -75,7 +79,7 @@ class ImportRoutes:
             ]
         entry.enter(RouteState.OPEN)
         entry.problem = ""
-        entry.backoff.reset()
+        entry.backoff = None
         entry.description = message.description
         entry.contract = message.contract
         terms = (message.contract, message.epoch, message.first)
@@ -107,9 +111,9 @@ class ImportRoutes:
             return self.close(peer, source, entry)
         return []
 
-    def suspend(self, entry: RemoteTopic) -> None:
-        """Suspends the route of an entry that outlives its peer's link."""
-        entry.problem = "its peer is away"
+    def suspend(self, entry: RemoteTopic, problem: str) -> None:
+        """Suspends the route of an entry that outlives its peer's link; ``problem`` says why, for users."""
+        entry.problem = problem
         if entry.state is RouteState.LINGERING:
             entry.enter(RouteState.IDLE)
         elif entry.state in {RouteState.OPEN, RouteState.OPENING}:
@@ -142,7 +146,7 @@ class ImportRoutes:
         elif entry.state is RouteState.WAITING and entry.timer is None:
             actions.append(Detach(peer, source, 0))  # it waited for a new link
         entry.route = 0
-        entry.backoff.reset()
+        entry.backoff = None
         if entry.state is RouteState.OPEN:
             entry.enter(RouteState.LINGERING)
         if entry.state is not RouteState.IDLE:
@@ -157,6 +161,8 @@ class ImportRoutes:
         if entry.state is RouteState.LINGERING:
             entry.enter(RouteState.IDLE)
         else:
+            if entry.backoff is None:
+                entry.backoff = Backoff(mesh_limits.BACKOFF_FIRST, mesh_limits.BACKOFF_MAX, self._rng)
             self._enter(peer, source, entry, RouteState.WAITING, now + entry.backoff.delay())
         return actions
 

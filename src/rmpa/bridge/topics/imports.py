@@ -38,9 +38,7 @@ from rmpa.bridge.topics.remote_topic import RemoteTopic, RouteState
 from rmpa.config.param_rules import CLOCK
 from rmpa.config.permission_rules import Access
 from rmpa.config.settings import LimitSettings
-from rmpa.core.backoff import Backoff
 from rmpa.core.contract import Contracts
-from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping
@@ -104,13 +102,14 @@ class Imports:
         self._policy = policy
         self._limit_settings = limit_settings
         self._names = names
-        self._rng = rng
         self._contracts = contracts if contracts is not None else Contracts()
-        self._routes = ImportRoutes(self.get, self._contracts, position)
+        self._routes = ImportRoutes(self.get, self._contracts, position, rng)
         self._peers: dict[int, _ImportPeer] = {}
         self.ways = RelayPaths(gate.may_relay)
         """Selects the path to each module that relays offer."""
         self._local_types: dict[str, str] = {}
+        self._strings: dict[str, str] = {}
+        """Names of nodes and types that many sources share, so that each is kept once."""
 
     def __iter__(self) -> Iterator[tuple[int, Source, RemoteTopic]]:
         """Every known source with its peer; changes during the iteration may be missed."""
@@ -244,13 +243,14 @@ class Imports:
         self._routes.link_up(peer)
         return self._ways_changed(self.ways.linked(peer, who)) if who is not None else []
 
-    def link_away(self, peer: int, *, briefly: bool = False) -> tuple[list[Action], bool]:
+    def link_away(self, peer: int, *, briefly: bool = False, parked: bool = False) -> tuple[list[Action], bool]:
         """Suspends the routes of a peer that may come back; sources that do not outlive the link are dropped.
 
         Args:
             peer: The peer's number.
             briefly: Drop nothing yet: the link fell silent, and most silent peers are back soon. The method is
                 called again without it if the peer is not.
+            parked: The peer is there, and is linked again when something needs it.
 
         Returns:
             The actions, and whether a source waits for the peer; if none does, call ``link_down`` next.
@@ -271,7 +271,7 @@ class Imports:
                 actions.append(Detach(peer, source, entry.route, keep=goes_on, missed=missed and not goes_on))
             entry.route = 0
             if keep:
-                self._routes.suspend(entry)
+                self._routes.suspend(entry, "" if parked else "its peer is away")
             else:
                 actions += self._drop(peer, source, entry)
         return actions, bool(known.entries)
@@ -393,7 +393,7 @@ class Imports:
 
     def _add(self, peer: int, offer: TopicOffer, now: float) -> list[Action]:
         known = self._peers[peer].entries
-        source = offer.source
+        source = Source(offer.topic, self._shared(offer.node))
         actions: list[Action] = []
         if source in known:
             entry = known[source]
@@ -408,9 +408,8 @@ class Imports:
             name = self._peers[peer].name
             self._peers[peer].surplus.add(source, offer)
             return [Warn("topics.too_many", name, peer_limits.warning(name, "topics", self._limit_settings.topics))]
-        backoff = Backoff(mesh_limits.BACKOFF_FIRST, mesh_limits.BACKOFF_MAX, self._rng)
         topic = self._names_of(self._peers[peer], offer.origin).local_name(source.topic, offer.type)
-        entry = known[source] = RemoteTopic(offer.type, topic, backoff, origin=offer.origin)
+        entry = known[source] = RemoteTopic(self._shared(offer.type), topic, origin=offer.origin)
         self._peers[peer].topics.setdefault(topic, {})[source] = None
         if offer.origin is not None:
             self._peers[peer].relayed.setdefault(offer.origin.instance, {})[source] = None
@@ -423,6 +422,11 @@ class Imports:
                 Warn("nodes.too_many", name, peer_limits.warning(name, "nodes", self._limit_settings.nodes))
             )
         return actions + self._report_conflict(peer, source, entry)
+
+    def _shared(self, text: str) -> str:
+        if len(self._strings) >= limits.SHARED_STRINGS:
+            self._strings.clear()  # the strings live on where they are used
+        return self._strings.setdefault(text, text)
 
     def _show_or_hide(self, peer: int, source: Source, entry: RemoteTopic) -> list[Action]:
         nodes = self._peers[peer].nodes

@@ -61,7 +61,6 @@ class RemoteTopic:
     Args:
         type: Its message type.
         topic: Its topic in the local graph.
-        backoff: Delays between attempts to open its route.
         shown: Whether it is in the local graph.
         hidden: Why it is not, or empty.
         denied: Whether it is hidden because no permission lets its module publish it here.
@@ -79,11 +78,11 @@ class RemoteTopic:
         origin: Its module and node, if its peer only relays it.
         crowded: Whether it is hidden because of ``limits.nodes``.
         direct: Whether a local node is connected to its publisher directly, and only the peer's agent has died.
+        backoff: Delays between attempts to open its route, after the first one that failed.
     """
 
     type: str
     topic: str
-    backoff: Backoff
     shown: bool = False
     hidden: str = ""
     denied: bool = False
@@ -100,6 +99,7 @@ class RemoteTopic:
     origin: Origin | None = None
     crowded: bool = False
     direct: bool = False
+    backoff: Backoff | None = None
 
     def enter(self, state: RouteState, timer: float | None = None) -> None:
         """Change the route's state.

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.bridge.messages import Source
 from rmpa.bridge.relay import service_place
+from rmpa.bridge.session.peer_proxies import ProxyCallbacks
 from rmpa.core.errors import RmpaError
 from rmpa.ros.node.service_server import ServiceEndpoint
 
@@ -91,7 +92,7 @@ class ProxiedService:
         """Put it into the graph, in a later turn of the loop."""
         self._begun = True
         self._refused = ""
-        self._proxies.hold(self._origin.node, self._key, self._ready, self._left)
+        self._proxies.hold(self._origin.node, self._key, ProxyCallbacks(self._ready, self._left))
 
     def refuse(self, text: str) -> None:
         """Say why it cannot be in the graph."""

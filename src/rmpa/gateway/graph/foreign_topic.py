@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.messages import Source
+from rmpa.bridge.session.peer_proxies import ProxyCallbacks
 from rmpa.core import limits as core_limits
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.wire.tcpros import LENGTH, printable
@@ -81,7 +82,7 @@ class ProxiedTopic:
         """Put it into the graph, in a later turn of the loop."""
         self._begun = True
         self._refused = ""
-        self._proxies.hold(self._origin.node, self._key, self._ready, self._left)
+        self._proxies.hold(self._origin.node, self._key, ProxyCallbacks(self._ready, self._left))
 
     def refuse(self, text: str) -> None:
         """Say why it cannot be in the graph."""

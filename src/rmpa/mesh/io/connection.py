@@ -28,7 +28,7 @@ from rmpa.mesh.connection_events import (
     Refused,
 )
 from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.handshake import Lane
+from rmpa.mesh.handshake import Feature, Lane
 from rmpa.mesh.io.securing import tls_failure
 from rmpa.mesh.io.sockets import reset_at_close, unacknowledged
 from rmpa.mesh.path_mtu import StallWatch
@@ -83,6 +83,10 @@ class ConnectionOwner(Protocol):
 
     def connection_control(self, connection: Connection, payload: bytes) -> None:
         """A control frame came."""
+        ...
+
+    def connection_lane(self, connection: Connection, word: int) -> None:
+        """A lane frame came; ``word`` is a ``LaneWord``, or a number of a later version."""
         ...
 
     def connection_ponged(self, connection: Connection) -> None:
@@ -159,6 +163,8 @@ class Connection:
         """Whether the remote side broke the protocol."""
         self.silent = False
         """Once ended: whether it ended by silence (lease expired, no route, reset) rather than by a bye."""
+        self.orderly = False
+        """Once ended: whether one side ended it by a frame (bye, refuse)."""
         self.held: list[bytes] = []
         """Payloads of control frames that were not sent, because this side has agreed to park the link."""
         self.stalls = StallWatch(segment, clock.now())
@@ -175,6 +181,8 @@ class Connection:
         self._probe: int | None = None
         self._probed_at = -math.inf
         self._sent_before = 0
+        self._own_bytes = 0
+        """Bytes of the machine's own frames that were sent."""
         self.stream = Stream(
             sock,
             on_bytes=self._receive,
@@ -339,6 +347,15 @@ class Connection:
         before, self._sent_before = self._sent_before, self.stream.bytes_out
         return self._sent_before != before or unacknowledged(self.sock) > 0
 
+    def knows(self, feature: Feature) -> bool:
+        """Whether the remote side knows what was added after the first release; only once its hello has come."""
+        return self._machine.remote is not None and bool(self._machine.remote.features & feature)
+
+    @property
+    def data_out(self) -> int:
+        """Bytes that the kernel took, without keepalives and the like."""
+        return self.stream.bytes_out - self._own_bytes
+
     def segment(self, size: int) -> None:
         """Send in packets of at most ``size`` bytes from now on."""
         self.stalls = StallWatch(size, self._clock.now(), self.stalls)
@@ -390,7 +407,7 @@ class Connection:
         if isinstance(event, ControlReceived):
             self._owner.connection_control(self, event.payload)
         elif isinstance(event, MarkReceived):
-            self._on_mark(event.kind, event.route, event.sequence)
+            self._marked(event)
         elif isinstance(event, PongReceived):
             self._ponged(event)
         elif isinstance(event, HelloReceived):
@@ -410,12 +427,22 @@ class Connection:
         elif isinstance(event, Parted):
             self._owner.connection_parted(self)
         elif isinstance(event, PartingEnded):
-            self._send_output()
-            held, self.held = self.held, []
-            for payload in held:
-                self.send_control(payload)
+            self._send_held()
         elif isinstance(event, ConnectionClosed):
+            self.orderly = event.orderly
             self._finish(event.reason)
+
+    def _marked(self, event: MarkReceived) -> None:
+        if event.kind is FrameKind.LANE:
+            self._owner.connection_lane(self, event.route)
+        else:
+            self._on_mark(event.kind, event.route, event.sequence)
+
+    def _send_held(self) -> None:
+        self._send_output()
+        held, self.held = self.held, []
+        for payload in held:
+            self.send_control(payload)
 
     def _ponged(self, event: PongReceived) -> None:
         if event.stamp == self._probe:
@@ -427,7 +454,9 @@ class Connection:
     def _send_output(self) -> None:
         """Send the machine's output; a closing connection then waits for the remote end to close, or its time-out."""
         if self._machine.has_output:
-            self.stream.send((self._machine.take_output(),), URGENT)
+            output = self._machine.take_output()
+            self._own_bytes += len(output)
+            self.stream.send((output,), URGENT)
             self._check_urgent()
         if self._machine.state is ConnectionState.CLOSING and not self._finishing:
             # After a close at once, further bytes of the remote side would cause a reset, which overtakes the bye.

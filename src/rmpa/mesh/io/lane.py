@@ -15,6 +15,8 @@ from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, pack_fragment_header
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rmpa.runtime.buffers import Buffer
     from rmpa.runtime.stream import Stream
 
@@ -24,10 +26,12 @@ class LaneSender:
 
     Args:
         name: ``express`` or ``bulk``, for people.
+        on_wanted: Called when something is queued while the lane has no connection.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, on_wanted: Callable[[], None] | None = None) -> None:
         self.name = name
+        self._on_wanted = on_wanted if on_wanted is not None else _nothing
         self.outbox = Outbox(core_limits.ROUTE_QUEUE_MESSAGES, limits.LANE_QUEUE_BYTES, frame=pack_fragment_header)
         self.ended = False
         """Whether the link is closing: nothing is sent or queued any more."""
@@ -46,6 +50,12 @@ class LaneSender:
         self._stream = stream
         stream.adopt(self.outbox, pack_fragment_header)
 
+    def pause(self) -> None:
+        """Send nothing on the present connection, which stays, and on which nothing is half sent."""
+        if self._stream is not None:
+            self._stream.adopt(Outbox(1, limits.CONNECTION_URGENT_BYTES), None)
+        self._stream = None
+
     def disconnect(self) -> int:
         """Handle the end of the connection; return how many messages were cut off, without those in the kernel."""
         self._stream = None
@@ -58,6 +68,7 @@ class LaneSender:
     def end(self) -> None:
         """Take no more messages, because the link closes; waiting ones are sent within the drain time."""
         self.ended = True
+        self._on_wanted = _nothing  # its link holds this lane
         self._stream = None
 
     def clear(self) -> None:
@@ -83,7 +94,11 @@ class LaneSender:
         header = pack_data_header(size, route, sequence, stamp_ns)
         if self._stream is not None:
             return self._stream.send((header, payload), route)
-        return 0 if self.ended else self.outbox.push(b"".join((header, payload)), route, self._loop.time())
+        if self.ended:
+            return 0
+        dropped = self.outbox.push(b"".join((header, payload)), route, self._loop.time())
+        self._on_wanted()
+        return dropped
 
     def open(self, route: int, size: int, sequence: int, stamp_ns: int) -> QueuedMessage:
         """Begin a message of ``size`` bytes that follow by ``extend``, before the next one of its route."""
@@ -99,7 +114,9 @@ class LaneSender:
             return self._stream.extend(parcel, data)
         if self.ended:
             return 0
-        return self.outbox.extend(parcel, bytes(data))
+        dropped = self.outbox.extend(parcel, bytes(data))
+        self._on_wanted()
+        return dropped
 
     def abandon(self, parcel: QueuedMessage) -> None:
         """Give up a message whose rest will never come."""
@@ -115,6 +132,7 @@ class LaneSender:
             self._stream.send_mark(frame, route)
         elif not self.ended:
             self.outbox.push(frame, route, self._loop.time(), pinned=True)
+            self._on_wanted()
 
     def set_terms(self, route: int, depth: int, max_age: float | None, *, strict: bool) -> None:
         """Bound the waiting messages of one route; see ``core.outbox``.
@@ -140,3 +158,7 @@ class LaneSender:
         if self._stream is not None:
             self._stream.pump()
         return count
+
+
+def _nothing() -> None:
+    """The ``on_wanted`` of a lane that always has a connection, or that has ended."""

@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.mesh import limits
 from rmpa.mesh.frames import FrameKind
+from rmpa.mesh.handshake import Feature
 from rmpa.mesh.io.lane import LaneSender
+from rmpa.mesh.io.sockets import unacknowledged
+from rmpa.mesh.lane_demand import LaneDemand
 
 if TYPE_CHECKING:
     from rmpa.core.clock import Clock
@@ -18,6 +21,10 @@ if TYPE_CHECKING:
 OnLinkData = Callable[["PeerLink", int, int, int, memoryview], None]
 OnLinkPart = Callable[["PeerLink", int, int, int, int, memoryview], None]
 OnLinkMark = Callable[["PeerLink", FrameKind, int, int], None]
+
+
+_KEEPALIVE_BYTES: Final = 256
+"""At most so many bytes on the way may be keepalives, encrypted ones too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,9 +55,10 @@ class PeerLink:
     Args:
         connection: That of the express lane; its handshake is done.
         clock: The time.
+        on_bulk_wanted: Called with this link when something waits for the bulk lane, which has no connection.
     """
 
-    def __init__(self, connection: Connection, clock: Clock) -> None:
+    def __init__(self, connection: Connection, clock: Clock, on_bulk_wanted: Callable[[PeerLink], None]) -> None:
         self.id: Final = connection.id
         self.identity: Final = connection.identity
         self.guid: Final = connection.identity.guid
@@ -65,7 +73,9 @@ class PeerLink:
         self.bulk_connection: Connection | None = None
         """The connection of the bulk lane, while there is one."""
         self.express: Final = LaneSender("express")
-        self.bulk: Final = LaneSender("bulk")
+        self.bulk: Final = LaneSender("bulk", lambda: on_bulk_wanted(self))
+        self.lane_demand: Final = LaneDemand(dialled=connection.dialled, agreed=connection.knows(Feature.LANES))
+        """Decides whether the bulk lane has a connection."""
         self.silent = False
         """Once the link is down: whether it ended without a bye, so that the peer may soon be linked again."""
         self.crashed = False
@@ -77,8 +87,10 @@ class PeerLink:
         self.touched_at = clock.now()
         """Monotonic seconds of the last control frame in either direction."""
         self._clock = clock
+        self._on_bulk_wanted = on_bulk_wanted
         self._needed = True
         self._handlers: LinkHandlers | None = None
+        self._bulk_data_out = 0
         self._bulk_bytes_in = self._bulk_bytes_out = 0  # of the bulk lane's earlier connections
         self.express.connect(connection.stream)
 
@@ -224,22 +236,51 @@ class PeerLink:
             self.detach(old)
             old.sever("replaced by a newer bulk lane")
         self.bulk_connection = bulk
+        self._bulk_data_out = 0
+        self.lane_demand.up(self._clock.now())
         bulk.need(needed=self._needed)
         self._receive_from(bulk)
         self.bulk.connect(bulk.stream)
 
-    def detach(self, bulk: Connection) -> bool:
-        """Handle the end of a connection; return whether it was the bulk lane's."""
-        if self.bulk_connection is not bulk:
+    def want_bulk(self) -> None:
+        """Let the bulk lane be dialled, although no message waits for it yet."""
+        self._on_bulk_wanted(self)
+
+    def bulk_used(self) -> bool:
+        """Whether data was sent on the bulk lane since the last call, or waits, or is not acknowledged yet."""
+        bulk = self.bulk_connection
+        if bulk is None:
             return False
+        before, self._bulk_data_out = self._bulk_data_out, bulk.data_out
+        sent = before != self._bulk_data_out
+        return sent or self.bulk.outbox.pending_bytes > 0 or unacknowledged(bulk.sock) > _KEEPALIVE_BYTES
+
+    def pause_bulk(self) -> None:
+        """Send nothing on the bulk lane's connection, which stays; messages wait."""
+        self.bulk.pause()
+
+    def resume_bulk(self) -> None:
+        """Send on the bulk lane's connection again."""
+        if self.bulk_connection is not None:
+            self.bulk.connect(self.bulk_connection.stream)
+
+    def end_bulk(self, reason: str) -> None:
+        """End the bulk lane's connection, on which nothing is on the way."""
+        bulk = self.bulk_connection
+        if bulk is not None:
+            self.bulk.pause()
+            self.detach(bulk, lost=False)
+            bulk.close(reason)
+
+    def detach(self, bulk: Connection, *, lost: bool = True) -> None:
+        """Take the connection from the bulk lane; ``lost``: messages on the way may be lost."""
         self.bulk_connection = None
         self._bulk_bytes_in += bulk.stream.bytes_in
         self._bulk_bytes_out += bulk.stream.bytes_out
         bulk.deliver_to(None, None, None)
         self.bulk.disconnect()
-        if self._handlers is not None:
+        if lost and self._handlers is not None:
             self._handlers.lane_lost(self)
-        return True
 
     def end_lanes(self, reason: str) -> None:
         """Stop sending and close the bulk lane's connection, because the express lane's connection is closing."""

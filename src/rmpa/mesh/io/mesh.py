@@ -11,11 +11,11 @@ from itertools import count
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config.settings import LaneSettings
-from rmpa.core.backoff import Backoff
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionRole
 from rmpa.mesh.handshake import Lane, Refusal
+from rmpa.mesh.io.bulk_lanes import BulkLanes
 from rmpa.mesh.io.connection import Connection
 from rmpa.mesh.io.dialler import Dialler
 from rmpa.mesh.io.link import LinkHandlers, PeerLink
@@ -126,8 +126,6 @@ class Mesh:
         self._dialled: dict[int, Guid] = {}
         """Dialled connections without a finished handshake, each with the peer or link that it was dialled for."""
         self._dials: set[asyncio.Task[None]] = set()
-        self._bulk_dials: dict[int, asyncio.Task[None]] = {}
-        self._bulk_backoffs: dict[int, Backoff] = {}
         self._redials = Redials(
             self.dialler,
             start=self._start,
@@ -149,7 +147,9 @@ class Mesh:
                 pause=self._acceptor.pause,
             )
             security.on_denied.append(self._denied)
-        self._rng = rng
+        self._bulk_lanes = BulkLanes(
+            self._connect_bulk, self._start, clock=self._clock, rng=rng, counters=self.counters
+        )
         self._ids = count(1)
         self._acting = False
         self._running = False
@@ -173,7 +173,7 @@ class Mesh:
         tasks: list[asyncio.Task[None]] = [
             *securing,
             *self._dials,
-            *self._bulk_dials.values(),
+            *self._bulk_lanes.close(),
             *self._redials.close(),
         ]
         for task in tasks:
@@ -251,7 +251,7 @@ class Mesh:
         if connection.lane == Lane.BULK:
             self._bulk_opened(connection)
             return
-        link = self._links[connection.id] = PeerLink(connection, self._clock)
+        link = self._links[connection.id] = PeerLink(connection, self._clock, self._bulk_lanes.want)
         self._peering.link_up(
             link.id, link.identity, self._clock.now(), dialled=link.dialled, endpoint=link.remote_endpoint
         )
@@ -296,6 +296,11 @@ class Mesh:
             link.touch()
             self._on_control(link, payload)
 
+    def connection_lane(self, connection: Connection, word: int) -> None:
+        """The peer says something about the bulk lane."""
+        if (link := self._links.get(connection.id)) is not None:
+            self._bulk_lanes.said(link, word)
+
     def connection_ponged(self, connection: Connection) -> None:
         """The remote clock is known better."""
         if (link := self._used(connection)) is not None:
@@ -308,7 +313,12 @@ class Mesh:
             self._redials.begin(link)
 
     def connection_tick(self, connection: Connection) -> None:
-        """Check whether the data that a link sends gets through."""
+        """Check whether the data that a link sends gets through, and whether a bulk lane is used."""
+        if connection.lane == Lane.BULK:
+            for each in self._links.values():
+                if each.bulk_connection is connection:
+                    self._bulk_lanes.tick(each)
+                    return
         link = self._used(connection)
         if self._running and link is not None:
             self.paths.look(link)
@@ -338,7 +348,7 @@ class Mesh:
         if connection.lane == Lane.BULK:
             self._bulk_ended(connection, reason)
             return
-        self._bulk_backoffs.pop(connection.id, None)
+        self._bulk_lanes.link_ended(connection.id)
         guid = self._dialled.pop(connection.id, None)
         if guid is not None:
             self._peering.dial_failed(guid, reason, now, connection.remote_endpoint)
@@ -391,7 +401,7 @@ class Mesh:
                 link.use(self.handlers)
                 _log.info("= %s: linked (%s)", output.identity, "dialled" if link.dialled else "accepted")
                 self._on_link_up(link)
-                self._dial_bulk(link)
+                self._bulk_lanes.link_up(link)
             case LinkDown():
                 _log.info("= %s: link down: %s", output.identity, output.reason)
                 replaced = output.cause is LinkDownCause.REPLACED
@@ -419,56 +429,30 @@ class Mesh:
 
     # --- bulk lanes -----------------------------------------------------------------------------------------
 
-    def _dial_bulk(self, link: PeerLink, delay: float = 0.0) -> None:
-        """Dial the bulk lane of a link that this side dialled, at the endpoint that worked for the express lane."""
-        ours = self._running and link.used and link.dialled
-        if ours and link.bulk_connection is None and link.id not in self._bulk_dials:
-            self._bulk_dials[link.id] = task = self._start(self._connect_bulk(link, delay), f"bulk {link.name}")
-            task.add_done_callback(lambda _: self._bulk_dials.pop(link.id, None))
-
-    async def _connect_bulk(self, link: PeerLink, delay: float) -> None:
-        backoff = self._bulk_backoff(link)
-        await asyncio.sleep(delay)
-        while link.used:
-            try:
-                sock = await self.dialler.connect(link.remote_endpoint, Lane.BULK)
-                secured = await self._secure_dialled(sock)
-            except OSError as error:
-                self.counters.add("link.bulk_failed")
-                _log.debug("! %s: no bulk lane: %s", link.name, error)
-                await asyncio.sleep(backoff.delay())
-                continue
-            if is_over(link):
-                sock.close()  # the link ended meanwhile
-                return
-            self._open(sock, ConnectionRole.DIALLER, link.remote_endpoint, link.guid, Lane.BULK, secured=secured)
+    async def _connect_bulk(self, link: PeerLink) -> None:
+        """Connect the bulk lane of a link that this side dialled, at the endpoint of the express lane."""
+        sock = await self.dialler.connect(link.remote_endpoint, Lane.BULK)
+        secured = await self._secure_dialled(sock)
+        if is_over(link):
+            sock.close()  # the link ended meanwhile
             return
+        self._open(sock, ConnectionRole.DIALLER, link.remote_endpoint, link.guid, Lane.BULK, secured=secured)
 
     def _bulk_opened(self, bulk: Connection) -> None:
         link = next((link for link in self.links() if link.identity.is_same_run(bulk.identity)), None)
         if link is None:
             bulk.close("its express lane is gone")
             return
-        self._bulk_backoffs.pop(link.id, None)
         tune_bulk(bulk.sock, self._lanes, self.counters)  # the lane of an accepted one is only known now
-        link.attach(bulk)
-        _log.debug("= %s: bulk lane (%s)", bulk.name, "dialled" if bulk.dialled else "accepted")
+        self._bulk_lanes.opened(link, bulk)
 
     def _bulk_ended(self, bulk: Connection, reason: str) -> None:
-        """Handle the end or the refusal of a bulk lane's connection; the link goes on and gets another connection."""
+        """Handle the end or the refusal of a bulk lane's connection; the link goes on."""
         expected = self._dialled.pop(bulk.id, None)
         _log.debug("= %s: bulk lane ended: %s", bulk.name, reason)
         for link in list(self._links.values()):
-            ours = link.detach(bulk)
-            if ours or (link.used and expected is not None and link.guid == expected):
-                if link.used:
-                    self.counters.add("link.bulk_lost")
-                    _log.info("= %s: the bulk lane is gone (%s); small messages go on", link.name, reason)
-                self._dial_bulk(link, self._bulk_backoff(link).delay())
+            self._bulk_lanes.ended(link, bulk, reason, expected=expected is not None and link.guid == expected)
         self._act()
-
-    def _bulk_backoff(self, link: PeerLink) -> Backoff:
-        return self._bulk_backoffs.setdefault(link.id, Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, self._rng))
 
     # --- connections ----------------------------------------------------------------------------------------
 

@@ -116,10 +116,13 @@ class ControlOperations:
 
     async def ping(self, args: Args) -> PingReply:
         """``peer``: its name or GUID; ``count``: the number of pings."""
-        link = self._session(args.get("peer", "")).link
+        session = self._session(args.get("peer", ""))
         count = args.get("count", 1)
         if not isinstance(count, int) or not 1 <= count <= limits.CONTROL_PINGS_MAX:
             raise ConfigError("count", f"{count!r} is not between 1 and {limits.CONTROL_PINGS_MAX}")
+        await self._bridge.sessions.reach(session)
+        link = session.link
+        link.touch()
         times = [await link.ping() for _ in range(count)]
         host, port = link.remote_endpoint
         return PingReply(times=tuple(times), remote=f"{host}:{port}")
@@ -170,8 +173,10 @@ class ControlOperations:
         if peer is None and what == node_requests.INFO:
             return await self._nodes.info(args)
         if peer is None:
+            sessions = list(self._bridge.sessions.reachable())
+            few = sum(not session.linked for session in sessions) <= limits.PARKED_ASKED_MAX
             return await asyncio.gather(
-                *(self._nodes_of(session) for session in list(self._bridge.sessions.linked()))
+                *(self._nodes_of(one) if one.linked or few else _proxies_of(one) for one in sessions)
             )
         session = self._session(peer)
         if what == node_requests.LIST:
@@ -213,14 +218,14 @@ class ControlOperations:
         return await self._sites.answer(args)
 
     def _session(self, name: object) -> PeerSession:
-        """The linked peer of a name or GUID.
+        """The linked or parked peer of a name or GUID.
 
         Raises:
             PeerRefused: Several peers have that name.
-            UnreachableError: No linked peer has it.
+            UnreachableError: No such peer has it.
         """
         peer = str(name)
-        sessions = list(self._bridge.sessions.linked())
+        sessions = list(self._bridge.sessions.reachable())
         fitting = [s for s in sessions if peer in {s.link.name, str(s.link.guid), str(s.link.guid).partition("#")[0]}]
         if len(fitting) == 1:
             return fitting[0]
@@ -229,6 +234,13 @@ class ControlOperations:
         similar = did_you_mean(peer, [session.link.name for session in sessions])
         remedy = "`rmpa peer list` shows who is there, and why one is not linked"
         raise UnreachableError("linked peer", repr(peer), f"did you mean {similar}?" if similar else remedy)
+
+
+async def _proxies_of(session: PeerSession) -> PeerNodes:
+    """The nodes of a parked peer as far as this module has proxies of them; the peer is not asked."""
+    nodes = tuple(NodeLine(name=node) for node, _ in session.proxies)
+    problem = "parked: only nodes with topics or services that cross; `rmpa node list --peer` asks it"
+    return PeerNodes(peer=session.link.name, nodes=nodes, problem=problem)
 
 
 def _topics(args: Args) -> frozenset[str] | None:

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import msgspec
 
+from rmpa.bridge.session.peer_session import PeerState
+from rmpa.mesh.lane_demand import LaneState
 from rmpa.observe.io.direct_section import direct_counts
 from rmpa.observe.shared_address import mark_shared_addresses
 from rmpa.observe.snapshot import BoundInfo, DetectorInfo, LaneInfo, LinkInfo, PeerInfo, ProbesInfo
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.io.mesh import Mesh
     from rmpa.mesh.io.path_monitor import PathMonitor
+    from rmpa.mesh.mode import MeshMode
     from rmpa.mesh.peering_events import PeerStatus
     from rmpa.runtime.stream import Stream
 
@@ -40,6 +43,7 @@ class EndpointView(Protocol):
     identity: Identity
     mesh: Mesh
     discovery: Discovery
+    mode: MeshMode
 
 
 class PeersSection:
@@ -58,7 +62,7 @@ class PeersSection:
     def infos(self, endpoint: EndpointView) -> tuple[PeerInfo, ...]:
         """Every peer that is known, by name."""
         now = self._clock.now()
-        links = {session.link.guid: session for session in self._bridge.sessions.linked()}
+        links = {session.link.guid: session for session in self._bridge.sessions.reachable()}
         yield_to_data()  # a millisecond each with a full roster
         roster = {view.identity.guid: view for view in endpoint.discovery.peers()}
         yield_to_data()
@@ -70,7 +74,8 @@ class PeersSection:
             session = links.get(guid)
             info = self._peer(roster.get(guid), statuses.get(guid), session, now)
             if session is not None:
-                info = msgspec.structs.replace(info, link=self._link(session.link, endpoint.mesh.paths, now))
+                if session.linked:
+                    info = msgspec.structs.replace(info, link=self._link(session.link, endpoint.mesh.paths, now))
                 theirs = len(self._bridge.topics.imports.offered_by(session.peer))
                 ours = self._bridge.topics.exports.topics_for(session.peer)
                 yield_to_data()
@@ -109,8 +114,10 @@ class PeersSection:
         identity = (view or status or session.link).identity  # type: ignore[union-attr] # one of the three is there
         conflicts = view.conflicts if view is not None else ()
         unlinked = status.since if status is not None and status.since is not None else view.since if view else now
-        if session is not None:
+        if session is not None and session.linked:
             state, since = "linked", session.link.since or now
+        elif session is not None:
+            state, since = "parked" if session.state is PeerState.PARKED else "linking", session.away_since
         elif view is not None and not view.present:
             state, since = "conflict", view.since
         elif status is not None and status.state == "refused":
@@ -149,12 +156,16 @@ class PeersSection:
             queued=link.queue_bytes,
             dropped=link.dropped,
             heard_ago=now - link.heard_at,
+            rests=link.rests,
             packet=paths.packet_bytes(link),
             path_problem=problem.text if problem is not None else "",
             path_remedy=problem.remedy if problem is not None else "",
             lanes=(
                 _lane(link.express, link.connection.stream),
-                _lane(link.bulk, link.bulk_connection.stream if link.bulk_connection is not None else None),
+                msgspec.structs.replace(
+                    _lane(link.bulk, link.bulk_connection.stream if link.bulk_connection is not None else None),
+                    unneeded=link.lane_demand.state is LaneState.ABSENT,
+                ),
             ),
         )
 

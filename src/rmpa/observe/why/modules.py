@@ -69,7 +69,7 @@ def _further(snapshot: Snapshot, peer: PeerInfo, told: PeerAgent | None, refusal
 
 def _lanes(link: LinkInfo) -> Iterator[Check]:
     for lane in link.lanes:
-        if not lane.connected:
+        if not lane.connected and not lane.unneeded:
             text = f"the {lane.name} lane has no connection: {lane.queued} bytes wait"
             yield Check("lanes", WARN, text, "it is dialled again by itself; is a firewall between the modules?")
     if link.dropped:
@@ -77,6 +77,9 @@ def _lanes(link: LinkInfo) -> Iterator[Check]:
         yield Check("lanes", WARN, text, "contracts with max_rate or priority say what may be left out")
     elif all(lane.connected for lane in link.lanes):
         yield Check("lanes", OK, f"{len(link.lanes) or 'all'} lanes are connected, nothing was dropped")
+    elif all(lane.connected or lane.unneeded for lane in link.lanes):
+        idle = ", ".join(lane.name for lane in link.lanes if not lane.connected)
+        yield Check("lanes", OK, f"nothing was dropped; the {idle} lane is connected when a message wants it")
 
 
 def _answer(peer: PeerInfo, version: str, told: PeerAgent | None, refusal: str) -> Check:

@@ -47,7 +47,7 @@ _FLOWING: Final = frozenset({"open", "lingering"})
 def find_peer(snapshot: Snapshot, name: str) -> PeerInfo | None:
     """The peer with a name or GUID; of several peers of one name, a linked one."""
     fitting = [p for p in snapshot.peers if name in (p.name, p.guid, p.guid.partition("#")[0])]
-    return min(fitting, key=lambda p: p.state != "linked", default=None)
+    return min(fitting, key=lambda p: (p.state != "linked", p.state != "parked"), default=None)
 
 
 def peer_stages(snapshot: Snapshot, name: str) -> tuple[Check, ...]:
@@ -77,6 +77,9 @@ def peer_stages(snapshot: Snapshot, name: str) -> tuple[Check, ...]:
         )
         return (heard, Check("link", OK, f"no link of its own; {peer.via} passes on what it publishes"))
     found = Check("peer", OK, f"{peer.name} is known, by {peer.source or 'its link'} ({peer.guid})")
+    if peer.state == "parked":
+        text = f"parked for {peer.since_ago:.0f} s: nothing needed the link; it is made on demand, in a round trip"
+        return (found, Check("link", OK, text))
     if peer.state != "linked" or peer.link is None:
         return (found, _unlinked(peer))
     return (found, _linked(peer))
@@ -104,7 +107,8 @@ def _linked(peer: PeerInfo) -> Check:
     text = f"linked by {link.remote} for {link.up_ago:.0f} s"
     if link.rtt is not None:
         text += f", round trip {link.rtt * 1e3:.1f} ms"
-    if link.heard_ago is not None and link.heard_ago > mesh_limits.EXPRESS_LEASE / 2:
+    lease = mesh_limits.IDLE_LEASE if link.rests else mesh_limits.EXPRESS_LEASE
+    if link.heard_ago is not None and link.heard_ago > lease / 2:
         text += f"; silent for {link.heard_ago:.1f} s"
         return Check("link", WARN, text, "if it stays so, the cable or the radio is the place to look at")
     if link.path_problem:

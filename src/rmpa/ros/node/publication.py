@@ -9,7 +9,9 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import deque
-from typing import TYPE_CHECKING, TypeAlias
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final, Protocol, TypeAlias
 
 from rmpa.ros import limits
 from rmpa.ros.wire.slave_api import OUTBOUND, BusConnection
@@ -17,7 +19,7 @@ from rmpa.ros.wire.tcpros import TopicDescription, check_subscriber, printable, 
 from rmpa.runtime import limits as runtime_limits
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping
+    from collections.abc import Awaitable, Callable, Mapping, Sequence
 
     from rmpa.core.outbox import QueuedMessage
     from rmpa.ros.node.accepted_connection import AcceptedConnection
@@ -30,8 +32,49 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
+_NOTHING: Final[Mapping[str, str]] = MappingProxyType({})
+
+
 def _ignore(*_: object) -> None:
     pass
+
+
+class PublicationEvents(Protocol):
+    """What a publication tells its owner.
+
+    All are called in the event loop, and may call methods of the publication.
+    """
+
+    __slots__ = ()
+
+    def first_subscriber(self) -> None:
+        """Demand rises from 0."""
+
+    def last_subscriber(self) -> None:
+        """Demand returns to 0."""
+
+    def mismatch(self, fields: Mapping[str, str], text: str) -> None:
+        """A subscriber was refused; its header and the text of the error header."""
+
+    def listeners_changed(self) -> None:
+        """``Publication.listeners`` has changed."""
+
+    def request(self, caller: str) -> Awaitable[RosReply | None] | None:
+        """Answer the ``requestTopic`` of a subscriber with this caller id.
+
+        Its reply of ``None`` is the publication's own address. ``None`` instead of an awaitable: no need to wait.
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class _Callbacks:
+    """Events as functions; see ``Publication``."""
+
+    first_subscriber: Callable[[], None]
+    last_subscriber: Callable[[], None]
+    mismatch: Callable[[Mapping[str, str], str], None]
+    listeners_changed: Callable[[], None]
+    request: Callable[[str], Awaitable[RosReply | None] | None]
 
 
 class Publication:
@@ -48,11 +91,33 @@ class Publication:
         on_last_subscriber: Called when demand returns to 0.
         on_mismatch: ``(fields, text)``: a subscriber was refused; its header and the text of the error header.
         on_listeners: ``listeners`` has changed.
-        on_request: ``(caller id) -> reply``: awaited for the answer to a subscriber's ``requestTopic``; its reply of
-            ``None`` is this publication's own address. ``None`` instead of an awaitable: no need to wait.
+        on_request: ``(caller id) -> reply``: see ``PublicationEvents.request``.
+        events: Instead of the callbacks: an agent with thousands of topics has one small object for each.
         queue_messages: Messages queued for one slow subscriber; above it the oldest is dropped.
         queue_bytes: Bytes queued for one slow subscriber; one message always fits.
     """
+
+    __slots__ = (
+        "_description",
+        "_dropped_before",
+        "_had",
+        "_held",
+        "_latched",
+        "_left",
+        "_open",
+        "_partial",
+        "_queue_bytes",
+        "_queue_messages",
+        "_reply",
+        "_size",
+        "_whole",
+        "_withdrawn",
+        "bytes",
+        "caller_id",
+        "events",
+        "messages",
+        "topic",
+    )
 
     def __init__(
         self,
@@ -64,7 +129,8 @@ class Publication:
         on_last_subscriber: Callable[[], None] = _ignore,
         on_mismatch: Callable[[Mapping[str, str], str], None] = _ignore,
         on_listeners: Callable[[], None] = _ignore,
-        on_request: Callable[[str], Awaitable[RosReply | None] | None] | None = None,
+        on_request: Callable[[str], Awaitable[RosReply | None] | None] = _ignore,
+        events: PublicationEvents | None = None,
         queue_messages: int = limits.SUBSCRIBER_QUEUE_MESSAGES,
         queue_bytes: int = limits.SUBSCRIBER_QUEUE_BYTES,
     ) -> None:
@@ -75,21 +141,22 @@ class Publication:
         self.bytes = 0
         """Bytes published, lengths included; each message counts once, whatever the number of subscribers."""
         self._description: TopicDescription | None = None
-        self._reply: dict[str, str] = {}
-        self._on_first = on_first_subscriber
-        self._on_last = on_last_subscriber
-        self._on_mismatch = on_mismatch
-        self._on_listeners = on_listeners
-        self.on_request = on_request
-        """See above; read by the node that serves this publication."""
-        self._had: dict[str, tuple[bytes, ...]] = {}
+        self._reply: Mapping[str, str] = _NOTHING
+        self.events: PublicationEvents = (
+            events
+            if events is not None
+            else _Callbacks(on_first_subscriber, on_last_subscriber, on_mismatch, on_listeners, on_request)
+        )
+        """See above."""
+        self._had: dict[str, tuple[bytes, ...]] | None = None
         """Latched messages that a subscriber has had by another path, by its caller id."""
         self._queue_messages = queue_messages
         self._queue_bytes = queue_bytes
         self._held: tuple[SubscriberConnection, ...] = ()
         self._open: tuple[SubscriberConnection, ...] = ()
-        self._latched: deque[bytes] = deque(maxlen=1)
-        self._partial: list[tuple[SubscriberConnection, QueuedMessage]] = []
+        # Empty containers take most of the memory of a topic without a subscriber; these are made when needed.
+        self._latched: deque[bytes] | None = None
+        self._partial: Sequence[tuple[SubscriberConnection, QueuedMessage]] = ()
         self._whole: bytearray | None = None
         self._size = self._left = 0
         self._dropped_before = 0
@@ -105,7 +172,7 @@ class Publication:
     @property
     def latched(self) -> tuple[bytes, ...]:
         """The messages kept for later subscribers, oldest first, with their lengths in front."""
-        return tuple(self._latched)
+        return tuple(self._latched) if self._latched is not None else ()
 
     @property
     def subscribers(self) -> int:
@@ -161,7 +228,7 @@ class Publication:
         else:
             self._serve(connection)
         if first and self.subscribers:
-            self._on_first()
+            self.events.first_subscriber()
 
     def describe(self, description: TopicDescription) -> int:
         """Set the description: held subscribers that match are served, the others refused.
@@ -179,9 +246,9 @@ class Publication:
         reply = publisher_header(self.topic, self.caller_id, description)
         old: tuple[SubscriberConnection, ...] = ()
         if self._reply and self._reply != reply:
-            self._latched.clear()
+            self._latched = None
             old, self._open = self._open, ()
-            self._on_listeners()
+            self.events.listeners_changed()
             for connection in old:
                 self._count_dropped(connection)
                 connection.close()
@@ -195,7 +262,7 @@ class Publication:
                 self._refuse(connection, problem)
             self._held = tuple(other for other in self._held if other is not connection)
         if before and not self.subscribers:
-            self._on_last()
+            self.events.last_subscriber()
         return len(old)
 
     def publish_framed(self, framed: Buffer) -> int:
@@ -210,7 +277,7 @@ class Publication:
         self.messages += 1
         self.bytes += len(framed)
         if self._description is not None and self._description.latching:
-            self._latched.append(bytes(framed))
+            self._keep_latched(bytes(framed))
         dropped = 0
         for connection in self._open:
             dropped += connection.send(framed)
@@ -237,10 +304,10 @@ class Publication:
             return
         self.messages += 1
         self.bytes += self._size
-        partial, self._partial = self._partial, []
+        partial, self._partial = self._partial, ()
         if self._whole is not None:
             framed, self._whole = bytes(self._whole), None
-            self._latched.append(framed)
+            self._keep_latched(framed)
             served = {connection for connection, _ in partial}
             for connection in self._open:
                 if connection not in served:
@@ -255,16 +322,16 @@ class Publication:
             The number of disconnected subscribers: if any, the owner should register the topic again.
         """
         broken = [connection for connection, message in self._partial if connection.abandon(message)]
-        self._partial = []
+        self._partial = ()
         self._whole = None
         before = self.subscribers
         for connection in broken:
             self._count_dropped(connection)
             connection.close()
         self._open = tuple(connection for connection in self._open if connection not in broken)
-        self._on_listeners()
+        self.events.listeners_changed()
         if before and not self.subscribers:
-            self._on_last()
+            self.events.last_subscriber()
         return len(broken)
 
     def bound(self, messages: int) -> None:
@@ -275,12 +342,13 @@ class Publication:
 
     def keep(self, depth: int) -> None:
         """Set the number of latched messages that are kept for later subscribers."""
-        self._latched = deque(self._latched, maxlen=min(depth, limits.LATCHED_MAX))
+        self._latched = deque(self._latched or (), maxlen=min(depth, limits.LATCHED_MAX))
 
     def forget_latched(self) -> None:
         """Drop the latched messages, because their source is gone or will send them again."""
-        self._latched.clear()
-        self._had.clear()
+        if self._latched is not None:
+            self._latched.clear()
+        self._had = None
 
     def hang_up(self, caller_id: str) -> bool:
         """Close the connections of one subscriber; return whether there was one."""
@@ -298,8 +366,8 @@ class Publication:
             had: As ``latched`` returned them; empty: it gets all again.
         """
         if had:
-            self._had[caller_id] = had
-        else:
+            self._had = {**(self._had or {}), caller_id: had}
+        elif self._had is not None:
             self._had.pop(caller_id, None)
 
     async def drained(self, timeout: float = runtime_limits.DRAIN_TIMEOUT) -> None:  # noqa: ASYNC109 - for all together
@@ -314,27 +382,32 @@ class Publication:
         for connection in connections:
             self._count_dropped(connection)
             connection.close()
-        self._latched.clear()
-        self._partial = []
+        self._latched = None
+        self._partial = ()
         self._whole = None
+
+    def _keep_latched(self, framed: bytes) -> None:
+        if self._latched is None:
+            self._latched = deque(maxlen=1)
+        self._latched.append(framed)
 
     def _serve(self, connection: SubscriberConnection) -> None:
         _log.debug(
             "> %s: serves subscriber %s at %s", self.topic, printable(connection.caller_id), connection.peer[0]
         )
         connection.accept(self._reply, self._queue_messages, self._queue_bytes)
-        had = self._had.pop(connection.caller_id, ())
-        for framed in self._latched:
+        had = self._had.pop(connection.caller_id, ()) if self._had is not None else ()
+        for framed in self.latched:
             if framed not in had:
                 connection.send(framed)
         if not connection.stream.closed:
             self._open += (connection,)
-            self._on_listeners()
+            self.events.listeners_changed()
 
     def _refuse(self, connection: SubscriberConnection, text: str) -> None:
         _log.debug("! %s: refuses subscriber %s: %s", self.topic, printable(connection.caller_id), text)
         connection.refuse(text)
-        self._on_mismatch(connection.fields, text)
+        self.events.mismatch(connection.fields, text)
 
     def _count_dropped(self, connection: SubscriberConnection) -> None:
         self._dropped_before += connection.dropped
@@ -346,6 +419,6 @@ class Publication:
         self._partial = [(other, message) for other, message in self._partial if other is not connection]
         self._held = tuple(other for other in self._held if other is not connection)
         self._open = tuple(other for other in self._open if other is not connection)
-        self._on_listeners()
+        self.events.listeners_changed()
         if before and not self.subscribers and not self._withdrawn:
-            self._on_last()
+            self.events.last_subscriber()

@@ -250,8 +250,8 @@ class SlaveNode:
             return self._answer(self._on_kill(caller, reason))
         if method == "requestTopic" and reply.code == 1:
             publication = self._publications.get(str(params[1]))
-            if publication is not None and publication.on_request is not None:
-                other = publication.on_request(str(params[0]))
+            if publication is not None:
+                other = publication.events.request(str(params[0]))
                 if other is not None:
                     return self._answer_other(other, reply)
         return list(reply)

@@ -67,6 +67,8 @@ LOG_CHARACTERS: Final = 1024
 """Characters of one line of the log; the rest is cut."""
 SILENT_AFTER: Final = 1.0
 """Time without a word on a link after which its module is shown as silent. Keepalives come more often."""
+SILENT_AFTER_REST: Final = 8.0
+"""The same for a link at rest, whose keepalives come every 5 s."""
 AWAY_AFTER: Final = 7.0
 """Time without a beacon after which a module without a link is shown as away. Heartbeats come every 5 s."""
 FORGET_AFTER: Final = 600.0

@@ -34,14 +34,16 @@ if TYPE_CHECKING:
     )
     from rmpa.web.monitor.resources import ResourceFacts
 
-_STATES = {"refused": "refused", "conflict": "refused", "relayed": "relayed"}
+_STATES = {"refused": "refused", "conflict": "refused", "relayed": "relayed", "parked": "parked"}
 
 
 def module_state(peer: PeerInfo) -> str:
-    """The word for a peer: ``up``, ``silent``, ``linking``, ``refused``, ``relayed`` or ``away``."""
+    """The word for a peer: ``up``, ``silent``, ``linking``, ``refused``, ``relayed``, ``parked`` or ``away``."""
     if peer.state == "linked":
-        heard = peer.link.heard_ago if peer.link else None
-        return "silent" if heard is not None and heard > limits.SILENT_AFTER else "up"
+        if peer.link is None or peer.link.heard_ago is None:
+            return "up"
+        after = limits.SILENT_AFTER_REST if peer.link.rests else limits.SILENT_AFTER
+        return "silent" if peer.link.heard_ago > after else "up"
     if peer.state in _STATES:
         return _STATES[peer.state]
     return "away" if peer.beacon_ago is None or peer.beacon_ago > limits.AWAY_AFTER else "linking"

@@ -67,7 +67,7 @@ const Wire = memo(({ name, module, a, b, geo, labelled }) => {
   const line = chord(a, b, geo.node, 0);
   const middle = line.at(0.5);
   const about = known(module.state);
-  const quiet = module.state === "up" || module.state === "relayed";
+  const quiet = module.state === "up" || module.state === "relayed" || module.state === "parked";
   return html`<g class="wire ${module.state} ${about.tone}"><path d=${line.d} />
     ${!quiet && html`<g class="seal" transform="translate(${middle.x} ${middle.y})"><circle r="19" /><svg x="-11" y="-11" width="22" height="22" viewBox="0 0 16 16">${shape(module.state)}</svg></g>`}
     ${!quiet && labelled && html`<text class="word" x=${middle.x} y=${middle.y + 42}>${about.word}</text>`}</g>`;
@@ -184,7 +184,7 @@ function concerns(state) {
   const found = [];
   for (const [id, alarm] of entries(state, "alarms")) found.push({ id, level: alarm.level, text: alarm.text, who: alarm.resource || alarm.module, to: alarm.resource ? href("resource", alarm.resource) : href("alarms"), since: alarm.at });
   for (const [name, module] of entries(state, "modules")) {
-    if (module.state !== "up" && module.state !== "here" && module.state !== "relayed")
+    if (module.state !== "up" && module.state !== "here" && module.state !== "relayed" && module.state !== "parked")
       found.push({ id: `m${name}`, level: { refused: "ERROR", away: "STALE" }[module.state] || "WARN", text: `${known(module.state).word}${module.error ? `: ${module.error}` : ""}`, who: name, to: href("module", name), since: module.since });
     else if (module.error) found.push({ id: `m${name}`, level: "WARN", text: module.error, who: name, to: href("module", name) });
   }

@@ -102,7 +102,10 @@ class Side:
                 asyncio.get_running_loop().call_soon(other.asks.message, back, decode(payload))
 
         attached = cast(
-            "PeerSession", SimpleNamespace(peer=number, link=SimpleNamespace(name=other.name, send_control=send))
+            "PeerSession",
+            SimpleNamespace(
+                peer=number, linked=True, link=SimpleNamespace(name=other.name, send_control=send, parked=False)
+            ),
         )
         self.links[number] = attached
         return attached

@@ -61,7 +61,10 @@ class Module:
             cast("Any", SimpleNamespace(offered=self.offered, local=self._local)),
             Contracts((), AUTO.transport),
             cast("Any", SimpleNamespace(of_topic=self._of_topic, forget=self.forgotten.append)),
-            cast("Any", SimpleNamespace(get=self.sessions.get, linked=self.sessions.values)),
+            cast(
+                "Any",
+                SimpleNamespace(get=self.sessions.get, linked=self.sessions.values, reachable=self.sessions.values),
+            ),
             cast(
                 "Any",
                 SimpleNamespace(
@@ -81,7 +84,9 @@ class Module:
     @staticmethod
     def _session(number: int) -> Any:
         link = SimpleNamespace(name=f"peer{number}", silent=True)
-        return SimpleNamespace(peer=number, link=link, linked=True, same_machine=False, address=f"10.0.0.{number}")
+        return SimpleNamespace(
+            peer=number, link=link, linked=True, reachable=True, same_machine=False, address=f"10.0.0.{number}"
+        )
 
     def _local(self, _peer: int, source: Source) -> Source | None:
         return source if source in self.offered else None

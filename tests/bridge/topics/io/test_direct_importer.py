@@ -48,7 +48,9 @@ class Module:
         self.connected: list[object] = []
         self.checked = asyncio.Event()
         link = SimpleNamespace(name="a")
-        self.session: Any = SimpleNamespace(peer=1, link=link, linked=True, same_machine=False, address="10.0.0.1")
+        self.session: Any = SimpleNamespace(
+            peer=1, link=link, linked=True, reachable=True, same_machine=False, address="10.0.0.1"
+        )
         self.callers: frozenset[str] = frozenset()
         publication = SimpleNamespace(callers=self.callers, listeners=())
         monkeypatch.setattr(direct_importer, "probe", self._probe)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.mesh.frames import FrameKind
+from rmpa.ros.wire.tcpros import LENGTH
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
     from rmpa.bridge.data.io.route_sender import RouteSender
     from rmpa.core.counters import Counters
     from rmpa.mesh.io.link import PeerLink
+
+_LENGTH: Final = LENGTH.size
 
 
 class DataHandler(Protocol):
@@ -68,10 +71,9 @@ class DataReceiver:
         if handler is None:
             self._counters.add("route.unknown")
             return
-        if len(payload) < 4 or int.from_bytes(payload[:4], "little") != len(payload) - 4:
-            raise RemoteProtocolError(
-                f"a data frame of {len(payload)} bytes on route {route} does not hold one message"
-            )
+        size = len(payload)
+        if size < _LENGTH or LENGTH.unpack_from(payload)[0] != size - _LENGTH:
+            raise RemoteProtocolError(f"a data frame of {size} bytes on route {route} does not hold one message")
         handler.message(sequence, stamp_ns, payload)
 
     def part(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:

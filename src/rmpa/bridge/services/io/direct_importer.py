@@ -291,7 +291,7 @@ class DirectServiceImporter:
     async def _ask(self, key: ServiceKey, attempt: int) -> None:
         session, known = self._sessions.get(key.peer), self.services.get(key)
         found: Grant | Unmet
-        if session is None or not session.linked or known is None:
+        if session is None or not session.reachable or known is None:
             found = NO_LINK
         else:
             found = await self._request(session, AskService(key.service, known.node, known.wanted))

@@ -46,7 +46,9 @@ from rmpa.bridge.services.remote_service import ServiceRouteState
 from rmpa.bridge.services.rules import ServiceRules
 from rmpa.bridge.session.graph_driver import GraphDriver
 from rmpa.bridge.session.part import Part
+from rmpa.bridge.session.peer_proxies import ProxyCallbacks
 from rmpa.bridge.session.peer_session import PeerState
+from rmpa.bridge.session.unchanged_graph import UnchangedGraph
 from rmpa.core.counters import RefusalLog
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
@@ -146,6 +148,7 @@ class Services(Part):
         self._budgets: dict[int, Budgets] = {}
         self._shown: dict[tuple[int, str], ShownService] = {}
         self._callers: dict[tuple[int, int], ShownService] = {}
+        self._unchanged = UnchangedGraph()
         self._driver: GraphDriver[ExportAction | ImportAction, AdvertiseServices] = GraphDriver(
             sessions,
             RefusalLog(_log, counters),
@@ -176,6 +179,7 @@ class Services(Part):
             gate=gate,
         )
         """Direct calls of local nodes to peers' servers."""
+        sessions.offers.count(lambda: self.exports.changes, lambda: self.exports.pending)
         rpc.on_notification(_MISMATCH, self._told_of_mismatch)
 
     def __iter__(self) -> Iterator[ShownService]:
@@ -321,10 +325,12 @@ class Services(Part):
 
     def _settled(self) -> None:
         self._serving.changed()
+        self._sessions.offers.changed()
 
     def depends(self, session: PeerSession) -> bool:
         """Whether nodes of this module have direct connections to the peer's."""
-        return any(key.peer == session.peer and each.grant for key, each in self.direct_imports.services)
+        granted = (key.peer == session.peer and each.grant for key, each in self.direct_imports.services)
+        return self._driver.waits(session) or any(granted)
 
     def lane_lost(self, session: PeerSession) -> None:
         """Report calls that the loss of the bulk lane's connection may have left without an answer."""
@@ -336,8 +342,10 @@ class Services(Part):
 
     def reconcile(self) -> None:
         """Register missing services again, and close routes and connections that are not used."""
-        services = self._core.state().services
-        self._driver.look((*self.exports.seen, *services))
+        state = self._core.state()
+        services = state.services
+        if self._unchanged.is_due(state, steady=not self._core.unreachable()):
+            self._driver.look((*self.exports.seen, *services))
         before = asyncio.get_running_loop().time() - limits.SERVICE_IDLE
         for shown in yielding_to_data(list(self._shown.values()), every=16):
             proxy, caller = shown.proxy, shown.caller
@@ -350,8 +358,10 @@ class Services(Part):
     # --- the local graph ---------------------------------------------------------------------------------------
 
     def _look_at(self, names: Iterable[str]) -> None:
-        services = self._core.state().services
+        services: Mapping[str, Mapping[str, str]] | None = None
         for service in names:
+            if services is None:  # not without a name: after each change this copies the core's tables
+                services = self._core.state().services
             providers = services.get(service, {})
             local = next((LocalService(node, uri) for node, uri in providers.items() if not is_own(node)), None)
             # Imports first: a peer's service of this name is hidden before the local one is offered.
@@ -411,7 +421,8 @@ class Services(Part):
         shown = self._shown[action.peer, action.service] = ShownService(
             action.peer, action.service, action.node, self.imports.peer_name(action.peer)
         )
-        session.proxies.hold(action.node, f"service {action.service}", lambda proxy: self._expose(shown, proxy))
+        user = ProxyCallbacks(lambda proxy: self._expose(shown, proxy))
+        session.proxies.hold(action.node, f"service {action.service}", user)
         self.direct_imports.shown(action.peer, action.service)
 
     def _expose(self, shown: ShownService, proxy: SlaveNode) -> None:
@@ -490,6 +501,8 @@ class Services(Part):
         elif session is not None and session.state is PeerState.AWAY:
             text = f"service [{shown.service}]: the agent of {shown.peer_name} has crashed, only direct calls work"
             self._fail_waiting(shown, text)
+        elif session is not None and not session.linked:
+            self._sessions.want(session)
         elif remote.state is ServiceRouteState.IDLE and not self.imports.is_away(shown.peer):
             self._act(self.imports.want(shown.peer, shown.service, asyncio.get_running_loop().time()))
 

@@ -115,7 +115,7 @@ class DirectExporter:
         """
         if (expiry := self._expiries.pop(session.peer, None)) is not None:
             expiry.cancel()
-        shared = any(other.address == session.address for other in self._sessions.linked() if other is not session)
+        shared = any(other.address == session.address for other in self._sessions.reachable() if other is not session)
         if session.link.silent and not crashed and not session.same_machine and not shared:
             self._act(self.grants.unreachable(session.peer))
 

@@ -390,7 +390,7 @@ class DirectImporter:
     async def _ask_peer(self, key: DirectKey, attempt: int) -> None:
         session, entry = self._sessions.get(key.peer), self._imports.get(key.peer, key.source)
         found: Grant | Unmet
-        if session is None or not session.linked or entry is None:
+        if session is None or not session.reachable or entry is None:
             found = NO_LINK
         else:
             limit = self._asking.setdefault(key.peer, asyncio.Semaphore(limits.DIRECT_ASKS))

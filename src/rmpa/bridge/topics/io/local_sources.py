@@ -39,6 +39,8 @@ class LocalSources:
     def changed(self, change: GraphChange) -> None:
         """Remembers the type of a publisher that registers; forgets it when the publisher leaves."""
         if change.kind is RegistrationKind.PUBLISHER:
+            if is_own(change.node) and not self._relay.enabled:
+                return  # thousands of proxies, whose types only a relay needs
             source = Source(change.name, change.node)
             if not change.added:
                 self._types.pop(source, None)

@@ -31,6 +31,7 @@ from rmpa.bridge.policy import Policy, is_own
 from rmpa.bridge.relay import LinkedPeer
 from rmpa.bridge.session.graph_driver import GraphDriver
 from rmpa.bridge.session.part import Part
+from rmpa.bridge.session.unchanged_graph import UnchangedGraph
 from rmpa.bridge.topics.claims import ClaimDeadlines
 from rmpa.bridge.topics.exports import Exports
 from rmpa.bridge.topics.imports import Imports
@@ -153,6 +154,7 @@ class Topics(Part):
         self._act = self._driver.act
         self._absent = AbsentPeers(lambda peer: self._act(self.exports.unclaimed(peer)), self.outbound.forget, gate)
         self._claims = ClaimDeadlines()
+        self._unchanged = UnchangedGraph()
         self._claims_timer = MachineTimer(self._claims.next_timer, self._claims_over)
         self._mismatches = Mismatches()
         self.losses = LossReports(self.exports, sessions, self._peers, self._absent, rpc, counters, refusals)
@@ -234,7 +236,8 @@ class Topics(Part):
         peer, identity = session.peer, session.link.identity
         now = asyncio.get_running_loop().time()
         if peer in self._peers:
-            _log.info("= %s is back: reliable topics go on", session.link.name)
+            if not session.unparked:
+                _log.info("= %s is back: reliable topics go on", session.link.name)
             self._claims.begin(peer, now)
         else:
             self._begin(session, now)
@@ -287,7 +290,7 @@ class Topics(Part):
         self._act(exports)
         if session.link.silent:
             # Most silences end soon with a new link, so nothing leaves the local graph yet.
-            imports, _ = self.imports.link_away(peer, briefly=True)
+            imports, _ = self.imports.link_away(peer, briefly=True, parked=session.link.parked)
             self._act(imports)
 
     def grace_over(self, session: PeerSession) -> bool:
@@ -335,7 +338,7 @@ class Topics(Part):
 
     def depends(self, session: PeerSession) -> bool:
         """Whether nodes of this module have direct connections to the peer's."""
-        return any(key.peer == session.peer for key, _ in self.direct_imports.routes)
+        return self._driver.waits(session) or any(key.peer == session.peer for key, _ in self.direct_imports.routes)
 
     def lane_lost(self, session: PeerSession) -> None:
         """Aborts messages that came in part over a lost bulk lane, and lets the senders repeat or drop theirs."""
@@ -435,9 +438,11 @@ class Topics(Part):
 
     def reconcile(self) -> None:
         """Registers missing publications again, and stops counting losses of topics without local subscribers."""
-        self._look_at_all()
         self._absent.expire(asyncio.get_running_loop().time())
         state = self._core.state()
+        compared = self._unchanged.is_due(state, steady=not self._core.unreachable())
+        if compared:
+            self._look_at_all()
 
         def subscribed(topic: str) -> bool:
             return any(not is_own(node) for node in state.subscribers.get(topic, ()))
@@ -446,10 +451,13 @@ class Topics(Part):
         for topics in list(self._peers.values()):
             topics.unheard(subscribed)
             yield_to_data()
-            if again := topics.reconcile(state.publishers):
+            if compared and (again := topics.reconcile(state.publishers)):
                 self._counters.add("proxy.registered_again", again)
 
     def _demand(self, peer: int, source: Source, *, wanted: bool) -> None:
+        session = self._sessions.get(peer)
+        if wanted and session is not None:
+            self._sessions.want(session)
         self._act(self.imports.demand(peer, source, asyncio.get_running_loop().time(), wanted=wanted))
 
     def _occurred(self, session: PeerSession, source: Source, occurred: QosEvent) -> None:
@@ -488,6 +496,7 @@ class Topics(Part):
         """Drops what belongs to sources that are gone, or that new rules keep home."""
         self._forget_mismatches()
         self.direct_exports.policy_changed()
+        self._sessions.offers.changed()
 
     def _forget_mismatches(self) -> None:
         """Forgets the mismatches of sources that are gone."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import OrderedDict
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -34,13 +33,58 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class _Published:
-    """A topic of the peer at its proxy: the publication, whose ``topic`` is the local name, and the message type."""
+    """A topic of the peer at its proxy: what its publication tells, and what is registered.
 
-    node: SlaveNode
-    publication: Publication
-    type: str
+    Args:
+        topics: All of the peer.
+        action: The source, its local name and its type.
+    """
+
+    __slots__ = ("_action", "_topics", "node", "publication")
+
+    def __init__(self, topics: PeerTopics, action: Publish) -> None:
+        self._topics = topics
+        self._action = action
+        self.node: SlaveNode
+        self.publication: Publication
+
+    @property
+    def source(self) -> Source:
+        """The peer's topic and node."""
+        return self._action.source
+
+    @property
+    def topic(self) -> str:
+        """The name in the local graph."""
+        return self._action.topic or self._action.source.topic
+
+    @property
+    def type(self) -> str:
+        """The message type."""
+        return self._action.type
+
+    def ready(self, node: SlaveNode) -> None:
+        self.node = node
+        self._topics.published(self)
+
+    def left(self, node: SlaveNode) -> None:
+        self._topics.unpublished(self, node)
+
+    def first_subscriber(self) -> None:
+        self._topics.on_demand(self.source, True)
+
+    def last_subscriber(self) -> None:
+        self._topics.on_demand(self.source, False)
+
+    def mismatch(self, fields: Mapping[str, str], text: str) -> None:
+        self._topics.on_mismatch(self.source, printable(fields.get("callerid", "")), text)
+
+    def listeners_changed(self) -> None:
+        self._topics.on_listeners(self.source)
+
+    def request(self, caller: str) -> Awaitable[RosReply | None] | None:
+        return self._topics.on_request(self.source, caller)
 
 
 class PeerTopics:
@@ -74,11 +118,11 @@ class PeerTopics:
         self._core = core
         self._session = session
         self._counters = counters
-        self._on_demand = on_demand
-        self._on_mismatch = on_mismatch
+        self.on_demand = on_demand
+        self.on_mismatch = on_mismatch
         self._on_occurred = on_occurred
-        self._on_listeners = on_listeners
-        self._on_request = on_request
+        self.on_listeners = on_listeners
+        self.on_request = on_request
         self._published: dict[Source, _Published] = {}
         self.flows: dict[int, ImportFlow] = {}
         """The flow of each open route, by its id."""
@@ -100,17 +144,12 @@ class PeerTopics:
 
     def publish(self, action: Publish) -> None:
         """Publish a source at its proxy, in a later turn of the loop."""
-        self._session.proxies.hold(
-            action.source.node,
-            _key(action.source),
-            lambda node: self._publish(action, node),
-            lambda node: self._unpublish(action.source, node),
-        )
+        self._session.proxies.hold(action.source.node, action.source, _Published(self, action))
 
     def retract(self, action: Retract) -> None:
         """Retract a source: its data stops at once, its registration in a later turn of the loop."""
         self._over(action.source, missed=True)
-        self._session.proxies.release(action.source.node, _key(action.source))
+        self._session.proxies.release(action.source.node, action.source)
 
     def describe(self, action: Describe, on_ack: Callable[[int], None]) -> None:
         """Prepare for data on a newly opened route, and answer the waiting subscribers with its description.
@@ -331,26 +370,19 @@ class PeerTopics:
 
     # --- at the proxies ----------------------------------------------------------------------------------------
 
-    def _publish(self, action: Publish, node: SlaveNode) -> None:
-        source = action.source
-        publication = Publication(
-            action.topic or source.topic,
-            node.name,
-            on_first_subscriber=lambda: self._on_demand(source, True),
-            on_last_subscriber=lambda: self._on_demand(source, False),
-            on_mismatch=lambda fields, text: self._on_mismatch(source, printable(fields.get("callerid", "")), text),
-            on_listeners=lambda: self._on_listeners(source),
-            on_request=lambda caller: self._on_request(source, caller),
-        )
-        node.add_publication(publication)
-        published = self._published[source] = _Published(node, publication, action.type)
+    def published(self, published: _Published) -> None:
+        """Register a topic whose proxy exists."""
+        node = published.node
+        published.publication = Publication(published.topic, node.name, events=published)
+        node.add_publication(published.publication)
+        self._published[published.source] = published
         self._register(published)
 
-    def _unpublish(self, source: Source, node: SlaveNode) -> None:
-        published = self._published.pop(source, None)
-        if published is None:
-            return  # it was never published
-        topic = published.publication.topic
+    def unpublished(self, published: _Published, node: SlaveNode) -> None:
+        """Unregister a topic; nothing happens if it was never registered."""
+        if self._published.pop(published.source, None) is None:
+            return
+        topic = published.topic
         self._core.call("unregisterPublisher", node.name, topic, node.uri)
         # rospy does not leave a publisher when the master removes it, so its connection is closed.
         node.remove_publication(topic)
@@ -360,8 +392,3 @@ class PeerTopics:
         code, status, _ = self._core.call("registerPublisher", node.name, topic, published.type, node.uri)
         if code != 1:
             _log.error("! the local core does not take %s of %s: %s", topic, node.name, status)
-
-
-def _key(source: Source) -> str:
-    """The key under which a source holds its node's proxy."""
-    return f"topic {source.topic}"

@@ -58,6 +58,7 @@ class ExportedTopic:
         self._run = max(1, clock.wall_ns())
         self._sequence = 0
         self._limits = TopicLimits(entry.rate, entry.size)
+        self._limited = bool(self._limits)
         self._traffic = SiteTraffic(clock.now())
         self._sent_before = self._dropped_before = 0
         self._problem = ""
@@ -279,7 +280,7 @@ class ExportedTopic:
             if repeated:
                 return  # the publisher was connected anew, and gave its last message again
             self._latched = message
-        if self._limits and not self._limits.admit(self._clock.now(), size):
+        if self._limited and not self._limits.admit(self._clock.now(), size):
             self._limit(message)
             return
         if self._held is not None:

@@ -58,14 +58,14 @@ class SiteNeighbour:
         self.imports = SiteImports(rules)
         """What is shown of the other sites."""
         self.on_sites: Callable[[tuple[str, ...]], None] = lambda _: None
-        """Called with the names of the other sites, after each change of what they have."""
+        """Called with the names of the other sites, after each change of them."""
         self.on_site_source: Callable[[SiteSource, bool], None] = lambda _source, _there: None
         """Called when another site announces or withdraws a source; not for those that go together with the site."""
         self.on_leads: Callable[[bool], None] = lambda _: None
         """Called when this gateway begins to lead its site, and when it ends."""
         self._leader: Leader | None = None
         self._active = False
-        self._sites: frozenset[str] = frozenset()
+        self._sites: tuple[str, ...] = ()
         self._tokens: dict[str, Declared] = {}
         self._declared: list[Declared] = []
         self._timer = MachineTimer(self._next_timer, self._handle_timer)
@@ -183,20 +183,23 @@ class SiteNeighbour:
         elif self._active and not leads:
             _log.info("= another gateway of site %s leads now", self._own.site)
             self._rest()
-        self.exports.sites_seen(self.catalogue.sites)
+        if (sites := self.catalogue.sites) != self._sites:
+            self._tell_sites(sites)
         self._act()
-        self._tell_sites()
-        self.on_sites(self.catalogue.sites)
         self._timer.arm()
 
-    def _tell_sites(self) -> None:
-        """Log which sites have come, and which have gone."""
-        there = frozenset(self.catalogue.sites)
-        for site in sorted(there - self._sites):
-            _log.info("= site %s is joined", site)
-        for site in sorted(self._sites - there):
-            _log.warning("! site %s is unreachable: its gateway has ended, or the way to it; `rmpa site list`", site)
+    def _tell_sites(self, there: tuple[str, ...]) -> None:
+        """Tell which sites have come, and which have gone."""
+        for site in there:
+            if site not in self._sites:
+                _log.info("= site %s is joined", site)
+        for site in self._sites:
+            if site not in there:
+                text = "! site %s is unreachable: its gateway has ended, or the way to it; `rmpa site list`"
+                _log.warning(text, site)
         self._sites = there
+        self.exports.sites_seen(there)
+        self.on_sites(there)
 
     def _act(self) -> None:
         """Do what the plans say, or forget it while another gateway leads."""

@@ -44,6 +44,8 @@ HERE: Final = "why.here"
 """The request to a subscriber's agent: how a topic of this module arrives there. Replied by ``Diagnosis``, a list."""
 _NO_PUBLISHER: Final = frozenset({"publisher", PERMISSION_THERE})
 """The stages that fail where a peer has no publisher, or does not tell of one: the name may be something else's."""
+_REACHED: Final = frozenset({"linked", "relayed", "parked"})
+"""States of peers that can be asked; a parked one is linked for it."""
 _MOVING: Final = frozenset({"open", "lingering", "opening"})
 
 
@@ -146,7 +148,9 @@ class WhyService:
         told, refusal = None, ""
         snapshot = self._snapshots.build(frozenset())
         found = find_peer(snapshot, name)
-        session = next((s for s in self._bridge.sessions.linked() if found and str(s.link.guid) == found.guid), None)
+        session = next(
+            (s for s in self._bridge.sessions.reachable() if found and str(s.link.guid) == found.guid), None
+        )
         if session is not None:
             try:
                 told = msgspec.convert(await self._bridge.rpc.request(session, AGENT_INFO, {}), PeerAgent)
@@ -172,7 +176,7 @@ class WhyService:
 
     def _carrier(self, peer: PeerInfo) -> PeerSession | None:
         """The link that carries what a peer publishes: its own, or that of the relay that passes it on."""
-        for session in self._bridge.sessions.linked():
+        for session in self._bridge.sessions.reachable():
             if str(session.link.guid) == peer.guid or (peer.via and session.link.name == peer.via):
                 return session
         return None
@@ -184,24 +188,26 @@ class WhyService:
         coming = [peer.guid for peer in peers if self._offers(peer, topic)]
         if not coming and not own and not self._adrift(topic):
             # No peer offers it; one may have it, and not let it cross.
-            known = await asyncio.gather(*(self._both_ends(peer, topic) for peer in peers))
-            told = [(p.guid, e.there) for p, e in zip(peers, known, strict=True) if e.there is not None]
+            asked = _without_many_parked(peers)
+            known = await asyncio.gather(*(self._both_ends(peer, topic) for peer in asked))
+            told = [(p.guid, e.there) for p, e in zip(asked, known, strict=True) if e.there is not None]
             coming = [guid for guid, there in told if there.sources]
             coming = coming or [guid for guid, there in told if there.permitted is False]
         coming += self._adrift(topic)
         ways = [self._arrives(guid, topic) for guid in coming]
-        ways += [self._leaves(topic, peer.guid) for peer in peers if own and peer.state == "linked"]
+        to = [peer for peer in _without_many_parked(peers) if own and peer.state in ("linked", "parked")]
+        ways += [self._leaves(topic, peer.guid) for peer in to]
         found = [diagnosis for diagnoses in await asyncio.gather(*ways) for diagnosis in diagnoses]
         return tuple(found) or (await self._nowhere(topic, [peer.name for peer in peers]),)
 
     def _reachable_peers(self) -> list[PeerInfo]:
-        return [peer for peer in self._snapshots.build(frozenset()).peers if peer.state in ("linked", "relayed")]
+        return [peer for peer in self._snapshots.build(frozenset()).peers if peer.state in _REACHED]
 
     def _adrift(self, topic: str) -> list[str]:
         """The peers whose agent has died while a node of theirs is connected directly to a subscriber here."""
         snapshot = self._snapshots.build(frozenset({topic}))
         left = {r.peer for t in snapshot.topics for r in t.routes if r.direction == "in" and connected_directly(r)}
-        return [p.guid for p in snapshot.peers if p.name in left and p.state not in ("linked", "relayed")]
+        return [p.guid for p in snapshot.peers if p.name in left and p.state not in _REACHED]
 
     def _offers(self, peer: PeerInfo, topic: str) -> bool:
         session = self._carrier(peer)
@@ -290,7 +296,7 @@ class WhyService:
             carried = [(peer, at) for peer in peers if (at := self._carrier(peer)) is not None]
             offering = [p.guid for p, at in carried if self._services.offers(at, service, p.instance)]
             found = await asyncio.gather(
-                *(self._calls(guid, service) for guid in offering or [p.guid for p in peers])
+                *(self._calls(guid, service) for guid in offering or [p.guid for p in _without_many_parked(peers)])
             )
             served = tuple(diagnosis for diagnosis in found if diagnosis.node)
             served = served or tuple(diagnosis for diagnosis in found if _is_denied(diagnosis))
@@ -338,3 +344,9 @@ def _is_denied(found: Diagnosis) -> bool:
 def _no_link(peer: str) -> Check:
     remedy = "ask on its own machine; or try again in a moment"
     return Check("link", FAIL, f"there is no link to {peer} that could be asked", remedy)
+
+
+def _without_many_parked(peers: list[PeerInfo]) -> list[PeerInfo]:
+    """The peers to ask all at once: with very many parked ones, those alone that have a link."""
+    many = sum(peer.state == "parked" for peer in peers) > observe_limits.PARKED_ASKED_MAX
+    return [peer for peer in peers if not (many and peer.state == "parked")]

@@ -20,10 +20,11 @@ if TYPE_CHECKING:
     from rmpa.web.server.agent_watch import AgentWatch, Reading
 
 _log = logging.getLogger(__name__)
-_LEVELS: Final = {"here": "OK", "up": "OK", "relayed": "OK", "refused": "ERROR"}
+_LEVELS: Final = {"here": "OK", "up": "OK", "relayed": "OK", "parked": "OK", "refused": "ERROR"}
 """Levels of the history by the state of a link; all others are warnings."""
 WORDS: Final = {
     "up": "linked",
+    "parked": "is parked",
     "linking": "no link",
     "away": "is away",
     "silent": "is silent",

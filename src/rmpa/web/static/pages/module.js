@@ -59,7 +59,7 @@ function PeerAgent({ name, up, connection, version }) {
 
 const PURPOSE = { express: "control, small messages", bulk: "large messages" };
 const Lanes = ({ lanes, linked }) => linked && !(lanes || []).length ? html`<p class="empty">The agent does not tell of lanes.</p>` : html`<${Table} caption="Lanes" columns=${["Lane", "State", "#In", "#Out", "#Waiting", "#Dropped"]} empty="It has no link.">${(lanes || []).map((lane) => html`<tr key=${lane.name}><th scope="row">${lane.name}<div class="muted">${PURPOSE[lane.name] || ""}</div></th>
-  <td><${Mark} state=${lane.connected ? "up" : "linking"} word=${lane.connected ? "connected" : "no connection"} /></td><td class="number">${bytes(lane.bytes_in)}</td><td class="number">${bytes(lane.bytes_out)}</td><td class="number">${lane.queued ? bytes(lane.queued) : "–"}</td><td class="number">${count(lane.dropped)}</td></tr>`)}<//>`;
+  <td><${Mark} state=${lane.connected ? "up" : lane.unneeded ? "away" : "linking"} word=${lane.connected ? "connected" : lane.unneeded ? "not needed now" : "no connection"} /></td><td class="number">${bytes(lane.bytes_in)}</td><td class="number">${bytes(lane.bytes_out)}</td><td class="number">${lane.queued ? bytes(lane.queued) : "–"}</td><td class="number">${count(lane.dropped)}</td></tr>`)}<//>`;
 
 const Agent = ({ agent, detail }) => html`<${Panel} title="Agent"><${Facts} rows=${[
   ["Version", agent.version], ["Runs for", html`<${Since} moment=${agent.started} />`], ["CPU", agent.cpu !== undefined ? html`${percent(agent.cpu)} of a core` : undefined], ["Memory", bytes(agent.rss)],
