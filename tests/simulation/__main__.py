@@ -13,6 +13,7 @@ from tests.simulation.lanes_scenario import LanesScenario
 from tests.simulation.large_scenario import LargeScenario
 from tests.simulation.mesh_scenario import MeshScenario
 from tests.simulation.reliable_scenario import ReliableScenario
+from tests.simulation.rests_scenario import RestsScenario
 from tests.simulation.scenario import Scenario
 from tests.simulation.swim_scenario import SwimScenario
 
@@ -22,7 +23,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.simulation", description=__doc__)
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--peers", type=int, default=2, help="not with --kind reliable and direct")
-    kinds = ["rosters", "mesh", "lanes", "reliable", "direct", "swim", "thousand"]
+    kinds = ["rosters", "mesh", "lanes", "reliable", "direct", "swim", "rests", "thousand"]
     parser.add_argument("--kind", choices=kinds, default="rosters")
     parser.add_argument("--loss", type=float, default=0.01, help="thousand: share of datagrams that are lost")
     parser.add_argument("--parts", default="", help="thousand: also churn, partition; comma-separated")
@@ -38,7 +39,9 @@ def main() -> int:
     elif arguments.kind == "reliable":
         scenario = ReliableScenario(arguments.seed, keep=True)
     else:
-        make = {"rosters": Scenario, "mesh": MeshScenario, "lanes": LanesScenario}[arguments.kind]
+        make = {"rosters": Scenario, "mesh": MeshScenario, "lanes": LanesScenario, "rests": RestsScenario}[
+            arguments.kind
+        ]
         scenario = make(arguments.seed, arguments.peers, keep=True)
     problem = ""
     try:
