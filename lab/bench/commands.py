@@ -31,6 +31,7 @@ from lab.bench import (
     startup,
     storm,
     tasks,
+    thousand,
     throughput,
     trust,
     web,
@@ -100,6 +101,7 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
     ),
     "fleet": Measurement("2 to 64 modules: start, rest, a stream beside classic ROS, losses", fleet.measure),
     "idle": Measurement("what an agent costs while nothing happens", idle.measure),
+    "thousand": Measurement("a mesh of up to a thousand modules, simulated", thousand.measure, needs=()),
     "tasks": Measurement(
         "how evenly a resource's task runs, beside loops of rospy and roscpp",
         tasks.measure,
