@@ -62,6 +62,50 @@ def test_a_link_rests_when_neither_side_needs_it() -> None:
     assert calm * 15 < busy
 
 
+@pytest.mark.parametrize("peers", [3, 31])
+def test_an_agent_wakes_once_for_the_keepalives_of_all_its_resting_links(peers: int) -> None:
+    """The other sides' agents have times of their own; what they send is not counted here."""
+    rng, time = random.Random(peers), Time()
+    links = []
+    for number in range(peers):
+        far = replace(HIGH, instance=rng.randbytes(16))
+        ours, theirs = (LOW, far) if number % 2 else (far, LOW)
+        dialler = side(ConnectionRole.DIALLER, ours, time, expected=theirs.guid)
+        acceptor = side(ConnectionRole.ACCEPTOR, theirs, time)
+        deliver(dialler.link.take_output(), acceptor.link, time.now)
+        acceptor.link.accept(time.now)
+        exchange(dialler, acceptor, time)
+        rest(dialler, acceptor, time)
+        links.append((dialler, acceptor) if number % 2 else (acceptor, dialler))
+        time.now += rng.random() / peers
+    run_all(links, time, 20.0)
+    fired, pings = run_all(links, time, 600.0)
+    assert len(fired) <= 600 / limits.IDLE_KEEPALIVE_INTERVAL + 1
+    assert pings <= peers * 2 * (600 / limits.IDLE_KEEPALIVE_INTERVAL + 1), "a ping and its pong, one way each"
+    assert all(each.link.state is ConnectionState.UP for pair_ in links for each in pair_)
+
+
+def run_all(links: list[tuple[Side, Side]], time: Time, seconds: float) -> tuple[set[int], int]:
+    """Let all links run; return the milliseconds at which timers of the first sides fired, and how often any sent."""
+    end, sent = time.now + seconds, 0
+    fired: set[int] = set()
+    machines = [(pair_, each) for pair_ in links for each in pair_]
+    while True:
+        due, (pair_, each) = min(
+            (((t if (t := m[1].link.next_timer()) is not None else end + 1), m) for m in machines), key=lambda x: x[0]
+        )
+        if due > end:
+            time.now = end
+            return fired, sent
+        time.now = max(time.now, due)
+        each.link.handle_timer(time.now)
+        if each is pair_[0]:
+            fired.add(round(time.now * 1000))
+        if each.link.has_output:
+            sent += 2
+        exchange(*pair_, time)
+
+
 def test_silence_at_rest_ends_the_link_by_the_longer_lease() -> None:
     time = Time()
     dialler, acceptor = pair(time)

@@ -13,6 +13,7 @@ import pytest
 from rmpa.mesh import limits
 from tests.simulation.mesh_scenario import MeshScenario
 from tests.simulation.network import Weather
+from tests.simulation.rests_scenario import RestsScenario
 
 FACTOR = int(os.environ.get("RMPA_SIMULATION_SEEDS", "1"))
 BLOCK = 25
@@ -23,6 +24,12 @@ BLOCKS = [(count, block) for count, blocks in ((2, 4), (3, 2), (4, 1), (5, 1)) f
 def test_small_networks_are_linked_after_healing(count: int, block: int) -> None:
     for seed in range(block * BLOCK, (block + 1) * BLOCK):
         MeshScenario(seed, count).play()
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_links_that_rest_and_wake_are_whole_after_healing(count: int) -> None:
+    for seed in range(15 * FACTOR):
+        RestsScenario(seed, count).play()
 
 
 @pytest.mark.parametrize("seed", range(4 * FACTOR))

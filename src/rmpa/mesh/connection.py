@@ -180,7 +180,8 @@ class ConnectionProtocol:
         self._expected = expected
         self._label = label
         self._state = ConnectionState.HANDSHAKING
-        self._keepalive = Keepalive(lease, now, acceptor=role is ConnectionRole.ACCEPTOR)
+        phase = int.from_bytes(ours.instance[:2], "big") / 65536 * limits.IDLE_KEEPALIVE_INTERVAL
+        self._keepalive = Keepalive(lease, now, acceptor=role is ConnectionRole.ACCEPTOR, phase=phase)
         self._parting = Parting(self._keepalive, dialler=role is ConnectionRole.DIALLER)
         self._deadline = now + limits.HANDSHAKE_TIMEOUT
         self._reason = ""

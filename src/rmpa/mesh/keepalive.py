@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from rmpa.mesh import limits
 from rmpa.mesh.frames import PaceFlag
 
@@ -19,6 +21,8 @@ class Keepalive:
     Args:
         lease: Seconds that this side promises.
         now: When the connection was established.
+        phase: When the keepalives of all resting links of this agent fall: at this time plus multiples of
+            ``limits.IDLE_KEEPALIVE_INTERVAL``, so that the agent wakes once for all of them.
         acceptor: Whether the remote side dialled. The acceptor pings a little later than the dialler, so that on an
             idle connection it sends only pongs.
     """
@@ -30,6 +34,7 @@ class Keepalive:
         "_excused",
         "_excused_at",
         "_interval",
+        "_phase",
         "_pinged",
         "_remote_lease",
         "_short",
@@ -43,8 +48,9 @@ class Keepalive:
         "sent",
     )
 
-    def __init__(self, lease: float, now: float, *, acceptor: bool) -> None:
+    def __init__(self, lease: float, now: float, *, acceptor: bool, phase: float = 0.0) -> None:
         self._acceptor = acceptor
+        self._phase = phase
         self.promise(lease)
         self.needed = self.remote_needs = True
         """Whether this side, and the remote one, needs the short lease."""
@@ -125,12 +131,22 @@ class Keepalive:
         the driver does not arm its timer again after each receive. The same timer checks the path MTU and whether the
         peer is gone, so its interval stays below ``quiet_after``.
         """
-        next_ping = self.sent + self._interval
         if self._burst:
             next_ping = self._pinged + limits.WAKE_PING_INTERVAL
-        elif not self.rests:
-            next_ping = min(next_ping, self._pinged + limits.CLOCK_INTERVAL)
+        elif self.rests:
+            next_ping = self._common_time(self.sent + self._interval)
+        else:
+            next_ping = min(self.sent + self._interval, self._pinged + limits.CLOCK_INTERVAL)
         return min(self.lease_end, next_ping)
+
+    def _common_time(self, due: float) -> float:
+        """The agent's common time next to ``due``: the last one before it, for the acceptor the first one after it.
+
+        The acceptor's may be late, because it seldom pings: the pongs that it sends are signs of life too.
+        """
+        grid = limits.IDLE_KEEPALIVE_INTERVAL
+        turns = (due - self._phase) / grid
+        return self._phase + grid * (math.ceil(turns) if self._acceptor else math.floor(turns + 1e-9))
 
     @property
     def lease_end(self) -> float:
