@@ -40,6 +40,11 @@ class OpenedSession(MemorySession):
         self.events = events
         self.endpoints: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
         self.stale = False
+        self.refused: dict[str, int] = {}
+
+    def take_refused(self) -> dict[str, int]:
+        refused, self.refused = self.refused, {}
+        return refused
 
     async def close(self) -> None:  # type: ignore[override] # a real one ends threads
         self.events.append("session closed")

@@ -166,12 +166,20 @@ class Gateway:
         """Opens the session anew where it listens and its certificate was renewed: Zenoh reads that once."""
         while True:
             await asyncio.sleep(limits.CERTIFICATE_LOOK_PERIOD)
+            self._count()
             if self.session is not None and self.session.stale:
                 self._reopen = True
                 self._begin_rejoin()
 
+    def _count(self) -> None:
+        """Add what the session has refused to the agent's counters, which `rmpa doctor` and /diagnostics show."""
+        refused = self.session.take_refused() if self.session is not None else {}
+        for reason, count in refused.items():
+            self.agent.bridge.counters.add(reason, count)
+
     def report(self) -> dict[str, object]:
         """What the gateway joins, as JSON values: the reply to the operation ``gateway``."""
+        self._count()
         session = self.session
         return {
             "name": self._settings.name,

@@ -33,6 +33,11 @@ DESCRIBE_TIMEOUT: Final = 10.0
 """Seconds for the description of another site's service; its server may be probed for it over two meshes."""
 LAST_VALUE_MAX: Final = 32 * MIB
 """Bytes of a message that is kept as a last value: a map of 5,000 by 5,000 cells. Larger ones are not kept."""
+LAST_VALUE_DEFINITION_MAX: Final = 64 * KIB
+"""Characters of the definition that is kept with a last value, also in memory; a longer one is left out. The longest
+of ROS 1 has some 30 KB."""
+LAST_VALUES_ASKED_MAX: Final = 64
+"""Questions for last values that are answered at once; further ones are refused. Each may read 64 MiB."""
 LAST_VALUES_MAX: Final = 4096
 """Last values that are kept; the oldest go first. A module has some 20 latched topics."""
 LAST_VALUES_BYTES_MAX: Final = 256 * MIB
@@ -96,8 +101,18 @@ ROS2_PROBLEMS_MAX: Final = 500
 """Problems of the neighbour ROS 2 that are kept for ``rmpa site``; the oldest go first."""
 ROS2_TYPES_MAX: Final = 500
 """Types that are learnt from publishers and ROS 2 nodes, and pairs that are kept; ROS has some 160 of its own."""
-ROS2_DESCRIPTION_MAX: Final = 1024 * 1024
+ROS2_DESCRIPTION_MAX: Final = 256 * 1024
 """Bytes of a type's description from a ROS 2 node; the largest of ROS 2's own types has 30 KB."""
+ROS2_DESCRIBED_TYPES_MAX: Final = 128
+"""Types in one description; for each, rosbags makes a class. The most that one of ROS 2's own has are some 20."""
+ROS2_PARTS_MAX: Final = 20_000
+"""Fields of a type with those of all types within it, each time that it embeds them: conversions are made of these.
+Some bytes of a definition can embed billions. The largest type of ROS has some 200."""
+ROS2_LEARNT_FIELDS_MAX: Final = 100_000
+"""Fields and types in all descriptions that are kept: some 1 KB each."""
+ROS2_WORK_MAX: Final = 2_000_000
+"""Elements of the arrays of one message that are converted one by one, and each 64 bytes that are made up for fields
+that its sender lacks: a second of the gateway's time. Arrays of numbers are copied whole, and do not count."""
 ROS2_ARRAY_MAX: Final = 1_000_000
 """Elements of all arrays of fixed size in a type that a ROS 2 node describes: an empty message must have them all."""
 
@@ -110,6 +125,11 @@ SITE_MODULES_MAX: Final = 512
 """Modules of one other site that are shown, as many as the mesh has peers."""
 SITE_SOURCES_MAX: Final = 16_384
 """Topics (once for each publisher) and services of one other site that are shown, or of this one that are offered."""
+SITES_SOURCES_MAX: Final = 65_536
+"""Topics and services of all other sites together that are shown: some 5 KB each. Any program that reaches the router
+can announce more; they are counted as ``site.limit`` and left out."""
+SITE_NAMES_WAITING_MAX: Final = 64
+"""Sources that wait for one name here which another one holds; each is judged again whenever it is free."""
 SITE_SETTLE: Final = 0.05
 """Seconds from the end of a token to the end of what it stands for. The tokens of a gateway that was killed go one by
 one, within some milliseconds: its own may be the last, and then the others are lost and not withdrawn."""

@@ -222,5 +222,8 @@ class OwnedSession(ZenohSession, Protocol):
     def stale(self) -> bool:
         """Whether it has to be opened anew for others to connect to it: its certificate was renewed."""
 
+    def take_refused(self) -> dict[str, int]:
+        """What was dropped or refused since the last call, by its reason, such as ``zenoh.reply.limit``."""
+
     async def close(self) -> None:
         """Close it and end its threads."""

@@ -51,14 +51,14 @@ async def test_the_last_value_is_there_after_a_restart(tmp_path: Path) -> None:
 
 
 async def test_the_oldest_values_go_first(tmp_path: Path) -> None:
-    store = LastValueStore(tmp_path / "values.sqlite", values_max=3, bytes_max=100)
+    store = LastValueStore(tmp_path / "values.sqlite", values_max=3, bytes_max=100 + 3 * len("float32 x"))
     await store.open()
     for number in range(5):
         store.put(numbered(number), value(b"x" * 30, number))
     assert list(store.headers) == [numbered(2), numbered(3), numbered(4)]
     store.put(numbered(5), value(b"y" * 60, 5))
     assert list(store.headers) == [numbered(4), numbered(5)]
-    assert not store.put(numbered(4), value(b"z" * 101, 6))
+    assert not store.put(numbered(4), value(b"z" * 128, 6))
     assert list(store.headers) == [numbered(5)]
     assert store.dropped == 1
     await store.close()
@@ -111,7 +111,7 @@ async def test_a_disk_that_takes_nothing_is_a_warning_and_values_are_still_answe
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(limits, "LAST_VALUES_INTERVAL", 0.001)
-    monkeypatch.setattr(limits, "LAST_VALUES_PENDING_MAX", 10)
+    monkeypatch.setattr(limits, "LAST_VALUES_PENDING_MAX", 20)
     (tmp_path / "no_folder").write_text("a file where the folder should be")
     store = LastValueStore(tmp_path / "no_folder" / "values.sqlite")
     with caplog.at_level(logging.WARNING):
@@ -168,3 +168,19 @@ async def test_without_a_state_directory_values_are_kept_while_it_runs() -> None
     assert await store.body(MAP) == b"map"
     assert "no state directory" in store.problem
     await store.close()
+
+
+async def test_definitions_count_and_giant_ones_are_left_out(tmp_path: Path) -> None:
+    """Another site's header may have half a megabyte of definition beside a message of one byte."""
+    store = LastValueStore(tmp_path / "values.sqlite", bytes_max=100_000)
+    await store.open()
+    for number in range(50):
+        giant = "x" * (limits.LAST_VALUE_DEFINITION_MAX + 1)
+        store.put(ValueKey("eve", f"/giant{number}", "/n"), LastValue("a/B", "0" * 32, giant, True, number, b"x"))
+    assert {header.definition for header in store.headers.values()} == {""}
+    for number in range(50):
+        text = "x" * 10_000
+        store.put(ValueKey("eve", f"/long{number}", "/n"), LastValue("a/B", "0" * 32, text, True, 100 + number, b"x"))
+    assert len(store.headers) == 9, "100,000 bytes, with the definitions"
+    await store.close()
+    assert (tmp_path / "values.sqlite").stat().st_size < 1_000_000

@@ -173,6 +173,23 @@ async def test_a_malformed_query_is_an_error_and_a_large_value_is_not_kept(
     assert kept.part.report()["dropped"] == 1
 
 
+async def test_a_flood_of_questions_is_refused_and_the_next_one_is_answered(
+    kept: Kept, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each may read 64 MiB from the disk."""
+    monkeypatch.setattr(limits, "LAST_VALUES_ASKED_MAX", 2)
+    kept.part.export(topic("/wanted"))
+    kept.graph.send("/wanted", b"x", latching=True)
+    answers = await asyncio.gather(*(kept.ask("arm/v/wanted") for _ in range(10)))
+    good = [reply for replies in answers for reply in replies if reply.ok]
+    bad = [reply for replies in answers for reply in replies if not reply.ok]
+    assert (len(good), len(bad)) == (2, 8)
+    assert all(b"ask again later" in reply.payload for reply in bad)
+    assert kept.part.report()["refused"] == 8
+    (reply,) = await kept.ask("arm/v/wanted")
+    assert reply.ok
+
+
 def test_keys_and_patterns() -> None:
     key = value_key("here", "arm", "/base/map")
     assert key == "rmpa/1/here/arm/v/base/map"

@@ -15,9 +15,10 @@ from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 from rosbags.typesys.base import normalize_fieldname
 
-from rmpa.core.errors import RmpaError
+from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.gateway.ros2.layout import HEADER, TIMES, Layouts, name2_of
 from rmpa.gateway.ros2.transcoder import Transcoder
+from rmpa.gateway.ros2.type_size import check_ros1_size
 from rmpa.gateway.ros2.types import ros2_name, snake_case
 
 if TYPE_CHECKING:
@@ -57,13 +58,20 @@ class Conversion:
         self.ros2 = ros2
         self._store = types.store
         self._fields = fields
+        try:
+            check_ros1_size(ros1.name, ros1.specifications)
+        except RemoteProtocolError as error:
+            raise NoConversion(str(error)) from error
         if fields is None:
             self._check_fields(ros1.name, ros2)
         else:
             self._check_paths(fields)
         layouts = Layouts(ros1.specifications, self._store.fielddefs)
         parts = layouts.of(ros1.name, ros2) if fields is None else None
-        self._transcoder = Transcoder(parts) if parts is not None else None
+        try:
+            self._transcoder = Transcoder(parts) if parts is not None else None
+        except ValueError as error:
+            raise NoConversion(f"{ros1.name} and {ros2} cannot be converted: {error}") from error
 
     @property
     def direct(self) -> bool:

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from rosbags.typesys.base import TypesysError
 
-from rmpa.core.errors import RmpaError
+from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.conversion import Conversion, NoConversion
 from rmpa.gateway.ros2.derived import derive_ros1
+from rmpa.gateway.ros2.type_size import check_ros1_size
 from rmpa.gateway.ros2.types import ros2_name
 from rmpa.ros.types.definitions import DefinitionError, known_types
 
@@ -40,6 +41,7 @@ class Ros2Pairs:
         self._find = find
         self._ros1: dict[str, MessageType] = {}
         self._variants: dict[tuple[str, str], Ros2Types] = {}
+        self._learnt_fields = 0
         self._out: dict[tuple[str, str], Conversion | NoConversion] = {}
         self._in: dict[tuple[str, str], Conversion | NoConversion] = {}
 
@@ -64,8 +66,12 @@ class Ros2Pairs:
         """Take in a definition that a publisher sent, and return the type of ROS 2 and its hash.
 
         Raises:
-            NoConversion: A rule maps it to a type that is not known here.
+            NoConversion: A rule maps it to a type that is not known here, or it is too large.
         """
+        try:
+            check_ros1_size(kind.name, kind.specifications)
+        except RemoteProtocolError as error:
+            raise NoConversion(f"{kind.name} has no form in ROS 2: {error}") from error
         if len(self._ros1) < limits.ROS2_TYPES_MAX:
             self._ros1[kind.name] = kind
         if (known := self.ros2_type(kind.name)) is not None:
@@ -140,7 +146,10 @@ class Ros2Pairs:
         """
         if len(self._variants) >= limits.ROS2_TYPES_MAX:
             raise NoConversion(f"{limits.ROS2_TYPES_MAX} types of ROS 2 were learnt already; {name} is not")
+        if self._learnt_fields >= limits.ROS2_LEARNT_FIELDS_MAX:
+            raise NoConversion(f"{self._learnt_fields} fields of ROS 2 were learnt already; {name} is not")
         variant = described_types(self._types, name, type_hash, fields)
+        self._learnt_fields += sum(1 + len(each[1]) for each in fields.values())
         self._variants[name, type_hash] = variant
         if name not in self._types:  # so the mesh's own topics can have the type too
             self._types.take(fields)

@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Final
 
+from rmpa.gateway import limits
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
@@ -99,11 +101,16 @@ class Transcoder:
 
     Args:
         parts: What a message is made of, in order.
+
+    Raises:
+        ValueError: Arrays of a fixed length make each message too much work.
     """
 
     def __init__(self, parts: Sequence[Part]) -> None:
-        self._to_cdr = _compile(_ToCdr().write(parts))
-        self._to_ros1 = _compile(_ToRos1().write(parts))
+        if max(_work(parts, Side.ROS1), _work(parts, Side.ROS2)) > limits.ROS2_WORK_MAX:
+            raise ValueError("its arrays of a fixed length are too large")
+        self._to_cdr = _compile(_ToCdr(), parts)
+        self._to_ros1 = _compile(_ToRos1(), parts)
 
     def to_cdr(self, raw: Buffer) -> bytes:
         """Convert a message of ROS 1, without a length in front, to CDR with its head.
@@ -132,8 +139,8 @@ class _Writer:
     ``_rest`` by ``_known``: after a string nothing (1), after an alignment the alignment.
     """
 
-    place = "i"
-    """The variable of the place in CDR."""
+    made = Side.ROS1
+    """The side that the function makes a message of."""
 
     def __init__(self) -> None:
         self._lines: list[str] = []
@@ -142,6 +149,8 @@ class _Writer:
         self._rest = 0
         self._run = 0
         self._names = 0
+        self.texts: list[str] = []
+        """The names of fields, for errors: ``TEXTS`` of the function, whose code has none."""
 
     def add(self, *lines: str) -> None:
         self._lines += [" " * self._indent + line for line in lines]
@@ -185,6 +194,24 @@ class _Writer:
         self._indent -= 1
         self.forget()
 
+    def check(self, part: Text | Items, name: str, what: str) -> None:
+        """Check a length against the bound of ROS 2."""
+        if part.bound:
+            self.texts.append(part.name)
+            field = f"{{TEXTS[{len(self.texts) - 1}]}}"
+            text = f"{field} has {{{name}}} {what}; ROS 2 allows {part.bound}"
+            self.add(f"if {name} > {part.bound}: raise ValueError(f'{text}')")
+
+    def check_work(self, part: Items, name: str) -> None:
+        """Count what a loop does: few bytes may claim many elements, each of which the other side fills up."""
+        self.add(
+            f"t += {name} * {1 + _work(part.parts, self.made)}",
+            f"if t > {limits.ROS2_WORK_MAX}: raise ValueError('its arrays have too many elements')",
+        )
+
+    def write(self, parts: Iterable[Part]) -> list[str]:
+        raise NotImplementedError
+
     def number(self, part: Number) -> None:
         raise NotImplementedError
 
@@ -201,8 +228,10 @@ class _Writer:
 class _ToCdr(_Writer):
     """ROS 1 to CDR: ``i`` is the place in ROS 1's bytes, ``c`` that in CDR."""
 
+    made = Side.ROS2
+
     def write(self, parts: Iterable[Part]) -> list[str]:
-        self.add("i = c = 0", "out = [HEAD]", "add = out.append")
+        self.add("i = c = t = 0", "out = [HEAD]", "add = out.append")
         self.parts(parts)
         self.flush()
         self.add("if i != end: raise ValueError(f'a message of {end} bytes has {i}')", "return b''.join(out)")
@@ -252,9 +281,7 @@ class _ToCdr(_Writer):
         else:
             name = self.name()
             self.add(f"{name} = U(s, i)[0]")
-            if part.bound:
-                text = f"{part.name} has {{{name}}} bytes; ROS 2 allows {part.bound}"
-                self.add(f"if {name} > {part.bound}: raise ValueError(f'{text}')")
+            self.check(part, name, "bytes")
             self.add(
                 f"add(P({name} + 1))",
                 f"add(s[i + 4:i + 4 + {name}])",
@@ -277,14 +304,13 @@ class _ToCdr(_Writer):
             self.add("add(s[i:i + 4])", "c += 4")
             self.moved(4)
         self.add("i += 4")
-        if part.bound:
-            text = f"{part.name} has {{{name}}} elements; ROS 2 allows {part.bound}"
-            self.add(f"if {name} > {part.bound}: raise ValueError(f'{text}')")
+        self.check(part, name, "elements")
         stride = _stride(part)
         if stride is None:
             self.add(
                 f"if {name} * {_least(part.parts, Side.ROS1)} > end - i: raise ValueError('an array is too long')"
             )
+            self.check_work(part, name)
             self.loop(part, name)
             return
         size, alignment = stride
@@ -301,7 +327,7 @@ class _ToRos1(_Writer):
     """CDR to ROS 1: ``i`` is the place in CDR, behind its head."""
 
     def write(self, parts: Iterable[Part]) -> list[str]:
-        self.add("i = 0", "out = []", "add = out.append")
+        self.add("i = t = 0", "out = []", "add = out.append")
         self.parts(parts)
         self.flush()
         # Some serializers fill the end up to 4 bytes.
@@ -377,6 +403,7 @@ class _ToRos1(_Writer):
             self.add(
                 f"if {name} * {_least(part.parts, Side.ROS2)} > end - i: raise ValueError('an array is too long')"
             )
+            self.check_work(part, name)
             self.loop(part, name)
             return
         size, alignment = stride
@@ -416,11 +443,26 @@ def _least(parts: Sequence[Part], side: Side) -> int:
     return max(total, 1)
 
 
+def _work(parts: Iterable[Part], made: Side) -> int:
+    """What a message, or an element, costs beyond its own bytes: turns of loops, and 64 bytes that are filled up.
+
+    Arrays whose length each message says count by themselves.
+    """
+    total = 0
+    for part in parts:
+        if isinstance(part, Number):
+            total += part.size * part.count // 64 if part.side is made else 0
+        elif isinstance(part, Items) and part.count is not None:
+            total += part.count * (1 + _work(part.parts, made))
+    return total
+
+
 _U32: Final = struct.Struct("<I")
 
 
-def _compile(lines: Sequence[str]) -> Callable[[Buffer, int], bytes]:
+def _compile(writer: _Writer, parts: Sequence[Part]) -> Callable[[Buffer, int], bytes]:
     """Make a function of its lines, which have nothing of the types but numbers."""
+    lines = writer.write(parts)
     names: dict[str, Any] = {
         "HEAD": HEAD,
         "NULL": b"\0",
@@ -428,6 +470,7 @@ def _compile(lines: Sequence[str]) -> Callable[[Buffer, int], bytes]:
         "ZEROS": [bytes(count) for count in range(8)],
         "U": _U32.unpack_from,
         "P": _U32.pack,
+        "TEXTS": writer.texts,
     }
     exec("\n".join(("def convert(s, end):", *lines)), names)  # noqa: S102 - see above
     made: Callable[[Buffer, int], bytes] = names["convert"]

@@ -16,9 +16,12 @@ from rosbags.typesys.store import Typestore
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
-from rmpa.ros.limits import DEFINITION_DEPTH_MAX, DEFINITION_FIELDS_MAX
+from rmpa.gateway.ros2.type_size import check_size
+from rmpa.ros.limits import DEFINITION_FIELDS_MAX
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from rmpa.ros.wire.tcpros import Buffer
 
 SERVICE: Final = "get_type_description"
@@ -70,6 +73,8 @@ def parse_type_response(raw: Buffer) -> dict[str, Any]:
         raise RemoteProtocolError(f"the node does not describe the type: {message.failure_reason[:200]}")
     described = message.type_description
     all_types = (described.type_description, *described.referenced_type_descriptions)
+    if len(all_types) > limits.ROS2_DESCRIBED_TYPES_MAX:
+        raise RemoteProtocolError(f"a type's description has {len(all_types)} types")
     made: dict[str, Any] = {_type_name(each.type_name): ([], _fields(each)) for each in all_types}
     _check_size(made)
     return made
@@ -84,6 +89,8 @@ def _type_name(name: str) -> str:
 def _fields(described: Any) -> list[tuple[str, Any]]:
     if len(described.fields) > DEFINITION_FIELDS_MAX:
         raise RemoteProtocolError(f"{described.type_name} has {len(described.fields)} fields")
+    if not described.fields:  # ROS 2's have one at least; elements without bytes may be claimed without end
+        raise RemoteProtocolError(f"{described.type_name[:80]} has no fields")
     for field in described.fields:
         if len(field.name) > limits.ROS2_NAME_MAX or _FIELD_NAME.fullmatch(field.name) is None:
             raise RemoteProtocolError(f"{field.name[:80]!r} is not the name of a field of ROS 2")
@@ -94,33 +101,24 @@ def _fields(described: Any) -> list[tuple[str, Any]]:
 
 
 def _check_size(types: dict[str, Any]) -> None:
-    """Check that no type contains itself, and that arrays of fixed size are not too large; in linear time."""
-    sizes: dict[str, int] = {}
+    """Check that no type contains itself, and how much each is with all that it embeds."""
 
-    def measure(name: str, inside: tuple[str, ...]) -> int:
-        if name in inside or len(inside) > DEFINITION_DEPTH_MAX:
-            raise RemoteProtocolError(f"{name} contains itself, or is nested too deeply")
-        if name not in sizes:
-            fields = types[name][1] if name in types else ()
-            sizes[name] = 1 + sum(size(desc, (*inside, name)) for _, desc in fields)
-        return sizes[name]
-
-    def size(desc: Any, inside: tuple[str, ...]) -> int:
-        count, inner = 1, desc
-        if desc[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-            inner, bound = desc[1]
-            count = bound if desc[0] == Nodetype.ARRAY else 1
-        return count * (measure(str(inner[1]), inside) if inner[0] == Nodetype.NAME else 1)
+    def fields_of(name: str) -> Iterator[tuple[str, int]]:
+        for _, desc in types[name][1] if name in types else ():
+            inner = desc[1][0] if desc[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE) else desc
+            count = desc[1][1] if desc[0] == Nodetype.ARRAY else 1
+            yield str(inner[1]) if inner[0] == Nodetype.NAME else "", count
 
     for name in types:
-        if measure(name, ()) > limits.ROS2_ARRAY_MAX:
-            raise RemoteProtocolError(f"{name} has arrays of more than {limits.ROS2_ARRAY_MAX} elements")
+        check_size(name, fields_of)
 
 
 def _desc(kind: Any) -> Any:
     number, capacity = int(kind.type_id), int(kind.capacity)
     for base, node in ((_UNBOUNDED, Nodetype.SEQUENCE), (_BOUNDED, Nodetype.SEQUENCE), (_ARRAY, Nodetype.ARRAY)):
         if number > base:
+            if base == _ARRAY and not capacity:
+                raise RemoteProtocolError("a field is an array of no elements")
             return (node, (_inner(kind, number - base), 0 if base == _UNBOUNDED else capacity))
     return _inner(kind, number)
 

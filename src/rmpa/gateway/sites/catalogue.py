@@ -61,16 +61,18 @@ class SiteCatalogue:
 
     Args:
         own: This site's name, whose tokens are ignored.
+        counters: ``site.token.malformed``, ``site.token.later_version``, ``site.limit``.
     """
 
-    def __init__(self, own: str) -> None:
+    def __init__(self, own: str, counters: Counters | None = None) -> None:
         self._own = own
         self._sites: dict[str, _Site] = {}
+        self._sources = 0
+        """Of all sites together."""
         self._ending: TimerQueue[str] = TimerQueue()
         self._by_token: dict[str, SiteModule | SiteSource] = {}
         self._events: list[CatalogueEvent] = []
-        self.counters = Counters()
-        """``site.token.malformed``, ``site.token.later_version``, ``site.limit``."""
+        self.counters = counters if counters is not None else Counters()
 
     # --- what is there ------------------------------------------------------------------------------------------
 
@@ -199,20 +201,20 @@ class SiteCatalogue:
         into = known if known is not None else site.orphans.setdefault(item.module, set())
         if item in into:
             return
-        if site.sources >= limits.SITE_SOURCES_MAX:
+        if site.sources >= limits.SITE_SOURCES_MAX or self._sources >= limits.SITES_SOURCES_MAX:
             if not into and known is None:
                 del site.orphans[item.module]
             self._refuse(site)
             return
         into.add(item)
-        site.sources += 1
+        self._count(site, 1)
         if known is not None:
             self._tell(CatalogueChange.FOUND, item)
 
     def _went(self, site: _Site, item: SiteModule | SiteSource, key: str, now: float) -> None:
         if isinstance(item, SiteSource) and item in site.orphans.get(item.module, ()):
             site.orphans[item.module].discard(item)
-            site.sources -= 1
+            self._count(site, -1)
             if not site.orphans[item.module]:
                 del site.orphans[item.module]
             return
@@ -229,14 +231,18 @@ class SiteCatalogue:
                 # Its token is there still: it may be shown again with its module's.
                 site.orphans.setdefault(module, set()).add(source)
             else:
-                site.sources -= 1
+                self._count(site, -1)
             self._tell(CatalogueChange.GONE, source)
         self._tell(CatalogueChange.GONE, module)
 
     def _end_source(self, site: _Site, source: SiteSource) -> None:
         site.modules[source.module].discard(source)
-        site.sources -= 1
+        self._count(site, -1)
         self._tell(CatalogueChange.GONE, source)
+
+    def _count(self, site: _Site, more: int) -> None:
+        site.sources += more
+        self._sources += more
 
     def _refuse(self, site: _Site) -> None:
         site.refused += 1

@@ -51,7 +51,7 @@ class SiteHistory:
             known.add(source)
             return
         known.discard(source)
-        withdrawn = self._withdrawn.setdefault(site, deque())
+        withdrawn = self._withdrawn.setdefault(site, deque(maxlen=limits.SITE_SOURCES_MAX))
         withdrawn.append((self._now(), source))
         while withdrawn[0][0] < self._now() - _ENDING:
             withdrawn.popleft()
@@ -78,6 +78,17 @@ class SiteHistory:
             oldest = min(away, key=self._since.__getitem__)
             del self._since[oldest]
             self._forget(oldest)
+        self._bound()
+
+    def _bound(self) -> None:
+        """Forget what the sites had that left first, if it is too much."""
+        away = sorted(self.away, key=self._since.__getitem__)
+        total = sum(len(self._sources.get(site, ())) for site in away)
+        for site in away:
+            if total <= limits.SITES_SOURCES_MAX:
+                return
+            total -= len(self._sources.get(site, ()))
+            self._forget(site)
 
     def _forget(self, site: str) -> None:
         """Forget what a site had."""

@@ -2,14 +2,17 @@
 
 A source is known by site, module, kind, node and name; a new run of its module continues it. Of two sources that want
 one name here with different types (or two services of one name) the first is shown, and one of this site's own
-modules goes before all others; the reason is told for the other, which is shown once the name is free.
+modules goes before all others; the reason is told for the other, which is shown once the name is free. Of one name
+only the first ``limits.SITE_NAMES_WAITING_MAX`` wait.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from rmpa.gateway import limits
 from rmpa.gateway.neighbour import ForeignSource, SourceKind
 from rmpa.gateway.sites.part import SiteImport
 
@@ -51,7 +54,7 @@ class SiteImports:
         self._shown: dict[_Ident, SiteImport] = {}
         self._hidden: dict[_Ident, str] = {}
         self._holders: dict[_Name, dict[_Ident, SiteImport]] = {}
-        self._waiting: dict[_Name, list[_Ident]] = {}
+        self._waiting: dict[_Name, dict[_Ident, None]] = {}
         self._waits_for: dict[_Ident, _Name] = {}
         self._own: dict[_Name, list[MeshSource]] = {}
         self._changes: list[ImportChange] = []
@@ -150,8 +153,10 @@ class SiteImports:
         entry = SiteImport(source, announced)
         conflict = self._conflict(ident, entry)
         if conflict:
-            self._waiting.setdefault(_name(entry), []).append(ident)
-            self._waits_for[ident] = _name(entry)
+            waiting = self._waiting.setdefault(_name(entry), {})
+            if len(waiting) < limits.SITE_NAMES_WAITING_MAX:
+                waiting[ident] = None
+                self._waits_for[ident] = _name(entry)
             return None, conflict
         return entry, ""
 
@@ -164,9 +169,9 @@ class SiteImports:
                 return f"{wanted.name} is a service of {where}; a gateway.rule can give it another name here"
             if own.type not in (wanted.type, "*"):
                 return f"{wanted.name} has the type {own.type} at {where}, and {wanted.type} there"
-        for other, shown in self._holders.get(name, {}).items():
-            if other == ident:
-                continue
+        # All that are shown under one name have one type: any of them tells.
+        holders = ((other, shown) for other, shown in self._holders.get(name, {}).items() if other != ident)
+        for _, shown in itertools.islice(holders, 1):
             where = f"{shown.source.site}/{shown.source.module}{shown.source.node}"
             if wanted.kind is SourceKind.SERVICE:
                 return f"{wanted.name} is shown from {where} already; a gateway.rule can give it another name here"
@@ -197,7 +202,7 @@ class SiteImports:
     def _stop_waiting(self, ident: _Ident) -> None:
         name = self._waits_for.pop(ident, None)
         if name is not None:
-            self._waiting[name].remove(ident)
+            del self._waiting[name][ident]
             if not self._waiting[name]:
                 del self._waiting[name]
 

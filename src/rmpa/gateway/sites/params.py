@@ -27,6 +27,7 @@ from rmpa.bridge.params.rules import key_problem
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
 from rmpa.gateway.sites.keys import ROOT
+from rmpa.ros.limits import PARAM_DEPTH_MAX
 from rmpa.ros.master.parameters import leaves
 
 if TYPE_CHECKING:
@@ -172,19 +173,22 @@ def from_json(data: Buffer) -> Any:
     """The value of a JSON text.
 
     Raises:
-        RemoteProtocolError: It is none, too large, or contains null, which ROS does not have.
+        RemoteProtocolError: It is none, too large, nested too deeply, or contains null, which ROS does not have.
     """
     if len(data) > bridge_limits.PARAM_TEXT_MAX:
         raise RemoteProtocolError(f"a value of {len(data)} bytes; at most {bridge_limits.PARAM_TEXT_MAX} cross")
     value = _decode(data, object)
-    if _has_null(value):
-        raise RemoteProtocolError("the value is null or contains one, which ROS does not have; leave it out")
+    _check_members(value)
     return value
 
 
-def _has_null(value: object) -> bool:
-    members = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-    return value is None or any(map(_has_null, members))
+def _check_members(value: object, depth: int = 0) -> None:
+    if value is None:
+        raise RemoteProtocolError("the value is null or contains one, which ROS does not have; leave it out")
+    if depth > PARAM_DEPTH_MAX:
+        raise RemoteProtocolError(f"the value is nested deeper than {PARAM_DEPTH_MAX} levels")
+    for member in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        _check_members(member, depth + 1)
 
 
 def followed_of(key: str) -> tuple[str, str, str] | None:

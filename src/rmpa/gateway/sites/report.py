@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
+    from rmpa.core.counters import Counters
     from rmpa.gateway.sites.catalogue import SiteCatalogue
     from rmpa.gateway.sites.exports import SiteExports
     from rmpa.gateway.sites.imports import SiteImports
@@ -30,6 +31,11 @@ def sites_report(catalogue: SiteCatalogue, imports: SiteImports) -> dict[str, ob
             "beyond_limits": catalogue.refused(site),
         }
     return found
+
+
+def site_counts(counters: Counters) -> dict[str, int]:
+    """The counts that are about sites, of counters that may be the agent's."""
+    return {name: count for name, count in counters.as_dict().items() if name.startswith("site.")}
 
 
 def refusals_report(exports: SiteExports, imports: SiteImports) -> dict[str, object]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import ctypes
 import logging
 import threading
-from collections import deque
+from collections import Counter, deque
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from rmpa.gateway.zenoh import limits
@@ -90,6 +90,7 @@ class ArrivalQueue(Generic[_T]):
                 old, old_size, _ = self._items.popleft()
                 self._waiting_bytes -= old_size
                 self.dropped += 1
+                self._arrivals.refused["zenoh.arrival.dropped"] += 1
                 if self._discard is not None:
                     self._arrivals.discarded.append((self._discard, old))
             if not self._scheduled:
@@ -142,6 +143,8 @@ class Arrivals:
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self.lock = threading.Lock()
+        self.refused: Counter[str] = Counter()
+        """What was dropped or refused, by its reason; guarded by ``lock``."""
         self.discarded: deque[tuple[Callable[..., None], object]] = deque()
         """What was dropped, with the function that is told; guarded by ``lock``."""
         self._ready: deque[ArrivalQueue[object]] = deque()
@@ -149,6 +152,11 @@ class Arrivals:
         self._closed = False
         self._window_end = 0.0
         self._in_window = 0
+
+    def refuse(self, reason: str) -> None:
+        """Count something that was refused, from any thread."""
+        with self.lock:
+            self.refused[reason] += 1
 
     def schedule(self, queue: ArrivalQueue[_T]) -> None:
         """Give a queue its turn. The caller has the lock."""

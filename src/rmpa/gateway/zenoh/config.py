@@ -101,6 +101,7 @@ class ZenohConfig:
             "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": round(
                 limits.DROP_WAIT_MAX * 1e6
             ),
+            "transport/link/rx/max_message_size": limits.ZENOH_MESSAGE_MAX,
             "transport/shared_memory/enabled": False,
             "timestamping/enabled": True,
         }

@@ -62,6 +62,27 @@ ARRIVED_QUERIES: Final = 1_000
 """Queries of one queryable that wait for the event loop; above it the oldest is finished without an answer."""
 ARRIVED_TOKENS: Final = 200_000
 """Changes of tokens of one watcher that wait for the event loop: a hundred sites of a thousand sources, twice."""
+ZENOH_MESSAGE_MAX: Final = 257 * 1024 * 1024
+"""Bytes of one message of Zenoh that are put together from its fragments: the largest of ROS, and its head. Zenoh's
+own value is 1 GiB, which any program that connects could have this process hold."""
+ATTACHMENT_MAX: Final = 4096
+"""Bytes of an attachment; the longest that this gateway or ROS 2 writes has some 900. A message or query with a
+longer one is dropped before it is stored, and counted as ``zenoh.attachment.long``."""
+KEY_MAX: Final = 4096
+"""Characters of the key of a message, token or query, and of a query's parameters; those of ROS names have at most
+some 900. Longer ones are dropped, and counted as ``zenoh.key.long``."""
+ARRIVED_TOKEN_BYTES: Final = 64 * 1024 * 1024
+"""Characters of the tokens that wait for the event loop."""
+REPLIES_MAX: Final = 20_000
+"""Answers to one query; further ones are dropped, and counted as ``zenoh.reply.limit``. The most that a gateway asks
+for are the last values of a site, of which it keeps 4,096."""
+REPLY_BYTES_MAX: Final = 256 * 1024 * 1024
+"""Bytes of all answers to one query; one answer always fits. A gateway gives last values of 64 MiB at most."""
+ANSWER_BYTES_MAX: Final = 256 * 1024 * 1024
+"""Bytes of answers that wait for Zenoh in all; one always fits. Above it a query ends without the answer, which is
+counted as ``zenoh.answer.limit``: a client that asks and does not read must not fill the memory."""
+ANSWERS_WAITING_MAX: Final = 20_000
+"""Answers that wait for Zenoh in all, likewise."""
 DRAIN_MESSAGES: Final = 256
 """Messages that the event loop takes before it looks at its other work: at most a millisecond or so."""
 DRAIN_BYTES: Final = 8 * 1024 * 1024

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from rmpa.core.errors import StartError
 from rmpa.gateway.zenoh import limits
 from rmpa.gateway.zenoh.arrivals import ArrivalQueue, Arrivals, keep_thread_state
-from rmpa.gateway.zenoh.queries import ArrivedQuery, PendingGet, content
+from rmpa.gateway.zenoh.queries import AnswerBudget, ArrivedQuery, PendingGet, content
 from rmpa.gateway.zenoh.sending import NumberedPublisher, QueuedPublisher, SendingLane
 from rmpa.gateway.zenoh.socket_tuning import SocketTuning
 from rmpa.gateway.zenoh.worker import SerialWorker
@@ -114,6 +114,7 @@ class OpenSession:
         self._loop = loop
         self.zid = str(session.zid())
         self._arrivals = Arrivals(loop)
+        self._budget = AnswerBudget(self._arrivals.refuse)
         self._declarations = SerialWorker("zenoh declarations")
         self._queries = SerialWorker("zenoh queries")
         self._lanes: dict[ZenohPriority, SendingLane] = {}
@@ -248,12 +249,15 @@ class OpenSession:
         put = self._zenoh.SampleKind.PUT
 
         def arrived(sample: Any) -> None:
-            if sample.kind == put:
-                payload = content(sample.payload)
+            if sample.kind != put or not self._readable(sample.attachment):
+                return
+            name = fixed or str(sample.key_expr)
+            if fixed or self._short(name):
+                payload, attachment = content(sample.payload), content(sample.attachment)
                 size = len(payload)
                 queue.add(
-                    ZenohSample(fixed or str(sample.key_expr), payload, content(sample.attachment)),
-                    size,
+                    ZenohSample(name, payload, attachment),
+                    size + len(attachment),
                     1 + size // limits.BATCH_MESSAGE if batches else 1,
                 )
 
@@ -277,11 +281,13 @@ class OpenSession:
         self._check(key)
         put = self._zenoh.SampleKind.PUT
         queue: ArrivalQueue[tuple[str, bool]] = ArrivalQueue(
-            self._arrivals, lambda change: on_token(*change), limits.ARRIVED_TOKENS, 0
+            self._arrivals, lambda change: on_token(*change), limits.ARRIVED_TOKENS, limits.ARRIVED_TOKEN_BYTES
         )
 
         def arrived(sample: Any) -> None:
-            queue.add((str(sample.key_expr), sample.kind == put))
+            name = str(sample.key_expr)
+            if self._short(name):
+                queue.add((name, sample.kind == put), len(name))
 
         def declare() -> list[Any]:
             return [self._session.liveliness().declare_subscriber(key, self._direct(arrived), history=True)]
@@ -300,7 +306,14 @@ class OpenSession:
         )
 
         def arrived(query: Any) -> None:
-            arrival = ArrivedQuery(query, self._queries)
+            if not (
+                self._readable(query.attachment)
+                and self._short(str(query.key_expr))
+                and self._short(str(query.parameters))
+            ):
+                query.drop()
+                return
+            arrival = ArrivedQuery(query, self._queries, self._budget)
             queue.add(arrival, len(arrival.payload))
 
         def declare() -> list[Any]:
@@ -322,7 +335,7 @@ class OpenSession:
         zenoh = self._zenoh
         self._check(selector.partition("?")[0])
         done: asyncio.Future[list[ZenohReply]] = self._loop.create_future()
-        pending = PendingGet(done, self._call_loop)
+        pending = PendingGet(done, self._call_loop, self._arrivals.refuse)
         cancellation = zenoh.CancellationToken()
         body = payload if isinstance(payload, bytes) else bytes(payload)
 
@@ -351,7 +364,7 @@ class OpenSession:
         except TimeoutError:
             return pending.collected()
         finally:
-            if not done.done() or done.cancelled():
+            if pending.unfinished or not done.done() or done.cancelled():
                 self._queries.submit(cancellation.cancel)
 
     async def close(self) -> None:
@@ -401,6 +414,27 @@ class OpenSession:
             callback(arrived)
 
         return self._zenoh.handlers.Callback(called, ended, indirect=False)
+
+    def take_refused(self) -> dict[str, int]:
+        """What was dropped or refused since the last call, by its reason, such as ``zenoh.reply.limit``."""
+        with self._arrivals.lock:
+            refused = dict(self._arrivals.refused)
+            self._arrivals.refused.clear()
+        return refused
+
+    def _readable(self, attachment: Any) -> bool:
+        """Whether an attachment may be copied; called in Zenoh's threads, before anything is."""
+        if attachment is None or len(attachment) <= limits.ATTACHMENT_MAX:
+            return True
+        self._arrivals.refuse("zenoh.attachment.long")
+        return False
+
+    def _short(self, text: str) -> bool:
+        """Whether a key, or a query's parameters, may be kept."""
+        if len(text) <= limits.KEY_MAX:
+            return True
+        self._arrivals.refuse("zenoh.key.long")
+        return False
 
     def _call_loop(self, function: Callable[[], None]) -> None:
         with contextlib.suppress(RuntimeError):  # the loop was closed before the session

@@ -58,6 +58,7 @@ class Ros1BridgeNeighbour:
         self._present = PresenceTable()
         self._exports: dict[MeshSource, BridgedExport | BridgedServiceExport] = {}
         self._imports: dict[tuple[BridgedKind, BridgedTopic], BridgedImport | BridgedServiceImport] = {}
+        self._shown: set[tuple[SourceKind, str, str]] = set()
         self._refused: dict[tuple[str, str], str] = {}
         self._malformed = 0
         self._listening: Declared | None = None
@@ -83,6 +84,7 @@ class Ros1BridgeNeighbour:
             each.close()
         self._exports.clear()
         self._imports.clear()
+        self._shown.clear()
         self._announcer.close()
 
     def report(self) -> dict[str, object]:
@@ -158,7 +160,7 @@ class Ros1BridgeNeighbour:
         if not why and "*" in (topic.type, topic.md5):
             why = "the bridge does not know its type"
         source = ForeignSource(_SHOWN[kind], SITE, "", node, decision.name, topic.type)
-        if not why and any(_same(each.source_here, source) for each in self._imports.values()):
+        if not why and _place(source) in self._shown:
             why = "bridges have it with another type too, which was seen first"
         if why:
             self._refused["in", topic.name] = why
@@ -172,12 +174,14 @@ class Ros1BridgeNeighbour:
                 self._graph, self._session, self._announcer, topic, source, timeout, decision.why
             )
         self._imports[kind, topic] = made
+        self._shown.add(_place(source))
 
     def _hide(self, kind: BridgedKind, topic: BridgedTopic) -> None:
         self._refused.pop(("in", topic.name), None)
         made = self._imports.pop((kind, topic), None)
         if made is not None:
             made.close()
+            self._shown.discard(_place(made.source_here))
 
     async def _beat(self) -> None:
         loop = asyncio.get_running_loop()
@@ -188,8 +192,9 @@ class Ros1BridgeNeighbour:
                 self._hide(kind, topic)
 
 
-def _same(one: ForeignSource, other: ForeignSource) -> bool:
-    return (one.kind, one.node, one.name) == (other.kind, other.node, other.name)
+def _place(source: ForeignSource) -> tuple[SourceKind, str, str]:
+    """What only one type can have here."""
+    return source.kind, source.node, source.name
 
 
 def _base_name(namespace: str) -> str:

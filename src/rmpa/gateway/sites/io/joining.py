@@ -72,17 +72,18 @@ def make_site_neighbour(
     def why_not(site: str, source: MeshSource) -> str:
         return rules.refusal(site, source.module, source.name, Access.CALL)
 
+    counters = None if agent is None else agent.bridge.counters
     history = SiteHistory(clock.now)
     store = _store_file(settings)
     seen = SiteSeenValues(LastValueStore(store.with_suffix(".seen.sqlite") if store is not None else None))
     parts: list[SitePart] = [
         SiteLastValues(gateway.site, session, graph, LastValueStore(store), rules.kept, refusal, clock.wall_ns),
         seen,
-        SiteTopics(gateway.site, graph, session, rules, settings.make_contracts(), clock, seen.keep),
+        SiteTopics(gateway.site, graph, session, rules, settings.make_contracts(), clock, seen.keep, counters),
         SiteServices(gateway.site, session, graph, services.timeout, why_not, clock.wall_ns),
     ]
     own = SiteGateway(gateway.site, gateway.rank, secrets.token_hex(16))
-    neighbour = SiteNeighbour(graph, session, own, rules, parts)
+    neighbour = SiteNeighbour(graph, session, own, rules, parts, counters)
     neighbour.on_sites = history.seen
     neighbour.on_site_source = lambda source, there: history.source(source, there=there)
     if isinstance(graph, AgentGraph):

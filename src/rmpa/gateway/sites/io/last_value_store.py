@@ -13,6 +13,7 @@ import asyncio
 import contextlib
 import logging
 import sqlite3
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from rmpa.gateway import limits
@@ -106,11 +107,13 @@ class LastValueStore:
             self.dropped += 1
             self.forget(key)
             return False
+        if len(value.definition) > limits.LAST_VALUE_DEFINITION_MAX:
+            value = replace(value, definition="")
         self._pending.pop(key, None)
         self._pending[key] = value
         self._drop(key)
         self._index[key] = header = header_of(key, value)
-        self._size += header.size
+        self._size += _cost(header)
         self._bound()
         self._write_soon()
         return True
@@ -155,12 +158,12 @@ class LastValueStore:
         """Take a value out of the index; return whether it was there."""
         header = self._index.pop(key, None)
         if header is not None:
-            self._size -= header.size
+            self._size -= _cost(header)
         return header is not None
 
     def _set_index(self, index: dict[ValueKey, ValueHeader]) -> None:
         self._index = index
-        self._size = sum(header.size for header in index.values())
+        self._size = sum(map(_cost, index.values()))
 
     def _bound(self) -> None:
         if self._size > self._bytes_max or len(self._index) > self._values_max:
@@ -168,12 +171,12 @@ class LastValueStore:
                 if self._size <= self._bytes_max and len(self._index) <= self._values_max:
                     break
                 self.forget(key)
-        waiting = sum(len(value.body) for value in self._pending.values() if value is not None)
+        waiting = sum(_weight(value) for value in self._pending.values() if value is not None)
         for key, value in list(self._pending.items()) if waiting > self._pending_max else ():
             if waiting <= self._pending_max:
                 break
             if value is not None:
-                waiting -= len(value.body)
+                waiting -= _weight(value)
                 del self._pending[key]
                 self._drop(key)
                 self.dropped += 1
@@ -333,3 +336,12 @@ def header_of(key: ValueKey, value: LastValue) -> ValueHeader:
 
 def _places(keys: Iterable[ValueKey]) -> list[tuple[str, str, str]]:
     return [(key.module, key.topic, key.node) for key in keys]
+
+
+def _cost(header: ValueHeader) -> int:
+    """Bytes that a value takes, as ``bytes_max`` counts them: of its definition too, which is kept in memory."""
+    return header.size + len(header.definition)
+
+
+def _weight(value: LastValue) -> int:
+    return len(value.body) + len(value.definition)

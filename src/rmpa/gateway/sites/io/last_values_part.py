@@ -87,6 +87,7 @@ class SiteLastValues(PassivePart):
         self._watched: dict[ValueKey, _Watched] = {}
         self._looks = asyncio.Semaphore(limits.LATCH_LOOKS_AT_ONCE)
         self._tasks: set[asyncio.Task[None]] = set()
+        self._answering = self._refused = 0
         self._looking: dict[ValueKey, asyncio.Task[None]] = {}
         self._opening = asyncio.get_running_loop().create_task(store.open(), name="open last values")
         self._queryable: Declared = session.queryable(value_key(site, "*", "**"), self._take)
@@ -134,7 +135,12 @@ class SiteLastValues(PassivePart):
             }
             for key, header in self._store.headers.items()
         ]
-        return {"values": values, "problem": self._store.problem, "dropped": self._store.dropped}
+        return {
+            "values": values,
+            "problem": self._store.problem,
+            "dropped": self._store.dropped,
+            "refused": self._refused,
+        }
 
     async def close(self) -> None:
         """Write what waits, and end."""
@@ -209,7 +215,15 @@ class SiteLastValues(PassivePart):
     # --- what is asked ----------------------------------------------------------------------------------------------
 
     def _take(self, query: ZenohQuery) -> None:
-        self._spawn(self._answer(query), "answer of last values")
+        if self._answering >= limits.LAST_VALUES_ASKED_MAX:
+            self._refused += 1
+            query.reply_error("too many questions for last values at once; ask again later")
+            return
+        self._answering += 1
+        self._spawn(self._answer(query), "answer of last values").add_done_callback(self._answered)
+
+    def _answered(self, _task: asyncio.Task[None]) -> None:
+        self._answering -= 1
 
     async def _answer(self, query: ZenohQuery) -> None:
         try:

@@ -14,12 +14,13 @@ from rmpa.gateway.sites.exports import SiteExports
 from rmpa.gateway.sites.imports import SiteImports
 from rmpa.gateway.sites.keys import GATEWAY, SiteGateway, SiteModule, SiteSource, parse_token, token_keys
 from rmpa.gateway.sites.leader import Leader
-from rmpa.gateway.sites.report import refusals_report, sites_report
+from rmpa.gateway.sites.report import refusals_report, site_counts, sites_report
 from rmpa.runtime.machine_timer import MachineTimer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from rmpa.core.counters import Counters
     from rmpa.gateway.neighbour import MeshSource, OwnGraph
     from rmpa.gateway.sites.part import SiteExport, SitePart
     from rmpa.gateway.sites.rules import CrossingRules
@@ -37,6 +38,7 @@ class SiteNeighbour:
         own: This gateway: its site, rank and run.
         rules: Decide what may cross.
         parts: Carry topics, services and so on.
+        counters: As of ``SiteCatalogue``.
     """
 
     def __init__(
@@ -46,12 +48,13 @@ class SiteNeighbour:
         own: SiteGateway,
         rules: CrossingRules,
         parts: Sequence[SitePart],
+        counters: Counters | None = None,
     ) -> None:
         self._graph = graph
         self._session = session
         self._own = own
         self._parts = tuple(parts)
-        self.catalogue = SiteCatalogue(own.site)
+        self.catalogue = SiteCatalogue(own.site, counters)
         """What the other sites have."""
         self.exports = SiteExports(own.site, rules)
         """What this site offers."""
@@ -115,7 +118,7 @@ class SiteNeighbour:
             "sites": sites_report(self.catalogue, self.imports),
             "offered": len(self.exports.sources),
             "refused": refusals_report(self.exports, self.imports),
-            "counters": self.catalogue.counters.as_dict(),
+            "counters": site_counts(self.catalogue.counters),
             "parts": {part.name: part.report() for part in self._parts},
         }
 

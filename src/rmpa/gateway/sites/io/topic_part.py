@@ -15,6 +15,7 @@ from rmpa.gateway.sites.io.exported_topic import ExportedTopic
 from rmpa.gateway.sites.io.imported_topic import ImportedTopic, InterruptedTopic
 from rmpa.gateway.sites.io.topic_subscription import TopicSubscription
 from rmpa.gateway.sites.keys import ROOT
+from rmpa.gateway.sites.report import site_counts
 from rmpa.gateway.sites.topic_header import REFUSED
 from rmpa.ros.wire.tcpros import LENGTH
 
@@ -40,6 +41,8 @@ class SiteTopics:
         contracts: The contracts of topics, which become Zenoh's QoS.
         clock: Both clocks.
         on_latched: Called with each message of a latched topic of another site.
+        counters: ``site.message.malformed``, ``site.message.looped``, ``site.message.unwanted_node``, and
+            ``site.message.unkept``: a latched message of a node that no node here wants, and that found no room.
     """
 
     name = "topics"
@@ -53,6 +56,7 @@ class SiteTopics:
         contracts: Contracts,
         clock: Clock,
         on_latched: OnLatched = lambda *_: None,
+        counters: Counters | None = None,
     ) -> None:
         self._on_latched = on_latched
         self._site = site
@@ -71,8 +75,7 @@ class SiteTopics:
         self._questions: dict[SiteModule, tuple[Declared, Declared]] = {}
         self._reader = AttachmentReader()
         self._check_timer: asyncio.TimerHandle | None = None
-        self.counters = Counters()
-        """``site.message.malformed``, ``site.message.looped``, ``site.message.unwanted_node``."""
+        self.counters = counters if counters is not None else Counters()
 
     # --- SitePart -------------------------------------------------------------------------------------------------
 
@@ -159,7 +162,7 @@ class SiteTopics:
             "in": [topic.report() for topic in into if topic.used],
             "offered": len(out),
             "shown": len(into),
-            "counters": self.counters.as_dict(),
+            "counters": site_counts(self.counters),
         }
 
     async def close(self) -> None:
@@ -226,6 +229,12 @@ class SiteTopics:
         known = subscription.latched
         if source.latched and (source.node in known or len(known) < limits.LATCHED_NODES_MAX):
             last = sample.payload if batch is None else bytes(batch[-1][LENGTH.size :])
+            if (
+                sum(len(each[0]) for node, each in known.items() if node != source.node) + len(last)
+                > limits.HELD_BYTES
+            ):
+                self.counters.add("site.message.unkept")
+                return
             known[source.node] = last, sequence + len(batch or (1,)) - 1, stamp, source
 
     def _check_later(self) -> None:
