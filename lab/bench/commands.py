@@ -18,6 +18,7 @@ from lab.bench import (
     crosstraffic,
     decision,
     fleet,
+    fleet_graph,
     gateway,
     idle,
     joining,
@@ -31,6 +32,7 @@ from lab.bench import (
     startup,
     storm,
     tasks,
+    thousand,
     throughput,
     trust,
     web,
@@ -99,7 +101,9 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
         "what it costs to follow a real roscore, and how soon changes are seen", roscore.measure, (why_no_ros,)
     ),
     "fleet": Measurement("2 to 64 modules: start, rest, a stream beside classic ROS, losses", fleet.measure),
+    "fleet_graph": Measurement("what the topics of 999 peers cost one agent", fleet_graph.measure, needs=()),
     "idle": Measurement("what an agent costs while nothing happens", idle.measure),
+    "thousand": Measurement("a mesh of up to a thousand modules, simulated", thousand.measure, needs=()),
     "tasks": Measurement(
         "how evenly a resource's task runs, beside loops of rospy and roscpp",
         tasks.measure,

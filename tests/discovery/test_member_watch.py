@@ -67,7 +67,7 @@ class Agent:
                 self.detector.receive(ack, output.address, self.now)
 
     def run(self, seconds: float, talker: Identity | None = None) -> None:
-        """Let time pass; ``talker`` sends something each second, and nobody answers probes."""
+        """Let time pass; ``talker`` sends something each second, and it alone answers probes."""
         for _ in range(round(seconds)):
             self.now += 1.0
             if talker is not None:
@@ -75,6 +75,8 @@ class Agent:
             self.membership.handle_timer(self.now)
             while (at := self.detector.next_timer()) is not None and at <= self.now:
                 self.detector.handle_timer(at)
+                if talker is not None:
+                    self.answer(talker)
             self.flush()
 
     def watched(self, identity: Identity) -> bool:

@@ -35,6 +35,7 @@ SNAPSHOT = Snapshot(
         rss=41_000_000,
         addresses=("10.0.0.1",),
         interfaces=("wlan0",),
+        links="full mesh (3 modules, mesh.full_mesh_up_to = 64)",
         config_file="/etc/rmpa/rmpa.toml",
         realtime=("SCHED_FIFO 50: granted",),
         end_connections="this process has no CAP_NET_ADMIN; run the agent with it",

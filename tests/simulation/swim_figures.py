@@ -144,9 +144,14 @@ def long_loss(seed: int, count: int, hours: float) -> bool:
     """A long time at 1 % loss; return whether no member was held to have failed."""
     scenario = SwimScenario(seed + 2, count, loss=0.01, delay=(0.0002, 0.02), beacons=0.0)
     scenario.start()
-    found = false_alarms(scenario, hours * 3600)
-    say(f"{hours:g} h at 1 % loss, {count} members: {found[0]} suspicions (counted at each), {found[1]} failures")
-    return found[1] == 0
+    begun = scenario.world.now
+    while (spent := scenario.world.now - begun) < hours * 3600:
+        false_alarms(scenario, min(3600.0, hours * 3600 - spent))
+        figures = scenario.figures
+        passed = (scenario.world.now - begun) / 3600
+        say(f"{passed:g} h at 1 % loss, {count} members: {figures.false_failures} of them held to have failed, ")
+        say(f"  {figures.false_suspicions} suspicions (counted at each that heard of one)")
+    return scenario.figures.false_failures == 0
 
 
 def say(text: str) -> None:

@@ -51,7 +51,7 @@ def test_a_killed_member_is_known_to_a_hundred_within_five_seconds() -> None:
 
 def test_a_third_killed_at_once_is_known_to_the_others_and_no_other_is_accused() -> None:
     scenario = settled(90)
-    death = Deaths(scenario, scenario.world.rng.sample(scenario.living(), 30), 12)
+    death = Deaths(scenario, scenario.world.rng.sample(scenario.living(), 30), 8)
     assert death.missed == 0
     assert scenario.figures.false_failures == 0
     assert scenario.disagreements() == []

@@ -12,6 +12,7 @@ from rmpa.cli.graph import GraphName, read_graph, read_namespace
 from rmpa.cli.node_names import ask_peer, find_uri, module_of, peers_nodes, read_node, unreachable_nodes, uris_of
 from rmpa.cli.options import GraphOptions, graph_options
 from rmpa.cli.output import Column, print_json, print_line, print_table, warn
+from rmpa.cli.selection import Selection, selection_options, summary
 from rmpa.core.errors import RmpaError
 from rmpa.ros.core.node_calls import ping_node
 from rmpa.ros.node_info import NodeFacts, NodeLine, describe_node, list_nodes
@@ -38,8 +39,9 @@ _COLUMNS = (
 )
 @click.argument("namespace", default="")
 @click.option("-v", "--verbose", is_flag=True, help="With module, counts of topics and services, and address.")
+@selection_options
 @graph_options
-def list_(namespace: str, verbose: bool, options: GraphOptions) -> None:
+def list_(namespace: str, verbose: bool, selection: Selection, options: GraphOptions) -> None:
     """List the nodes of this module and of its peers, all or those of a NAMESPACE.
 
     Each linked peer is asked for its nodes, including those of which nothing crosses. A node of a peer is written
@@ -51,7 +53,15 @@ def list_(namespace: str, verbose: bool, options: GraphOptions) -> None:
     if wanted.peer is None:
         found += [(None, line) for line in _own(master, graph, with_uris=verbose or options.as_json)]
     found += peers_nodes(master, graph, wanted.peer)
-    found = [(peer, line) for peer, line in found if wanted.contains(line.name, (peer,))]
+    fitting = set(selection.names({line.name for _, line in found}))
+    found = every = [
+        (peer, line)
+        for peer, line in found
+        if wanted.contains(line.name, (peer,)) and line.name in fitting and selection.wants_peer(peer)
+    ]
+    if not options.as_json and selection.is_long(found):
+        found = [*selection.shown(found)]  # this module's own are the first
+        click.echo(summary(len(every), "nodes", ("remote" if peer else "of this module" for peer, _ in every)) + "\n")
     if options.as_json or verbose:
         here = module_of(master)
         if options.as_json:
@@ -61,6 +71,8 @@ def list_(namespace: str, verbose: bool, options: GraphOptions) -> None:
     else:
         for peer, line in found:
             print_line(str(GraphName(line.name, peer)), "cyan" if peer is not None else None)
+    if not options.as_json:
+        selection.print_rest(every, "nodes", "rmpa node list MODULE:/, /NAMESPACE, --match '*driver*'")
     for peer, line in found:
         if line.problem:
             warn(f"{GraphName(line.name, peer)} cannot be reached at {line.uri}: {line.problem}")

@@ -11,6 +11,7 @@ import click
 
 from rmpa.cli.options import agent_option, json_option
 from rmpa.cli.output import Column, duration, print_json, print_line, print_table, size, warn
+from rmpa.cli.selection import LINES, Selection, summary
 from rmpa.cli.topic_crossing import shown_state
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import PeerRefused, RmpaError
@@ -19,6 +20,8 @@ from rmpa.observe.io.control_client import ControlClient, choose_agent
 from rmpa.observe.snapshot import PingReply
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from rmpa.observe.snapshot import LaneInfo, PeerInfo, ProbesInfo, RouteInfo, Snapshot, TopicInfo
 
 _COLOURS: Final = {
@@ -29,6 +32,8 @@ _COLOURS: Final = {
     "refused": "red",
     "conflict": "red",
 }
+_USUAL: Final = frozenset({"linked", "relayed", "parked"})
+"""States that are no problem."""
 _COLUMNS: Final = tuple(
     Column(title, right=title not in ("PEER", "STATE", "ADDRESS", "DIALLED"))
     for title in ("PEER", "STATE", "SINCE", "ADDRESS", "DIALLED", "RTT", "CLOCK", "IN", "OUT", "QUEUE", "DROPS")
@@ -46,31 +51,68 @@ def connect(agent: str | None) -> ControlClient:
     return ControlClient(choose_agent(os.environ, agent).path)
 
 
-@click.command("list", epilog="\b\nExamples:\n  rmpa peer list\n  rmpa peer list --json | jq '.[].name'\n")
+@click.command(
+    "list",
+    epilog="""\
+\b
+Examples:
+  rmpa peer list
+  rmpa peer list 'arm*' --state linked --state refused
+  rmpa peer list --json | jq '.[].name'
+""",
+)
+@click.argument("pattern", default="")
+@click.option("--state", "states", multiple=True, help="Only peers in this state; may be given again.")
+@click.option("--limit", type=click.IntRange(1), help=f"At most so many. [default: {LINES} on a terminal]")
+@click.option("--all", "everything", is_flag=True, help="Leave nothing out on a terminal.")
 @json_option
 @agent_option
-def list_(as_json: bool, agent: str | None) -> None:
-    """List the peers, and how their links are.
+def list_(
+    pattern: str, states: tuple[str, ...], limit: int | None, everything: bool, as_json: bool, agent: str | None
+) -> None:
+    """List the peers, all or those with names like PATTERN, and how their links are.
 
     A link is "at rest" while nothing depends on it: its silence is then noticed after 16 s in place of 1 s.
 
-    CLOCK is the peer's wall clock less ours, with the bound of its error.
+    CLOCK is the peer's wall clock less ours, with the bound of its error. Of very many peers a terminal shows a
+    summary and the first ones: those with a problem, then those with most traffic.
     """
     with connect(agent) as client:
         snapshot = client.snapshot()
+    selection = Selection(pattern, limit=limit, everything=everything)
+    fitting = set(selection.names(peer.name for peer in snapshot.peers))
+    peers = [p for p in snapshot.peers if p.name in fitting and (not states or p.state in states)]
     if as_json:
-        print_json(snapshot.peers)
+        print_json(peers)
         return
     if not snapshot.peers:
         where = ", ".join(snapshot.agent.interfaces) or "no interface"
         click.echo(f"{snapshot.agent.name} knows no peers yet (domain {snapshot.agent.domain}, looking on {where})")
+    elif not peers:
+        click.echo(summary(len(snapshot.peers), "peers", (p.state for p in snapshot.peers)) + "; none of them fits")
     else:
-        colours = [_COLOURS.get(p.state, "") for p in snapshot.peers]
-        print_table(_COLUMNS, [_row(p) for p in snapshot.peers], colours=colours)
+        if selection.is_long(peers):
+            peers.sort(key=_urgency)
+            click.echo(summary(len(peers), "peers", (p.state for p in peers)) + "\n")
+        shown = selection.shown(peers)
+        print_table(_COLUMNS, [_row(p) for p in shown], colours=[_COLOURS.get(p.state, "") for p in shown])
+        selection.print_rest(peers, "peers", "rmpa peer list 'arm*', --state linked")
     if snapshot.agent.links.startswith("links on demand"):
         click.echo(f"{snapshot.agent.name} keeps {snapshot.agent.links}")
-    for trouble in _troubles(snapshot):
+    troubles = _troubles(snapshot, peers)
+    told = selection.shown(troubles)
+    for trouble in told:
         warn(trouble)
+    if len(told) < len(troubles):
+        warn(f"... {len(troubles) - len(told):,} more of this kind; all: rmpa peer list --all")
+
+
+def _urgency(info: PeerInfo) -> tuple[int, int, str]:
+    """The order of a list that is not shown whole: problems first, then by traffic."""
+    link = info.link
+    problem = info.conflicts or info.beyond or (link is not None and link.path_problem)
+    usual = info.state in _USUAL and not problem
+    return int(usual), 0 if link is None else -(link.bytes_in + link.bytes_out), info.name
 
 
 def _row(info: PeerInfo) -> list[str]:
@@ -95,9 +137,9 @@ def _row(info: PeerInfo) -> list[str]:
     ]
 
 
-def _troubles(snapshot: Snapshot) -> list[str]:
+def _troubles(snapshot: Snapshot, peers: Sequence[PeerInfo]) -> list[str]:
     found = list(snapshot.notes)
-    for info in snapshot.peers:
+    for info in peers:
         found += [f"{info.name}: {conflict}" for conflict in info.conflicts]
         found += [bound.text for bound in info.beyond]
         if info.link is not None and info.link.path_problem:

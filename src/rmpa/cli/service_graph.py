@@ -10,6 +10,7 @@ import click
 from rmpa.cli.graph import origin_json, origin_text, peers_of, print_names, read_name, read_namespace
 from rmpa.cli.options import GraphOptions, graph_options
 from rmpa.cli.output import Column, print_json, print_line, print_table, warn
+from rmpa.cli.selection import Selection, selection_options, summary
 from rmpa.cli.service_crossing import crossing, print_crossing, transport_json, transport_text, transports
 from rmpa.cli.service_probe import known_type, probe, probe_all
 from rmpa.core.errors import RmpaError
@@ -41,8 +42,9 @@ def _service_json(graph: Graph, name: str, found: Probed | None = None) -> dict[
 )
 @click.argument("namespace", default="")
 @click.option("-v", "--verbose", is_flag=True, help="Types and nodes too; each server is asked.")
+@selection_options
 @graph_options
-def list_(namespace: str, verbose: bool, options: GraphOptions) -> None:
+def list_(namespace: str, verbose: bool, selection: Selection, options: GraphOptions) -> None:
     """List services, all or those of a NAMESPACE.
 
     A service that a peer offers has its name behind it: /add  [base]. With -v or --json it has its transport, too.
@@ -50,6 +52,12 @@ def list_(namespace: str, verbose: bool, options: GraphOptions) -> None:
     master, graph = options.graph()
     wanted = read_namespace(namespace, "service")
     names = [name for name in sorted(graph.services) if wanted.contains(name, peers_of(graph.services[name]))]
+    names = every = selection.with_peers(names, lambda name: peers_of(graph.services[name]))
+    if not options.as_json and selection.is_long(names):
+        names.sort(key=lambda name: (bool(peers_of(graph.services[name])), name))
+        owners = ("remote" if peers_of(graph.services[name]) else "of this module" for name in names)
+        click.echo(summary(len(names), "services", owners) + "\n")
+        names = [*selection.shown(names)]
     found = asyncio.run(probe_all(master, names)) if verbose else {}
     if options.as_json:
         mesh = transports(master)
@@ -65,6 +73,8 @@ def list_(namespace: str, verbose: bool, options: GraphOptions) -> None:
         print_table(columns[:shown], [row[:shown] for row in rows])
     else:
         print_names(names, graph.services)
+    if not options.as_json:
+        selection.print_rest(every, "services", "rmpa service list MODULE:/, /NAMESPACE, --match '*/start'")
 
 
 def _type_of(found: Probed) -> str:

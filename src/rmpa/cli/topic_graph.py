@@ -6,9 +6,11 @@ from typing import TYPE_CHECKING
 
 import click
 
+from rmpa.bridge.proxy_names import proxied_peer
 from rmpa.cli.graph import origin_json, origin_text, peers_mark, peers_of, print_names, read_name, read_namespace
 from rmpa.cli.options import GraphOptions, graph_options
 from rmpa.cli.output import duration, print_json, print_line, printable, warn
+from rmpa.cli.selection import Selection, selection_options, summary
 from rmpa.cli.topic_crossing import ask_agent, facts, shown_state
 from rmpa.core.errors import RmpaError
 
@@ -34,11 +36,20 @@ def _topic_json(graph: Graph, name: str) -> dict[str, object]:
 @click.option("-v", "--verbose", is_flag=True, help="Types and counts, publishers and subscribers apart.")
 @click.option("-p", "--publishers", is_flag=True, help="Only topics that have a publisher.")
 @click.option("-s", "--subscribers", is_flag=True, help="Only topics that have a subscriber.")
+@selection_options
 @graph_options
-def list_(namespace: str, verbose: bool, publishers: bool, subscribers: bool, options: GraphOptions) -> None:
+def list_(
+    namespace: str,
+    verbose: bool,
+    publishers: bool,
+    subscribers: bool,
+    selection: Selection,
+    options: GraphOptions,
+) -> None:
     """List topics, all or those of a NAMESPACE.
 
-    A topic that peers publish has their names behind it: /cmd  [joystick].
+    A topic that peers publish has their names behind it: /cmd  [joystick]. A terminal shows the first of very many,
+    this module's own before the others.
     """
     _, graph = options.graph()
     wanted = read_namespace(namespace, "topic")
@@ -49,15 +60,31 @@ def list_(namespace: str, verbose: bool, publishers: bool, subscribers: bool, op
         and (not publishers or graph.publishers.get(name))
         and (not subscribers or graph.subscribers.get(name))
     ]
+    names = selection.with_peers(names, lambda name: peers_of(graph.publishers.get(name, ())))
     if options.as_json:
         print_json([_topic_json(graph, name) for name in names])
-    elif verbose:
+        return
+    every = names
+    if selection.is_long(names):
+        remote = {name for name in names if _is_remote(graph, name)}
+        owners = {peer for name in remote for peer in peers_of(graph.publishers[name])}
+        click.echo(summary(len(names), "topics", ("remote" if n in remote else "of this module" for n in names)))
+        click.echo(f"the remote ones are of {len(owners):,} module{'s' if len(owners) != 1 else ''}\n")
+        names = [*selection.shown(sorted(names, key=lambda name: (name in remote, name)))]
+    if verbose:
         if not subscribers:
             _verbose("Published topics", "publisher", graph, [n for n in names if n in graph.publishers])
         if not publishers:
             _verbose("Subscribed topics", "subscriber", graph, [n for n in names if n in graph.subscribers])
     else:
         print_names(names, graph.publishers)
+    selection.print_rest(every, "topics", "rmpa topic list MODULE:/, /NAMESPACE, --match '*/scan', --peer 'arm*'")
+
+
+def _is_remote(graph: Graph, name: str) -> bool:
+    """Whether peers alone publish a topic."""
+    nodes = graph.publishers.get(name, ())
+    return bool(nodes) and all(proxied_peer(node) is not None for node in nodes)
 
 
 def _verbose(title: str, what: str, graph: Graph, names: list[str]) -> None:

@@ -278,6 +278,8 @@ class FailureDetector:
             self._probing.end(sequence)
             return
         if probe.asked is None:
+            # If it is dead, the one that it would probe has to be probed by another: many may have died at once.
+            self._probe_extra(self._table.next_after(member), now)
             helpers = [m for m in self._table.some(limits.INDIRECT_PROBES, member) if m.state is MemberState.ALIVE]
             self._probing.ask(sequence, len(helpers), now)
             for helper in helpers:

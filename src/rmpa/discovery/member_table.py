@@ -155,6 +155,11 @@ class MemberTable:
         index = bisect_left(self._ring, (self._own, 0)) % len(self._ring)
         return self._all[self._ring[index][1]]
 
+    def next_after(self, member: Member) -> Member:
+        """The member that follows another one in that order; the same one if it is alone."""
+        index = bisect_left(self._ring, (member.run, member.guid.place)) + 1
+        return self._all[self._ring[index % len(self._ring)][1]]
+
     def some(self, count: int, without: Member | None = None) -> list[Member]:
         """Up to ``count`` different members at random."""
         chosen: dict[int, Member] = {}

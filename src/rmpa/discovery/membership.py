@@ -226,10 +226,9 @@ class MembershipProtocol:
 
     def set_demand(self, now: float, *, on: bool) -> None:
         """Take in whether this agent links on demand: its heartbeats then become rarer as the mesh grows."""
-        if self._pace.demand != on:
-            self._pace.demand = on
-            if self._heartbeat_at is not None:
-                self._heartbeat_at = min(self._heartbeat_at, now + limits.HEARTBEAT_INTERVAL)
+        if self._pace.demand != on and self._heartbeat_at is not None:
+            self._heartbeat_at = min(self._heartbeat_at, now + limits.HEARTBEAT_INTERVAL)
+        self._pace.demand = on
 
     def set_seeds(self, seeds: Iterable[Address]) -> None:
         """Send announcements to these addresses, now and with each heartbeat; they replace the former seeds."""
@@ -309,6 +308,11 @@ class MembershipProtocol:
     def peers(self) -> tuple[PeerView, ...]:
         """All peers in GUID order, those included that a conflict keeps from being members."""
         return self._endpoints.views()
+
+    @property
+    def members(self) -> int:
+        """The number of peers that are present."""
+        return len(self._endpoints.present())
 
     def silent_seeds(self) -> list[Address]:
         """The seeds at whose address there is no member."""
@@ -520,13 +524,12 @@ class MembershipProtocol:
         deaf = not multicast and now - peer.multicast_at <= peer.silence
         if not (unknown or deaf or beacon.kind is BeaconKind.ANNOUNCE):
             return
-        members = len(self._endpoints.present())
-        if not (multicast and self._multicast and is_many(members)):
+        if not (multicast and self._multicast and is_many(self.members)):
             self._send_answer(peer, now)
         elif self._burst:
             self.counters.add("beacon.answer_spared")  # the next beacon of this agent's own burst tells the sender
         else:
-            self._late_answers.add(peer.identity.guid.place, members, now)
+            self._late_answers.add(peer.identity.guid.place, self.members, now)
 
     def _send_late_answers(self, now: float) -> None:
         """Answer the newcomers of a large mesh that got no link meanwhile."""
@@ -535,9 +538,7 @@ class MembershipProtocol:
             self._send_multicast(BeaconKind.HEARTBEAT, now)
             return
         for place in places:
-            endpoint = self._endpoints.get(place)
-            if endpoint is not None and endpoint.current is not None:
-                peer = endpoint.current
+            if (endpoint := self._endpoints.get(place)) is not None and (peer := endpoint.current) is not None:
                 self._send_answer(peer, now, self._gossip(self._unheard_by_multicast(now), peer, now))
 
     def _send_answer(self, peer: PeerInstance, now: float, gossip: tuple[Guid, ...] | None = None) -> None:

@@ -134,7 +134,7 @@ class LinkEnd:
         assert not self.gone
         self.wires["express"].send((Frame(FrameKind.CONTROL, payload).serialize(),), URGENT)
 
-    def need(self, *, needed: bool) -> None:
+    def need(self, *, needed: bool, parks: bool = False) -> None:
         """What the bridge says of this link."""
         self.needed = needed
 

@@ -303,7 +303,8 @@ class PeerSessions:
         now = asyncio.get_running_loop().time()
         self.offers.settled(lambda session: self.may_park(session.link))
         for session in self.linked():
-            if now - session.link.touched_at >= mesh_limits.REST_AFTER:
+            yield_to_data()
+            if session.linked and now - session.link.touched_at >= mesh_limits.REST_AFTER:
                 needed = self._depends(session)
                 session.link.need(needed=needed, parks=not needed and self._may_park(session))
         for session in self:

@@ -1,0 +1,391 @@
+"""One module of a large simulated mesh: the real machines of its agent, and what it knows of the others' offers."""
+
+from __future__ import annotations
+
+import random
+import time
+from dataclasses import dataclass
+from ipaddress import IPv4Address
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core.clock import earliest
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity
+from rmpa.discovery.beacon import Beacon
+from rmpa.discovery.events import PeerChanged, PeerFound, PeerLost, PeerRestarted, SendMulticast
+from rmpa.discovery.failure_detector import FailureDetector
+from rmpa.discovery.member_watch import MemberWatch
+from rmpa.discovery.membership import MembershipProtocol
+from rmpa.discovery.swim_events import MemberOffers, MemberSuspected, SwimEvent
+from rmpa.mesh import limits as mesh_limits
+from rmpa.mesh.handshake import Hello
+from rmpa.mesh.mode import MeshMode
+from rmpa.mesh.peering import Peering
+from rmpa.mesh.peering_events import CloseLink, Dial, LinkDown, LinkUp
+from tests.simulation.large_network import TCP_BYTES, Link
+
+if TYPE_CHECKING:
+    from rmpa.discovery.beacon import Address
+    from rmpa.discovery.events import Event, LossReason
+    from rmpa.discovery.swim_packets import SwimPacket
+    from rmpa.mesh.peering_events import PeeringOutput
+    from tests.simulation.large_network import LargeNetwork
+
+TOPICS: Final = 20
+"""Topics that each module offers."""
+CATALOGUE_BYTES: Final = 2 * 24 + 80 * TOPICS + 2 * 52
+"""Bytes of the catalogue over a link: two frames, some 80 bytes a topic, and their packets' headers."""
+HANDSHAKE_BYTES: Final = 2 * (24 + 60 + 52)
+OFFERS_SPREAD_MAX: Final = 5.0
+"""Longest random delay before a parked peer is dialled for its newer offers."""
+
+
+@dataclass(slots=True)
+class Tally:
+    """What all modules together saw; counted where it happens, because a thousand of them know a million peers."""
+
+    members: int = 0
+    """Pairs (module, member that it knows)."""
+    suspected: int = 0
+    suspected_falsely: int = 0
+    lost_falsely: int = 0
+    """Living and reachable members that a module lost."""
+    links: int = 0
+    links_made: int = 0
+
+
+class Module:
+    """An agent without sockets and without ROS.
+
+    Args:
+        network: Where it lives.
+        number: From 1; gives its address and name.
+        tally: Shared by all modules.
+    """
+
+    def __init__(self, network: LargeNetwork, number: int, tally: Tally) -> None:
+        self.network = network
+        self.tally = tally
+        self.name = f"module{number}"
+        self.address: Address = (str(IPv4Address(0x0A000000 + number)), 40000)
+        self.run = 0
+        self.alive = False
+        self.reachable = True
+        self.links: dict[int, Link] = {}
+        self.offers = 1
+        self.wants: set[int] = set()
+        """The places of peers whose data is used here: their links stay."""
+        self.known: dict[int, tuple[bytes, int]] = {}
+        """The run and the version of the offers that are known, by the peer's place."""
+        self.lost_at: dict[int, float] = {}
+        """When each peer was lost, by its place; only if ``watch`` is set."""
+        self.watch = False
+        self.metered = False
+        self.cpu = 0.0
+        """Processor time of this module's machines in seconds, if ``metered``."""
+        self._armed: float | None = None
+        self._flushing = False
+        self._ids = 0
+
+    @property
+    def place(self) -> int:
+        """The place of its GUID, the same in each run."""
+        return Guid.of(*self.address, 1).place
+
+    # --- life -------------------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Start a new run."""
+        self.run += 1
+        self.alive = True
+        rng = random.Random(self.network.world.rng.getrandbits(64))
+        now = self.network.now
+        self.identity = Identity(Guid.of(*self.address, self.run), rng.randbytes(16), self.name)
+        self.detector = FailureDetector(self.identity, rng=rng.random)
+        self.membership = MembershipProtocol(self.identity, rng=rng.random, vouches=self.detector.vouches)
+        self.member_watch = MemberWatch(self.detector, self.membership)
+        self.peering = Peering(self.identity, rng=rng.random, alive=self._is_alive)
+        self.mode = MeshMode()
+        self.rng = rng
+        self._armed = None
+        self.network.join(self)
+        self.membership.start(now)
+        self.flush()
+
+    def _is_alive(self, number: int) -> bool:
+        """Whether the other end of a link sends; of one at rest the code asks it when it matters."""
+        link = self.links.get(number)
+        if link is None or not link.up:
+            return False
+        other = link.other(self)
+        return other.alive and other.run == link.runs[link.ends.index(other)] and self._reaches(other)
+
+    def kill(self) -> None:
+        """The machine loses its power: no goodbye, and no reset of its connections."""
+        self.alive = False
+        self.network.leave(self)
+        self.tally.members -= len(self._present())
+        self.known = {}
+        for link in self.links.values():
+            self._find_dead(link)
+        self.links = {}
+
+    def _find_dead(self, link: Link) -> None:
+        """The other end notices by its lease; sooner where something depends on the link."""
+        other = link.other(self)
+        lease = mesh_limits.EXPRESS_LEASE if link.used else mesh_limits.IDLE_LEASE
+        at = 0 if link.ends[0] is other else 1
+        self.tally.links -= link.up
+        link.up = False
+        run = other.run
+        self.network.world.after(lease, lambda: other.link_ended(link.ids[at], "silent", run, silent=True))
+
+    def part(self, link: Link) -> None:
+        """The path of a link that leads across a partition is gone: both ends notice by their leases."""
+        if self._reaches(link.other(self)) or not link.up:
+            return
+        lease = mesh_limits.EXPRESS_LEASE if link.used else mesh_limits.IDLE_LEASE
+        self.network.world.after(lease, lambda: self._end(link, "silent", parked=False, silent=True))
+
+    def _present(self) -> set[int]:
+        return {view.identity.guid.place for view in self.membership.peers() if view.present}
+
+    def change_offers(self) -> None:
+        """A node of this module advertises something new."""
+        self.offers += 1
+        self.detector.set_version(self.offers, self.network.now)
+        for link in list(self.links.values()):
+            link.other(self).learn(self)
+        self.flush()
+
+    # --- packets ----------------------------------------------------------------------------------------------
+
+    def hear_beacon(self, beacon: Beacon, source: Address, *, multicast: bool) -> None:
+        """A beacon came."""
+        if not self.alive:
+            return
+        began = time.process_time() if self.metered else 0.0
+        self.membership.receive(beacon, source, self.network.now, multicast=multicast)
+        self.flush()
+        if self.metered:
+            self.cpu += time.process_time() - began
+
+    def hear_unicast(self, packet: Beacon | SwimPacket, source: Address) -> None:
+        """A datagram came to this module's own port."""
+        if isinstance(packet, Beacon):
+            self.hear_beacon(packet, source, multicast=False)
+        elif self.alive:
+            began = time.process_time() if self.metered else 0.0
+            self.detector.receive(packet, source, self.network.now)
+            self.flush()
+            if self.metered:
+                self.cpu += time.process_time() - began
+
+    # --- outputs, events, time --------------------------------------------------------------------------------
+
+    def flush(self) -> None:
+        """Do what the machines ask for, until they are quiet; set the timer."""
+        if self._flushing:
+            return
+        self._flushing = True
+        busy = True
+        while busy:
+            busy = False
+            for output in self.membership.outputs():
+                size = len(output.beacon.serialize())
+                if isinstance(output, SendMulticast):
+                    self.network.multicast(self, output.beacon, size)
+                else:
+                    self.network.unicast(self, output.address, output.beacon, size, "beacon")
+            for send in self.detector.outputs():
+                self.network.unicast(self, send.address, send.packet, len(send.packet.serialize()), "swim")
+            for event in self.membership.events():
+                busy = True
+                self._on_event(event)
+            for heard in self.member_watch.events(self.network.now):
+                busy = True
+                self._on_swim(heard)
+            for order in self.peering.take():
+                busy = True
+                self._on_order(order)
+        self._flushing = False
+        self._arm()
+
+    def _arm(self) -> None:
+        when = earliest(self.membership.next_timer(), self.detector.next_timer(), self.peering.next_timer())
+        if when is None or (self._armed is not None and self._armed <= when):
+            return
+        self._armed = when
+        run = self.run
+        self.network.world.at(when, lambda: self._wake(when, run))
+
+    def _wake(self, when: float, run: int) -> None:
+        if self._armed == when:
+            self._armed = None
+        if not self.alive or run != self.run:
+            return
+        began = time.process_time() if self.metered else 0.0
+        now = self.network.now
+        self.membership.handle_timer(now)
+        self.detector.handle_timer(now)
+        self.peering.handle_timer(now)
+        self.flush()
+        if self.metered:
+            self.cpu += time.process_time() - began
+
+    def _on_event(self, event: Event) -> None:
+        now = self.network.now
+        self.member_watch.membership_changed(event, now)
+        match event:
+            case PeerFound(identity=identity, source=source):
+                self.tally.members += 1
+                self.peering.peer_found(identity, now, source[0] if source else None)
+                self._count_modules()
+            case PeerChanged(identity=identity):
+                self.peering.peer_found(identity, now)
+            case PeerRestarted(identity=identity, previous=previous, source=source):
+                self.peering.peer_gone(previous.guid, now)
+                self._forget(previous)
+                self.peering.peer_found(identity, now, source[0] if source else None)
+            case PeerLost(identity=identity, reason=reason):
+                self.tally.members -= 1
+                self._judge_loss(identity, reason)
+                self.peering.peer_gone(identity.guid, now)
+                self._forget(identity)
+                self._count_modules()
+            case _:
+                pass
+
+    def _judge_loss(self, identity: Identity, reason: LossReason) -> None:
+        if self.watch:
+            self.lost_at[identity.guid.place] = self.network.now
+        module = self.network.modules.get(identity.guid.endpoint)
+        if module is not None and module.identity.instance == identity.instance and self._reaches(module):
+            self.tally.lost_falsely += 1
+            self.network.world.note(self.name, f"lost {identity.name} falsely: {reason.value}")
+
+    def _reaches(self, module: Module) -> bool:
+        return self.network.reaches(self.address[0], module.address[0])
+
+    def _forget(self, identity: Identity) -> None:
+        place = identity.guid.place
+        known = self.known.get(place)
+        if known is not None and known[0] == identity.instance:
+            del self.known[place]
+
+    def _count_modules(self) -> None:
+        if self.mode.count(self.membership.members + 1):
+            self.membership.set_demand(self.network.now, on=self.mode.demand)
+            self.detector.set_active(self.network.now, active=self.mode.demand)
+
+    def _on_swim(self, event: SwimEvent) -> None:
+        match event:
+            case MemberSuspected(guid=guid, instance=instance):
+                self.tally.suspected += 1
+                module = self.network.modules.get(guid.endpoint)
+                alive = module is not None and module.identity.instance == instance and self._reaches(module)
+                self.tally.suspected_falsely += alive
+            case MemberOffers(guid=guid, instance=instance, version=version):
+                known = self.known.get(guid.place)
+                if known is not None and known[0] == instance and known[1] < version:
+                    spread = min(OFFERS_SPREAD_MAX, self.mode.modules / 100) * self.rng.random()
+                    run = self.run
+                    self.network.world.after(spread, lambda: self._fetch(guid, version, run))
+            case _:
+                pass
+
+    def _fetch(self, guid: Guid, version: int, run: int) -> None:
+        known = self.known.get(guid.place)
+        if self.alive and run == self.run and known is not None and known[1] < version:
+            self.peering.want(guid, self.network.now)
+            self.flush()
+
+    # --- links ------------------------------------------------------------------------------------------------
+
+    def _on_order(self, order: PeeringOutput) -> None:
+        match order:
+            case Dial(guid=guid, endpoints=endpoints):
+                run = self.run
+                self.network.later(lambda: self._dialled(guid, endpoints[0], run), times=3.0)
+            case LinkUp(link_id=link_id, identity=identity):
+                self._linked(self.links[link_id], identity)
+            case LinkDown(identity=identity):
+                self.member_watch.link_down(identity.guid, identity.instance)
+                self.membership.link_down(identity.guid, self.network.now, identity.instance)
+            case CloseLink(link_id=link_id, reason=reason) if link_id in self.links:
+                self._end(self.links[link_id], reason, parked=False)
+            case _:
+                pass
+
+    def _dialled(self, guid: Guid, endpoint: Address, run: int) -> None:
+        """A dial has got its answer, or will not get one."""
+        if not self.alive or run != self.run:
+            return
+        now = self.network.now
+        other = self.network.modules.get(endpoint)
+        if other is None or not self._reaches(other):
+            self.network.world.after(mesh_limits.DIAL_TIMEOUT, lambda: self._unanswered(guid, run))
+            return
+        hello = Hello.of(self.identity, lease=mesh_limits.EXPRESS_LEASE, expected=guid)
+        self.network.count("link", HANDSHAKE_BYTES + TCP_BYTES, 1)
+        refuse = other.peering.judge(hello)
+        if refuse is not None:
+            self.peering.dial_refused(guid, refuse, now, endpoint)
+            self.flush()
+            return
+        self.tally.links_made += 1
+        self.tally.links += 1
+        link = Link((self, other), (self.next_id(), other.next_id()), (self.run, other.run))
+        self.links[link.ids[0]] = other.links[link.ids[1]] = link
+        other.peering.link_up(link.ids[1], self.identity, now, dialled=False)
+        other.flush()
+        self.peering.link_up(link.ids[0], other.identity, now, dialled=True, endpoint=endpoint)
+        self.flush()
+
+    def _unanswered(self, guid: Guid, run: int) -> None:
+        if self.alive and run == self.run:
+            self.peering.dial_failed(guid, "no answer", self.network.now)
+            self.flush()
+
+    def next_id(self) -> int:
+        """A number for a link."""
+        self._ids += 1
+        return self._ids
+
+    def _linked(self, link: Link, identity: Identity) -> None:
+        now = self.network.now
+        self.membership.link_up(identity, now, identity.guid.endpoint)
+        self.member_watch.link_up(identity, now, answers_probes=True)
+        other = link.other(self)
+        self.network.later(lambda: self.learn(other))
+        link.used = link.used or other.identity.guid.place in self.wants
+        if link.ends[0] is self:
+            self.network.world.after(mesh_limits.PARK_AFTER, lambda: self._rest(link))
+
+    def learn(self, other: Module) -> None:
+        """A peer's catalogue came over the link."""
+        if not (self.alive and other.alive):
+            return
+        self.network.count("catalogue", CATALOGUE_BYTES, 1)
+        self.known[other.identity.guid.place] = (other.identity.instance, other.offers)
+        self.detector.learn_version(other.identity.guid, other.identity.instance, other.offers, self.network.now)
+        self.flush()
+
+    def _rest(self, link: Link) -> None:
+        """Nothing depended on the link for long: it is parked if both sides link on demand."""
+        if link.up and not link.used and all(end.mode.demand for end in link.ends):
+            self._end(link, "parked", parked=True)
+        elif link.up and not link.used:
+            self.network.world.after(mesh_limits.PARK_AFTER, lambda: self._rest(link))
+
+    def _end(self, link: Link, reason: str, *, parked: bool, silent: bool = False) -> None:
+        self.tally.links -= link.up
+        link.up = False
+        for end, number, run in zip(link.ends, link.ids, link.runs, strict=True):
+            end.link_ended(number, reason, run, silent=silent, parked=parked)
+
+    def link_ended(self, number: int, reason: str, run: int, *, silent: bool = False, parked: bool = False) -> None:
+        """A link is over."""
+        if self.alive and run == self.run and self.links.pop(number, None) is not None:
+            self.peering.link_down(number, reason, self.network.now, silent=silent, parked=parked)
+            self.flush()
