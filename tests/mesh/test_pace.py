@@ -159,8 +159,33 @@ def test_a_peer_that_died_at_rest_is_noticed_soon_once_it_is_needed() -> None:
     dialler.link.need(time.now, needed=True)
     pass_time(dialler.link, time, limits.GHOST_QUIET)
     assert dialler.link.quiet_after == limits.GHOST_QUIET
-    pass_time(dialler.link, time, limits.HANDSHAKE_TIMEOUT)
+    assert not any(isinstance(event, ConnectionClosed) for event in dialler.events), "it has time to answer"
+    pass_time(dialler.link, time, limits.WAKE_TIMEOUT - limits.GHOST_QUIET + 0.01)
     assert dialler.link.state is ConnectionState.CLOSED
+    assert dialler.last() == ConnectionClosed("high was silent for its lease of 1.5 s", orderly=False)
+
+
+def test_a_pause_at_rest_that_is_shorter_than_the_lease_changes_nothing() -> None:
+    """The peer's process is stopped for 3 s (or this one: a suspended machine), and nothing needs the link."""
+    time = Time()
+    dialler, acceptor = pair(time)
+    rest(dialler, acceptor, time)
+    time.now += 3.0
+    run(dialler, acceptor, time, 30.0)
+    assert resting(dialler, acceptor) == [True, True]
+    assert dialler.link.state is acceptor.link.state is ConnectionState.UP
+
+
+def test_a_suspend_of_this_machine_is_not_the_peers_silence_and_the_next_use_asks_it() -> None:
+    time = Time()
+    dialler, acceptor = pair(time)
+    rest(dialler, acceptor, time)
+    time.now += 3600.0
+    dialler.link.handle_timer(time.now)
+    assert not any(isinstance(event, ConnectionClosed) for event in dialler.events)
+    dialler.link.need(time.now, needed=True)
+    pass_time(dialler.link, time, limits.WAKE_TIMEOUT + 0.01)
+    assert dialler.link.state is ConnectionState.CLOSED, "the peer has gone meanwhile"
 
 
 def test_an_earlier_release_never_rests_and_gets_no_frame_that_it_does_not_know() -> None:

@@ -43,7 +43,7 @@ class RestsScenario(MeshScenario):
         self.network.sides = {each.host: int(each is peer) for each in self.peers}
         for link in links:
             peer.process.run(partial(link.need, needed=True))
-        self.world.run(self.world.now + limits.HANDSHAKE_TIMEOUT + limits.EXPRESS_LEASE + 0.5)
+        self.world.run(self.world.now + limits.WAKE_TIMEOUT + limits.EXPRESS_LEASE)
         assert not any(link.up for link in links), f"{peer.name} has not noticed that its peers are gone"
 
     def _change(self, peer: MeshPeer) -> None:

@@ -341,7 +341,7 @@ class ConnectionProtocol:
         keepalive.needed, keepalive.parks = needed, parks
         self._parting.changed(now)
         if (self._parting.holding or keepalive.agree()) and needed:
-            keepalive.ask(now)
+            keepalive.ask(now, max(limits.WAKE_TIMEOUT, 3 * (self.clock.rtt or 0.0)))
         if not self._parting.holding:
             self._send_pace(now)
 

@@ -30,6 +30,7 @@ class Keepalive:
     __slots__ = (
         "_acceptor",
         "_asked",
+        "_before",
         "_burst",
         "_excused",
         "_excused_at",
@@ -39,6 +40,7 @@ class Keepalive:
         "_remote_lease",
         "_short",
         "_up_at",
+        "_within",
         "heard",
         "lease",
         "needed",
@@ -67,6 +69,8 @@ class Keepalive:
         """Pings that still follow each other closely."""
         self._asked: float | None = None
         """When this side began to need a link at rest, while the remote side's promise has not come."""
+        self._within = self._before = 0.0
+        """Seconds that it has from then on, and those that were excused before."""
 
     def promise(self, lease: float) -> None:
         """Promise another lease, in seconds, as the one of a link in use; only before the end of the handshake."""
@@ -89,9 +93,9 @@ class Keepalive:
             self._burst = limits.WAKE_PINGS  # the estimate of the remote clock is as old as the rest
         return self.lease != before
 
-    def ask(self, now: float) -> None:
-        """This side needs the short lease of a remote side that rests: it has to answer soon."""
-        self._asked = now
+    def ask(self, now: float, within: float) -> None:
+        """This side needs the short lease of a remote side that rests, which has to answer ``within`` seconds."""
+        self._asked, self._within, self._before = now, within, self.excused
 
     def remote_pace(self, lease: float, now: float, flags: int) -> None:
         """The remote side promises ``lease`` seconds from now on; ``flags`` are bits of ``PaceFlag``."""
@@ -151,10 +155,11 @@ class Keepalive:
     @property
     def lease_end(self) -> float:
         """When the silence of the remote side ends the connection."""
-        end = self.heard + self.awaited_lease
+        end = self.heard + max(self._remote_lease, self.awaited_lease) + self.excused
         if self._asked is not None:
-            end = min(end, max(self._asked, self.heard) + limits.HANDSHAKE_TIMEOUT)
-        return end + self.excused
+            asked = max(self._asked, self.heard) + max(0.0, self.excused - self._before)
+            end = min(end, asked + self._within)
+        return end
 
     @property
     def awaited_lease(self) -> float:
@@ -163,6 +168,8 @@ class Keepalive:
         After the acceptor's welcome a whole round trip passes before the dialler's first byte arrives, and this time
         still belongs to the handshake. With the lease alone, a path with a longer round trip could not carry a link.
         """
+        if self._asked is not None:
+            return min(self._within, self._remote_lease)
         if self._acceptor and self.heard <= self._up_at:
             return max(self._remote_lease, limits.HANDSHAKE_TIMEOUT)
         return self._remote_lease

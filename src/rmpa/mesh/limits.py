@@ -23,6 +23,8 @@ IDLE_LEASE: Final = 16.0
 costs a twentieth of the packets. Both ends agree on it; an earlier release never does."""
 IDLE_KEEPALIVE_INTERVAL: Final = 5.0
 """Interval of the keepalives of a link at rest: two of them may be late before the link falls."""
+WAKE_TIMEOUT: Final = 1.5
+"""A peer at rest that does not answer for this long (or three round trips) when the link is needed again is gone."""
 WAKE_PINGS: Final = 5
 """Pings that follow each other when a link's rest ends: the best of them gives the latency of the first messages an
 exact clock."""
