@@ -24,6 +24,7 @@ from rmpa.discovery.events import (
     PeerFound,
     PeerLost,
     PeerRestarted,
+    RunDoubted,
     SendMulticast,
     SendUnicast,
 )
@@ -248,7 +249,7 @@ def test_a_restart_behind_a_link_waits_until_the_link_falls(one: Harness) -> Non
     one.membership.events()
     one.now += 0.4
     one.hear(new(BeaconKind.ANNOUNCE))
-    assert one.membership.events() == []
+    assert one.membership.events() == [RunDoubted(who(2))]
     one.now += 0.4
     one.membership.outputs()
     one.membership.link_down(who(2).guid, one.now)
@@ -266,7 +267,7 @@ def test_a_ghost_behind_a_live_link_changes_nothing(one: Harness) -> None:
     one.hear(late)
     one.now += 1
     one.membership.link_down(who(2).guid, one.now)
-    assert one.membership.events() == []
+    assert one.membership.events() == [RunDoubted(who(2, 2))]  # its link is checked, no more
     assert one.present() == ["peer2"]
 
 
@@ -345,10 +346,23 @@ def test_a_conflict_ends_with_a_goodbye(one: Harness) -> None:
 def test_a_working_link_survives_a_conflict(one: Harness) -> None:
     twins(one, linked=True)
     events = one.membership.events()
-    assert [type(e) for e in events] == [PeerFound, PeerConflict]
+    assert [type(e) for e in events if not isinstance(e, RunDoubted)] == [PeerFound, PeerConflict]
     assert one.present() == ["left"]
     one.membership.link_down(who(2).guid, one.now)
     assert [type(e) for e in one.membership.events()] == [PeerLost]
+
+
+def test_another_run_at_the_place_of_a_linked_peer_has_its_link_checked(one: Harness) -> None:
+    """A peer that lost its power and is back: its link, if it is at rest, would be noticed as dead after 16 s."""
+    one.membership.link_up(who(2), one.now, ("10.0.0.2", 40002))
+    assert [type(e) for e in one.membership.events()] == [PeerFound]
+    new = Speaker(who(2, run=2))
+    one.now += 1
+    one.hear(new())
+    assert one.membership.events() == [RunDoubted(who(2))]
+    one.now += 1.5  # the link was asked, and did not answer
+    one.membership.link_down(who(2).guid, one.now, who(2).instance)
+    assert [type(e) for e in one.membership.events()] == [PeerRestarted]
 
 
 def test_somebody_else_with_our_guid(one: Harness) -> None:

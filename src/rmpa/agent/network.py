@@ -15,7 +15,7 @@ from rmpa.core import limits
 from rmpa.core.errors import RmpaError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
-from rmpa.discovery.events import PeerChanged, PeerConflict, PeerFound, PeerLost, PeerRestarted
+from rmpa.discovery.events import PeerChanged, PeerConflict, PeerFound, PeerLost, PeerRestarted, RunDoubted
 from rmpa.discovery.io.discovery import Discovery
 from rmpa.discovery.io.interfaces import choose, further_addresses, list_interfaces, pick_address
 from rmpa.discovery.swim_events import MemberOffers, MemberSuspected
@@ -184,6 +184,8 @@ class NetworkEndpoint:
                 self._count(identity.guid, present=False)
                 self.mesh.peer_gone(identity.guid)
                 self._bridge.sessions.lost(identity)
+            case RunDoubted(identity=identity):
+                self._check_link(identity.guid)
             case PeerConflict():
                 pass  # discovery has logged the error, at a bounded rate
 
@@ -191,13 +193,16 @@ class NetworkEndpoint:
         """Take in what the failure detector has found; discovery itself acts on failures."""
         match event:
             case MemberSuspected(guid=guid):
-                link = self.mesh.link(guid)
-                if link is not None:
-                    link.touch()  # a link at rest would notice after many seconds whether the peer is there
+                self._check_link(guid)
             case MemberOffers(guid=guid, instance=instance, version=version):
                 self._bridge.sessions.offers.heard(guid, instance, version, 1 + len(self._members))
             case _:
                 pass
+
+    def _check_link(self, guid: Guid) -> None:
+        """Wake the link of a peer that may be gone: a link at rest would notice that after many seconds."""
+        if (link := self.mesh.link(guid)) is not None:
+            link.touch()
 
     def _link_up(self, link: PeerLink) -> None:
         # Its beacons come from its mesh port; an accepted connection may come from any port.

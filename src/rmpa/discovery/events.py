@@ -130,6 +130,14 @@ class PeerConflict:
 
 
 @dataclass(frozen=True, slots=True)
+class RunDoubted:
+    """Another run was heard at the address of a linked peer: its link is worth a check, as it may have restarted."""
+
+    identity: Identity
+    """The linked run."""
+
+
+@dataclass(frozen=True, slots=True)
 class ConflictCleared:
     """Only one of the two peers of a ``PeerConflict`` over a GUID address is left."""
 
@@ -137,7 +145,7 @@ class ConflictCleared:
     identity: Identity
 
 
-Event = PeerFound | PeerChanged | PeerRestarted | PeerLost | PeerConflict | ConflictCleared
+Event = PeerFound | PeerChanged | PeerRestarted | PeerLost | PeerConflict | RunDoubted | ConflictCleared
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,6 +32,7 @@ from rmpa.discovery.events import (
     PeerFound,
     PeerLost,
     PeerRestarted,
+    RunDoubted,
     SendMulticast,
     SendUnicast,
 )
@@ -374,8 +375,13 @@ class MembershipProtocol:
             if not current.linked:
                 self._peer_lost(endpoint, LossReason.CONFLICT)
         elif change is EndpointChange.WAITING:
-            self._clear_conflict(endpoint, now)
-            self._endpoints.changed(current.identity.guid.place)
+            self._run_waits(endpoint, current, now)
+
+    def _run_waits(self, endpoint: Endpoint, current: PeerInstance, now: float) -> None:
+        if current.linked and not endpoint.own:
+            self._events.append(RunDoubted(current.identity))
+        self._clear_conflict(endpoint, now)
+        self._endpoints.changed(current.identity.guid.place)
 
     def _peer_found(self, endpoint: Endpoint, now: float) -> None:
         peer = endpoint.current

@@ -218,6 +218,29 @@ async def test_killed_peer_comes_back_as_a_new_instance() -> None:
             await again.mesh.close()
 
 
+async def test_a_restarted_peer_has_the_link_at_rest_of_its_former_run_checked() -> None:
+    """The former run's host lost its power: no connection ended, and at rest the silence is noticed late."""
+    async with peers(2) as (one, other):
+        await until(lambda: one.linked(other) and other.linked(one), "a link")
+        successor = replace(other.identity, guid=Guid.of("127.0.0.1", other.port, 1), instance=b"s" * 16)
+
+        async def answer() -> int:
+            sock, frame = await raw(one, successor)
+            sock.close()
+            assert frame.kind is FrameKind.REFUSE
+            return Refuse.parse(frame.payload).code
+
+        assert await answer() == Refusal.DUPLICATE  # the link is in use: two live runs
+        one.link(other).need(needed=False)
+        other.link(one).need(needed=False)
+        await until(lambda: one.link(other).rests, "the link rests")
+        assert await answer() == Refusal.ALREADY_LINKED  # it may dial again soon
+        assert not one.link(other).rests  # and the link is asked for a sign of life meanwhile
+        await until(lambda: not other.link(one).rests, "the live run answers")
+        assert await answer() == Refusal.DUPLICATE
+        assert one.linked(other)
+
+
 @pytest.mark.parametrize("garbage", [b"GET / HTTP/1.1\r\n\r\n" * 4, bytes(64), b"\xff" * 64])
 async def test_garbage_on_the_port_closes_that_connection_only(
     garbage: bytes, caplog: pytest.LogCaptureFixture

@@ -14,7 +14,7 @@ from rmpa.config.settings import LaneSettings
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionRole
-from rmpa.mesh.handshake import Lane, Refusal
+from rmpa.mesh.handshake import Lane, Refusal, Refuse
 from rmpa.mesh.io.bulk_lanes import BulkLanes
 from rmpa.mesh.io.connection import Connection
 from rmpa.mesh.io.dialler import Dialler
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from rmpa.core.clock import Clock
     from rmpa.core.guid import Guid
     from rmpa.core.identity import Identity
-    from rmpa.mesh.handshake import Hello, Refuse
+    from rmpa.mesh.handshake import Hello
     from rmpa.mesh.io.securing import MeshSecurity, OnJoin, SecuredSocket
     from rmpa.mesh.peering_events import SocketAddress
 
@@ -235,7 +235,15 @@ class Mesh:
 
     def connection_judge(self, connection: Connection, hello: Hello) -> Refuse | None:  # noqa: ARG002 - the protocol's form
         """Decide on a hello; the peering machine knows the links that are up."""
-        return self._peering.judge(hello)
+        refuse = self._peering.judge(hello)
+        if refuse is None or refuse.code != Refusal.DUPLICATE:
+            return refuse
+        for link in self.links():
+            if link.guid.place == hello.guid.place and link.rests:
+                # The peer may have restarted without an end of its connections, which a link at rest notices late.
+                link.touch()
+                return Refuse(Refusal.ALREADY_LINKED, "the link of your former run is being checked; dial again")
+        return refuse
 
     def connection_prove(self, connection: Connection, hello: Hello) -> Refuse | None:
         """Compare a hello with the certificate, and with the names of the links that it would replace or join."""
