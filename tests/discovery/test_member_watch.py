@@ -10,10 +10,10 @@ from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.events import Event, LossReason, PeerFound, PeerLost
-from rmpa.discovery.failure_detector import FailureDetector
 from rmpa.discovery.member_watch import MemberWatch
 from rmpa.discovery.membership import MembershipProtocol
-from rmpa.discovery.swim_packets import MemberState, News, SwimKind, SwimPacket
+from rmpa.discovery.swim.failure_detector import FailureDetector
+from rmpa.discovery.swim.packets import MemberState, News, SwimKind, SwimPacket
 
 OWN = Identity(Guid.of("10.0.0.1", 40000), bytes(range(16)), "own")
 PEER = Identity(Guid.of("10.0.0.2", 40000), bytes(range(1, 17)), "peer")

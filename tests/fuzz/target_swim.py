@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.guid import Guid
-from rmpa.discovery.swim_packets import MemberState, News, SwimKind, SwimPacket, is_swim
+from rmpa.discovery.swim.packets import MemberState, News, SwimKind, SwimPacket, is_swim
 
 _GUID = Guid.of("10.0.0.1", 40001, 7)
 _RUN = bytes(range(16))

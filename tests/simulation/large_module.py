@@ -13,10 +13,10 @@ from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.discovery.beacon import Beacon
 from rmpa.discovery.events import PeerChanged, PeerFound, PeerLost, PeerRestarted, SendMulticast
-from rmpa.discovery.failure_detector import FailureDetector
 from rmpa.discovery.member_watch import MemberWatch
 from rmpa.discovery.membership import MembershipProtocol
-from rmpa.discovery.swim_events import MemberOffers, MemberSuspected, SwimEvent
+from rmpa.discovery.swim.events import MemberOffers, MemberSuspected, SwimEvent
+from rmpa.discovery.swim.failure_detector import FailureDetector
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.handshake import Hello
 from rmpa.mesh.mode import MeshMode
@@ -27,7 +27,7 @@ from tests.simulation.large_network import TCP_BYTES, Link
 if TYPE_CHECKING:
     from rmpa.discovery.beacon import Address
     from rmpa.discovery.events import Event, LossReason
-    from rmpa.discovery.swim_packets import SwimPacket
+    from rmpa.discovery.swim.packets import SwimPacket
     from rmpa.mesh.peering_events import PeeringOutput
     from tests.simulation.large_network import LargeNetwork
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.discovery.beacon import Address, Beacon
-    from rmpa.discovery.swim_packets import SwimPacket
+    from rmpa.discovery.swim.packets import SwimPacket
     from tests.simulation.large_module import Module
 
 UDP_HEADERS: Final = 28

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
-from rmpa.discovery.failure_detector import FailureDetector
-from rmpa.discovery.swim_events import MemberFailed, MemberHeardOf, MemberLeft, MemberOffers, MemberSuspected
-from rmpa.discovery.swim_packets import SwimPacket
+from rmpa.discovery.swim.events import MemberFailed, MemberHeardOf, MemberLeft, MemberOffers, MemberSuspected
+from rmpa.discovery.swim.failure_detector import FailureDetector
+from rmpa.discovery.swim.packets import SwimPacket
 
 if TYPE_CHECKING:
     from tests.simulation.network import Address

@@ -14,7 +14,7 @@ from tests.simulation.swim_member import SwimMember
 
 if TYPE_CHECKING:
     from rmpa.core.guid import Guid
-    from rmpa.discovery.swim_events import MemberFailed, MemberLeft, MemberSuspected
+    from rmpa.discovery.swim.events import MemberFailed, MemberLeft, MemberSuspected
     from tests.simulation.network import Address
 
 BEACONS: Final = 20.0

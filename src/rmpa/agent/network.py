@@ -18,7 +18,7 @@ from rmpa.core.identity import Identity
 from rmpa.discovery.events import PeerChanged, PeerConflict, PeerFound, PeerLost, PeerRestarted, RunDoubted
 from rmpa.discovery.io.discovery import Discovery
 from rmpa.discovery.io.interfaces import choose, further_addresses, list_interfaces, pick_address
-from rmpa.discovery.swim_events import MemberOffers, MemberSuspected
+from rmpa.discovery.swim.events import MemberOffers, MemberSuspected
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.handshake import Feature
 from rmpa.mesh.io.link import LinkHandlers
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.discovery.events import Event
     from rmpa.discovery.io.interfaces import Interface
-    from rmpa.discovery.swim_events import SwimEvent
+    from rmpa.discovery.swim.events import SwimEvent
     from rmpa.mesh.io.link import PeerLink
 
 _log = logging.getLogger(__name__)

@@ -5,16 +5,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rmpa.discovery.events import LossReason, PeerFound, PeerLost, PeerRestarted
-from rmpa.discovery.swim_events import MemberFailed, MemberHeardOf, MemberLeft
+from rmpa.discovery.swim.events import MemberFailed, MemberHeardOf, MemberLeft
 
 if TYPE_CHECKING:
     from rmpa.core.guid import Guid
     from rmpa.core.identity import Identity
     from rmpa.discovery.endpoint import PeerInstance
     from rmpa.discovery.events import Event
-    from rmpa.discovery.failure_detector import FailureDetector
     from rmpa.discovery.membership import MembershipProtocol
-    from rmpa.discovery.swim_events import SwimEvent
+    from rmpa.discovery.swim.events import SwimEvent
+    from rmpa.discovery.swim.failure_detector import FailureDetector
 
 
 class MemberWatch:

@@ -22,7 +22,7 @@ from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.events import Event, HeardBy, LossReason, PeerConflict, PeerFound, PeerLost, PeerRestarted
 from rmpa.discovery.io.discovery import Discovery
 from rmpa.discovery.io.interfaces import Interface, list_interfaces
-from rmpa.discovery.swim_events import MemberOffers
+from rmpa.discovery.swim.events import MemberOffers
 from rmpa.trust.keyring import GroupKey, KeyRing
 from rmpa.trust.packets import PacketSigner, PacketTrust, PacketVerifier
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from rmpa.discovery.events import PeerView
-    from rmpa.discovery.swim_events import SwimEvent
+    from rmpa.discovery.swim.events import SwimEvent
 
 DEADLINE = 15.0
 

@@ -11,7 +11,7 @@ from rmpa.core.identity import Identity
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.io.packet_filter import PacketFilter
-from rmpa.discovery.swim_packets import SwimKind, SwimPacket
+from rmpa.discovery.swim.packets import SwimKind, SwimPacket
 from rmpa.trust.keyring import GroupKey, KeyPurpose, KeyRing
 from rmpa.trust.packets import PacketSigner, PacketTrust, PacketVerifier
 

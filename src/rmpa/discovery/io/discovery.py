@@ -13,7 +13,6 @@ from rmpa.core.counters import Counters, RefusalLog
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon
 from rmpa.discovery.events import PeerConflict, SendMulticast
-from rmpa.discovery.failure_detector import FailureDetector
 from rmpa.discovery.io import sockets
 from rmpa.discovery.io.interfaces import (
     Interface,
@@ -27,6 +26,7 @@ from rmpa.discovery.io.packet_filter import PacketFilter
 from rmpa.discovery.io.seeds import SeedResolver, resolve_ipv4
 from rmpa.discovery.member_watch import MemberWatch
 from rmpa.discovery.membership import MembershipProtocol
+from rmpa.discovery.swim.failure_detector import FailureDetector
 from rmpa.runtime.event_loop import yield_to_data
 from rmpa.runtime.machine_timer import MachineTimer
 from rmpa.runtime.system_clock import SystemClock
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
     from rmpa.discovery.beacon import Address
     from rmpa.discovery.events import Event, Output, PeerView
-    from rmpa.discovery.swim_events import DetectorView, MemberView, SendSwim, SwimEvent
+    from rmpa.discovery.swim.events import DetectorView, MemberView, SendSwim, SwimEvent
     from rmpa.trust.packets import PacketTrust
 
 _log = logging.getLogger(__name__)

@@ -11,7 +11,7 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import RUN_AT, Beacon, BeaconOtherDomain, BeaconOtherVersion, sender_of
-from rmpa.discovery.swim_packets import SwimPacket, is_swim
+from rmpa.discovery.swim.packets import SwimPacket, is_swim
 from rmpa.trust.keyring import KeyPurpose
 from rmpa.trust.packets import Verdict
 

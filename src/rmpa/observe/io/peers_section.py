@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
     from rmpa.discovery.events import PeerView
     from rmpa.discovery.io.discovery import Discovery
-    from rmpa.discovery.swim_events import DetectorView, MemberView
+    from rmpa.discovery.swim.events import DetectorView, MemberView
     from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.io.mesh import Mesh

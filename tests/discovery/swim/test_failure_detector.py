@@ -10,8 +10,7 @@ import pytest
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.discovery import limits
-from rmpa.discovery.failure_detector import FailureDetector
-from rmpa.discovery.swim_events import (
+from rmpa.discovery.swim.events import (
     MemberFailed,
     MemberHeardOf,
     MemberLeft,
@@ -21,7 +20,8 @@ from rmpa.discovery.swim_events import (
     SendSwim,
     SwimEvent,
 )
-from rmpa.discovery.swim_packets import MemberState, News, SwimKind, SwimPacket
+from rmpa.discovery.swim.failure_detector import FailureDetector
+from rmpa.discovery.swim.packets import MemberState, News, SwimKind, SwimPacket
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from rmpa.discovery import limits
-from rmpa.discovery.swim_packets import RUN_BYTES, MemberState, News
+from rmpa.discovery.swim.packets import RUN_BYTES, MemberState, News
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -21,10 +21,8 @@ from rmpa.core.sizes import UINT32_MAX
 from rmpa.core.timer_queue import TimerQueue
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.discovery import limits
-from rmpa.discovery.dissemination import Dissemination
-from rmpa.discovery.member_table import GoneMembers, Member, MemberTable
-from rmpa.discovery.probing import Probing
-from rmpa.discovery.swim_events import (
+from rmpa.discovery.swim.dissemination import Dissemination
+from rmpa.discovery.swim.events import (
     DetectorView,
     MemberFailed,
     MemberHeardOf,
@@ -36,7 +34,9 @@ from rmpa.discovery.swim_events import (
     SendSwim,
     SwimEvent,
 )
-from rmpa.discovery.swim_packets import RUN_BYTES, MemberState, News, SwimKind, SwimPacket
+from rmpa.discovery.swim.member_table import GoneMembers, Member, MemberTable
+from rmpa.discovery.swim.packets import RUN_BYTES, MemberState, News, SwimKind, SwimPacket
+from rmpa.discovery.swim.probing import Probing
 
 if TYPE_CHECKING:
     from collections.abc import Callable

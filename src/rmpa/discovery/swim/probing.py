@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from rmpa.core.guid import Guid
     from rmpa.discovery.beacon import Address
-    from rmpa.discovery.member_table import Member
+    from rmpa.discovery.swim.member_table import Member
 
 Relay = tuple[int, int, "Guid", bytes, "Address"]
 """A probe for another member: place of the subject, the request's number, the subject's GUID and run, and the address

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rmpa.core.guid import Guid
     from rmpa.discovery.beacon import Address
-    from rmpa.discovery.swim_packets import MemberState, SwimPacket
+    from rmpa.discovery.swim.packets import MemberState, SwimPacket
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from rmpa.core.errors import LimitExceeded
 from rmpa.core.guid import Guid
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconMalformed, BeaconOtherDomain, BeaconOtherVersion
-from rmpa.discovery.swim_packets import (
+from rmpa.discovery.swim.packets import (
     MemberState,
     News,
     SwimKind,

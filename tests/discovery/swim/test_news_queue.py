@@ -6,8 +6,8 @@ import random
 
 from rmpa.core.guid import Guid
 from rmpa.discovery import limits
-from rmpa.discovery.news_queue import NewsQueue
-from rmpa.discovery.swim_packets import MemberState, News
+from rmpa.discovery.swim.news_queue import NewsQueue
+from rmpa.discovery.swim.packets import MemberState, News
 
 
 def news(number: int, state: MemberState = MemberState.ALIVE, accuser: bytes = b"", incarnation: int = 0) -> News:

@@ -6,9 +6,9 @@ import math
 from typing import TYPE_CHECKING
 
 from rmpa.discovery import limits
-from rmpa.discovery.news_queue import NewsQueue
-from rmpa.discovery.swim_events import SendSwim
-from rmpa.discovery.swim_packets import RUN_BYTES, MemberState, News, SwimKind, SwimPacket, room_for_news
+from rmpa.discovery.swim.events import SendSwim
+from rmpa.discovery.swim.news_queue import NewsQueue
+from rmpa.discovery.swim.packets import RUN_BYTES, MemberState, News, SwimKind, SwimPacket, room_for_news
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rmpa.core.guid import Guid
     from rmpa.core.identity import Identity
     from rmpa.discovery.beacon import Address
-    from rmpa.discovery.member_table import Member, MemberTable
+    from rmpa.discovery.swim.member_table import Member, MemberTable
 
 
 class Dissemination:

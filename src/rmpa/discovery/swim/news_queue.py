@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rmpa.discovery import limits
-from rmpa.discovery.swim_packets import MemberState
+from rmpa.discovery.swim.packets import MemberState
 
 if TYPE_CHECKING:
-    from rmpa.discovery.swim_packets import News
+    from rmpa.discovery.swim.packets import News
 
 _Key = tuple[int, bytes, bytes]
 
