@@ -28,7 +28,6 @@ import pytest
 from rmpa.agent import Agent
 from rmpa.config import limits as config_limits
 from rmpa.config.settings import Multicast, PeerRule, PolicySettings, Settings
-from rmpa.core import limits as core_limits
 from rmpa.core.errors import UnreachableError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
@@ -335,7 +334,7 @@ async def thousands_of_peers_are_invented(world: World) -> None:
 
     await world.beside(work)
     assert world.near.network.endpoint is not None
-    assert len(world.near.network.endpoint.discovery.peers()) > core_limits.PEERS_MAX / 2
+    assert len(world.near.network.endpoint.discovery.peers()) > discovery_limits.STRANGERS_MAX / 2
     assert world.near.network.endpoint.discovery.counters["roster.full"] > 0
     assert world.linked()
 

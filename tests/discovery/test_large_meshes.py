@@ -179,7 +179,7 @@ def test_forged_peers_never_displace_a_parked_one() -> None:
     agent.run(1.0)
     agent.meet(1)
     agent.membership.events()
-    for number in range(1, core_limits.PEERS_MAX + 100):
+    for number in range(1, limits.STRANGERS_MAX + 100):
         agent.hear(number, BeaconKind.ANNOUNCE, lease=120.0)
     for _ in range(40):
         agent.run(1.0)

@@ -616,13 +616,17 @@ def test_change_of_interfaces_sends_a_shorter_burst(one: Harness) -> None:
 
 
 def test_membership_is_bounded_and_links_go_first(one: Harness) -> None:
-    for i in range(2 * core_limits.PEERS_MAX):
+    for i in range(2 * limits.STRANGERS_MAX):
         guid = Guid.of(IPv4Address(0x0A010000 + i), 4000)
         one.hear(Speaker(replace(who(2), guid=guid, instance=i.to_bytes(16, "big"), name=f"n{i}"))())
-    assert len(one.membership.peers()) == core_limits.PEERS_MAX - 1
+    assert len(one.membership.peers()) == limits.STRANGERS_MAX
     assert one.membership.counters["roster.full"]
-    one.membership.link_up(who(3), one.now)
-    assert "peer3" in one.present()
+    for i in range(core_limits.PEERS_MAX):
+        guid = Guid.of(IPv4Address(0x0A020000 + i), 4000)
+        linked = replace(who(3), guid=guid, instance=(1 << 64 | i).to_bytes(16, "big"), name=f"linked{i}")
+        one.membership.link_up(linked, one.now)
+    assert "linked3" in one.present()
+    assert not any(name.startswith("n") for name in one.present())
     assert len(one.membership.peers()) == core_limits.PEERS_MAX - 1
 
 
@@ -696,14 +700,14 @@ def test_announcements_to_many_forged_addresses_are_few(one: Harness) -> None:
 
 
 def test_full_membership_evicts_silent_peers_at_a_limited_rate(one: Harness) -> None:
-    flood(one, core_limits.PEERS_MAX - 1)
+    flood(one, limits.STRANGERS_MAX)
     one.hear(Speaker(who(3))())
     assert "peer3" not in one.present(), "all spoke a moment ago"
     one.run(limits.HEARTBEAT_LATE)
     one.hear(Speaker(who(4))())
     assert "peer4" in one.present()
     flood(one, 1000, first=5000)
-    assert len(one.present()) == core_limits.PEERS_MAX - 1
+    assert len(one.present()) == limits.STRANGERS_MAX
     new = [name for name in one.present() if name.startswith("n5") and len(name) > 4]
     assert len(new) <= limits.EVICTIONS_PER_SECOND
     assert one.membership.counters["roster.full"] >= 1000 - limits.EVICTIONS_PER_SECOND
@@ -711,12 +715,12 @@ def test_full_membership_evicts_silent_peers_at_a_limited_rate(one: Harness) -> 
 
 def test_a_linked_peer_gives_way_to_nobody(one: Harness) -> None:
     one.membership.link_up(who(3), one.now)
-    flood(one, core_limits.PEERS_MAX - 2)
+    flood(one, limits.STRANGERS_MAX)
     for second in range(60):
         one.run(1.0)
         flood(one, 100, first=5000 + 100 * second)
     assert "peer3" in one.present()
-    assert len(one.membership.peers()) == core_limits.PEERS_MAX - 1
+    assert len(one.membership.peers()) == limits.STRANGERS_MAX + 1
 
 
 def test_old_forged_beacon_takes_no_endpoint_when_the_link_falls(one: Harness) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left, insort
 from typing import TYPE_CHECKING
 
+from rmpa.core import limits as core_limits
 from rmpa.core.timer_queue import TimerQueue
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.discovery import limits
@@ -31,6 +32,7 @@ class EndpointTable:
         self._timers: TimerQueue[int] = TimerQueue()
         self._present: list[PeerInstance] = []
         self._present_places: list[int] = []
+        self._strangers: set[int] = set()
         self._names: dict[int, str] = {}
         self._by_name: dict[str, list[int]] = {}
 
@@ -43,6 +45,11 @@ class EndpointTable:
     def __iter__(self) -> Iterator[Endpoint]:
         """In the order of their places, which is that of GUIDs."""
         return iter([self._all[place] for place in self._order])
+
+    @property
+    def is_full(self) -> bool:
+        """Whether there is no room for one more peer that was never linked."""
+        return len(self._all) >= core_limits.PEERS_MAX or len(self._strangers) >= limits.STRANGERS_MAX
 
     def get(self, place: int) -> Endpoint | None:
         """The endpoint at a place, or ``None``."""
@@ -83,6 +90,10 @@ class EndpointTable:
     def _index(self, place: int, endpoint: Endpoint | None) -> None:
         """Update the indexes at one place; a thousand peers that appear at once must not cost a million steps."""
         peer = endpoint.current if endpoint is not None else None
+        if endpoint is None or endpoint.own or (peer is not None and peer.verified):
+            self._strangers.discard(place)
+        else:
+            self._strangers.add(place)
         name = peer.identity.name if peer is not None else None
         before = self._names.get(place)
         if name != before:

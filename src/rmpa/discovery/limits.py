@@ -96,9 +96,12 @@ UNICAST_HEARTBEATS_PER_SECOND: Final = 10.0
 each still gets one a minute."""
 UNICAST_HEARTBEATS_AT_ONCE: Final = 8
 """Unicast heartbeats, to linked and unlinked peers, in one run of the timer; each takes some 0.1 ms."""
+STRANGERS_MAX: Final = 1024
+"""Peers that were never linked and may be known at one time: they may be forged, and each of them costs a few
+microseconds wherever all peers are looked at. Peers of a large mesh are linked once, and then count no more."""
 EVICTIONS_PER_SECOND: Final = 10.0
-"""Peers a second that are removed for new ones when ``PEERS_MAX`` is reached: unlinked peers that missed a
-heartbeat."""
+"""Peers a second that are removed for new ones when ``PEERS_MAX`` or ``STRANGERS_MAX`` is reached: unlinked ones that
+missed a heartbeat."""
 BEACONS_PER_WAKE: Final = 64
 """Packets handled in one callback, 100 microseconds each; pending data is handled between them."""
 BEACONS_UNPROVED_PER_SECOND: Final = 4000.0

@@ -124,7 +124,7 @@ class MembershipProtocol:
         key = identity.guid.place
         endpoint = self._endpoints.get(key)
         if endpoint is None:
-            if len(self._endpoints) >= core_limits.PEERS_MAX and not self._evict(self._eviction.for_heard(now)):
+            if self._endpoints.is_full and not self._evict(self._eviction.for_heard(now)):
                 self.counters.add("roster.full")
                 return
             endpoint = self._endpoints.add(key, Endpoint())
