@@ -54,7 +54,7 @@ def states(scenario: MeshScenario) -> set[str]:
     return {status.state for peer in scenario.peers for status in peer.mesh.peers()}
 
 
-@pytest.mark.parametrize("seed", range(8 * FACTOR))
+@pytest.mark.parametrize("seed", range(4 * FACTOR))
 def test_links_park_come_back_and_park_again(seed: int) -> None:
     scenario = MeshScenario(seed, 4, keep=True, calm=True, make_peer=ParkingPeer)
     world = scenario.world
@@ -78,7 +78,7 @@ def test_links_park_come_back_and_park_again(seed: int) -> None:
         assert not any(process.failures for peer in scenario.peers for process in peer.processes)
 
 
-@pytest.mark.parametrize("seed", range(8 * FACTOR))
+@pytest.mark.parametrize("seed", range(4 * FACTOR))
 def test_a_wanted_peer_is_linked_soon_and_hears_what_was_meant_for_it(seed: int) -> None:
     scenario = MeshScenario(seed, 3, keep=True, calm=True, make_peer=ParkingPeer)
     world = scenario.world
