@@ -62,6 +62,17 @@ def test_a_link_rests_when_neither_side_needs_it() -> None:
     assert calm * 15 < busy
 
 
+def test_silence_is_worth_a_check_at_the_pace_of_the_link() -> None:
+    """In use within a second, at rest before the long lease ends, and soon when it is needed again."""
+    time = Time()
+    dialler, acceptor = pair(time)
+    assert dialler.link.quiet_after == limits.GHOST_QUIET < limits.EXPRESS_LEASE
+    rest(dialler, acceptor, time)
+    assert limits.IDLE_KEEPALIVE_INTERVAL < dialler.link.quiet_after < limits.IDLE_LEASE
+    dialler.link.need(time.now, needed=True)  # and no answer comes
+    assert dialler.link.quiet_after == limits.GHOST_QUIET
+
+
 @pytest.mark.parametrize("peers", [3, 31])
 def test_an_agent_wakes_once_for_the_keepalives_of_all_its_resting_links(peers: int) -> None:
     """The other sides' agents have times of their own; what they send is not counted here."""

@@ -365,7 +365,7 @@ async def test_a_killed_peer_leaves_no_lane_behind() -> None:
         other.kill()
         await until(lambda: not one.mesh.connections(), "nothing is left")
         assert len(one.downs) == 1
-        await until(lambda: not one.mesh._bulk_lanes._dials, "nobody dials its bulk lane")
+        await until(lambda: not one.mesh._bulk_lanes._dials, "no bulk lane is dialled")
 
 
 # --- a bulk lane in place of another ------------------------------------------------------------------------------

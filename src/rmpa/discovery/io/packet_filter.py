@@ -143,7 +143,8 @@ class PacketFilter:
         purpose = KeyPurpose.SWIM if swim else KeyPurpose.BEACON
         found = trust.verifier.verify(data, purpose, RUN_AT, now, trust.wall())
         if swim and found.verdict is Verdict.OLD_KEY:
-            self._counters.add("swim.old_key")  # who has an older key may be dialled, and says nothing of others
+            # A link with its sender is allowed; its news of other members is not believed.
+            self._counters.add("swim.old_key")
             return False
         if found.verdict in _USABLE:
             trust.heard(host, found)

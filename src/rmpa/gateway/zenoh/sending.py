@@ -244,8 +244,8 @@ class NumberedPublisher(_TurnPublisher[_Numbered]):
     def send(self, turn: list[_Numbered]) -> None:
         """Put the messages of one turn: as batches, singly, or both.
 
-        A subscriber that changes from one key to the other loses none: the batch goes first, and whoever has it
-        needs the single ones no longer.
+        A subscriber that changes from one key to the other loses none: the batch goes first, and a subscriber that
+        has received it ignores the single messages.
         """
         batched = self.batches_wanted and self.batch_handle is not None
         singly = self.wanted or self._cached or not batched
