@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -14,6 +15,9 @@ from rmpa.discovery.member_watch import MemberWatch
 from rmpa.discovery.membership import MembershipProtocol
 from rmpa.discovery.swim.failure_detector import FailureDetector
 from rmpa.discovery.swim.packets import MemberState, News, SwimKind, SwimPacket
+
+if TYPE_CHECKING:
+    from rmpa.discovery.beacon import Address
 
 OWN = Identity(Guid.of("10.0.0.1", 40000), bytes(range(16)), "own")
 PEER = Identity(Guid.of("10.0.0.2", 40000), bytes(range(1, 17)), "peer")
@@ -27,6 +31,7 @@ class Agent:
         self.membership = MembershipProtocol(OWN, rng=random.Random(2).random, vouches=self.detector.vouches)
         self.watch = MemberWatch(self.detector, self.membership)
         self.events: list[Event] = []
+        self.sent_to: set[Address] = set()
         self.membership.start(self.now)
         self.detector.set_active(self.now, active=True)
 
@@ -58,6 +63,7 @@ class Agent:
         """These members answer the probes that were sent to them."""
         by_address = {member.guid.endpoint: member for member in members}
         for output in self.detector.outputs():
+            self.sent_to.add(output.address)
             member, probe = by_address.get(output.address), output.packet
             if member is not None and probe.kind is SwimKind.PROBE:
                 subject = (member.guid, member.instance[:8])
@@ -93,6 +99,24 @@ def test_a_member_is_watched_once_its_link_has_said_that_it_answers() -> None:
     agent.membership.link_up(OTHER, agent.now)
     agent.watch.link_up(OTHER, agent.now, answers_probes=False)
     assert not agent.watched(OTHER), "it is of an older version"
+
+
+def test_a_member_of_an_earlier_release_gets_no_packet_and_is_lost_with_its_lease() -> None:
+    agent = Agent()
+    agent.meet(PEER)
+    agent.beacon(OTHER)
+    agent.membership.link_up(OTHER, agent.now)
+    agent.watch.link_up(OTHER, agent.now, answers_probes=False)
+    agent.run(30, talker=PEER)
+    assert OTHER in [view.identity for view in agent.membership.peers()], "its link stands"
+    agent.beacon(OTHER, sequence=2)
+    agent.watch.link_down(OTHER.guid, OTHER.instance)
+    agent.membership.link_down(OTHER.guid, agent.now, OTHER.instance)
+    agent.run(10, talker=PEER)
+    assert OTHER in [view.identity for view in agent.membership.peers()], "its beacons may come still"
+    agent.run(10, talker=PEER)
+    assert PeerLost(OTHER, LossReason.SILENCE) in agent.events
+    assert agent.sent_to == {PEER.guid.endpoint}
 
 
 def test_a_packet_of_a_member_shows_that_it_answers() -> None:

@@ -7,6 +7,7 @@ from enum import Enum, auto
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits as core_limits
+from rmpa.core.clock import earliest
 from rmpa.core.serial_number import is_later
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import BeaconKind
@@ -147,7 +148,8 @@ class Endpoint:
             return self._other_run(peer, now, departed=departed)
         if peer.leaving:
             return EndpointChange.LEAVING
-        return EndpointChange.KNOWN if peer.identity == previous else EndpointChange.CHANGED
+        same = peer.identity is previous or peer.identity == previous
+        return EndpointChange.KNOWN if same else EndpointChange.CHANGED
 
     def link_up(self, identity: Identity, now: float) -> EndpointChange:
         """Make the run of a link's handshake the current one, because the handshake proves that it is alive."""
@@ -204,10 +206,8 @@ class Endpoint:
 
     def next_timer(self) -> float | None:
         """When the first lease is over; that of a linked run never is."""
-        times = [v.deadline for v in self.others.values()]
-        if self.current is not None and not self.current.linked:
-            times.append(self.current.deadline)
-        return min(times, default=None)
+        first = self.current.deadline if self.current is not None and not self.current.linked else None
+        return earliest(first, *(v.deadline for v in self.others.values())) if self.others else first
 
     def _find(self, instance: bytes) -> PeerInstance | None:
         if self.current is not None and self.current.identity.instance == instance:

@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 class MemberWatch:
     """Watches the members that are known to answer probes: by the handshake of a link, by a packet, or by news.
 
-    A member becomes one by beacons or links alone, as without the failure detector. A run that has failed is no
-    member any more, unless it has a link.
+    A peer becomes a member by its own beacon or link alone, as without the failure detector. A run that has failed is
+    no member any more, unless it has a link. A peer of an earlier release does not answer probes and is not watched:
+    its link, and the lease of its beacons, show whether it is alive.
 
     Args:
         detector: The failure detector.
@@ -58,7 +59,7 @@ class MemberWatch:
                 pass
 
     def events(self, now: float) -> list[SwimEvent]:
-        """What the failure detector has found; the membership protocol is told what follows from it."""
+        """What the failure detector has found, each once; the membership protocol is updated by it."""
         events = self._detector.events()
         for event in events:
             match event:

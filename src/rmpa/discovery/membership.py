@@ -15,9 +15,9 @@ from rmpa.core import limits as core_limits
 from rmpa.core.clock import earliest
 from rmpa.core.counters import Counters
 from rmpa.core.identity import Identity
-from rmpa.core.serial_number import serial_add
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Address, Beacon, BeaconKind
+from rmpa.discovery.beacon_sender import BeaconSender
 from rmpa.discovery.endpoint import Endpoint, EndpointChange, PeerInstance
 from rmpa.discovery.endpoint_table import EndpointTable, Eviction
 from rmpa.discovery.events import (
@@ -33,12 +33,10 @@ from rmpa.discovery.events import (
     PeerLost,
     PeerRestarted,
     RunDoubted,
-    SendMulticast,
-    SendUnicast,
 )
-from rmpa.discovery.gossip import GossipCandidates, GossipSelector
+from rmpa.discovery.gossip import GossipCandidates
 from rmpa.discovery.pacing import BeaconPace, LateAnswers, is_many
-from rmpa.discovery.unicast import AnswerLimit, UnicastHeartbeats
+from rmpa.discovery.unicast import UnicastHeartbeats
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -75,14 +73,12 @@ class MembershipProtocol:
     ) -> None:
         self._vouches = vouches
         self.counters = counters if counters is not None else Counters()
-        self._own = identity
         self._rng = rng
-        self._multicast = multicast
         self._pace = BeaconPace(lease)
         self._endpoints = EndpointTable()
+        self._sender = BeaconSender(identity, self._endpoints, self._pace, self.counters, multicast=multicast)
         self._eviction = Eviction(self._endpoints)
         self._reported_names: set[frozenset[bytes]] = set()
-        self._answers = AnswerLimit()
         self._late_answers = LateAnswers(rng)
         self._candidates = GossipCandidates(rng)
         self._seeds: tuple[Address, ...] = ()
@@ -90,20 +86,16 @@ class MembershipProtocol:
         self._heartbeat_at: float | None = None
         self._disseminate_at: float | None = None
         self._disseminated_at = _NEVER
-        self._sequence = 0
-        self._gossip_selector = GossipSelector()
         self._unicast_heartbeats = UnicastHeartbeats()
-        self._closed = False
-        self._outputs: list[Output] = []
         self._events: list[Event] = []
 
     # --- inputs -----------------------------------------------------------------------------------------------
 
     def start(self, now: float) -> None:
         """Announce this agent: a burst of beacons, then only heartbeats."""
-        own = PeerInstance(self._own, now, now, core_limits.PEER_LEASE, HeardBy.LINK, HeardBy.LINK)
+        own = PeerInstance(self._sender.identity, now, now, core_limits.PEER_LEASE, HeardBy.LINK, HeardBy.LINK)
         own.linked = own.verified = True
-        self._endpoints.add(self._own.guid.place, Endpoint(own, own=True))
+        self._endpoints.add(self._sender.identity.guid.place, Endpoint(own, own=True))
         self._burst = self._burst_times(now, limits.BURST_OFFSETS)
         self._heartbeat_at = self._next_heartbeat(now)
         self.handle_timer(now)
@@ -118,7 +110,7 @@ class MembershipProtocol:
             multicast: Whether it came to the group, or else to this agent's own port.
         """
         identity = beacon.identity
-        if self._closed or identity.instance == self._own.instance:
+        if self._sender.closed or identity.instance == self._sender.identity.instance:
             self.counters.add("beacon.echo")
             return
         key = identity.guid.place
@@ -134,7 +126,8 @@ class MembershipProtocol:
             self._endpoints.heard(key)
         else:
             self._endpoints.changed(key)
-        candidates = [self._candidates.answered(address) for address in {identity.guid.endpoint, source}]
+        addresses = {identity.guid.endpoint, source} if self._candidates else ()
+        candidates = [self._candidates.answered(address) for address in addresses]
         self._apply(endpoint, change, now, previous=previous, source=source)
         if (
             change in {EndpointChange.NEW, EndpointChange.RESTARTED}
@@ -146,7 +139,8 @@ class MembershipProtocol:
             self.counters.add("beacon.late")
         elif change in {EndpointChange.NEW, EndpointChange.RESTARTED, EndpointChange.KNOWN, EndpointChange.CHANGED}:
             self._answer_if_unknown(endpoint, change, beacon, now, multicast=multicast)
-            self._apply_gossip(beacon, now)
+            if beacon.gossip or beacon.observed:
+                self._apply_gossip(beacon, now)
         self._remove_if_empty(key)
 
     def link_up(self, identity: Identity, now: float, source: Address | None = None) -> None:
@@ -201,7 +195,7 @@ class MembershipProtocol:
         source = endpoint.current.source
         self._apply(endpoint, change, now, previous=previous, source=source)
         if change is EndpointChange.RESTARTED:
-            self._send_answer(endpoint.current, now)
+            self._sender.send_answer(endpoint.current, now)
         self._remove_if_empty(key)
 
     def peer_failed(self, guid: Guid, instance: bytes, now: float, reason: LossReason = LossReason.FAILED) -> None:
@@ -217,11 +211,11 @@ class MembershipProtocol:
 
     def interfaces_changed(self, now: float, addresses: tuple[IPv4Address, ...] | None = None) -> None:
         """Announce this agent again after a change of interfaces, with its present addresses if they are given."""
-        if self._closed:
+        if self._sender.closed:
             return
         if addresses is not None:
-            own = self._own
-            self._own = Identity(own.guid, own.instance, own.name, own.domain, addresses)
+            own = self._sender.identity
+            self._sender.identity = Identity(own.guid, own.instance, own.name, own.domain, addresses)
         self._burst = self._burst_times(now, limits.BURST_AGAIN_OFFSETS)
         self.handle_timer(now)
 
@@ -238,22 +232,17 @@ class MembershipProtocol:
         if self._heartbeat_at is not None:
             for address in self._seeds:
                 if address not in known:
-                    self._send(BeaconKind.ANNOUNCE, address)
+                    self._sender.send(BeaconKind.ANNOUNCE, address)
 
     def goodbye(self, now: float) -> None:
         """Send a goodbye to the peers; afterwards nothing is sent, and beacons are ignored."""
-        if self._closed or self._heartbeat_at is None:
+        if self._sender.closed or self._heartbeat_at is None:
             return
-        if self._multicast:
-            self._outputs.append(SendMulticast(self._beacon(BeaconKind.GOODBYE)))
-        for peer in self._unicast_heartbeats.choose(self._unheard_by_multicast(now), now)[0]:
-            for address in peer.addresses:
-                self._send(BeaconKind.GOODBYE, address)
-        self._closed = True
+        self._sender.send_goodbye(self._unicast_heartbeats.choose(self._sender.unheard_by_multicast(now), now)[0])
 
     def next_timer(self) -> float | None:
         """When to call ``handle_timer``, in seconds of the clock; ``None``: never."""
-        if self._closed:
+        if self._sender.closed:
             return None
         return earliest(
             self._heartbeat_at,
@@ -267,14 +256,14 @@ class MembershipProtocol:
 
     def handle_timer(self, now: float) -> None:
         """Do what is due."""
-        if self._closed or self._heartbeat_at is None:
+        if self._sender.closed or self._heartbeat_at is None:
             return
         self._expire_leases(now)
         if self._burst and self._burst[0] <= now:
             self._burst = [at for at in self._burst if at > now]
             self._send_multicast(BeaconKind.ANNOUNCE, now)
             for address in self._seeds:
-                self._send(BeaconKind.ANNOUNCE, address)
+                self._sender.send(BeaconKind.ANNOUNCE, address)
         if self._heartbeat_at <= now:
             self._pace.advance(len(self._endpoints.present()))
             self._heartbeat_at = self._next_heartbeat(now)
@@ -283,23 +272,22 @@ class MembershipProtocol:
             met = {address for peer in self._endpoints.present() for address in peer.addresses} if self._seeds else ()
             for address in self._seeds:
                 if address not in met:
-                    self._send(BeaconKind.ANNOUNCE, address)
+                    self._sender.send(BeaconKind.ANNOUNCE, address)
         if self._disseminate_at is not None and self._disseminate_at <= now:
             self._disseminate(now)
         self._send_late_answers(now)
         for peer in self._unicast_heartbeats.take_some():
-            gossip = self._gossip(self._endpoints.present(), peer, now)
+            gossip = self._sender.gossip(self._endpoints.present(), peer, now)
             for address in peer.addresses:
-                self._send(BeaconKind.HEARTBEAT, address, gossip)
+                self._sender.send(BeaconKind.HEARTBEAT, address, gossip)
         for address in self._candidates.take_due(now):
-            self._send(BeaconKind.ANNOUNCE, address)
+            self._sender.send(BeaconKind.ANNOUNCE, address)
 
     # --- outputs and views ------------------------------------------------------------------------------------
 
     def outputs(self) -> list[Output]:
         """The beacons to send, in order; each is returned once."""
-        taken, self._outputs = self._outputs, []
-        return taken
+        return self._sender.take()
 
     def events(self) -> list[Event]:
         """What happened, in order; each event is returned once."""
@@ -333,7 +321,7 @@ class MembershipProtocol:
     @property
     def identity(self) -> Identity:
         """This agent's own, as the next beacon will carry it."""
-        return self._own
+        return self._sender.identity
 
     # --- changes to events ------------------------------------------------------------------------------------
 
@@ -444,7 +432,7 @@ class MembershipProtocol:
             if not endpoint.present:
                 self._peer_found(endpoint, now)
                 if not endpoint.own:
-                    self._send_answer(endpoint.current, now)
+                    self._sender.send_answer(endpoint.current, now)
 
     def _expire_leases(self, now: float) -> None:
         for key in self._endpoints.take_expired(now):
@@ -482,25 +470,13 @@ class MembershipProtocol:
 
     # --- sending ----------------------------------------------------------------------------------------------
 
-    def _beacon(self, kind: BeaconKind, gossip: tuple[Guid, ...] = ()) -> Beacon:
-        self._sequence = serial_add(self._sequence, 1)
-        lease = round(self._pace.lease * 1000)
-        return Beacon(kind, self._own, lease, self._sequence, gossip, self._endpoints.observed_addresses(gossip))
-
-    def _send(self, kind: BeaconKind, address: Address, gossip: tuple[Guid, ...] = ()) -> None:
-        if not self._closed:
-            self._outputs.append(SendUnicast(self._beacon(kind, gossip), address))
-
     def _send_multicast(self, kind: BeaconKind, now: float) -> None:
-        """Send to the group, with gossip about the peers that multicast does not reach."""
-        if self._multicast:
-            gossip = self._gossip(self._unheard_by_multicast(now), None, now)
-            self._outputs.append(SendMulticast(self._beacon(kind, gossip)))
-            self._late_answers.clear()
+        self._sender.send_multicast(kind, now)
+        self._late_answers.clear()  # all have got this beacon
 
     def _plan_unicast_heartbeats(self, now: float) -> None:
         """Queue unicast heartbeats, with gossip about all peers, for the peers that multicast does not reach."""
-        if not self._unicast_heartbeats.plan(self._unheard_by_multicast(now), now):
+        if not self._unicast_heartbeats.plan(self._sender.unheard_by_multicast(now), now):
             self.counters.add("beacon.whisper_limited")
 
     def _disseminate(self, now: float) -> None:
@@ -508,7 +484,7 @@ class MembershipProtocol:
         self._disseminate_at = None
         self._disseminated_at = now
         self._plan_unicast_heartbeats(now)
-        if self._unheard_by_multicast(now):
+        if self._sender.unheard_by_multicast(now):
             self._send_multicast(BeaconKind.HEARTBEAT, now)
 
     def _schedule_dissemination(self, now: float) -> None:
@@ -530,8 +506,8 @@ class MembershipProtocol:
         deaf = not multicast and now - peer.multicast_at <= peer.silence
         if not (unknown or deaf or beacon.kind is BeaconKind.ANNOUNCE):
             return
-        if not (multicast and self._multicast and is_many(self.members)):
-            self._send_answer(peer, now)
+        if not (multicast and self._sender.multicast and is_many(self.members)):
+            self._sender.send_answer(peer, now)
         elif self._burst:
             self.counters.add("beacon.answer_spared")  # the next beacon of this agent's own burst tells the sender
         else:
@@ -545,15 +521,8 @@ class MembershipProtocol:
             return
         for place in places:
             if (endpoint := self._endpoints.get(place)) is not None and (peer := endpoint.current) is not None:
-                self._send_answer(peer, now, self._gossip(self._unheard_by_multicast(now), peer, now))
-
-    def _send_answer(self, peer: PeerInstance, now: float, gossip: tuple[Guid, ...] | None = None) -> None:
-        for address in peer.addresses:
-            if self._answers.allows(address, now):
-                gossip = self._gossip(self._endpoints.present(), peer, now) if gossip is None else gossip
-                self._send(BeaconKind.ANSWER, address, gossip)
-            else:
-                self.counters.add("beacon.answer_limited")
+                gossip = self._sender.gossip(self._sender.unheard_by_multicast(now), peer, now)
+                self._sender.send_answer(peer, now, gossip)
 
     def _infer_multicast(
         self, peer: PeerInstance, beacon: Beacon, source: Address, now: float, *, was_candidate: bool
@@ -565,12 +534,12 @@ class MembershipProtocol:
         """
         if was_candidate:
             peer.found_by = HeardBy.GOSSIP
-        elif beacon.kind is BeaconKind.ANSWER and self._multicast and source not in self._seeds:
+        elif beacon.kind is BeaconKind.ANSWER and self._sender.multicast and source not in self._seeds:
             peer.multicast_at = now - self._pace.interval
 
     def _apply_gossip(self, beacon: Beacon, now: float) -> None:
         """Announce this agent to unknown peers of the sender."""
-        for address in self._endpoints.unknown_addresses(beacon.observed, self._own):
+        for address in self._endpoints.unknown_addresses(beacon.observed, self._sender.identity):
             if not self._candidates.add(address, now):
                 self.counters.add("gossip.full")
         self.hear_of(beacon.gossip, now)
@@ -578,26 +547,14 @@ class MembershipProtocol:
     def hear_of(self, guids: tuple[Guid, ...], now: float) -> None:
         """Announce this agent to unknown ones of these peers; only their own beacon makes them members."""
         for guid in guids:
-            if guid.place in self._endpoints or (guid.is_loopback and not self._own.guid.is_loopback):
+            if guid.place in self._endpoints or (guid.is_loopback and not self._sender.identity.guid.is_loopback):
                 continue
             if not self._candidates.add(guid.endpoint, now):
                 self.counters.add("gossip.full")
         for address in self._candidates.take_due(now):
-            self._send(BeaconKind.ANNOUNCE, address)
-
-    def _gossip(self, peers: list[PeerInstance], to: PeerInstance | None, now: float) -> tuple[Guid, ...]:
-        identity = to.identity if to is not None else self._own
-        return self._gossip_selector.choose(peers, to, now, loopback=identity.guid.is_loopback)
+            self._sender.send(BeaconKind.ANNOUNCE, address)
 
     # --- queries ----------------------------------------------------------------------------------------------
-
-    def _unheard_by_multicast(self, now: float) -> list[PeerInstance]:
-        """Members that get their heartbeats by unicast."""
-        members = self._endpoints.present()
-        if not self._multicast:
-            return list(members)
-        many = is_many(len(members))  # then a peer that a link brought has some time to be heard
-        return [v for v in members if now - max(v.multicast_at, v.since if many else _NEVER) > v.silence]
 
     def _burst_times(self, now: float, offsets: tuple[float, ...]) -> list[float]:
         return [now + offset + (limits.BURST_JITTER * self._rng() if offset else 0.0) for offset in offsets]

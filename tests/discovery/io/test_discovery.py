@@ -118,7 +118,7 @@ async def test_a_restart_on_the_same_port_is_told(agents: list[Agent], settings:
     await start(agents, base)
     await start([], pc)
     await until(base.names)
-    pc.discovery._membership._closed = True  # killed: no goodbye
+    pc.discovery._membership._sender.closed = True  # killed: no goodbye
     await pc.end()
     again = Agent("pc", settings, port=pc.port)
     await start(agents, again)
@@ -445,7 +445,7 @@ async def test_a_member_without_a_link_that_dies_is_lost_by_its_silence_to_probe
     await until(lambda: sum(isinstance(event, MemberOffers) and event.version == 7 for event in found) == 4)
     dead = mesh[4]
     agents.remove(dead)
-    dead.discovery._membership._closed = dead.discovery._detector._closed = True  # killed: no goodbye
+    dead.discovery._membership._sender.closed = dead.discovery._detector._closed = True  # killed: no goodbye
     await dead.end()
     lost = PeerLost(dead.identity, LossReason.FAILED)
     for agent in mesh[:4]:

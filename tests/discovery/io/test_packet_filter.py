@@ -110,6 +110,16 @@ def test_a_flood_of_probes_leaves_room_for_beacons() -> None:
     assert door.counters["swim.malformed"] == 1
 
 
+def test_a_flood_in_the_name_of_a_member_is_limited_over_all_addresses() -> None:
+    """In an open mesh a beacon shows all that a packet in its sender's name needs; source addresses can be forged."""
+    door = Door()
+    taken = [door.intake.parse(probe(FRIEND, n), source(n), 10.0, multicast=False, interface=1) for n in range(3000)]
+    assert sum(packet is not None for packet in taken) == limits.SWIM_BURST == door.counters["swim.in"]
+    assert door.counters["swim.limited"] == 3000 - limits.SWIM_BURST
+    assert door.intake.parse(packet(FRIEND, 7), ("10.0.0.2", 4000), 10.0, multicast=True, interface=1) is not None
+    assert door.intake.parse(probe(FRIEND, 1), ("10.0.0.2", 4000), 10.5, multicast=False, interface=1) is not None
+
+
 WALL = 1_790_000_000.0
 RING = KeyRing([GroupKey(1, b"k" * 32)], 0.0)
 

@@ -171,6 +171,16 @@ def test_an_agent_that_hears_nothing_accuses_no_other_and_vouches_for_none() -> 
     assert not mesh.detectors[0].vouches(other.guid, other.instance, mesh.now)
 
 
+def test_a_member_that_is_heard_is_not_suspected_although_it_does_not_answer() -> None:
+    mesh = Mesh(5)
+    mesh.dropped = lambda sender, _: sender == 0  # it hears all the others, and nothing that it sends arrives
+    mesh.run(20.0)
+    assert not [event for event in mesh.events[0] if isinstance(event, MemberSuspected | MemberFailed)]
+    assert all(
+        MemberFailed(mesh.identities[0].guid, mesh.identities[0].instance) in mesh.events[n] for n in range(1, 5)
+    )
+
+
 def test_a_linked_member_is_never_held_to_have_failed() -> None:
     mesh = Mesh(6)
     mesh.run(2)

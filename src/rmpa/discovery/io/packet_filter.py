@@ -11,9 +11,10 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import RUN_AT, Beacon, BeaconOtherDomain, BeaconOtherVersion, sender_of
+from rmpa.discovery.parsed_heartbeats import ParsedHeartbeats
 from rmpa.discovery.swim.packets import SwimPacket, is_swim
 from rmpa.trust.keyring import KeyPurpose
-from rmpa.trust.packets import Verdict
+from rmpa.trust.packets import TRAILER_BYTES, Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -43,10 +44,10 @@ class PacketFilter:
         domain: This agent's domain id.
         counters: ``beacon.in``, ``beacon.repeated``, ``beacon.flood``, ``beacon.unlinked_limited``,
             ``beacon.other_domain``, ``beacon.version``, ``beacon.malformed``; ``swim.in``,
-            ``swim.unlinked_limited`` and ``swim.malformed`` of packets of the failure detector, which have a limit
-            of their own.
+            ``swim.unlinked_limited``, ``swim.limited`` and ``swim.malformed`` of packets of the failure detector,
+            which have limits of their own.
         is_verified: Whether a run of a peer has or had a link: beacons of such peers, and echoes of this agent's
-            own, are not limited in rate.
+            own, are not limited in rate; packets of the failure detector are limited over all agents.
         trust: Of a secured mesh: only packets whose trailer is accepted are parsed; ``beacon.untagged``,
             ``beacon.forged`` and so on count the others.
     """
@@ -64,10 +65,12 @@ class PacketFilter:
         self._counters = counters
         self._is_verified = is_verified
         self._unlinked: dict[tuple[int, bool], TokenBucket] = {}
+        self._swim = TokenBucket(limits.SWIM_PER_SECOND, limits.SWIM_BURST)
         self._unproved = TokenBucket(limits.BEACONS_UNPROVED_PER_SECOND, limits.BEACONS_UNPROVED_BURST)
         self.overrun = False
         """Whether packets without a valid proof come faster than they can be looked at: pause the reading."""
         self._refusals = RefusalLog(_log, counters)
+        self._heartbeats = ParsedHeartbeats(0 if trust is None else TRAILER_BYTES)
         self._recent: OrderedDict[bytes, None] = OrderedDict()
         self._sources: OrderedDict[str, tuple[float, int]] = OrderedDict()
 
@@ -97,12 +100,16 @@ class PacketFilter:
             return None
         if self._trust is None and not self._is_new(data):
             return None
+        if (beacon := self._heartbeats.find(data)) is not None and self._is_verified(
+            beacon.identity.guid, beacon.identity.instance
+        ):
+            self._counters.add("beacon.in")
+            return beacon
         swim = is_swim(data)
         name = "swim" if swim else "beacon"
         try:
             verified = self._is_verified(*sender_of(data, self._domain))
-            if not verified and not self._within_limit(interface, now, swim=swim):
-                self._counters.add(f"{name}.unlinked_limited")
+            if not self._within_limits(interface, now, swim=swim, verified=verified):
                 return None
             packet = SwimPacket.parse(data, self._domain) if swim else Beacon.parse(data, self._domain)
         except BeaconOtherDomain as error:
@@ -117,6 +124,8 @@ class PacketFilter:
             self._refusals.refuse(now, f"{name}.malformed", host, f"from {host}: {error}; is another program there?")
         else:
             self._counters.add(f"{name}.in")
+            if verified and isinstance(packet, Beacon):
+                self._heartbeats.keep(data, packet)
             return packet
         return None
 
@@ -157,8 +166,18 @@ class PacketFilter:
             self._counters.add(f"beacon.{found.verdict}")
         return False
 
-    def _within_limit(self, interface: int, now: float, *, swim: bool) -> bool:
-        """Whether one more packet of an unlinked peer is within the limit of this interface."""
+    def _within_limits(self, interface: int, now: float, *, swim: bool, verified: bool) -> bool:
+        """Whether one more packet may be read; one that may not is counted."""
+        if not verified and not self._unlinked_limit(interface, swim=swim).take(now):
+            self._counters.add("swim.unlinked_limited" if swim else "beacon.unlinked_limited")
+            return False
+        if swim and not self._swim.take(now):
+            self._counters.add("swim.limited")
+            return False
+        return True
+
+    def _unlinked_limit(self, interface: int, *, swim: bool) -> TokenBucket:
+        """The limit of packets of unlinked peers on this interface."""
         bucket = self._unlinked.get((interface, swim))
         if bucket is None:
             if len(self._unlinked) >= _INTERFACES:
@@ -166,7 +185,7 @@ class PacketFilter:
             rate = limits.SWIM_UNLINKED_PER_SECOND if swim else limits.BEACONS_UNLINKED_PER_SECOND
             burst = limits.SWIM_UNLINKED_BURST if swim else limits.BEACONS_UNLINKED_BURST
             bucket = self._unlinked[interface, swim] = TokenBucket(rate, burst)
-        return bucket.take(now)
+        return bucket
 
     def _is_flood(self, host: str, now: float) -> bool:
         since, count = self._sources.get(host, (now, 0))

@@ -1,4 +1,4 @@
-"""What one failure detector sends: its packets, the news that they carry, and pieces of its table."""
+"""Makes the packets that one failure detector sends, with the news that they carry. Sans-I/O."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class Dissemination:
-    """Makes packets. Each carries this agent's own state, and news while there is some.
+    """Makes the packets of one failure detector. Each carries this agent's own state, and news while there is some.
 
     Args:
         identity: This agent's own.
@@ -62,27 +62,27 @@ class Dissemination:
             if self.at is None:
                 self.at = now + limits.GOSSIP_INTERVAL * self._rng()
 
-    def tell_own(self, now: float) -> None:
-        """This agent's own incarnation or version has changed."""
+    def spread_own(self, now: float) -> None:
+        """Spread this agent's own incarnation and version, of which one has changed."""
         self._table.own_changed(self.incarnation, self.version)
         self.spread(self._own_news(MemberState.ALIVE), now)
         if self.at is not None:
             self.at = now
 
     def leave(self) -> None:
-        """Tell some members that this agent leaves."""
+        """Send some members the news that this agent leaves."""
         self._queue.add(self._own_news(MemberState.LEFT))
-        for member in self._table.some(limits.LEAVE_FANOUT):
+        for member in self._table.sample(limits.LEAVE_FANOUT):
             self.send(SwimKind.NEWS, member.address, to=member)
 
     def stop(self) -> None:
-        """Spread nothing any more for now."""
+        """Drop all news, and gossip no more until there is other news."""
         self.at = None
         self._queue = NewsQueue()
 
     def gossip(self, now: float) -> None:
         """Send the news to some members in packets of its own."""
-        for member in self._table.some(limits.GOSSIP_FANOUT):
+        for member in self._table.sample(limits.GOSSIP_FANOUT):
             if len(self._queue):
                 self.send(SwimKind.NEWS, member.address, to=member)
         self.at = now + limits.GOSSIP_INTERVAL if len(self._queue) and len(self._table) else None
@@ -103,11 +103,12 @@ class Dissemination:
         Args:
             kind: What it is for.
             address: Where it goes.
-            to: The member that it goes to, which gets news, above all that it is suspected; ``None``: no member.
-            sequence: As the packet has it.
-            subject: As the packet has it.
-            buckets: As the packet has it.
-            ended: That the receiver, which is no member here, has failed: it may refute it.
+            to: The member that it goes to, which gets news: first of all, if it is suspected, that it is. ``None``:
+                the packet goes to an agent that is no member, and has no news.
+            sequence: The packet's ``sequence``.
+            subject: The packet's ``subject``.
+            buckets: The packet's ``buckets``.
+            ended: The news that the receiver, which is no member here, has failed: it may refute that.
         """
         news: list[News] = []
         if ended is not None:

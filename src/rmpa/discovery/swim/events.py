@@ -54,7 +54,7 @@ class MemberOffers:
 
 @dataclass(frozen=True, slots=True)
 class MemberHeardOf:
-    """A run answers probes that is not watched here: it is worth an announcement, if it is no member yet.
+    """A run that is not watched here answers probes: an announcement to it is worthwhile, if it is no member yet.
 
     Args:
         guid: Its GUID.

@@ -127,7 +127,7 @@ class FailureDetector:
             self._probe(member, now)
 
     def remove(self, guid: Guid, instance: bytes, now: float, *, left: bool = False) -> None:
-        """Watch a run no more; ``left``: it said goodbye, which is spread."""
+        """Stop watching a run; ``left``: it said goodbye, which is spread as news."""
         member = self._table.get(guid, instance)
         if member is None:
             return
@@ -150,16 +150,16 @@ class FailureDetector:
         """Spread the version of what this agent offers; 32 bits, only ever higher."""
         if version > self._news.version:
             self._news.version = version
-            self._tell_own(now)
+            self._spread_own(now)
 
     def learn_version(self, guid: Guid, instance: bytes, version: int, now: float) -> None:
-        """Take in a member's version that came in another way, such as by its link."""
+        """Take in the version of a member's offers that came otherwise than by a packet, such as over its link."""
         member = self._table.get(guid, instance)
         if member is not None:
             self._alive(member, member.incarnation, version, now)
 
     def leave(self) -> None:
-        """Tell some members that this agent leaves; afterwards nothing is sent, and packets are ignored."""
+        """Send some members the news that this agent leaves; afterwards nothing is sent, and packets are ignored."""
         if self._active and not self._closed:
             self._news.leave()
         self._closed = True
@@ -234,7 +234,10 @@ class FailureDetector:
         return self._hearsay.get(run) is not None or self._gone.get(run) is not None
 
     def vouches(self, guid: Guid, instance: bytes, now: float) -> bool:
-        """Whether a run is watched and has not failed, as far as an agent can say that still hears others."""
+        """Whether a run is watched, and this agent has heard a member lately.
+
+        A run that has failed is not watched any more. An agent that hears no member cannot say whether one is alive.
+        """
         watched = self._table.get(guid, instance) is not None
         return self._active and watched and now - self._heard_at <= limits.SWIM_DEAF
 
@@ -277,10 +280,15 @@ class FailureDetector:
         if probe is None or member is None or member.run != probe.run:
             self._probing.end(sequence)
             return
+        if member.heard > probe.at:
+            # Only the answer got lost, or the probe: on a path that works in one direction each of them would be.
+            self._probing.end(sequence)
+            self.counters.add("swim.heard")
+            return
         if probe.asked is None:
             # If it is dead, the one that it would probe has to be probed by another: many may have died at once.
             self._probe_extra(self._table.next_after(member), now)
-            helpers = [m for m in self._table.some(limits.INDIRECT_PROBES, member) if m.state is MemberState.ALIVE]
+            helpers = [m for m in self._table.sample(limits.INDIRECT_PROBES, member) if m.state is MemberState.ALIVE]
             self._probing.ask(sequence, len(helpers), now)
             for helper in helpers:
                 subject = _subject(member)
@@ -395,9 +403,9 @@ class FailureDetector:
         if member.state is MemberState.ALIVE:
             self._news.spread(member.news(), now)
 
-    def _tell_own(self, now: float) -> None:
+    def _spread_own(self, now: float) -> None:
         self._changed_at = now
-        self._news.tell_own(now)
+        self._news.spread_own(now)
 
     def _take(self, news: News, now: float, *, table: bool) -> None:
         """Take in what a member says of another one; ``table``: what it holds, perhaps for long."""
@@ -462,7 +470,7 @@ class FailureDetector:
             self._events.append(MemberHeardOf(packet.guid, packet.run))
 
     def _refute(self, news: News, now: float) -> None:
-        """What others hold of this agent is wrong, such as that it has failed: tell them how it is."""
+        """Refute wrong news of this agent, such as that it has failed, by a higher incarnation."""
         false = news.state is not MemberState.ALIVE or news.version > self._news.version
         if not false or news.incarnation < self._news.incarnation:
             return
@@ -473,7 +481,7 @@ class FailureDetector:
         if news.state is not MemberState.ALIVE:
             self._set_health(self._health + 1)
         self._news.incarnation = news.incarnation + 1
-        self._tell_own(now)
+        self._spread_own(now)
 
     def _accused(self, member: Member, accuser: bytes, now: float, *, sure: bool = False) -> None:
         """An agent had no answer of a member; ``sure``: as many as are needed had none."""

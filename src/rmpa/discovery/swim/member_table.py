@@ -160,8 +160,8 @@ class MemberTable:
         index = bisect_left(self._ring, (member.run, member.guid.place)) + 1
         return self._all[self._ring[index % len(self._ring)][1]]
 
-    def some(self, count: int, without: Member | None = None) -> list[Member]:
-        """Up to ``count`` different members at random."""
+    def sample(self, count: int, without: Member | None = None) -> list[Member]:
+        """Up to ``count`` different members, chosen at random; ``without`` is never among them."""
         chosen: dict[int, Member] = {}
         for _ in range(3 * count):
             if len(chosen) == count or not self._ring:

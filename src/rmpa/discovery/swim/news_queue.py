@@ -14,7 +14,7 @@ _Key = tuple[int, bytes, bytes]
 
 
 class NewsQueue:
-    """News to be sent, that which was sent least often first. Newer news of a member replaces older.
+    """News to be sent; the news that was sent least often comes first. Newer news of a member replaces older news.
 
     Suspicions of one member by different accusers count as different news, because each confirms the others.
     """

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from rmpa.discovery.swim.member_table import Member
 
 Relay = tuple[int, int, "Guid", bytes, "Address"]
-"""A probe for another member: place of the subject, the request's number, the subject's GUID and run, and the address
-of the one that asked."""
+"""A probe on behalf of another member: place of the subject, the request's number, the subject's GUID and run,
+and the address of the member that requested it."""
 
 
 @dataclass(slots=True)
@@ -86,7 +86,7 @@ class Probing:
         return sequence
 
     def ask(self, sequence: int, asked: int, now: float) -> None:
-        """Others were asked to probe too, which takes longer."""
+        """Record that ``asked`` other members were asked to probe too; their answers may take longer."""
         probe = self._probes[sequence]
         probe.asked = asked
         self._timers.set(sequence, now + probe.timeout * limits.INDIRECT_TIMEOUT_FACTOR)
@@ -96,7 +96,7 @@ class Probing:
         return self._probes.get(sequence)
 
     def nack(self, sequence: int) -> None:
-        """One of those that were asked had no answer."""
+        """Record that one of the members that were asked had no answer either."""
         probe = self._probes.get(sequence)
         if probe is not None:
             probe.nacks += 1
