@@ -6,8 +6,11 @@ import asyncio
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import pytest
+
 from rmpa.bridge import limits as bridge_limits
 from rmpa.config.settings import LimitSettings
+from rmpa.core.errors import ConfigError
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros import limits as ros_limits
@@ -17,10 +20,9 @@ from tests.agent.test_diagnostics import Statuses, settings
 if TYPE_CHECKING:
     from pathlib import Path
 
-    import pytest
-
     from rmpa.agent import Agent
-    from rmpa.observe.snapshot import BoundInfo, Snapshot
+    from rmpa.observe.peer_info import BoundInfo
+    from rmpa.observe.snapshot import Snapshot
 
 
 async def snapshot(name: str, place: Path) -> Snapshot:
@@ -109,3 +111,53 @@ async def test_topics_beyond_the_limit_of_either_side_are_told(
         assert none_told.failed is not None
         assert (one_there.failed.name, "limits.topics = 2" in one_there.failed.text) == ("limit", True)
         assert (none_told.failed.name, "limits.topics = 3" in none_told.failed.text) == ("offer", True)
+
+
+async def test_a_snapshot_with_a_bound_has_what_is_used_and_counts_the_rest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ros_limits, "NODE_CHECK_INTERVAL", 1e6)  # the nodes are made up
+    async with running(settings("near", tmp_path), settings("far", tmp_path)) as (near, far):
+        register(far, range(8))
+        for number in range(8):
+            assert (
+                far.core.call(
+                    "registerService", f"/n{number}", f"/s{number}", "rosrpc://127.0.0.1:9", "http://127.0.0.1:9/"
+                )[0]
+                == 1
+            )
+        await until(lambda: stands(near, *range(8)) and near.services.imports.shown("/s7") is not None)
+        near.core.call("registerSubscriber", "/own", "/t6", "std_msgs/String", "http://127.0.0.1:9/")
+        near.core.call("registerPublisher", "/own", "/mine", "std_msgs/String", "http://127.0.0.1:9/")
+        await until(lambda: "/mine" in near.core.state().publishers)
+        whole = near.snapshots.build()
+        assert (whole.topics_left, whole.services_left) == (0, 0)
+        enough = near.snapshots.build(most=len(whole.topics))
+        assert [topic.name for topic in enough.topics] == [topic.name for topic in whole.topics]
+        part = near.snapshots.build(most=0)
+        shown = {topic.name for topic in part.topics}
+        assert {"/t6", "/mine"} <= shown, "a node of this module subscribes to the one and publishes the other"
+        assert not {"/t0", "/t7"} & shown
+        assert len(part.topics) + part.topics_left == len(whole.topics)
+        assert len(part.services) + part.services_left == len(whole.services)
+        assert part.services_left == 8
+        some = near.snapshots.build(most=len(part.topics) + 2)
+        assert {topic.name for topic in some.topics} == shown | {"/t0", "/t1"}
+
+
+async def test_a_snapshot_has_the_parts_that_are_asked_for(tmp_path: Path) -> None:
+    async with running(settings("near", tmp_path), settings("far", tmp_path)) as (near, far):
+        for name in ("/s1", "/s2"):
+            assert far.core.call("registerService", "/n", name, "rosrpc://127.0.0.1:9", "http://127.0.0.1:9/")[0] == 1
+        await until(lambda: near.services.imports.shown("/s2") is not None)
+        ask = near.operations.snapshot
+        assert ask({"topics": []}).services == ()
+        assert ask({"topics": []}).topics == ()
+        assert [peer.name for peer in ask({"topics": []}).peers] == ["far"]
+        agent = ask({"topics": [], "peers": False})
+        assert (agent.peers, agent.agent.name) == ((), "near")
+        assert {"/s1", "/s2"} <= {info.name for info in ask({"topics": [], "services": True}).services}
+        assert [info.name for info in ask({"topics": [], "services": ["/s2"]}).services] == ["/s2"]
+        assert {"/s1", "/s2"} <= {info.name for info in ask({}).services}
+        with pytest.raises(ConfigError, match="is not a number of topics"):
+            ask({"most": "many"})

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.bridge.messages import AdvertiseServices, ServiceOffer
 from rmpa.config.settings import PeerRule, ServiceRule, ServiceSettings, Settings
 from rmpa.core.errors import PeerRefused
 from rmpa.mesh import limits
@@ -113,6 +114,35 @@ async def test_a_call_is_counted_on_both_sides(settings: Callable[..., Settings]
         assert there.latency is not None
         assert here.latency.max >= there.latency.min > 0
     assert provider(b) == ""
+
+
+async def test_types_are_told_although_the_offer_came_again_since_the_service_was_opened(
+    settings: Callable[..., Settings],
+) -> None:
+    """The catalogue of a new link comes at the same time as the first call opens a service."""
+    async with running(settings("a"), settings("b")) as (a, b), serving(a) as server:
+        await until(lambda: provider(b))
+        (session,) = b.bridge.sessions
+        again = AdvertiseServices(added=(ServiceOffer("/add", "/adder"),))
+        for _ in range(2):
+            connection = await connect(b)
+            assert b.services.message(session, again)
+            other = await asyncio.wait_for(connect(b), 20.0)
+            assert other.description.type == "a/Add"
+            assert await other.call(b"1", 20.0) == (True, b"1")
+            other.close()
+            connection.close()
+        connection = await connect(b)
+        server.keeps = True
+        asked = asyncio.create_task(connection.call(b"2", 20.0))
+        await until(lambda: len(server.calls) == 3)
+        assert b.services.message(session, again)
+        other = await asyncio.wait_for(connect(b), 20.0)
+        assert other.description.type == "a/Add"
+        server.calls[-1].reply(True, b"kept")
+        assert await asked == (True, b"kept"), "a call under way is not disturbed"
+        other.close()
+        connection.close()
 
 
 async def test_a_short_outage_keeps_services_and_answers_calls(

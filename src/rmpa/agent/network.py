@@ -15,10 +15,12 @@ from rmpa.core import limits
 from rmpa.core.errors import RmpaError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
+from rmpa.core.token_bucket import TokenBucket
 from rmpa.discovery.events import PeerChanged, PeerConflict, PeerFound, PeerLost, PeerRestarted, RunDoubted
 from rmpa.discovery.io.discovery import Discovery
 from rmpa.discovery.io.interfaces import choose, further_addresses, list_interfaces, pick_address
 from rmpa.discovery.swim.events import MemberOffers, MemberSuspected
+from rmpa.discovery.swim.packets import MemberState
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.handshake import Feature
 from rmpa.mesh.io.link import LinkHandlers
@@ -68,7 +70,8 @@ class NetworkEndpoint:
         on_displaced: Callable[[], None],
         trust: AgentTrust | None = None,
     ) -> None:
-        clock = SystemClock()
+        self._clock = clock = SystemClock()
+        self._checking_dials = TokenBucket(mesh_limits.CHECKING_DIALS_PER_SECOND, mesh_limits.CHECKING_DIALS_BURST)
         self._settings = settings
         self._bridge = bridge
         sessions, receiver = bridge.sessions, bridge.receiver
@@ -103,6 +106,7 @@ class NetworkEndpoint:
             clock=clock,
             security=trust.membership if trust is not None else None,
             on_join=trust.on_join if trust is not None else None,
+            held=sessions.offers.held,
         )
         self.discovery = Discovery(
             self.identity,
@@ -146,8 +150,9 @@ class NetworkEndpoint:
     def _may_park(self, link: PeerLink) -> bool:
         """Whether this agent would do without a link that nothing needs; a relay must hear of changes at once."""
         relays = self._settings.relay or self._settings.gateway.site != ""
-        watched = self.discovery.member(link.guid, link.identity.instance) is not None
-        return self.mode.demand and not relays and watched
+        member = self.discovery.member(link.guid, link.identity.instance)
+        answers = member is not None and member.state is MemberState.ALIVE  # else the link is the only sign of life
+        return self.mode.demand and not relays and answers
 
     def _denied(self) -> None:
         """End the sessions of parked peers that are revoked; the mesh ends the links of the others."""
@@ -193,7 +198,11 @@ class NetworkEndpoint:
         """Take in what the failure detector has found; discovery itself acts on failures."""
         match event:
             case MemberSuspected(guid=guid):
-                self._check_link(guid)
+                if self.mesh.link(guid) is not None:
+                    self._check_link(guid)
+                elif self._checking_dials.take(self._clock.now()):
+                    # Probes use UDP alone, which a firewall may block: a parked peer that TCP reaches has not failed.
+                    self.mesh.want(guid)
             case MemberOffers(guid=guid, instance=instance, version=version):
                 self._bridge.sessions.offers.heard(guid, instance, version, 1 + len(self._members))
             case _:
@@ -207,12 +216,14 @@ class NetworkEndpoint:
     def _link_up(self, link: PeerLink) -> None:
         # Its beacons come from its mesh port; an accepted connection may come from any port.
         remote = link.connection.remote
+        features = remote.features if remote is not None else 0
         self.discovery.link_up(
             link.identity,
             (link.remote_endpoint[0], link.identity.guid.port),
-            answers_probes=remote is not None and bool(remote.features & Feature.SWIM),
+            answers_probes=bool(features & Feature.SWIM),
         )
-        self._bridge.sessions.link_up(link)
+        held = remote.held if remote is not None else b""
+        self._bridge.sessions.link_up(link, compares=bool(features & Feature.OFFERS), held=held)
 
     def _link_down(self, link: PeerLink, down: LinkDown) -> None:
         self._bridge.sessions.link_down(link)

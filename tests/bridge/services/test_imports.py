@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import pytest
 
 from rmpa.bridge import limits
@@ -27,6 +29,9 @@ from rmpa.bridge.services.remote_service import ServiceRouteState
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from tests.bridge.services.test_rules import apply_rules, rules
+
+if TYPE_CHECKING:
+    from rmpa.bridge.policy import PolicyDecision
 
 MD5 = "6a2e34150c00229791cc89ff309fff21"
 ROUTE = limits.SERVICE_ROUTES + 1
@@ -214,3 +219,48 @@ def test_other_rules_touch_only_what_they_change(imports: ServiceImports) -> Non
     assert remote is not None
     assert remote.state is ServiceRouteState.OPEN
     assert apply_rules(imports, rules()) == [Provide(1, "/sub", "/n")]
+
+
+def test_a_name_that_all_modules_have_costs_one_judgement_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Modules of one kind have the same names: judging all claims for each new one would be quadratic.
+    judged = []
+    known = rules()
+    made = ServiceImports(known)
+    original = known.judge
+
+    def judge(service: str, node: str) -> PolicyDecision:
+        judged.append(node)
+        return original(service, node)
+
+    monkeypatch.setattr(known, "judge", judge)
+    peers = 200
+    for number in range(1, peers + 1):
+        made.link_up(number, f"arm{number}", number)
+        made.advertised(number, offer("/start", full=True))
+    assert made.shown("/start") == (1, made.get(1, "/start"))
+    assert len(judged) <= 2 * peers
+    judged.clear()
+    assert made.gone(2) == [], "it was not shown"
+    assert judged == []
+    assert made.gone(1)[-1] == Provide(3, "/start", "/n")
+    assert hidden(made, peers, "/start") == "arm3 provides it too, and is shown: its GUID is lower"
+    made.local("/start", "/mine")
+    judged.clear()
+    made.link_up(peers + 1, "leg", peers + 1)
+    assert made.advertised(peers + 1, offer("/start", full=True)) == []
+    assert hidden(made, peers + 1, "/start") == "/mine of this module provides it itself"
+    assert len(judged) == 1
+    assert made.shown("/start") is None
+
+
+def test_new_rules_judge_a_name_that_all_modules_have_once() -> None:
+    made = ServiceImports(rules())
+    for number in range(1, 5):
+        made.link_up(number, f"arm{number}", number)
+        made.advertised(number, offer("/start", full=True))
+    denied = (PeerRule("arm1", policy=PolicySettings(deny=("/start",))),)
+    actions = apply_rules(made, rules(peers=denied))
+    assert [type(action) for action in actions] == [Withdraw, Provide]
+    assert made.shown("/start") == (2, made.get(2, "/start"))
+    assert "arm1" in hidden(made, 1, "/start")
+    assert "arm2 provides it too" in hidden(made, 4, "/start")

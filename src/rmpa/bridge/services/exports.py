@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.actions import Send, Warn
-from rmpa.bridge.catalogue.offers import CataloguePeer, OfferCatalogue
+from rmpa.bridge.catalogue.offers import CataloguePeer, OfferCatalogue, Portion
 from rmpa.bridge.messages import (
     AdvertiseServices,
     CloseService,
@@ -136,6 +136,7 @@ class _Callers:
 
 
 _Peer = CataloguePeer[str, LocalService, ServiceOffer, str]
+_Portion = Portion[str, ServiceOffer, str]
 _DEFAULT_LIMITS: Final = LimitSettings()
 
 
@@ -299,7 +300,7 @@ class ServiceExports:
 
     # --- advertising -------------------------------------------------------------------------------------------
 
-    def link_up(self, peer: int, name: str, instance: str = "") -> list[ExportAction]:
+    def link_up(self, peer: int, name: str, instance: str = "", held: int | None = None) -> list[ExportAction]:
         """Begin the advertisement to a peer; ``advertise`` goes on with it.
 
         What came from this very run of the peer is not offered to it.
@@ -308,10 +309,19 @@ class ServiceExports:
             peer: The peer's number.
             name: The peer's name.
             instance: The peer's run, as 32 hexadecimal digits.
+            held: The digest of what the peer holds of the present version; ``None``: nothing.
         """
         self._peers[peer] = _Callers()
-        first = self._catalogue.link_up(peer, name, instance, judged=False)
-        return [Send(peer, AdvertiseServices(tuple(first.added), tuple(first.removed), full=True, more=first.more))]
+        return _told_portion(peer, self._catalogue.link_up(peer, name, instance, judged=False, held=held))
+
+    def again(self, peer: int) -> list[ExportAction]:
+        """Begin the advertisement to a linked peer once more; ``advertise`` goes on with it."""
+        first = self._catalogue.again(peer)
+        return _told_portion(peer, first) if first is not None else []
+
+    def digest(self, peer: int) -> int | None:
+        """The digest of what a linked peer was told; ``None`` while it was not told all."""
+        return self._catalogue.digest(peer)
 
     def link_down(self, peer: int) -> list[ExportAction]:
         """End all routes of a peer whose link is gone."""
@@ -327,9 +337,7 @@ class ServiceExports:
             ready: ``(peer)``: whether a message may be sent to this peer now.
         """
         return [
-            Send(peer, AdvertiseServices(tuple(portion.added), tuple(portion.removed), more=portion.more))
-            for peer, portion in self._catalogue.portions(ready)
-            if portion.is_news
+            action for peer, portion in self._catalogue.portions(ready) for action in _told_portion(peer, portion)
         ]
 
     def _offer(self, known: _Peer, service: str, server: LocalService) -> ServiceOffer | None:
@@ -430,3 +438,13 @@ class ServiceExports:
         session = peer.sessions.pop(route)
         closed = Send(number, ServiceClosed(route, reason[: limits.CONTROL_TEXT_MAX]))
         return [EndRoute(number, route, session.requests), closed] if session.requests else [closed]
+
+
+def _told_portion(peer: int, portion: _Portion) -> list[ExportAction]:
+    """Makes the message of a portion, if there is one."""
+    if portion.unchanged:
+        return [Send(peer, AdvertiseServices(unchanged=True))]
+    if not portion.is_news:
+        return []
+    message = AdvertiseServices(tuple(portion.added), tuple(portion.removed), portion.full, portion.more)
+    return [Send(peer, message)]

@@ -153,6 +153,8 @@ class ServiceImports:
         self._local: dict[str, str] = {}
         # By the name here, then by peer: the services that have this name.
         self._claims: dict[str, dict[int, RemoteService]] = {}
+        # By the name here: the peer whose service is shown. Of a name that many peers have, not all claims are read.
+        self._shown: dict[str, int] = {}
         self._opening: dict[tuple[int, int], RemoteService] = {}
 
     def __iter__(self) -> Iterator[tuple[int, RemoteService]]:
@@ -167,8 +169,8 @@ class ServiceImports:
 
     def shown(self, service: str) -> tuple[int, RemoteService] | None:
         """The peer's service that is in the local graph by this name."""
-        claims = self._claims.get(service, {})
-        return next(((peer, remote) for peer, remote in claims.items() if remote.shown), None)
+        peer = self._shown.get(service)
+        return None if peer is None else (peer, self._claims[service][peer])
 
     def peer_name(self, peer: int) -> str:
         """The name of a peer, for texts."""
@@ -226,6 +228,8 @@ class ServiceImports:
 
     def _choose_of(self, instances: Collection[str]) -> list[ImportAction]:
         """Choose again among the services of these modules: another path to them may be the best now."""
+        if not instances:
+            return []
         touched = [
             service
             for service, claims in self._claims.items()
@@ -285,7 +289,14 @@ class ServiceImports:
         known, full, more = self._peers.get(peer), message.full, message.more
         if known is None:
             return iter(())
+        if message.unchanged is True:
+            return iter(())  # also what the servers said of them: the peer's version counts each change of a server
         return known.changes(message.added, message.removed, lambda offer: offer.service, full=full, more=more)
+
+    def held(self, peer: int) -> list[ServiceOffer] | None:
+        """All that a peer offers, as it was received; ``None`` if some offers were only counted."""
+        known = self._peers.get(peer)
+        return known.held(lambda: _offers(known)) if known is not None else []
 
     def take_in(self, peer: int, change: Change[ServiceOffer, str]) -> list[ImportAction]:
         """Apply a portion of a peer's advertisement."""
@@ -336,7 +347,7 @@ class ServiceImports:
             remote.hidden = f"{others[peer].wire} of the same peer has this name here already"
             return actions
         others[peer] = remote
-        return actions + self._choose(name)
+        return actions + self._claim(name, peer, remote)
 
     def _remove(self, peer: int, wire: str, reason: str) -> list[ImportAction]:
         known = self._peers[peer]
@@ -347,17 +358,18 @@ class ServiceImports:
         # Messages may have crossed: the route asked for last may be open at the peer, for another server perhaps.
         actions = self._release(peer, remote, reason)
         another_way = remote.origin is not None and self.ways.remove(peer, remote.origin)
-        if remote.shown:
-            remote.shown = False
+        was_shown, remote.shown = remote.shown, False
+        if was_shown:
+            del self._shown[remote.name]
             actions.append(Withdraw(peer, remote.name, remote.node, reason))
             known.nodes.hide(remote.node)
         claims = self._claims.get(remote.name, {})
         if claims.get(peer) is remote:
             del claims[peer]
-            if claims:
-                actions += self._choose(remote.name)
-            else:
+            if not claims:
                 del self._claims[remote.name]
+            elif was_shown:
+                actions += self._choose(remote.name)
         if remote.origin is not None and another_way:
             actions += self._choose_of({remote.origin.instance})
         return actions + self._next_in(known)
@@ -412,20 +424,48 @@ class ServiceImports:
         if name != remote.name or (claimed is None and is_crossing_name(name)):
             actions = self._remove(number, wire, "a rule has another name for it now")
             return actions + self._offer(number, known, ServiceOffer(wire, remote.node, remote.origin))
-        return [] if again or claimed is not remote else self._choose(name)
+        if again or claimed is not remote or next(iter(self._claims[name])) != number:
+            return []  # the first claim to a name stands for all of them
+        return self._choose(name)
+
+    def _claim(self, service: str, number: int, remote: RemoteService) -> list[ImportAction]:
+        """Choose after one more claim to a name; the others are not judged again if the one that is shown stays.
+
+        Modules of one kind have the same names, so a name may have as many claims as there are modules.
+        """
+        first, local = self._shown.get(service), self._local.get(service)
+        claims = self._claims[service]
+        objection = self._objection(service, number, remote)
+        if local is not None:
+            remote.hidden = self._own_first(local)
+        elif first is not None and self._preference(first, claims[first]) < self._preference(number, remote):
+            remote.hidden = self._outranked(first)
+        elif objection is not None:
+            remote.hidden = objection
+        else:
+            return self._choose(service)
+        return []
+
+    @staticmethod
+    def _own_first(local: str) -> str:
+        return f"{local} of this module provides it itself"
+
+    def _outranked(self, first: int) -> str:
+        return f"{self._peers[first].name} provides it too, and is shown: its GUID is lower"
 
     def _choose(self, service: str) -> list[ImportAction]:
         """Choose the one service of this name that is shown, and hide those of the other peers."""
         claims = self._claims[service]
         local = self._local.get(service)
-        seen: str | None = f"{local} of this module provides it itself" if local is not None else None
+        seen: str | None = self._own_first(local) if local is not None else None
         new: tuple[int, RemoteService] | None = None
         left: list[_ServiceImportPeer] = []
         actions: list[ImportAction] = []
         for number in sorted(claims, key=lambda number: self._preference(number, claims[number])):
             remote = claims[number]
             nodes = self._peers[number].nodes
-            objection = self._objection(service, number, remote)
+            # Judged only where it matters: a thousand modules may have this name.
+            objection = self._objection(service, number, remote) if seen is None or remote.shown else None
             hidden = seen or objection
             nodes.leave(remote.node, service)
             if hidden is None and not nodes.free(remote.node):
@@ -433,7 +473,7 @@ class ServiceImports:
                 hidden = f"{self._peers[number].name} has more nodes than limits.nodes = {nodes.limit} of this module"
             if hidden is None:
                 new = (number, remote)
-                seen = f"{self._peers[number].name} provides it too, and is shown: its GUID is lower"
+                seen = self._outranked(number)
             elif remote.shown:
                 actions += self._hide(number, remote, hidden)
                 left.append(self._peers[number])
@@ -442,6 +482,7 @@ class ServiceImports:
         if new is not None and not new[1].shown:
             number, remote = new
             remote.shown, remote.hidden = True, ""
+            self._shown[service] = number
             self._peers[number].nodes.show(remote.node)
             actions.append(Provide(number, service, remote.node))
         # Only now: the services that this chooses could take the place that was found free above.
@@ -475,6 +516,8 @@ class ServiceImports:
     def _hide(self, number: int, remote: RemoteService, reason: str) -> list[ImportAction]:
         actions = self._release(number, remote, reason)
         remote.shown = False
+        if self._shown.get(remote.name) == number:
+            del self._shown[remote.name]
         self._peers[number].nodes.hide(remote.node)
         return [*actions, Withdraw(number, remote.name, remote.node, reason)]
 
@@ -568,3 +611,7 @@ class ServiceImports:
         if state not in TRANSITIONS[remote.state]:
             raise LocalProtocolError(f"{remote.wire}: {remote.state.name} does not lead to {state.name}")
         remote.state = state
+
+
+def _offers(known: _ServiceImportPeer) -> list[ServiceOffer]:
+    return [ServiceOffer(wire, remote.node, remote.origin) for wire, remote in known.entries.items()]

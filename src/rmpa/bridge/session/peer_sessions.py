@@ -100,8 +100,14 @@ class PeerSessions:
 
     # --- links ---------------------------------------------------------------------------------------------------
 
-    def link_up(self, link: PeerLink) -> None:
-        """Attach a link to the session that waits for it, or begin a session."""
+    def link_up(self, link: PeerLink, *, compares: bool = False, held: bytes = b"") -> None:
+        """Attach a link to the session that waits for it, or begin a session.
+
+        Args:
+            link: The link.
+            compares: Whether the peer compares catalogues by their digests.
+            held: What the peer's hello says that it holds of this module's offers.
+        """
         session = self._waiting_for(link)
         if session is not None:
             session.unparked = session.state in (PeerState.PARKED, PeerState.WANTED)
@@ -111,7 +117,7 @@ class PeerSessions:
             session = self._begin(link)
         session.time.resumed_at = lambda: link.resumed_at
         self._by_link[link] = session
-        self.offers.link_up(session)
+        self.offers.link_up(session, compares=compares, held=held)
         self._receiver.link_up(link, session.peer, session.handlers)
         for part in self._parts:
             part.link_up(session)
@@ -132,14 +138,18 @@ class PeerSessions:
         return session
 
     def _waiting_for(self, link: PeerLink) -> PeerSession | None:
-        """The waiting session of this run of the peer, if there is one; ends that of an earlier run."""
-        for session in self:
-            if session.linked:
-                continue
+        """The waiting session of this run of the peer, if there is one; else ends that of an earlier run."""
+        waiting = [session for session in self if not session.linked]
+        for session in waiting:
             if session.link.identity.is_same_run(link.identity):
                 return session
+        for session in waiting:
             if session.link.identity.is_same_module(link.identity, secured=self._gate.on):
+                unsure = session.state is PeerState.PARKED
                 self._end(session)
+                if unsure:
+                    # Two modules may have one name by mistake: this one is dialled, and shown again if it answers.
+                    self.on_want(session.link.guid)
         return None
 
     def link_down(self, link: PeerLink) -> None:

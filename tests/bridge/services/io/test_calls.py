@@ -7,7 +7,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rmpa.bridge import limits
@@ -18,6 +18,7 @@ from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST, Outbox, QueuedMessage
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros import limits as ros_limits
+from rmpa.ros.wire.services import ServiceDescription
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.runtime.buffers import Buffer
 
+DESCRIPTION = ServiceDescription("a/Add", "6a2e34150c00229791cc89ff309fff21")
 SMALL = b"x" * 100
 MIDDLE = bytes(range(256)) * 64
 LARGE = bytes(range(251)) * 4000
@@ -153,7 +155,7 @@ class Ends:
         self.pool = Pool()
         self.stats, self.served = CallStats(), CallStats()
         self.budgets, self.budgets_there = Budgets(), Budgets()
-        self.caller = Caller(self.there, 2, "service [/add] of base", self.budgets, self.stats)
+        self.caller = Caller(self.there, 2, "service [/add] of base", self.budgets, self.stats, DESCRIPTION)
         self.server = Server(self.back, 1, cast("ServicePool", self.pool), 7.0, self.budgets_there, self.served)
         self.there.takers[2] = self.server
         self.back.takers[1] = self.caller
@@ -295,6 +297,7 @@ async def test_a_slow_link_holds_up_only_what_is_larger_than_it_takes() -> None:
 
 
 @given(st.lists(st.sampled_from([0, 1, 8191, 8192, 8193, 131067, 131068, 131069, 300_000]), max_size=6))
+@settings(deadline=None)
 def test_bodies_arrive_whole_and_once(sizes: list[int]) -> None:
     async def run() -> None:
         wire, kept = Wire(), Kept()

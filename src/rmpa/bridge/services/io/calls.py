@@ -12,8 +12,10 @@ from rmpa.bridge.services.io.bodies import BodyReceiver, BodySender, Budget
 from rmpa.core.serial_number import SERIAL_MASK
 from rmpa.core.stats import SampleRing
 from rmpa.mesh import limits as mesh_limits
+from rmpa.ros.wire.services import ServiceDescription
 
 if TYPE_CHECKING:
+    from rmpa.bridge.services.exports import ServiceAbout
     from rmpa.bridge.services.io.bodies import BodyLink
     from rmpa.bridge.services.io.connection_pool import ServicePool
     from rmpa.ros.node.service_server import ServiceCall
@@ -24,6 +26,11 @@ _FAILED: Final = b"\x00"
 _RECENT: Final = 64
 """How many of the latest replies by the bulk lane are reported as lost if its connection is lost. Replies leave
 within a link's lease, so only the latest can be lost."""
+
+
+def description_of(about: ServiceAbout) -> ServiceDescription:
+    """The types that a peer tells of its service, as clients get them."""
+    return ServiceDescription(about.type, about.md5, about.request_type, about.response_type)
 
 
 def _text(body: Buffer) -> str:
@@ -70,10 +77,20 @@ class Caller(BodyReceiver):
         what: The service and its peer, for texts.
         budgets: The budgets of the peer's link.
         stats: The counts of the service.
+        description: Its types, as its server told them when it was opened.
     """
 
-    def __init__(self, link: BodyLink, requests: int, what: str, budgets: Budgets, stats: CallStats) -> None:
+    def __init__(
+        self,
+        link: BodyLink,
+        requests: int,
+        what: str,
+        budgets: Budgets,
+        stats: CallStats,
+        description: ServiceDescription,
+    ) -> None:
         super().__init__(budgets.incoming)
+        self.description: Final = description
         self._sender = BodySender(link, requests)
         self._what = what
         self._outgoing = budgets.outgoing

@@ -21,6 +21,7 @@ from rmpa.bridge.messages import (
     CloseService,
     OpenService,
     ServiceClosed,
+    ServiceOffer,
     ServiceOpened,
     Source,
 )
@@ -28,7 +29,7 @@ from rmpa.bridge.naming import Names
 from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.policy import Policy, is_own
 from rmpa.bridge.relay import service_place
-from rmpa.bridge.services.exports import ExportAction, LocalService, ServiceAbout, ServiceExports
+from rmpa.bridge.services.exports import ExportAction, LocalService, ServiceExports
 from rmpa.bridge.services.imports import (
     EndedService,
     ForgetAbout,
@@ -38,7 +39,7 @@ from rmpa.bridge.services.imports import (
     ServiceImports,
     Withdraw,
 )
-from rmpa.bridge.services.io.calls import Budgets, Caller, CallStats
+from rmpa.bridge.services.io.calls import Budgets, Caller, CallStats, description_of
 from rmpa.bridge.services.io.direct_exporter import DirectServiceExporter
 from rmpa.bridge.services.io.direct_importer import DirectServiceImporter
 from rmpa.bridge.services.io.serving import Serving
@@ -52,7 +53,6 @@ from rmpa.bridge.session.unchanged_graph import UnchangedGraph
 from rmpa.core.counters import RefusalLog
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
-from rmpa.ros.wire.services import ServiceDescription
 from rmpa.ros.wire.tcpros import printable
 from rmpa.runtime.event_loop import yielding_to_data
 
@@ -68,6 +68,7 @@ if TYPE_CHECKING:
     from rmpa.core.counters import Counters
     from rmpa.ros.core.api import Core
     from rmpa.ros.node.slave_node import SlaveNode
+    from rmpa.ros.wire.services import ServiceDescription
 
 _log = logging.getLogger(__name__)
 
@@ -179,7 +180,7 @@ class Services(Part):
             gate=gate,
         )
         """Direct calls of local nodes to peers' servers."""
-        sessions.offers.count(lambda: self.exports.changes, lambda: self.exports.pending)
+        sessions.offers.add(self)
         rpc.on_notification(_MISMATCH, self._told_of_mismatch)
 
     def __iter__(self) -> Iterator[ShownService]:
@@ -250,7 +251,8 @@ class Services(Part):
         instance = link.identity.instance.hex()
         self.imports.ways.instance = self._relay.instance
         self._act(self.imports.link_up(peer, link.name, link.guid.value, instance))
-        self._act(self.exports.link_up(peer, link.name, instance))
+        held = session.held_there.services if session.held_there is not None else None
+        self._act(self.exports.link_up(peer, link.name, instance, held))
         for shown in [one for one in self._shown.values() if one.peer == peer and (one.waiting or one.asking)]:
             self._want(shown)
         self.direct_imports.link_up(session)
@@ -287,6 +289,33 @@ class Services(Part):
         self._act(self.imports.unlinked(session.peer))
         self._budgets.pop(session.peer, None)
         self._driver.gone(session)
+
+    @property
+    def changes(self) -> int:
+        """The number of changes of what is offered to any peer."""
+        return self.exports.changes
+
+    @property
+    def pending(self) -> bool:
+        """Whether a linked peer was not told all changes."""
+        return self.exports.pending
+
+    def told_digest(self, session: PeerSession) -> int | None:
+        """The digest of the services that a linked peer was told."""
+        return self.exports.digest(session.peer)
+
+    def held_offers(self, session: PeerSession) -> list[ServiceOffer] | None:
+        """The services that a peer offers, as they were received."""
+        return self.imports.held(session.peer)
+
+    def waits(self, session: PeerSession) -> bool:
+        """Whether an advertisement of a peer is not applied yet."""
+        return self._driver.waits(session)
+
+    def tell_again(self, session: PeerSession) -> None:
+        """Begin the advertisement to a linked peer once more."""
+        self._act(self.exports.again(session.peer))
+        self._driver.schedule()
 
     def advertised(self, session: PeerSession, payload: bytes) -> None:
         """Queue an advertisement of a peer's services."""
@@ -487,7 +516,11 @@ class Services(Part):
     async def _describe(self, shown: ShownService) -> ServiceDescription | str:
         remote = self.imports.get(shown.peer, shown.service)
         if remote is not None and remote.about is not None:
-            return _description(remote.about)
+            return description_of(remote.about)
+        if shown.caller is not None:  # its offer has come again since it was opened: the server may be another one
+            if shown.caller.active:
+                return shown.caller.description
+            self._act(self.imports.release(shown.peer, shown.service, "its type is asked for again"))
         answer: asyncio.Future[ServiceDescription | str] = asyncio.get_running_loop().create_future()
         shown.asking.append(answer)
         self._want(shown)
@@ -512,10 +545,10 @@ class Services(Part):
         if shown is None or session is None or not session.linked:
             return
         what = f"service [{shown.service}] of {shown.peer_name}"
-        caller = shown.caller = Caller(session.link, action.requests, what, self._budgets[action.peer], shown.stats)
+        description, budgets = description_of(action.about), self._budgets[action.peer]
+        caller = shown.caller = Caller(session.link, action.requests, what, budgets, shown.stats, description)
         session.handlers[action.route] = caller
         self._callers[action.peer, action.route] = shown
-        description = _description(action.about)
         asking, shown.asking = shown.asking, []
         for future in asking:
             if not future.done():
@@ -533,7 +566,8 @@ class Services(Part):
             caller, shown.caller = shown.caller, None
             caller.close(action.reason)
         shown = self._shown.get((action.peer, action.service))
-        if shown is not None and shown.caller is None:
+        parked = session is not None and session.state is PeerState.PARKED
+        if shown is not None and shown.caller is None and not parked:  # the next link opens it for calls that wait
             self._fail_waiting(shown, f"service [{shown.service}] of {shown.peer_name}: {action.reason}")
 
     def _fail_waiting(self, shown: ShownService, text: str) -> None:
@@ -562,7 +596,3 @@ class Services(Part):
     def _told_of_mismatch(self, session: PeerSession, args: dict[str, Any]) -> None:
         text = printable(str(args.get("text", ""))[: limits.CONTROL_TEXT_MAX])
         self._driver.warn("service.mismatch_remote", session.link.name, f"{session.link.name}: {text}")
-
-
-def _description(about: ServiceAbout) -> ServiceDescription:
-    return ServiceDescription(about.type, about.md5, about.request_type, about.response_type)

@@ -24,6 +24,7 @@ from rmpa.bridge.messages import (
     RouteClosed,
     RouteOpened,
     Source,
+    TopicOffer,
 )
 from rmpa.bridge.naming import Names
 from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
@@ -244,7 +245,8 @@ class Topics(Part):
         self.imports.ways.instance = self._relay.instance
         linked = LinkedPeer(identity.name, identity.instance.hex(), identity.guid)
         self._act(self.imports.link_up(peer, identity.name, linked))
-        self._act(self.exports.link_up(peer, identity.name, linked.instance))
+        held = session.held_there.topics if session.held_there is not None else None
+        self._act(self.exports.link_up(peer, identity.name, linked.instance, held))
         self.direct_imports.link_up(session)
         self.direct_exports.link_up(session)
         self._told()
@@ -346,6 +348,35 @@ class Topics(Part):
             if flow.contract.priority is not Priority.HIGH:
                 flow.torn()
         self.outbound.lane_lost(session.peer)
+
+    # --- both sides' catalogues (SharedCatalogue) ----------------------------------------------------------------
+
+    @property
+    def changes(self) -> int:
+        """Counts the changes of what is offered to any peer."""
+        return self.exports.changes
+
+    @property
+    def pending(self) -> bool:
+        """Whether a linked peer was not told all changes."""
+        return self.exports.pending
+
+    def told_digest(self, session: PeerSession) -> int | None:
+        """The digest of the topics that a linked peer was told."""
+        return self.exports.digest(session.peer)
+
+    def held_offers(self, session: PeerSession) -> list[TopicOffer] | None:
+        """The topics that a peer offers, as they were received."""
+        return self.imports.held(session.peer)
+
+    def waits(self, session: PeerSession) -> bool:
+        """Whether an advertisement of a peer is not applied yet."""
+        return self._driver.waits(session)
+
+    def tell_again(self, session: PeerSession) -> None:
+        """Begins the advertisement to a linked peer once more."""
+        self._act(self.exports.again(session.peer))
+        self._driver.schedule()
 
     # --- messages ----------------------------------------------------------------------------------------------
 
