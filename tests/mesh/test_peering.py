@@ -211,7 +211,7 @@ def test_a_new_instance_replaces_its_ghost() -> None:
 def test_new_instance_links_before_its_beacon() -> None:
     low = of(LOW, alive=False)
     low.link_up(1, HIGH, 0.0, dialled=False)
-    assert low.judge(Hello.of(AGAIN, lease=1.0, expected=None)) is None
+    assert low.judge(Hello.of(AGAIN, lease=1.0, expected=None), 1.0) is None
     low.link_up(2, AGAIN, 1.0, dialled=False)
     assert low.take()[1:] == [
         CloseLink(1, "the peer restarted"),
@@ -223,7 +223,7 @@ def test_new_instance_links_before_its_beacon() -> None:
 def test_two_live_instances_with_one_address_are_refused() -> None:
     low = of(LOW, alive=True)
     low.link_up(1, HIGH, 0.0, dialled=False)
-    verdict = low.judge(Hello.of(AGAIN, lease=1.0, expected=None))
+    verdict = low.judge(Hello.of(AGAIN, lease=1.0, expected=None), 1.0)
     assert verdict is not None
     assert verdict.code == Refusal.DUPLICATE
 
@@ -231,7 +231,7 @@ def test_two_live_instances_with_one_address_are_refused() -> None:
 def test_of_one_direction_the_newer_stays() -> None:
     low = of(LOW)
     low.link_up(1, HIGH, 0.0, dialled=False)
-    assert low.judge(Hello.of(HIGH, lease=1.0, expected=None)) is None
+    assert low.judge(Hello.of(HIGH, lease=1.0, expected=None), 1.0) is None
     low.link_up(2, HIGH, 1.0, dialled=False)
     reason = "replaced by a newer link"
     assert low.take() == [
@@ -287,7 +287,7 @@ class Crossing:
         if isinstance(what, Refuse):
             peering.dial_refused(theirs.guid, what, 0.0)
         elif what == "hello":
-            verdict = peering.judge(Hello.of(theirs, lease=1.0, expected=self.who[me].guid))
+            verdict = peering.judge(Hello.of(theirs, lease=1.0, expected=self.who[me].guid), 0.0)
             self.send(link, other, verdict if verdict is not None else "welcome")
             if verdict is None:
                 peering.link_up(link, theirs, 0.0, dialled=False)

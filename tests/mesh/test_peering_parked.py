@@ -8,6 +8,7 @@ from ipaddress import IPv4Address
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.mesh import limits
+from rmpa.mesh.handshake import Hello, Refusal, Refuse
 from rmpa.mesh.peering import Peering
 from rmpa.mesh.peering_events import CloseLink, Dial, LinkDown, LinkDownCause, LinkUp, PeeringOutput
 from tests.mesh.worlds import HIGH, LOW
@@ -50,6 +51,8 @@ def test_both_sides_dial_a_parked_peer_at_once_when_something_needs_it() -> None
         assert dials(peering.take()) == [peer.guid.endpoint]
         peering.want(peer.guid, 30.1)
         assert peering.take() == [], "one dial is enough"
+        (status,) = peering.peers()
+        assert (status.state, status.since) == ("dialling", 30.0)
         peering.link_up(2, peer, 30.2, dialled=True)
         assert peering.take() == [LinkUp(2, peer)]
         assert peering.peers()[0].state == "linked"
@@ -68,6 +71,92 @@ def test_a_dial_of_both_sides_at_once_leaves_one_link() -> None:
         closed = [each.link_id for each in outputs if isinstance(each, CloseLink)]
         assert kept[-1] == 3, "the one that the lower GUID dialled"
         assert closed == [2]
+
+
+class Crossing:
+    """Both sides want each other's parked link at once; what is on its way is delivered in the order of a test.
+
+    Link 1 is dialled by the lower GUID, link 2 by the higher one. What one side sends on one connection stays in
+    order, as TCP keeps it.
+    """
+
+    def __init__(self) -> None:
+        self.sides = {"low": parked(LOW, HIGH), "high": parked(HIGH, LOW)}
+        self.who = {"low": LOW, "high": HIGH}
+        self.wires: dict[tuple[int, str], list[Refuse | str]] = {(1, "low"): ["opened"], (2, "high"): ["opened"]}
+        self.ups: dict[str, list[int]] = {"low": [], "high": []}
+        for me, other in (("low", HIGH), ("high", LOW)):
+            self.sides[me].want(other.guid, 30.0)
+            assert dials(self.sides[me].take())
+
+    def choices(self) -> list[tuple[int, str]]:
+        return sorted(wire for wire, queue in self.wires.items() if queue)
+
+    def deliver(self, wire: tuple[int, str]) -> None:
+        """Deliver the next event of a connection at one side."""
+        (link, me), what = wire, self.wires[wire].pop(0)
+        peering, other = self.sides[me], "low" if me == "high" else "high"
+        theirs = self.who[other]
+        if isinstance(what, Refuse):
+            assert what.code == Refusal.ALREADY_LINKED
+            peering.dial_refused(theirs.guid, what, 30.0)
+        elif what == "opened":
+            if peering.dial_opened(theirs.guid, 30.0):
+                self.send(link, other, "hello")
+        elif what == "hello":
+            refuse = peering.judge(Hello.of(theirs, lease=1.0, expected=self.who[me].guid), 30.0)
+            self.send(link, other, refuse or "welcome")
+            if refuse is None:
+                peering.link_up(link, theirs, 30.0, dialled=False)
+        else:
+            peering.link_up(link, theirs, 30.0, dialled=True, endpoint=theirs.guid.endpoint)
+        for output in peering.take():
+            assert isinstance(output, LinkUp), "no link is replaced"
+            self.ups[me].append(output.link_id)
+
+    def send(self, link: int, to: str, what: Refuse | str) -> None:
+        self.wires.setdefault((link, to), []).append(what)
+
+
+def test_dials_that_cross_make_one_link_that_is_never_replaced_in_any_order() -> None:
+    """What is sent over the first link, such as a service call, would be lost with it."""
+    todo: list[list[tuple[int, str]]] = [[]]
+    ends = set()
+    while todo:
+        path = todo.pop()
+        world = Crossing()
+        for wire in path:
+            world.deliver(wire)
+        choices = world.choices()
+        todo.extend([*path, choice] for choice in choices)
+        if not choices:
+            assert world.ups["low"] == world.ups["high"], path
+            ends.add(tuple(world.ups["low"]))
+            assert all(peering.next_timer() is None for peering in world.sides.values()), "nothing is dialled again"
+    assert ends == {(1,), (2,)}, "whichever side was first"
+
+
+def test_a_hello_without_an_answer_does_not_keep_the_peers_dial_away() -> None:
+    hello = Hello.of(HIGH, lease=1.0, expected=LOW.guid)
+    low = parked(LOW, HIGH)
+    low.want(HIGH.guid, 30.0)
+    assert low.dial_opened(HIGH.guid, 30.0)
+    assert low.judge(hello, 30.0) is not None
+    assert low.judge(replace_instance(hello), 30.0) is None, "another run of the peer"
+    assert low.judge(hello, 30.0 + limits.CROSSING_TIME) is None
+    low.dial_failed(HIGH.guid, "no answer", 30.1)
+    assert low.judge(hello, 30.2) is None
+
+
+def test_the_dial_of_a_peer_that_was_never_linked_is_accepted_beside_ones_own() -> None:
+    low = Peering(LOW, rng=lambda: 0.5, alive=lambda _: True)
+    low.peer_found(HIGH, 0.0)
+    assert low.dial_opened(HIGH.guid, 0.1)
+    assert low.judge(Hello.of(HIGH, lease=1.0, expected=LOW.guid), 0.1) is None
+
+
+def replace_instance(hello: Hello) -> Hello:
+    return replace(hello, instance=AGAIN.instance)
 
 
 def test_a_wanted_peer_that_does_not_answer_is_dialled_again() -> None:

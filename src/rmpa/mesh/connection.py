@@ -145,6 +145,7 @@ class ConnectionProtocol:
         lease: Seconds after which the silence of this side means that it is dead.
         label: For log lines, until the remote side's name is known.
         prove: Judges whether the remote side is the module that its hello or welcome says; ``None`` accepts it.
+        held: ``(guid)``: what this side holds of a peer's offers, for the hello or welcome of an express lane.
     """
 
     def __init__(
@@ -162,6 +163,7 @@ class ConnectionProtocol:
         lease: float = limits.EXPRESS_LEASE,
         label: str = "?",
         prove: Callable[[Hello], Refuse | None] | None = None,
+        held: Callable[[Guid], bytes] = lambda _: b"",
     ) -> None:
         self.role = role
         self.clock = RemoteClock()
@@ -172,6 +174,7 @@ class ConnectionProtocol:
         self.on_data = on_data
         self.on_part = on_part if on_part is not None else _no_parts
         self._ours = ours
+        self._held = held
         self._wall_ns = wall_ns
         self._missing = 0
         """Bytes that are still missing of a data frame whose first bytes were handed on."""
@@ -187,7 +190,8 @@ class ConnectionProtocol:
         self._reason = ""
         self._output = bytearray()
         if role is ConnectionRole.DIALLER:
-            hello = Hello.of(ours, lease=lease, expected=expected, lane=lane)
+            held_now = held(expected) if expected is not None and lane is Lane.EXPRESS else b""
+            hello = Hello.of(ours, lease=lease, expected=expected, lane=lane, held=held_now)
             self._send(Frame(FrameKind.HELLO, hello.serialize()))
 
     @property
@@ -272,7 +276,9 @@ class ConnectionProtocol:
         hello = self._unanswered()
         if hello.lane == Lane.BULK:
             self._keepalive.promise(limits.BULK_LEASE)
-        welcome = Hello.of(self._ours, lease=self._keepalive.lease, expected=hello.guid, lane=hello.lane)
+        held = self._held(hello.guid) if hello.lane == Lane.EXPRESS else b""
+        lease = self._keepalive.lease
+        welcome = Hello.of(self._ours, lease=lease, expected=hello.guid, lane=hello.lane, held=held)
         self._send(Frame(FrameKind.WELCOME, welcome.serialize()))
         self._open(hello, now)
 
@@ -341,7 +347,7 @@ class ConnectionProtocol:
         keepalive.needed, keepalive.parks = needed, parks
         self._parting.changed(now)
         if (self._parting.holding or keepalive.agree()) and needed:
-            keepalive.ask(now, max(limits.WAKE_TIMEOUT, 3 * (self.clock.rtt or 0.0)))
+            keepalive.wake(now, max(limits.WAKE_TIMEOUT, 3 * (self.clock.rtt or 0.0)))
         if not self._parting.holding:
             self._send_pace(now)
 
@@ -357,8 +363,11 @@ class ConnectionProtocol:
 
     @property
     def holding(self) -> bool:
-        """Whether this side has agreed to part, and sends nothing until ``Parted`` or ``PartingEnded``."""
-        return self._state is ConnectionState.UP and self._parting.holding
+        """Whether this side has agreed to part, and sends nothing until ``Parted`` or ``PartingEnded``.
+
+        It stays true if the connection ends before either.
+        """
+        return self._parting.holding
 
     @property
     def quiet_after(self) -> float:

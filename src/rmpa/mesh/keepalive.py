@@ -29,7 +29,6 @@ class Keepalive:
 
     __slots__ = (
         "_acceptor",
-        "_asked",
         "_before",
         "_burst",
         "_excused",
@@ -41,6 +40,7 @@ class Keepalive:
         "_short",
         "_up_at",
         "_within",
+        "_woken",
         "heard",
         "lease",
         "needed",
@@ -67,7 +67,7 @@ class Keepalive:
         self._excused = self._excused_at = 0.0
         self._burst = 0
         """Pings that still follow each other closely."""
-        self._asked: float | None = None
+        self._woken: float | None = None
         """When this side began to need a link at rest, while the remote side's promise has not come."""
         self._within = self._before = 0.0
         """Seconds that it has from then on, and those that were excused before."""
@@ -93,9 +93,9 @@ class Keepalive:
             self._burst = limits.WAKE_PINGS  # the estimate of the remote clock is as old as the rest
         return self.lease != before
 
-    def ask(self, now: float, within: float) -> None:
-        """This side needs the short lease of a remote side that rests, which has to answer ``within`` seconds."""
-        self._asked, self._within, self._before = now, within, self.excused
+    def wake(self, now: float, within: float) -> None:
+        """Begin to need a link at rest: the remote side has to send its pace frame within ``within`` seconds."""
+        self._woken, self._within, self._before = now, within, self.excused
 
     def remote_pace(self, lease: float, now: float, flags: int) -> None:
         """The remote side promises ``lease`` seconds from now on; ``flags`` are bits of ``PaceFlag``."""
@@ -103,7 +103,7 @@ class Keepalive:
         self.remote_needs = bool(flags & PaceFlag.NEEDED)
         self.remote_parks = bool(flags & PaceFlag.PARKS)
         self.heard = now
-        self._asked = None
+        self._woken = None
 
     @property
     def flags(self) -> PaceFlag:
@@ -117,8 +117,11 @@ class Keepalive:
 
     @property
     def quiet_after(self) -> float:
-        """Seconds without bytes, at the present pace, after which the remote side is worth a check."""
-        if self._asked is not None:
+        """Seconds without bytes, at the present pace, after which the remote side may be gone.
+
+        Then its link does not prevent a link to a new run at its address.
+        """
+        if self._woken is not None:
             return limits.GHOST_QUIET
         return max(limits.GHOST_QUIET, self._remote_lease * limits.GHOST_QUIET / limits.EXPRESS_LEASE)
 
@@ -156,8 +159,8 @@ class Keepalive:
     def lease_end(self) -> float:
         """When the silence of the remote side ends the connection."""
         end = self.heard + max(self._remote_lease, self.awaited_lease) + self.excused
-        if self._asked is not None:
-            asked = max(self._asked, self.heard) + max(0.0, self.excused - self._before)
+        if self._woken is not None:
+            asked = max(self._woken, self.heard) + max(0.0, self.excused - self._before)
             end = min(end, asked + self._within)
         return end
 
@@ -168,7 +171,7 @@ class Keepalive:
         After the acceptor's welcome a whole round trip passes before the dialler's first byte arrives, and this time
         still belongs to the handshake. With the lease alone, a path with a longer round trip could not carry a link.
         """
-        if self._asked is not None:
+        if self._woken is not None:
             return min(self._within, self._remote_lease)
         if self._acceptor and self.heard <= self._up_at:
             return max(self._remote_lease, limits.HANDSHAKE_TIMEOUT)

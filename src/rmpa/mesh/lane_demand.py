@@ -1,14 +1,15 @@
 """When the bulk lane of a link has a connection: it is dialled when a message first wants it, and ends unused.
 
 Sans-I/O; one machine for each side of a link. Only the side that dialled the link dials its bulk lane; the other side
-asks for it. Three words, on the express lane, keep messages from being lost at the end of the lane::
+asks for it. Three words (``LaneWord``), in lane frames on the express lane, keep messages from being lost at the end
+of the lane::
 
     ABSENT ──want, or the other side's WANT──► WANTED ──connected──► UP ◄──────────┐
       ▲                                          ▲                   │ unused      │ KEEP
       │                                          └── lost ───────────┤ LEAVE sent  │
       └──────────── the acceptor's bye ◄──────────────────────── LEAVING ──────────┘
 
-The dialler stops to send, and says LEAVE. The acceptor ends the connection if it has nothing on the way; otherwise it
+The dialler stops sending, and says LEAVE. The acceptor ends the connection if it has nothing on the way; otherwise it
 answers KEEP. So neither side sends on a connection that the other side is about to end.
 
 A peer of an earlier release does not know these words: its lane is dialled with the link, and stays.
@@ -40,7 +41,7 @@ class LaneAction(Enum):
     DIAL = auto()
     SAY_WANT = auto()
     SAY_LEAVE = auto()
-    """Stop to send on the connection, which stays, and say LEAVE."""
+    """Send no more on the connection, which stays, and say LEAVE."""
     SAY_KEEP = auto()
     RESUME = auto()
     """Send on the connection again."""

@@ -38,6 +38,10 @@ takes one round trip and the exchange of both catalogues, so a function that is 
 WANT_GRACE: Final = 5.0
 """How long a parked peer may be dialled in vain, once something needs it, before it counts as lost: more than two
 rounds over all of its addresses (DIAL_TIMEOUT)."""
+CHECKING_DIALS_PER_SECOND: Final = 4.0
+"""Parked peers that are dialled a second because their probes are not answered: a firewall may block UDP alone."""
+CHECKING_DIALS_BURST: Final = 8
+"""Such dials at once. Where more peers fall silent they have probably failed, and dials to them would be in vain."""
 UNPARK_RATE: Final = 100.0
 """Parked peers that are dialled a second where the mesh has become small enough for all links, and where many peers
 have changed what they offer: each takes a millisecond at both sides."""
@@ -58,6 +62,9 @@ DIAL_STAGGER: Final = 0.1
 RFC 8305 allows, because robots are near each other."""
 DIAL_FALLBACK: Final = 2.0
 """The higher GUID waits this long for the lower one's dial, then dials itself (NAT, firewall)."""
+CROSSING_TIME: Final = 0.5
+"""How long the lower GUID refuses the dial of a peer to which it has sent a hello itself: more than a round trip. If
+its own hello is not answered for longer, the peer's dial is accepted."""
 BACKOFF_FIRST: Final = 0.1
 """Delay before the second attempt to dial."""
 BACKOFF_MAX: Final = 2.0

@@ -1,4 +1,6 @@
-"""How both sides of a connection agree to part for now, so that no frame of either is lost. Pure.
+"""How both sides agree to end the connection of a link that nothing needs, so that no frame of either is lost. Pure.
+
+The peer is *parked* then: both sides make the link again as soon as something needs it.
 
 ::
 
@@ -38,7 +40,7 @@ class PartingStep(Enum):
 
 
 class Parting:
-    """The agreement of one side.
+    """The agreement to end a connection for now, as one side sees it.
 
     Args:
         keepalive: Knows what both sides need, and whether they would part.
@@ -87,7 +89,7 @@ class Parting:
         return PartingStep.NOTHING
 
     def ask(self, now: float) -> bool:
-        """Whether the dialler is to ask now; at most once in a time of agreement."""
+        """Whether the dialler is to ask now; at most once while both sides stay willing."""
         since = self._willing_since
         if not self._dialler or self._asked or since is None or now - since < limits.PARK_AFTER:
             return False

@@ -20,7 +20,7 @@ from rmpa.core.clock import earliest
 from rmpa.core.timer_queue import TimerQueue
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.mesh import limits
-from rmpa.mesh.handshake import Hello, KnownLink, Refusal, Refuse, judge
+from rmpa.mesh.handshake import Hello, KnownLink, Lane, Refusal, Refuse, judge
 from rmpa.mesh.peering_events import (
     CloseLink,
     Dial,
@@ -87,6 +87,7 @@ class _Peer:
     link: _LinkInfo | None = None
     fell: float | None = None
     dialling: tuple[SocketAddress, ...] = ()
+    hello_at: float | None = None  # when the present dial sent its hello
     tried: set[SocketAddress] = field(default_factory=set)
     next_attempt: float | None = None
     forget_at: float | None = None
@@ -174,7 +175,8 @@ class Peering:
         peer = self._peers.get(guid.place)
         if peer is None or peer.link is not None or peer.dialling or peer.gone:
             return
-        peer.parked = False
+        if peer.parked:
+            peer.parked, peer.fell = False, now
         if peer.next_attempt is None or (peer.verified and not peer.refused):
             peer.backoff.reset()
             self._dial_at(peer, now)
@@ -184,19 +186,38 @@ class Peering:
         """Dial all parked peers, in ``spread`` seconds, because every peer is to be linked again."""
         for peer in self._peers.values():
             if peer.parked:
-                peer.parked = False
+                peer.parked, peer.fell = False, now
                 self._dial_at(peer, now + spread * self._rng() + (0.0 if peer.lower else limits.DIAL_FALLBACK))
 
     # --- events of the driver -------------------------------------------------------------------------------
 
-    def judge(self, hello: Hello) -> Refuse | None:
+    def judge(self, hello: Hello, now: float) -> Refuse | None:
         """Decide on a received hello; ``None`` accepts it, and the driver then calls ``link_up``."""
         peer = self._peers.get(hello.guid.place)
+        if peer is not None and hello.lane == Lane.EXPRESS and self._crosses(peer, hello, now):
+            text = "we dial each other; the link that the lower GUID dials stays"
+            return Refuse(Refusal.ALREADY_LINKED, text)
         known = []
         if peer is not None and peer.link is not None:
             link = peer.link
             known.append(KnownLink(link.identity.guid, link.identity.instance, link.dialled, self._alive(link.id)))
         return judge(hello, self._ours, known, busy=len(self._by_link) >= limits.LINKS_MAX)
+
+    def dial_opened(self, guid: Guid, now: float) -> bool:
+        """Take in that a ``Dial`` has a connection, on which the hello is sent next.
+
+        Returns:
+            Whether the connection is still wanted. If not, because the peer's own dial led to a link meanwhile, the
+            driver closes it, and this dial is over.
+        """
+        peer = self._peers.get(guid.place)
+        if peer is None or not peer.dialling:
+            return True
+        if peer.link is None:
+            peer.hello_at = now
+            return True
+        peer.dialling, peer.token_taken = (), False
+        return False
 
     def link_up(
         self, link_id: int, identity: Identity, now: float, *, dialled: bool, endpoint: SocketAddress | None = None
@@ -212,7 +233,7 @@ class Peering:
         """
         peer = self._peers.get(identity.guid.place) or self._add(identity)
         if dialled:
-            peer.dialling = ()
+            peer.dialling, peer.hello_at = (), None
             peer.good = peer.last_endpoint = endpoint
         new = _LinkInfo(link_id, identity, dialled, now)
         old = peer.link
@@ -397,6 +418,18 @@ class Peering:
         if peer.link is None and not peer.dialling:
             self._dial_at(peer, now if peer.lower else now + limits.DIAL_FALLBACK)
 
+    def _crosses(self, peer: _Peer, hello: Hello, now: float) -> bool:
+        """Whether a hello crosses that of this side, whose link stays.
+
+        The link of the hello would be replaced a round trip later, with the calls that are made over it meanwhile. An
+        unverified peer is accepted all the same: a forged beacon may lead this side's dial to an address without an
+        answer.
+        """
+        if not peer.lower or not peer.verified or peer.link is not None or peer.hello_at is None:
+            return False
+        same_run = peer.identity.instance == hello.instance
+        return same_run and now - peer.hello_at < limits.CROSSING_TIME
+
     def _keeps(self, old: _LinkInfo, new: _LinkInfo) -> bool:
         """Whether the old one of two links with one run of a peer stays.
 
@@ -430,7 +463,7 @@ class Peering:
         else:
             peer.tried.add(endpoint)
             peer.last_endpoint = endpoint
-        peer.dialling = ()
+        peer.dialling, peer.hello_at = (), None
         peer.token_taken = False
         if peer.gone:
             self._forget_if_idle(peer)

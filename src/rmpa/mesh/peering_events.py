@@ -94,7 +94,8 @@ class PeerStatus:
             was ended by agreement, and is made again when something needs the peer.
         link_id: Its link, if linked.
         lower: Whether this agent has the lower GUID of the two, and dials first.
-        since: When the link came up, or the last link fell, monotonic seconds; ``None`` before the first link.
+        since: When the link came up, or the last link fell, or a parked peer was wanted again, monotonic seconds;
+            ``None`` before the first link.
         attempts: Dials since the last link.
         last_error: Why there is no link, as far as is known; for a linked peer, why its previous link ended.
         next_attempt: When it is dialled next, monotonic seconds.

@@ -73,6 +73,10 @@ class ConnectionOwner(Protocol):
         """Compare the hello or welcome of a secured connection with its certificate; ``None`` accepts it."""
         ...
 
+    def connection_held(self, guid: Guid) -> bytes:
+        """What this agent holds of a peer's offers, for the hello or welcome to it."""
+        ...
+
     def connection_opened(self, connection: Connection) -> None:
         """The handshake succeeded."""
         ...
@@ -204,6 +208,7 @@ class Connection:
             lease=limits.BULK_LEASE if lane is Lane.BULK else limits.EXPRESS_LEASE,
             label=f"{endpoint[0]}:{endpoint[1]}",
             prove=None if secured is None else partial(owner.connection_prove, self),
+            held=owner.connection_held,
         )
         self._timer = MachineTimer(self._machine.next_timer, self._due, now=clock.now)
         self._send_output()
@@ -292,6 +297,11 @@ class Connection:
         if self._machine.has_output:
             self._send_output()
             self._timer.arm()
+
+    @property
+    def holding(self) -> bool:
+        """Whether this side has agreed to part, so that control frames are held back; see ``ConnectionProtocol``."""
+        return self._machine.holding
 
     @property
     def rests(self) -> bool:

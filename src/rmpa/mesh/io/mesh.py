@@ -84,6 +84,7 @@ class Mesh:
         dialler: Opens the connections; by default real ones.
         security: This module's membership of a secured mesh: all links use TLS then; ``None``: none does.
         on_join: Takes accepted connections for a join or a renewal, with their prefaces.
+        held: ``(guid)``: what this agent holds of a peer's offers, at most 255 bytes, for its hello to that peer.
     """
 
     def __init__(
@@ -102,8 +103,10 @@ class Mesh:
         dialler: Dialler | None = None,
         security: MeshSecurity | None = None,
         on_join: OnJoin | None = None,
+        held: Callable[[Guid], bytes] = lambda _: b"",
     ) -> None:
         self.identity = identity
+        self._held = held
         self.counters = counters if counters is not None else Counters()
         self.handlers: Final = handlers
         self._acceptor = Acceptor(listen_socket, self._accepted, name="links to peers", use=Use.LINK)
@@ -235,7 +238,7 @@ class Mesh:
 
     def connection_judge(self, connection: Connection, hello: Hello) -> Refuse | None:  # noqa: ARG002 - the protocol's form
         """Decide on a hello; the peering machine knows the links that are up."""
-        refuse = self._peering.judge(hello)
+        refuse = self._peering.judge(hello, self._clock.now())
         if refuse is None or refuse.code != Refusal.DUPLICATE:
             return refuse
         for link in self.links():
@@ -251,6 +254,10 @@ class Mesh:
             return None
         linked = [(link.identity, self._alive(link.id)) for link in self.links()]
         return prove(hello, connection.certificate, self._security, linked)
+
+    def connection_held(self, guid: Guid) -> bytes:
+        """What this agent holds of a peer's offers."""
+        return self._held(guid)
 
     def connection_opened(self, connection: Connection) -> None:
         """A handshake succeeded."""
@@ -413,9 +420,11 @@ class Mesh:
             case LinkDown():
                 _log.info("= %s: link down: %s", output.identity, output.reason)
                 replaced = output.cause is LinkDownCause.REPLACED
-                parked = output.cause is LinkDownCause.PARKED
-                self.counters.add("link.replaced" if replaced else "link.parked" if parked else "link.down")
                 down = self._links.get(output.link_id, ended)
+                # The next link of a peer that parted may be there before the bye of this one.
+                parted = replaced and down is not None and down.connection.holding
+                parked = parted or output.cause is LinkDownCause.PARKED
+                self.counters.add("link.parked" if parked else "link.replaced" if replaced else "link.down")
                 if down is not None:
                     down.parked = parked
                     down.silent = down.silent or replaced or parked
@@ -486,7 +495,10 @@ class Mesh:
             self._peering.dial_failed(dial.guid, f"{endpoint[0]}:{endpoint[1]}: {error}", self._clock.now(), endpoint)
             self._act()
         else:
-            self._open(sock, ConnectionRole.DIALLER, endpoint, dial.guid, secured=secured)
+            if self._peering.dial_opened(dial.guid, self._clock.now()):
+                self._open(sock, ConnectionRole.DIALLER, endpoint, dial.guid, secured=secured)
+            else:
+                sock.close()
 
     async def _secure_dialled(self, sock: socket.socket) -> SecuredSocket | None:
         """Do the TLS handshake of a dialled connection in a secured mesh; closes the socket if it fails."""
