@@ -23,8 +23,20 @@ from tests.observe.samples import SNAPSHOT
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator
+    from types import TracebackType
 
 DEADLINE = 30.0
+
+
+class Command(subprocess.Popen[str]):
+    """A running command; a test that fails meanwhile ends it, instead of waiting for its end."""
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is not None:
+            self.kill()
+        super().__exit__(kind, error, trace)
 
 
 @dataclass
@@ -34,8 +46,8 @@ class Place:
     path: Path
     environ: dict[str, str] = field(default_factory=dict)
 
-    def start(self, *arguments: str) -> subprocess.Popen[str]:
-        return subprocess.Popen(
+    def start(self, *arguments: str) -> Command:
+        return Command(
             [sys.executable, "-m", "rmpa.cli.main", *arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

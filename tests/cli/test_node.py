@@ -12,6 +12,7 @@ import msgspec
 import pytest
 
 from rmpa.cli.main import main
+from rmpa.cli.node_names import _untold
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.observe.snapshot import UnreachableInfo
 from rmpa.ros.environment import RosEnvironment
@@ -208,3 +209,13 @@ def test_nodes_of_peers(rmpa: Rmpa, talker: str, peer: list[dict[str, Any]]) -> 
     assert [one["killed"] for one in json.loads(out)] == [False, False]
     assert "joystick has no node /jo" in err
     assert "did you mean joystick?" in err
+
+
+def test_many_modules_that_do_not_tell_their_nodes_take_one_line() -> None:
+    parked = [PeerNodes(peer=f"arm{number}", nodes=(), problem="parked") for number in range(1000)]
+    told = [*parked, PeerNodes(peer="base", nodes=()), PeerNodes(peer="leg", nodes=(), problem="it is older")]
+    assert list(_untold(told)) == [
+        "1,000 modules (arm0, arm1, arm2, ...) do not tell their nodes, only those that stand here: parked",
+        "leg does not tell its nodes, only those that stand here: it is older",
+    ]
+    assert next(_untold(parked[:2])).startswith("arm0, arm1 do not tell")

@@ -36,14 +36,7 @@ from rmpa.observe.doctor.network import (
 from rmpa.observe.doctor.ros_environment import judge_shell
 from rmpa.observe.doctor.stale_connections import judge_stale_connections
 from rmpa.observe.health import Health, diagnostic_status
-from rmpa.observe.snapshot import (
-    EventInfo,
-    FilesInfo,
-    PeerInfo,
-    ServiceInfo,
-    Snapshot,
-    UnreachableInfo,
-)
+from rmpa.observe.snapshot import EventInfo, FilesInfo, ServiceInfo, Snapshot, UnreachableInfo
 from rmpa.ros.types.diagnostic_array import frame_array
 from tests.observe.doctor.test_firewall import IPTABLES_UFW, NFT_AGAINST, NFT_CLOSED, NFT_OPEN, NFT_OURS, PORTS
 from tests.observe.doctor.test_ros_environment import SHELL
@@ -54,6 +47,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from rmpa.observe.check import Check
+    from rmpa.observe.peer_info import PeerInfo
     from rmpa.observe.why.diagnosis import Diagnosis
 
 GOLDEN: Final = Path(__file__).with_name("golden")

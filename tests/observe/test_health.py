@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import msgspec
 import pytest
 
 from rmpa.observe import limits
 from rmpa.observe.health import HERE, Health, diagnostic_status
-from rmpa.observe.snapshot import EventInfo, FilesInfo, PeerInfo, RouteInfo, ServiceInfo, Snapshot, UnreachableInfo
+from rmpa.observe.peer_info import OffersInfo
+from rmpa.observe.snapshot import EventInfo, FilesInfo, RouteInfo, ServiceInfo, Snapshot, UnreachableInfo
 from rmpa.ros.types.diagnostic_array import DiagnosticLevel, DiagnosticStatus
 from tests.observe.samples import DIRECT, SNAPSHOT, VIEWER
+
+if TYPE_CHECKING:
+    from rmpa.observe.peer_info import PeerInfo
 
 CMD = "rmpa: joystick: /cmd"
 JOYSTICK, PC = SNAPSHOT.peers
 (ROUTE,) = SNAPSHOT.topics[0].routes
+DIFFERS = (
+    "its topics and services differ here from what it told, and are fetched again; if that lasts, restart this agent "
+    "and report it with both releases"
+)
 HEALTHY = msgspec.structs.replace(ROUTE, events={}, recent=(), contract={}, oversized=0, oversized_bytes=270_000_000)
 
 
@@ -214,8 +224,25 @@ def test_sources_of_one_topic_have_unique_names() -> None:
     [
         ({}, DiagnosticLevel.OK, "linked, round trip 0.43 ms"),
         ({"state": "linking", "link": None}, DiagnosticLevel.WARN, "linking"),
+        (
+            {"state": "parked", "link": None},
+            DiagnosticLevel.OK,
+            "parked: nothing needs it now; it is linked again when something does",
+        ),
+        (
+            {"state": "relayed", "link": None, "via": "gate"},
+            DiagnosticLevel.OK,
+            "relayed: gate passes on what it publishes",
+        ),
         ({"state": "refused", "link": None, "last_error": "another domain"}, DiagnosticLevel.ERROR, "another domain"),
         ({"state": "conflict", "link": None, "conflicts": ("one GUID",)}, DiagnosticLevel.ERROR, "one GUID"),
+        ({"offers": OffersInfo(version=3, right=True)}, DiagnosticLevel.OK, "linked, round trip 0.43 ms"),
+        ({"offers": OffersInfo(version=3, right=False)}, DiagnosticLevel.WARN, DIFFERS),
+        (
+            {"state": "parked", "link": None, "offers": OffersInfo(version=3, right=False)},
+            DiagnosticLevel.WARN,
+            DIFFERS,
+        ),
     ],
 )
 def test_levels_of_a_peer(change: dict[str, object], expected: DiagnosticLevel, text: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
+from rmpa.observe import peer_info
 from rmpa.observe import snapshot as s
 from tests.observe.samples import SNAPSHOT, VIEWER
 
@@ -28,7 +29,7 @@ def test_a_topics_peers_are_those_it_comes_from() -> None:
 
 
 def test_every_field_is_explained() -> None:
-    for struct in vars(s).values():
+    for struct in (*vars(peer_info).values(), *vars(s).values()):
         if not isinstance(struct, type) or not issubclass(struct, msgspec.Struct):
             continue
         for name in struct.__struct_fields__:

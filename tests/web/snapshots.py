@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
+from rmpa.observe.peer_info import BoundInfo, LinkInfo, PeerInfo
 from rmpa.observe.snapshot import (
     AgentInfo,
-    BoundInfo,
     EventInfo,
     FilesInfo,
     LatencyInfo,
-    LinkInfo,
-    PeerInfo,
     RouteInfo,
     SampleSpread,
     ServiceInfo,

@@ -15,7 +15,7 @@ from prometheus_client.openmetrics.parser import text_string_to_metric_families 
 from prometheus_client.parser import text_string_to_metric_families
 
 from rmpa.bridge.data.qos_events import QosEventKind
-from rmpa.observe.snapshot import Snapshot, TopicInfo
+from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo
 from rmpa.web import limits
 from rmpa.web.metrics import EVENT_KINDS, exposition, metrics
 from rmpa.web.server.figures import Figures, web_metrics
@@ -62,6 +62,8 @@ def value(name: str, labels: dict[str, str], snapshot: Snapshot | None = FULL) -
         ("rmpa_peers", {"state": "linked"}, 1),
         ("rmpa_peers", {"state": "refused"}, 0),
         ("rmpa_peer_linked", {"peer": "hand"}, 0),
+        ("rmpa_peer_link_missing", {"peer": "hand"}, 1),
+        ("rmpa_peer_link_missing", {"peer": "arm"}, 0),
         ("rmpa_peer_hidden", {"peer": "arm", "kind": "topics", "at": "here"}, 8),
         ("rmpa_link_clock_offset_seconds", {"peer": "arm"}, -0.25),
         ("rmpa_link_start_time_seconds", {"peer": "arm"}, 1_000_050.0),
@@ -127,6 +129,21 @@ def test_the_number_of_time_series_is_bounded_and_what_is_left_out_is_counted(
     assert found["rmpa_metrics_omitted", frozenset({("kind", "peer")})] == 4
     assert sum(name == "rmpa_route_messages_total" for name, _ in found) == 3
     assert found["rmpa_peers", frozenset({("state", "linked")})] == 6
+
+
+def test_what_is_used_comes_before_what_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "METRIC_ROUTES", 1)
+    monkeypatch.setattr(limits, "METRIC_PEERS", 1)
+    idle = RouteInfo(peer="a", node="/n", direction="in", state="idle", type="std_msgs/String")
+    used = msgspec.structs.replace(idle, state="open")
+    topics = (TopicInfo(name="/a", routes=(idle,)), TopicInfo(name="/b", routes=(used,)))
+    peers = (peer("a", state="parked", link=None), peer("b"))
+    found = samples(Snapshot(agent=AGENT, taken=1.0, peers=peers, topics=topics, topics_left=9, services_left=4))
+    assert [dict(labels)["topic"] for name, labels in found if name == "rmpa_route_open"] == ["/b"]
+    assert [dict(labels)["peer"] for name, labels in found if name == "rmpa_peer_linked"] == ["b"]
+    assert found["rmpa_metrics_omitted", frozenset({("kind", "route")})] == 10
+    assert found["rmpa_topics", frozenset()] == 11
+    assert found["rmpa_services", frozenset()] == 4
 
 
 def test_hostile_names_break_nothing() -> None:

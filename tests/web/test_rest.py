@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.observe.snapshot import PeerInfo, ServiceInfo, Snapshot, TopicInfo
+from rmpa.observe.peer_info import PeerInfo
+from rmpa.observe.snapshot import ServiceInfo, Snapshot, TopicInfo
 from rmpa.web import limits, rest
 from tests.web.snapshots import AGENT, FULL, SERVICE
 

@@ -41,16 +41,27 @@ class Master:
         """The error for a master that does not answer."""
         return UnreachableError("ROS master", f"{self.uri} ({self.source})", _REMEDY)
 
-    def snapshot(self, *, topics: tuple[str, ...] | None = None, figures: bool = False) -> Snapshot | None:
+    def snapshot(
+        self,
+        *,
+        topics: tuple[str, ...] | None = None,
+        services: tuple[str, ...] | bool | None = None,
+        peers: bool = True,
+        figures: bool = False,
+    ) -> Snapshot | None:
         """The snapshot of the master's agent; ``None`` without an agent, or if it does not answer.
 
         Args:
             topics: Only these topics are in it; ``None``: all, which takes the agent longer.
+            services: Only these are in it; ``True``: all; ``None``: all if all topics are in it, else none.
+            peers: Whether peers are in it.
             figures: Wait for the figures of direct connections, half a second at the first look.
         """
         if self.agent is not None:
             with contextlib.suppress(RmpaError), ControlClient(self.agent) as client:
-                return client.call("snapshot", Snapshot, topics=topics, figures=figures)
+                return client.call(
+                    "snapshot", Snapshot, topics=topics, services=services, peers=peers, figures=figures
+                )
         return None
 
 
@@ -74,14 +85,14 @@ def choose_master(master: str | None, agent: str | None, environ: Mapping[str, s
             return Master(DEFAULT_MASTER_URI, "no agent runs")
     found = choose_agent(environ, agent)
     with ControlClient(found.path) as client:
-        return Master(client.snapshot().agent.core_uri, f"the core of agent {found.name}", found.path)
+        return Master(client.agent().core_uri, f"the core of agent {found.name}", found.path)
 
 
 def _with_agent(uri: str, source: str, environ: Mapping[str, str]) -> Master:
     """A master given by its URI; with its agent if the URI is that of an agent's core."""
     for found in find_agents(environ):
         with contextlib.suppress(RmpaError), ControlClient(found.path) as client:
-            if same_core(client.snapshot().agent.core_uri, uri):
+            if same_core(client.agent().core_uri, uri):
                 return Master(uri, source, found.path)
     others = ", ".join(found.name for found in find_agents(environ))
     # The classic mistake: a shell that still points to yesterday's robot.

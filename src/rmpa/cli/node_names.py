@@ -15,7 +15,7 @@ from rmpa.ros.master.survey import lookup_calls, read_lookups
 from rmpa.ros.node_info import NodeLine, PeerNodes
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from rmpa.cli.graph import Graph
     from rmpa.cli.master import Master
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 _CALLER_ID: Final = "/rmpa_node"
+_NAMED: Final = 3
+"""Modules that one line names."""
 
 
 def read_node(text: str) -> GraphName:
@@ -56,13 +58,13 @@ async def uris_of(master: Master, names: Sequence[str]) -> dict[str, str]:
 
 def unreachable_nodes(master: Master) -> tuple[UnreachableInfo, ...]:
     """The nodes of the graph that the master's agent cannot connect to; none without an agent."""
-    snapshot = master.snapshot(topics=())
+    snapshot = master.snapshot(topics=(), peers=False)
     return snapshot.unreachable if snapshot is not None else ()
 
 
 def module_of(master: Master) -> str | None:
     """The name of the master's agent, if it has one."""
-    snapshot = master.snapshot(topics=())
+    snapshot = master.snapshot(topics=(), peers=False)
     return snapshot.agent.name if snapshot is not None else None
 
 
@@ -90,6 +92,21 @@ def ask_peer(master: Master, wanted: GraphName, what: str, kind: type[_T]) -> _T
             raise RmpaError(f"{error.reason}; {error.remedy}" if error.remedy else error.reason) from None
 
 
+def _untold(told: Iterable[PeerNodes]) -> Iterator[str]:
+    """Which modules do not tell their nodes, one line for all with the same reason: many modules may be parked."""
+    reasons: dict[str, list[str]] = {}
+    for one in told:
+        if one.problem:
+            reasons.setdefault(one.problem, []).append(one.peer)
+    for reason, peers in reasons.items():
+        first = ", ".join(peers[:_NAMED])
+        if len(peers) == 1:
+            yield f"{first} does not tell its nodes, only those that stand here: {reason}"
+        else:
+            names = f"{len(peers):,} modules ({first}, ...)" if len(peers) > _NAMED else first
+            yield f"{names} do not tell their nodes, only those that stand here: {reason}"
+
+
 def peers_nodes(master: Master, graph: Graph, peer: str | None) -> list[tuple[str | None, NodeLine]]:
     """The nodes of all peers, or of one; of those that no link leads to only those that have a proxy here.
 
@@ -109,9 +126,8 @@ def peers_nodes(master: Master, graph: Graph, peer: str | None) -> list[tuple[st
             if peer is None or not shown:
                 raise
             told = ()
-    for one in told:
-        if one.problem:
-            warn(f"{one.peer} does not tell its nodes, only those that stand here: {one.problem}")
+    for line in _untold(told):
+        warn(line)
     found: list[tuple[str | None, NodeLine]] = [(one.peer, line) for one in told for line in one.nodes]
     asked = {one.peer for one in told}
     found += [(name, line) for name, line in shown if name not in asked]

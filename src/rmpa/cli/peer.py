@@ -22,7 +22,8 @@ from rmpa.observe.snapshot import PingReply
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rmpa.observe.snapshot import LaneInfo, PeerInfo, ProbesInfo, RouteInfo, Snapshot, TopicInfo
+    from rmpa.observe.peer_info import LaneInfo, OffersInfo, PeerInfo, ProbesInfo
+    from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo
 
 _COLOURS: Final = {
     "linked": "green",
@@ -43,6 +44,7 @@ _ROUTES: Final = (
     *(Column(title, right=True) for title in ("MESSAGES", "RATE", "LATENCY", "P99", "LOST")),
 )
 
+_PARKED = "none: nothing needs it; it is made on demand, and probes notice within seconds if the peer is gone"
 _AT_REST = "at rest: nothing depends on the link, and its silence is noticed after 16 s"
 
 
@@ -78,7 +80,7 @@ def list_(
     summary and the first ones: those with a problem, then those with most traffic.
     """
     with connect(agent) as client:
-        snapshot = client.snapshot()
+        snapshot = client.snapshot(topics=())
     selection = Selection(pattern, limit=limit, everything=everything)
     fitting = set(selection.names(peer.name for peer in snapshot.peers))
     peers = [p for p in snapshot.peers if p.name in fitting and (not states or p.state in states)]
@@ -227,6 +229,8 @@ def _facts(info: PeerInfo) -> list[tuple[str, str]]:
     ]
     if info.probes is not None:
         facts.append(("Probes", _probes_text(info.probes)))
+    if info.offers is not None and info.offers.version:
+        facts.append(("Offers", offers_text(info.offers)))
     link = info.link
     if link is not None:
         who = "dialled by us" if link.dialled else "dialled by it"
@@ -247,12 +251,25 @@ def _facts(info: PeerInfo) -> list[tuple[str, str]]:
             facts.append(("Packets", f"of at most {link.packet} bytes to it"))
         if link.path_problem:
             facts += [("Path", link.path_problem), ("What to do", link.path_remedy)]
+    if info.state == "parked":
+        facts.append(("Link", _PARKED))
     if info.last_error:
         facts.append(("Last error", info.last_error))
     if info.next_attempt is not None:
         facts.append(("Next attempt", f"in {duration(info.next_attempt)}"))
     facts += [("Limit", bound.text) for bound in info.beyond]
     return facts + [("Conflict", conflict) for conflict in info.conflicts]
+
+
+def offers_text(offers: OffersInfo) -> str:
+    """``version 3 is here as the peer told it``, and how often it was not."""
+    state = {
+        True: "is here as the peer told it",
+        False: "differs here from what the peer told",
+        None: "is here, not compared",
+    }[offers.right]
+    times = f"; differed and was fetched again so far: {offers.differed}" if offers.differed else ""
+    return f"version {offers.version} {state}{times}"
 
 
 def _probes_text(probes: ProbesInfo) -> str:
@@ -280,7 +297,7 @@ def ping(name: str, count: int | None, interval: float, as_json: bool, agent: st
     times: list[float] = []
     sent = 0
     with connect(agent) as client:
-        found = find_peer(client.snapshot(), name)
+        found = find_peer(client.snapshot(topics=()), name)
         with contextlib.suppress(KeyboardInterrupt):
             while count is None or sent < count:
                 if sent:

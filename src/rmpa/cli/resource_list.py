@@ -55,7 +55,7 @@ def list_(known: bool, state: str | None, options: GraphOptions) -> None:
     try:
         master = options.master()
         here = _here(master)
-        module = snapshot.agent.name if (snapshot := master.snapshot(topics=())) is not None else None
+        module = snapshot.agent.name if (snapshot := master.snapshot(topics=(), peers=False)) is not None else None
     except UnreachableError as error:
         if not known:
             raise

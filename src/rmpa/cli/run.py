@@ -297,7 +297,7 @@ def _core_of(name: str) -> str | None:
         if found.name == name:
             try:
                 with ControlClient(found.path) as client:
-                    return client.snapshot().agent.core_uri
+                    return client.agent().core_uri
             except (UnreachableError, RmpaError):
                 return None
     return None

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 def crossing(master: Master, wanted: GraphName) -> tuple[ServiceInfo, ...]:
     """What the master's agent knows of a service, at all peers or the named one; empty without an agent."""
-    snapshot = master.snapshot()
+    snapshot = master.snapshot(topics=(), services=(wanted.name,), peers=False)
     return tuple(
         info
         for info in (snapshot.services if snapshot is not None else ())
@@ -24,7 +24,7 @@ def crossing(master: Master, wanted: GraphName) -> tuple[ServiceInfo, ...]:
 
 def transports(master: Master) -> dict[str, ServiceInfo]:
     """The peers' services in the master's graph, by name; empty without an agent."""
-    snapshot = master.snapshot(topics=())
+    snapshot = master.snapshot(topics=(), services=True, peers=False)
     return {info.name: info for info in (snapshot.services if snapshot is not None else ()) if info.transport}
 
 

@@ -24,7 +24,7 @@ def ask_agent(master: Master, topic: str, *, figures: bool = False) -> TopicInfo
         topic: The topic.
         figures: Wait for the figures of direct connections.
     """
-    snapshot = master.snapshot(topics=(topic,), figures=figures)
+    snapshot = master.snapshot(topics=(topic,), peers=False, figures=figures)
     return next((info for info in snapshot.topics if info.name == topic), None) if snapshot is not None else None
 
 

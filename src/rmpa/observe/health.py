@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from rmpa.observe.check import CheckLevel
-    from rmpa.observe.snapshot import PeerInfo, RouteInfo, ServiceInfo, Snapshot, SubscriberTransport, TopicInfo
+    from rmpa.observe.peer_info import PeerInfo
+    from rmpa.observe.snapshot import RouteInfo, ServiceInfo, Snapshot, SubscriberTransport, TopicInfo
 
 HERE: Final = "rmpa: this module"
 """The name of the agent's own status."""
@@ -205,6 +206,12 @@ def _missing(route: RouteInfo) -> Counter[str]:
     )
 
 
+_OFFERS_DIFFER: Final = (
+    "its topics and services differ here from what it told, and are fetched again; if that lasts, restart this agent "
+    "and report it with both releases"
+)
+
+
 def _agent(snapshot: Snapshot) -> Check:
     linked = sum(info.state == _LINKED for info in snapshot.peers)
     notes, files = list(snapshot.notes), snapshot.agent.files
@@ -230,11 +237,17 @@ def _judge_peer(info: PeerInfo, dropped: int, *, was_linked: bool) -> tuple[Chec
             return WARN, f"{dropped} messages dropped: the link takes them too slowly"
         troubles = [f"{link.path_problem}; {link.path_remedy}"] if link.path_problem else []
         troubles += [bound.text for bound in info.beyond]
+        if info.offers is not None and info.offers.right is False:
+            troubles.append(_OFFERS_DIFFER)
         if troubles:
             return WARN, "; ".join(troubles)
         return OK, "linked" + (f", round trip {link.rtt * 1e3:.2f} ms" if link.rtt is not None else "")
+    if info.state == "parked" and info.offers is not None and info.offers.right is False:
+        return WARN, _OFFERS_DIFFER
     if info.state == "parked":
         return OK, "parked: nothing needs it now; it is linked again when something does"
+    if info.state == "relayed":
+        return OK, f"relayed: {info.via or 'another peer'} passes on what it publishes"
     if info.state in ("conflict", "refused"):
         return FAIL, "; ".join((*info.conflicts, info.last_error)).strip("; ") or info.state
     return STALE if was_linked else WARN, info.state + (f": {info.last_error}" if info.last_error else "")

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 from rmpa.observe.transport_text import BY_RULE
 
 if TYPE_CHECKING:
-    from rmpa.observe.snapshot import PeerInfo, RouteInfo, SampleSpread, ServiceInfo, Snapshot, SubscriberTransport
+    from rmpa.observe.peer_info import PeerInfo
+    from rmpa.observe.snapshot import RouteInfo, SampleSpread, ServiceInfo, Snapshot, SubscriberTransport
 
 
 def number(value: float | None, scale: float = 1.0) -> str:

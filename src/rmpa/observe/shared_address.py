@@ -16,7 +16,7 @@ from rmpa.discovery import limits
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
-    from rmpa.observe.snapshot import PeerInfo
+    from rmpa.observe.peer_info import PeerInfo
 
 
 def mark_shared_addresses(peers: Sequence[PeerInfo], own: Collection[str]) -> tuple[PeerInfo, ...]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Self
 
 import msgspec
 
+from rmpa.observe.peer_info import PeerInfo  # noqa: TC001 - msgspec needs it to decode
 from rmpa.trust.status import TrustStatus  # noqa: TC001 - msgspec needs it to decode
 
 if TYPE_CHECKING:
@@ -110,155 +111,6 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
     core_memory: str = ""
     end_connections: str | None = None
     detector: DetectorInfo | None = None
-
-
-class LaneInfo(msgspec.Struct, kw_only=True, frozen=True):
-    """One of the two lanes of a link.
-
-    Attributes:
-        name: ``express`` (control and small messages) or ``bulk`` (large ones).
-        connected: Whether it has its TCP connection; messages for a lane without one wait.
-        unneeded: Whether it has none because nothing was sent on it for a while; the next message dials it.
-        bytes_in: Bytes that its present connection has received.
-        bytes_out: Bytes that its present connection has sent.
-        queued: Bytes that wait in its send queue.
-        dropped: Messages dropped because it was too slow, since the link came up.
-    """
-
-    name: str
-    connected: bool
-    unneeded: bool = False
-    bytes_in: int = 0
-    bytes_out: int = 0
-    queued: int = 0
-    dropped: int = 0
-
-
-class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
-    """The live link to a peer.
-
-    Attributes:
-        remote: ``address:port`` of the other end of the TCP connection.
-        dialled: Whether this agent dialled; else the peer did.
-        up_ago: Seconds since it came up.
-        rtt: The last round trip on the wire, seconds.
-        clock_offset: The peer's wall clock less this machine's, seconds.
-        clock_error: Bound of that offset's error, ± seconds.
-        bytes_in: Received since it came up.
-        bytes_out: Sent since it came up.
-        queued: Bytes in its send queues.
-        dropped: Messages dropped because the link was too slow.
-        heard_ago: Seconds since anything arrived.
-        rests: Whether the link is at rest: nothing depends on it, keepalives come every 5 s, silence is noticed after
-            16 s.
-        packet: Bytes of the largest packets that are sent, headers included.
-        path_problem: What is wrong with the network path, ready to read; empty if nothing is known.
-        path_remedy: What to do about that.
-        lanes: Its lanes, ``express`` first; empty from an agent that does not report them.
-    """
-
-    remote: str
-    dialled: bool
-    up_ago: float
-    rtt: float | None = None
-    clock_offset: float | None = None
-    clock_error: float | None = None
-    bytes_in: int = 0
-    bytes_out: int = 0
-    queued: int = 0
-    dropped: int = 0
-    heard_ago: float | None = None
-    rests: bool = False
-    packet: int | None = None
-    path_problem: str = ""
-    path_remedy: str = ""
-    lanes: tuple[LaneInfo, ...] = ()
-
-
-class BoundInfo(msgspec.Struct, kw_only=True, frozen=True):
-    """What one module hides of another one because a limit of its ``[limits]`` is exceeded.
-
-    Attributes:
-        kind: The limit: ``nodes``, ``topics`` or ``services``.
-        limit: Its value.
-        hidden: How many are hidden.
-        here: Whether this module hides the peer's; else the peer hides this module's.
-        text: Ready to read, with the remedy.
-    """
-
-    kind: str
-    limit: int
-    hidden: int
-    here: bool
-    text: str
-
-
-class ProbesInfo(msgspec.Struct, kw_only=True, frozen=True):
-    """What the failure detector holds of a peer.
-
-    Attributes:
-        state: ``alive``, or ``suspect``: it did not answer probes, and may refute that it has failed.
-        heard_ago: Seconds since its last packet; ``None`` if none came.
-        rtt: The last round trip of a probe in seconds; ``None`` before the first.
-        refuted: How often it was suspected and refuted that.
-        version: The version of what it offers.
-    """
-
-    state: str
-    heard_ago: float | None = None
-    rtt: float | None = None
-    refuted: int = 0
-    version: int = 0
-
-
-class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
-    """One peer of the roster.
-
-    Attributes:
-        name: Its name.
-        guid: Its GUID as text.
-        instance: The random id of its run, 32 hexadecimal digits.
-        addresses: Where it can be reached, best first.
-        state: ``linked``; ``linking`` (dialling, or waiting to be dialled); ``refused`` (by either side);
-            ``conflict`` (shares a GUID or a name with another); ``relayed`` (has no link; another peer relays its
-            topics); ``parked`` (both sides ended the link, as nothing needed it; it is made again on demand).
-        since_ago: Seconds since it came into this state.
-        found_ago: Seconds since it was found.
-        beacon_ago: Seconds since its last beacon.
-        source: How it was found: ``multicast``, ``unicast``, ``seed``, ``gossip`` or ``link``.
-        link: The link, while there is one.
-        last_error: Why the last attempt or link failed, ready to read; empty if none did.
-        next_attempt: Seconds until the next attempt to dial.
-        conflicts: What is wrong with its identity, each ready to read.
-        topics_in: The number of topics that it offers.
-        topics_out: The number of topics that it is offered.
-        via: The name of the peer that relays its topics, if one does.
-        beyond: What either side hides of the other by its limits.
-        direct_in: Subscribers here that are connected to its nodes directly.
-        direct_out: Its subscribers that may connect to nodes here directly.
-        probes: What the failure detector holds of it, while it probes.
-    """
-
-    name: str
-    guid: str
-    instance: str
-    state: str
-    since_ago: float
-    addresses: tuple[str, ...] = ()
-    found_ago: float | None = None
-    beacon_ago: float | None = None
-    source: str = ""
-    link: LinkInfo | None = None
-    last_error: str = ""
-    next_attempt: float | None = None
-    conflicts: tuple[str, ...] = ()
-    topics_in: int = 0
-    topics_out: int = 0
-    via: str = ""
-    beyond: tuple[BoundInfo, ...] = ()
-    direct_in: int = 0
-    direct_out: int = 0
-    probes: ProbesInfo | None = None
 
 
 class SampleSpread(msgspec.Struct, kw_only=True, frozen=True):
@@ -597,6 +449,8 @@ class Snapshot(msgspec.Struct, kw_only=True, frozen=True):
         notes: What the user should know (a port taken, no multicast), each ready to read.
         unreachable: Nodes of the local graph to which no connection can be made, by name.
         trust: The module's membership of a secured mesh; ``None``: trust is off.
+        topics_left: Topics that are not in it, as nothing here uses them, if only so many were asked for.
+        services_left: Services, likewise.
     """
 
     agent: AgentInfo
@@ -608,6 +462,8 @@ class Snapshot(msgspec.Struct, kw_only=True, frozen=True):
     notes: tuple[str, ...] = ()
     unreachable: tuple[UnreachableInfo, ...] = ()
     trust: TrustStatus | None = None
+    topics_left: int = 0
+    services_left: int = 0
 
 
 class FollowedInfo(msgspec.Struct, kw_only=True, frozen=True):

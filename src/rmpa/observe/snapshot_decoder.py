@@ -7,7 +7,8 @@ from typing import Generic, TypeVar
 import msgspec
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.observe.snapshot import AgentInfo, PeerInfo, ServiceInfo, Snapshot, TopicInfo, UnreachableInfo
+from rmpa.observe.peer_info import PeerInfo  # noqa: TC001 - msgspec reads the annotation
+from rmpa.observe.snapshot import AgentInfo, ServiceInfo, Snapshot, TopicInfo, UnreachableInfo
 from rmpa.trust.status import TrustStatus  # noqa: TC001 - msgspec reads the annotation
 
 _T = TypeVar("_T")
@@ -25,6 +26,8 @@ class _SnapshotParts(msgspec.Struct, kw_only=True, frozen=True):
     notes: tuple[str, ...] = ()
     unreachable: tuple[UnreachableInfo, ...] = ()
     trust: TrustStatus | None = None
+    topics_left: int = 0
+    services_left: int = 0
 
 
 class _SnapshotReply(msgspec.Struct, frozen=True):
@@ -85,6 +88,8 @@ class SnapshotDecoder:
                 notes=parts.notes,
                 unreachable=parts.unreachable,
                 trust=parts.trust,
+                topics_left=parts.topics_left,
+                services_left=parts.services_left,
             )
         except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
             raise RemoteProtocolError(f"not a snapshot: {error}") from None

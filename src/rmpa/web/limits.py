@@ -147,8 +147,8 @@ FOXGLOVE_STATUS_BURST: Final = 100.0
 malformed message disconnects it: it does not speak the protocol."""
 
 # --- /metrics -----------------------------------------------------------------------------------------------------
-METRIC_PEERS: Final = 512
-"""Peers in /metrics, each with some fifteen time series: as many as an agent may know."""
+METRIC_PEERS: Final = 1024
+"""Peers in /metrics, a linked one with some fifteen time series, a parked one with three; linked ones go first."""
 METRIC_ROUTES: Final = 2000
 """Routes in /metrics, each with some twenty time series; a module of 300 topics and three peers has some 1,000."""
 METRIC_SERVICES: Final = 1000
@@ -190,6 +190,13 @@ WEB_BACKLOG: Final = 128
 """Connections that wait to be accepted."""
 WEB_SHUTDOWN_TIMEOUT: Final = 2.0
 """Seconds for responses under way when the server ends."""
+WEB_TOPICS: Final = 2000
+"""Topics and services beyond which those that nothing uses are left out of the snapshots that the server reads again
+and again: the monitor and /metrics show no more of them, and each takes the agent 0.03 ms."""
+WEB_WHOLE_AGE: Final = 2.0
+"""Seconds that a snapshot of which nothing is left out is shared; the API alone asks for it."""
+WEB_WHOLE_TIMEOUT: Final = 8.0
+"""Seconds for the agent to answer with all of a large graph, which takes it a second of processor time."""
 WEB_SNAPSHOT_AGE: Final = 0.1
 """Seconds that a snapshot is shared before the agent is asked again: less than the monitor's pause between two."""
 WEB_AGENT_TIMEOUT: Final = 2.0

@@ -20,10 +20,13 @@ from rmpa.web import limits
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
-    from rmpa.observe.snapshot import LinkInfo, PeerInfo, RouteInfo, SampleSpread, ServiceInfo, Snapshot
+    from rmpa.observe.peer_info import LinkInfo, PeerInfo
+    from rmpa.observe.snapshot import RouteInfo, SampleSpread, ServiceInfo, Snapshot
 
 PEER_STATES: Final = ("linked", "linking", "refused", "conflict", "relayed", "parked")
 """The values of ``PeerInfo.state``."""
+_IN_ORDER: Final = frozenset({"linked", "relayed", "parked"})
+"""States of a peer that has its link, or needs none."""
 EVENT_KINDS: Final = (
     "deadline_missed",
     "lifespan_expired",
@@ -116,12 +119,15 @@ def metrics(snapshot: Snapshot | None) -> Iterator[Metric]:
     omitted = _Family(
         "rmpa_metrics_omitted", "Peers, routes, services and reasons left out for their number.", "gauge", ("kind",)
     )
-    peers = _bounded(omitted, "peer", snapshot.peers, limits.METRIC_PEERS)
-    routes = _bounded(
-        omitted, "route", [(t.name, route) for t in snapshot.topics for route in t.routes], limits.METRIC_ROUTES
-    )
+    known = sorted(
+        snapshot.peers, key=lambda peer: peer.state == "parked"
+    )  # those in use are never left out for them
+    peers = _bounded(omitted, "peer", known, limits.METRIC_PEERS)
+    all_routes = [(t.name, route) for t in snapshot.topics for route in t.routes]
+    all_routes.sort(key=lambda each: each[1].state == "idle")
+    routes = _bounded(omitted, "route", all_routes, limits.METRIC_ROUTES, snapshot.topics_left)
     shown = [each for each in snapshot.services if each.calls or not each.name.endswith(_LOGGER_SERVICES)]
-    services = _bounded(omitted, "service", shown, limits.METRIC_SERVICES)
+    services = _bounded(omitted, "service", shown, limits.METRIC_SERVICES, snapshot.services_left)
     reasons = _bounded(omitted, "reason", list(snapshot.counters.items()), limits.METRIC_REASONS)
     yield from _agent(snapshot)
     yield from _graph(snapshot)
@@ -133,8 +139,9 @@ def metrics(snapshot: Snapshot | None) -> Iterator[Metric]:
     yield omitted.metric
 
 
-def _bounded(omitted: _Family, kind: str, items: Sequence[_T], most: int) -> Sequence[_T]:
-    omitted.add(max(0, len(items) - most), kind)
+def _bounded(omitted: _Family, kind: str, items: Sequence[_T], most: int, left: int = 0) -> Sequence[_T]:
+    """The first ones; ``left`` counts those that the snapshot itself leaves out."""
+    omitted.add(max(0, len(items) - most) + left, kind)
     return items[:most]
 
 
@@ -166,10 +173,14 @@ def _agent(snapshot: Snapshot) -> Iterator[Metric]:
 def _graph(snapshot: Snapshot) -> Iterator[Metric]:
     topics = snapshot.topics
     figures = (
-        ("topics", "Topics of the local graph and of what peers offer.", len(topics)),
-        ("topics_crossing", "Topics that policy lets cross.", sum(each.crosses for each in topics)),
+        ("topics", "Topics of the local graph and of what peers offer.", len(topics) + snapshot.topics_left),
+        (
+            "topics_crossing",
+            "Topics that policy lets cross.",
+            sum(each.crosses for each in topics),
+        ),
         ("topics_mismatched", "Topics whose ends disagree about the type.", sum(bool(t.mismatches) for t in topics)),
-        ("services", "Services of the local graph and of peers.", len(snapshot.services)),
+        ("services", "Services of the local graph and of peers.", len(snapshot.services) + snapshot.services_left),
         ("nodes_unreachable", "Nodes to which no connection can be made.", len(snapshot.unreachable)),
     )
     for name, help_, value in figures:
@@ -191,6 +202,12 @@ def _peers(snapshot: Snapshot, peers: Iterable[PeerInfo]) -> Iterator[Metric]:
         number.add(sum(peer.state == state for peer in snapshot.peers), state)
     yield number.metric
     linked = _Family("rmpa_peer_linked", "Whether the peer has a link.", "gauge", ("peer",))
+    missing = _Family(
+        "rmpa_peer_link_missing",
+        "Whether the peer has no link and should have one: it is neither linked nor parked nor relayed.",
+        "gauge",
+        ("peer",),
+    )
     topics = _Family(
         "rmpa_peer_topics", "Topics that the peer offers (in) or is offered (out).", "gauge", ("peer", "direction")
     )
@@ -202,11 +219,12 @@ def _peers(snapshot: Snapshot, peers: Iterable[PeerInfo]) -> Iterator[Metric]:
     )
     for peer in peers:
         linked.add(peer.state == "linked", peer.name)
+        missing.add(peer.state not in _IN_ORDER, peer.name)
         topics.add(peer.topics_in, peer.name, "in")
         topics.add(peer.topics_out, peer.name, "out")
         for bound in peer.beyond:
             hidden.add(bound.hidden, peer.name, bound.kind, "here" if bound.here else "there")
-    yield from (family.metric for family in (linked, topics, hidden))
+    yield from (family.metric for family in (linked, missing, topics, hidden))
 
 
 def _links(taken: float, links: Sequence[tuple[str, LinkInfo]]) -> Iterator[Metric]:

@@ -17,7 +17,8 @@ from urllib.parse import unquote
 import msgspec
 
 from rmpa.core.names import is_legal_name
-from rmpa.observe.snapshot import AgentInfo, PeerInfo, ServiceInfo, Snapshot, TopicInfo, UnreachableInfo
+from rmpa.observe.peer_info import PeerInfo
+from rmpa.observe.snapshot import AgentInfo, ServiceInfo, Snapshot, TopicInfo, UnreachableInfo
 from rmpa.web import limits
 
 if TYPE_CHECKING:

@@ -35,6 +35,19 @@ NFT_OURS = NFT_CLOSED.replace("tcp dport 22 accept", "udp dport { 5353, 11400-11
 NFT_AGAINST = NFT_CLOSED.replace("policy drop", "policy accept").replace(
     "tcp dport 22 accept", "udp dport 11411 counter packets 3 bytes 90 drop"
 )
+NFT_UDP = """\
+table inet cut {
+	chain in {
+		type filter hook input priority filter; policy accept;
+		iif "lo" accept
+		meta l4proto udp drop
+	}
+	chain out {
+		type filter hook output priority filter; policy accept;
+		meta l4proto udp counter packets 3 bytes 90 drop
+	}
+}
+"""
 IPTABLES_UFW = """\
 -P INPUT DROP
 -P FORWARD DROP
@@ -53,6 +66,12 @@ IPTABLES_UFW = """\
         (NFT_CLOSED, CheckLevel.WARN, "inet filter input drops what no rule lets in"),
         (NFT_OURS, CheckLevel.OK, "lets ours in: udp dport { 5353, 11400-11450 } accept"),
         (NFT_AGAINST, CheckLevel.FAIL, "drops what agents send: udp dport 11411 counter"),
+        (NFT_UDP, CheckLevel.FAIL, "drops all UDP, also beacons and probes of agents: meta l4proto udp drop"),
+        (NFT_UDP.replace("l4proto udp", "l4proto { tcp, udp }"), CheckLevel.FAIL, "drops all UDP"),
+        (NFT_UDP.replace('iif "lo"', "udp dport 11411"), CheckLevel.OK, "none against agents"),
+        (NFT_UDP.replace('iif "lo"', "tcp dport 40001"), CheckLevel.FAIL, "drops all UDP"),
+        (NFT_UDP.replace("l4proto udp", "l4proto tcp"), CheckLevel.OK, "none against agents"),
+        (NFT_UDP.replace("meta", 'iifname "docker0" meta'), CheckLevel.OK, "none against agents"),
     ],
 )
 def test_nft(text: str, level: CheckLevel, part: str) -> None:
@@ -71,6 +90,11 @@ def test_nft(text: str, level: CheckLevel, part: str) -> None:
         (IPTABLES_UFW + "-A ufw-user-input -p tcp -m multiport --dports 40000:40010 -j ACCEPT\n", CheckLevel.OK),
         ("-P INPUT ACCEPT\n-A INPUT -p tcp -m tcp --dport 40001 -j REJECT\n", CheckLevel.FAIL),
         ("-P INPUT ACCEPT\n-A INPUT -p tcp -m tcp --dport 22 -j REJECT\n", CheckLevel.OK),
+        ("-P INPUT ACCEPT\n-A INPUT -p udp -j DROP\n", CheckLevel.FAIL),
+        ("-P INPUT ACCEPT\n-A INPUT -p udp -j REJECT --reject-with icmp-port-unreachable\n", CheckLevel.FAIL),
+        ('-P INPUT ACCEPT\n-A INPUT -p udp -m comment --comment "no UDP" -j DROP\n', CheckLevel.FAIL),
+        ("-P INPUT ACCEPT\n-A INPUT -s 10.0.0.0/8 -p udp -j DROP\n", CheckLevel.OK),
+        ("-P INPUT ACCEPT\n-A INPUT -p udp -m udp --dport 53 -j DROP\n", CheckLevel.OK),
     ],
 )
 def test_iptables(text: str, level: CheckLevel) -> None:

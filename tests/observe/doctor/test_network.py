@@ -124,6 +124,13 @@ def test_routes() -> None:
     assert judge_routes({})[0].level is CheckLevel.SKIPPED
 
 
+def test_routes_to_many_peers_are_counted() -> None:
+    found = judge_routes({f"10.0.{n >> 8}.{n & 255} (m{n})": "" for n in range(999)} | {"10.1.0.2 (arm)": "none"})
+    assert len(found) == 2
+    assert only(found, CheckLevel.FAIL).where == "10.1.0.2 (arm)"
+    assert only(found, CheckLevel.OK).text == "there is a way to 999 of 1,000 peers and seeds"
+
+
 def test_ports() -> None:
     ports = (
         Port("the ROS core", 11311, "Address already in use", "roscore (pid 7)"),

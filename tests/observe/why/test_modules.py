@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from rmpa.observe.peer_agent import PeerAgent
-from rmpa.observe.snapshot import BoundInfo, LaneInfo, PeerInfo
+from rmpa.observe.peer_info import BoundInfo, LaneInfo, PeerInfo
 from rmpa.observe.why.modules import diagnose_module
 from tests.observe.samples import SNAPSHOT
 from tests.observe.why.test_topics import LINK, PEER

@@ -153,6 +153,19 @@ async def test_a_page_is_greeted_and_gets_the_state_then_its_changes(core: RosCo
         assert "is away" in last["text"]
 
 
+async def test_a_link_that_is_parked_and_made_again_is_no_event(core: RosCore) -> None:
+    async with page_of(core, READ_ONLY) as (page, agent):
+        [linked, *others] = SNAPSHOT.peers
+        parked = msgspec.structs.replace(linked, state="parked", link=None)
+        for one, word in ((linked, "up"), (parked, "parked"), (linked, "up"), (parked, "parked")):
+            agent.snapshot = msgspec.structs.replace(agent.snapshot, peers=(one, *others))
+            await page.sees(lambda word=word: page.state.get("modules", {}).get(linked.name, {}).get("state") == word)
+        agent.snapshot = msgspec.structs.replace(agent.snapshot, peers=(*others,))
+        await page.sees(lambda: page.state["modules"][linked.name]["state"] == "away")
+        events = [each["text"] for each in (await page.ask(1, "history"))["value"] if each["module"] == linked.name]
+        assert [text.partition(": ")[2].partition(":")[0] for text in events] == ["is away"]
+
+
 async def test_a_page_is_told_when_the_agent_is_silent_and_when_it_is_back(core: RosCore) -> None:
     async with page_of(core) as (page, agent):
         await page.sees(lambda: page.state.get("reach", {}).get("ok"))

@@ -4,7 +4,8 @@
 
 It has the real pages and the real ``MonitorSession``; the agent, the hub and all answers are made up here.
 Scenes: ``demo`` (all is well), ``killed`` (the module base was killed), ``sick`` (one of each state, and alarms),
-``large`` (16 modules, 300 topics), ``mute`` (the agent does not answer), ``sensors`` (a laser and a camera).
+``large`` (16 modules, 300 topics), ``mute`` (the agent does not answer), ``sensors`` (a laser and a camera),
+``cut`` (18,000 topics are left out, /odom is one of them).
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from aiohttp import WSMsgType, web
 
 from rmpa.core.contract import ContractRule, Contracts
 from rmpa.observe.peer_agent import PeerAgent
-from rmpa.observe.snapshot import LaneInfo, Snapshot
+from rmpa.observe.peer_info import LaneInfo
+from rmpa.observe.snapshot import Snapshot
 from rmpa.observe.why.modules import diagnose_module
 from rmpa.web.hub import requests
 from rmpa.web.hub.rights import FULL
@@ -46,7 +48,7 @@ FIXTURES = Path(__file__).with_name("fixtures")
 STATIC = Path(__file__).parents[3] / "src/rmpa/web/static"
 CSP = "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; object-src 'none'"
 TICK = 0.1
-SCENES = ("demo", "killed", "sick", "large", "mute", "sensors")
+SCENES = ("demo", "killed", "sick", "large", "cut", "mute", "sensors")
 _SENSORS = {"/scan": "sensor_msgs/LaserScan", "/camera/image": "sensor_msgs/CompressedImage"}
 
 
@@ -80,7 +82,7 @@ class FakeAgent:
             base = self._recorded[2 if now - since < 7 else 3]
         else:
             self._since.clear()
-        if self.scene in ("sick", "large", "sensors"):
+        if self.scene in ("sick", "large", "cut", "sensors"):
             base = getattr(self, f"_{self.scene}")(base)
         age = now - self._started
         wobble = 1 + 0.004 * math.sin(now * 3)
@@ -185,6 +187,10 @@ class FakeAgent:
         more = tuple(msgspec.structs.replace(odom, name=name, type=kind) for name, kind in _SENSORS.items())
         return msgspec.structs.replace(base, topics=(*base.topics, *more))
 
+    def _cut(self, base: Snapshot) -> Snapshot:
+        topics = tuple(topic for topic in base.topics if topic.name != "/odom")
+        return msgspec.structs.replace(base, topics=topics, topics_left=18_000)
+
     def _large(self, base: Snapshot) -> Snapshot:
         replace = msgspec.structs.replace
         some = next(peer for peer in base.peers if peer.name == "base")
@@ -280,6 +286,10 @@ class FakeServer:
         )
 
     def _details(self, kind: str, name: str) -> Tree | None:
+        if self.agent.scene == "cut" and (kind, name) == ("topic", "/odom"):
+            whole = snapshots()[0]
+            found = details(whole, {}, kind, name)
+            return found and found | {"entry": self._builder.entry(whole, kind, name)}
         return details(self._snapshot, {one.key: one for one in self.agent.facts()}, kind, name)
 
     async def _socket(self, request: web.Request) -> web.WebSocketResponse:
@@ -360,6 +370,10 @@ class FakeServer:
     def _answer_contract(self, args: dict[str, Any]) -> Any:
         terms = Contracts((ContractRule(("/velocity*",), (), {"max_rate": 20.0}),)).explain(args["topic"], "")
         return {key: {"value": value, "rule": rule} for key, (value, rule) in terms.items()}
+
+    def _answer_find(self, args: dict[str, Any]) -> Any:
+        found = [{"kind": "topic", "name": "/odom", "type": "nav_msgs/Odometry"}]
+        return {"found": found if str(args["text"]) in "/odom" else []}
 
     def _answer_node(self, args: dict[str, Any]) -> Any:
         known = node_detail(self._snapshot, node_key(args["peer"], args["name"]))

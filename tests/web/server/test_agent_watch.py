@@ -7,6 +7,7 @@ import socket
 import threading
 from typing import TYPE_CHECKING, Protocol
 
+import msgspec
 import pytest
 
 from rmpa.core.errors import UnreachableError
@@ -138,4 +139,29 @@ async def test_an_agent_that_is_away_is_asked_no_more_often_and_found_again() ->
     agent.up = True
     agent.now += limits.WEB_SNAPSHOT_AGE
     assert (await watch.reading()).snapshot is FULL
+    await watch.close()
+
+
+async def test_all_of_a_large_graph_is_read_only_for_those_that_need_it() -> None:
+    part = msgspec.structs.replace(FULL, topics=(), topics_left=len(FULL.topics))
+    now, wholes = 0.0, 0
+    shown = part
+
+    def read_whole() -> Snapshot:
+        nonlocal wholes
+        wholes += 1
+        return FULL
+
+    watch = AgentWatch(lambda: shown, lambda: now, read_whole)
+    assert (await watch.reading()).snapshot == part
+    readings = await asyncio.gather(*(watch.whole() for _ in range(10)))
+    assert all(reading.snapshot is FULL for reading in readings)
+    assert wholes == 1
+    now += limits.WEB_WHOLE_AGE
+    assert (await watch.whole()).snapshot is FULL
+    assert wholes == 2
+    now += limits.WEB_WHOLE_AGE
+    shown = FULL  # nothing is left out
+    assert (await watch.whole()).snapshot is FULL
+    assert wholes == 2
     await watch.close()

@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.open_files import remedy
+from rmpa.observe import limits
 from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.observe.doctor.machine import judge_peer_clock
 from rmpa.observe.transport_text import fallbacks, stuck, subscriber_text
 from rmpa.observe.transport_text import remedy as remedy_for
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
 
-    from rmpa.observe.snapshot import AgentInfo, FilesInfo, PeerInfo, Snapshot, UnreachableInfo
+    from rmpa.observe.peer_info import PeerInfo
+    from rmpa.observe.snapshot import AgentInfo, FilesInfo, Snapshot, UnreachableInfo
     from rmpa.trust.status import TrustStatus
 
 
 _PERMISSION: Final = "permission."
 """The counters of what ``[[permission]]`` refused begin so."""
+_WITHOUT_LINK: Final = {
+    "parked": "nothing needs its link, which is made again on demand; probes watch it",
+    "relayed": "another peer passes on its topics",
+}
+"""States in which a peer has no link, and needs none."""
 
 
 def judge_agents(agents: Mapping[str, Snapshot | str], version: str) -> list[Check]:
@@ -72,8 +80,7 @@ def _agent(snapshot: Snapshot, version: str) -> Iterator[Check]:
         yield Check("peer", WARN, text, advice, where=here)
     if snapshot.trust is not None:
         yield judge_membership(snapshot.trust, snapshot.taken)
-    for peer in snapshot.peers:
-        yield from _peer(here, peer)
+    yield from _peers(here, snapshot.peers)
     yield from _transport(snapshot)
 
 
@@ -121,11 +128,27 @@ def _files(agent: AgentInfo, files: FilesInfo) -> Check:
     return Check("files", OK, text, where=agent.name)
 
 
+def _peers(agent: str, peers: Sequence[PeerInfo]) -> Iterator[Check]:
+    """All results about a few peers; of many peers the problems, and how many have none."""
+    found = [(peer, [*_peer(agent, peer)]) for peer in peers]
+    if len(peers) <= limits.DOCTOR_PEERS_LISTED:
+        yield from (check for _, checks in found for check in checks)
+        return
+    yield from (check for _, checks in found for check in checks if check.level is not OK)
+    well = Counter(peer.state for peer, checks in found if all(check.level is OK for check in checks))
+    states = ", ".join(f"{count:,} {state}" for state, count in well.most_common())
+    if well:
+        yield Check("peer", OK, f"{well.total():,} of {len(peers):,} have no problem: {states}", where=agent)
+
+
 def _peer(agent: str, peer: PeerInfo) -> Iterator[Check]:
     both = f"{agent}-{peer.name}"
     for conflict in peer.conflicts:
         yield Check.from_message("peer", FAIL, conflict, "give each module a --name of its own", both)
     link = peer.link
+    if peer.state in _WITHOUT_LINK:
+        yield Check("peer", OK, f"{peer.state}: {_WITHOUT_LINK[peer.state]}", where=both)
+        return
     if link is None:
         level = FAIL if peer.state == "refused" else WARN
         text = f"{peer.state}: {peer.last_error or 'no TCP connection yet'}"
@@ -133,7 +156,8 @@ def _peer(agent: str, peer: PeerInfo) -> Iterator[Check]:
         yield Check("peer", level, text, advice, where=both)
         return
     way = "found by multicast" if peer.source == "multicast" else f"found by {peer.source or 'its link'}"
-    yield Check("peer", OK, f"linked by {link.remote}, {way}", where=both)
+    rest = ", at rest" if link.rests else ""
+    yield Check("peer", OK, f"linked by {link.remote}{rest}, {way}", where=both)
     if link.path_problem:
         yield Check("mtu", WARN, link.path_problem, link.path_remedy, where=both)
     if link.dropped:

@@ -1,7 +1,8 @@
 """Searches the rules of nftables and iptables for signs that they drop agents' packets.
 
 These are signs, not proofs: only all rules together decide about a packet. A sign is a chain for incoming packets
-whose policy is to drop, or a rule that names a port of ours. The multicast check sends a real packet besides.
+whose policy is to drop, a rule that names a port of ours, or one that drops all UDP. The multicast check sends a real
+packet besides.
 """
 
 from __future__ import annotations
@@ -14,6 +15,13 @@ from rmpa.observe.check import FAIL, OK, WARN, Check
 
 _DROPS: Final = re.compile(r"\b(drop|reject|DROP|REJECT)\b")
 _ACCEPTS: Final = re.compile(r"\b(accept|ACCEPT)\b")
+_UDP: Final = re.compile(
+    r"(?:meta l4proto|ip protocol|ip6 nexthdr|-A \S+(?: -m comment --comment (?:\"[^\"]*\"|\S+))? -p)"
+    r" (?:udp|17|\{ ?[^{}]*\b(?:udp|17)\b[^{}]* ?\})"
+    r"(?: counter(?: packets \d+ bytes \d+)?| -m comment --comment (?:\"[^\"]*\"|\S+))*"
+    r" (?:-j )?(?:drop|reject|DROP|REJECT)\b"
+)
+"""A rule that drops UDP to and from every port and address, as nft or iptables print it."""
 _HOOK: Final = re.compile(r"type filter hook input .*policy (\w+)")
 _BLOCK: Final = re.compile(r"(table|chain) (.+?) \{")
 _RANGE: Final = re.compile(r"\b(\d{1,5})[-:](\d{1,5})\b")
@@ -28,6 +36,7 @@ class FirewallRules:
         source: The program that printed them.
         closed: Chains for incoming packets whose policy is to drop.
         drops: Rules that drop packets for a port of ours.
+        drops_udp: Rules that drop all UDP.
         accepts: Rules that accept packets for a port of ours.
         count: The number of all rules.
     """
@@ -35,12 +44,15 @@ class FirewallRules:
     source: str
     closed: list[str] = field(default_factory=list)
     drops: list[str] = field(default_factory=list)
+    drops_udp: list[str] = field(default_factory=list)
     accepts: list[str] = field(default_factory=list)
     count: int = 0
 
     def add(self, rule: str, ports: frozenset[int]) -> None:
-        """Count one rule, and keep it if it names a port of ours."""
+        """Count one rule, and keep it if it names a port of ours, or drops all UDP that no rule before it lets in."""
         self.count += 1
+        if _UDP.match(rule) and not any("udp" in accept or "tcp" not in accept for accept in self.accepts):
+            self.drops_udp.append(rule)
         if not names_port(rule, ports):
             return
         if _DROPS.search(rule):
@@ -97,6 +109,9 @@ def judge_rules(rules: FirewallRules, ports: str) -> Check:
     if rules.drops:
         remedy = f"take it out, or let {ports} in before it"
         return Check("firewall", FAIL, f"drops what agents send: {rules.drops[0]}", remedy, where=rules.source)
+    if rules.drops_udp:
+        text = f"drops all UDP, also beacons and probes of agents: {rules.drops_udp[0]}"
+        return Check("firewall", FAIL, text, f"take it out, or let {ports} in before it", where=rules.source)
     if rules.closed and not rules.accepts:
         text = f"{', '.join(rules.closed)} drops what no rule lets in, and no rule names our ports"
         remedy = f"let in {ports}; `rmpa up --port N` gives the mesh a port that rules can name"

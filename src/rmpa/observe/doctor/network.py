@@ -7,6 +7,7 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from rmpa.observe import limits
 from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
 
 if TYPE_CHECKING:
@@ -184,12 +185,15 @@ def judge_routes(routes: Mapping[str, str]) -> list[Check]:
         routes: Why there is none, or empty, by the address, ready to read (with the peer's name).
     """
     found = []
+    remedy = "`ip route get ADDRESS`; a gateway is missing, or the interface of that network is down"
     for target, problem in routes.items():
         if problem:
-            remedy = "`ip route get ADDRESS`; a gateway is missing, or the interface of that network is down"
             found.append(Check("route", FAIL, f"there is no way: {problem}", remedy, where=target))
-        else:
+        elif len(routes) <= limits.DOCTOR_PEERS_LISTED:
             found.append(Check("route", OK, "there is a way", where=target))
+    reached = sum(not problem for problem in routes.values())
+    if reached and len(routes) > limits.DOCTOR_PEERS_LISTED:
+        found.append(Check("route", OK, f"there is a way to {reached:,} of {len(routes):,} peers and seeds"))
     return found or [Check("route", SKIPPED, "no peer and no seed is known whose way could be looked for")]
 
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import TracebackType
 
+    from rmpa.observe.snapshot import AgentInfo
     from rmpa.observe.snapshot_decoder import SnapshotDecoder
 
 _T = TypeVar("_T")
@@ -120,6 +121,10 @@ class ControlClient:
             return decoder.decode(line)
         return self._parse("snapshot", line, Snapshot)
 
+    def agent(self) -> AgentInfo:
+        """What the agent tells of itself, without its peers, topics and services; raises as ``call``."""
+        return self.snapshot(topics=(), peers=False).agent
+
     def _exchange(self, op: str, args: dict[str, object]) -> bytes:
         try:
             self._sock.sendall(ControlRequest(op, args).serialize())
@@ -198,7 +203,7 @@ def choose_agent(environ: Mapping[str, str], name: str | None = None) -> FoundAg
     uri = environ.get("ROS_MASTER_URI", "")
     for agent in agents if uri else ():
         with contextlib.suppress(RmpaError), ControlClient(agent.path) as client:
-            if same_core(client.snapshot().agent.core_uri, uri):
+            if same_core(client.agent().core_uri, uri):
                 return agent
     modules = [agent for agent in agents if not _is_gateway(agent)]
     if len(modules) == 1:

@@ -97,8 +97,17 @@ class ControlOperations:
         return {operation.name: partial(operation.handler, self) for operation in OPERATIONS}
 
     def snapshot(self, args: Args) -> Snapshot:
-        """``topics``: the only ones that are wanted, or ``None`` for everything."""
-        return self._snapshots.build(_topics(args))
+        """A snapshot, or a part of it.
+
+        ``topics``: the only ones that are wanted, or ``None`` for all. ``services``: likewise, or ``true`` for all;
+        without it there are services in a snapshot of all topics. ``peers``: false leaves them out. ``most``: of
+        topics, and of services, those that nothing here uses are left out beyond so many.
+        """
+        topics, services, most = _topics(args), args.get("services"), args.get("most")
+        if most is not None and (not isinstance(most, int) or most < 0):
+            raise ConfigError("most", f"{most!r} is not a number of topics")
+        wanted = frozenset(map(str, services)) if isinstance(services, list) else services is True or None
+        return self._snapshots.build(topics, services=wanted, peers=args.get("peers") is not False, most=most)
 
     def snapshot_or_figures(self, args: Args) -> Snapshot | Awaitable[Snapshot]:
         """As ``snapshot``, with figures of direct connections, for which their nodes are asked.

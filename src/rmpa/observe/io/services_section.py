@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 from rmpa.observe.snapshot import SampleSpread, ServiceInfo
-from rmpa.runtime.event_loop import yield_to_data
+from rmpa.runtime.event_loop import sorted_yielding, yield_to_data, yielding_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterator
 
     from rmpa.bridge.services.exports import LocalService
     from rmpa.bridge.services.io.calls import CallStats
@@ -26,13 +27,45 @@ class ServicesSection:
     def __init__(self, services: Services) -> None:
         self._services = services
 
-    def infos(self) -> tuple[ServiceInfo, ...]:
-        """All services of the local graph, without the agent's own, and of the peers."""
-        found = [*self._local(), *self._remote()]
+    def used(self, most: int) -> tuple[Collection[str] | None, int]:
+        """The names to show where at most so many services can be shown, and the number of the other services.
+
+        First the services of this module and those that are or were called, all of them; then the others that are
+        shown, then the hidden ones. A name stands for all services of that name.
+
+        Returns:
+            The names, ``None`` for all, and how many services are left out.
+        """
+        first, shown, hidden = set(self._services.exports.seen), Counter[str](), Counter[str]()
+        for peer, remote in yielding_to_data(list(self._services.imports)):
+            known = self._services.shown(peer, remote.name)
+            if remote.route or remote.problem or (known is not None and (known.stats.calls or known.mismatch)):
+                first.add(remote.name)
+            (shown if remote.shown else hidden)[remote.name] += 1
+        counts = shown + hidden
+        room = most - sum(counts[name] or 1 for name in first)
+        left = 0
+        for name in (*sorted_yielding(shown), *sorted_yielding(hidden.keys() - shown.keys())):
+            if name in first:
+                continue
+            if room >= counts[name] and not left:
+                first.add(name)
+                room -= counts[name]
+            else:
+                left += counts[name]
+        return (first, left) if left else (None, 0)
+
+    def infos(self, wanted: Collection[str] | None = None) -> tuple[ServiceInfo, ...]:
+        """The services of the local graph, without the agent's own, and of the peers: all, or those of some names."""
+        if wanted is not None and not wanted:
+            return ()
+        found = [*self._local(wanted), *self._remote(wanted)]
         return tuple(sorted(found, key=lambda info: (info.name, info.direction == "in", info.peer)))
 
-    def _local(self) -> Iterator[ServiceInfo]:
+    def _local(self, wanted: Collection[str] | None) -> Iterator[ServiceInfo]:
         for service, server in list(self._services.exports.seen.items()):
+            if wanted is not None and service not in wanted:
+                continue
             yield_to_data()
             yield self._export(service, server)
 
@@ -61,8 +94,10 @@ class ServicesSection:
             **_figures(self._services.served.get(service)),
         )
 
-    def _remote(self) -> Iterator[ServiceInfo]:
-        for peer, remote in list(self._services.imports):
+    def _remote(self, wanted: Collection[str] | None) -> Iterator[ServiceInfo]:
+        for peer, remote in yielding_to_data(list(self._services.imports)):
+            if wanted is not None and remote.name not in wanted:
+                continue
             yield_to_data()
             yield self._import(peer, remote)
 

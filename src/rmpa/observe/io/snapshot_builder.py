@@ -123,23 +123,43 @@ class SnapshotBuilder:
             proxies=agent.proxies,
         )
 
-    def build(self, topics: Collection[str] | None = None) -> Snapshot:
+    def build(
+        self,
+        topics: Collection[str] | None = None,
+        *,
+        services: Collection[str] | bool | None = None,
+        peers: bool = True,
+        most: int | None = None,
+    ) -> Snapshot:
         """A snapshot of this moment. It yields to data between its parts.
 
         Args:
-            topics: The only topics that are wanted, without services, or ``None`` for all.
+            topics: The only topics that are wanted, or ``None`` for all.
+            services: The only services that are wanted; ``True``: all; ``None``: all if all topics are wanted.
+            peers: Whether peers are wanted.
+            most: Topics, and services, beyond which those are left out that nothing here uses; ``None``: all are in
+                it. The snapshot says how many are left out.
         """
         endpoint = self.endpoint
         counters: Counter[str] = Counter()
         for each in self._counters(endpoint):  # counters of one name add up: core and proxies have the same servers
             counters.update(each.as_dict())
         yield_to_data()
+        topics_left = services_left = 0
+        if services is None or isinstance(services, bool):
+            services = None if services or (services is None and topics is None) else ()
+        if most is not None and topics is None:
+            topics, topics_left = self._topics.used(most)
+        if most is not None and services is None:
+            services, services_left = self._services.used(most)
         return Snapshot(
             agent=self._agent(endpoint),
             taken=time.time(),
-            peers=self._peers.infos(endpoint) if endpoint is not None else (),
+            peers=self._peers.infos(endpoint) if endpoint is not None and peers else (),
             topics=self._topics.infos(topics),
-            services=self._services.infos() if topics is None else (),
+            services=self._services.infos(services),
+            topics_left=topics_left,
+            services_left=services_left,
             counters=dict(sorted(counters.items())),
             notes=self._notes(endpoint),
             unreachable=unreachable_infos(self._sources.core, time.monotonic()),

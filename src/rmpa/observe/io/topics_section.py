@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from itertools import chain
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
@@ -17,14 +17,7 @@ from rmpa.config.param_rules import CLOCK
 from rmpa.core import limits
 from rmpa.core.contract import KEYS, Contract
 from rmpa.observe.contract_term import ContractTerm
-from rmpa.observe.snapshot import (
-    EventInfo,
-    LatencyInfo,
-    RouteInfo,
-    SampleSpread,
-    TopicInfo,
-    UnreachableInfo,
-)
+from rmpa.observe.snapshot import EventInfo, LatencyInfo, RouteInfo, SampleSpread, TopicInfo, UnreachableInfo
 from rmpa.ros.wire.tcpros import LENGTH
 from rmpa.runtime.event_loop import sorted_yielding, yield_to_data, yielding_to_data
 from rmpa.runtime.system_clock import SystemClock
@@ -101,6 +94,8 @@ class TopicsSection:
 
     def infos(self, wanted: Collection[str] | None = None) -> tuple[TopicInfo, ...]:
         """All topics of the local graph and of the peers, by name; or those that are wanted."""
+        if wanted is not None and not wanted:
+            return ()
         state = self._core.state()
         routes: dict[str, list[RouteInfo]] = {}
         mismatches: dict[str, list[str]] = {}
@@ -132,6 +127,36 @@ class TopicsSection:
             )
             found.append(topic)
         return tuple(found)
+
+    def used(self, most: int) -> tuple[Collection[str] | None, int]:
+        """The topics to show where at most so many can be shown, and the number of the others.
+
+        First those with a node of this module or an open route, all of them, then those with a problem, then others.
+
+        Returns:
+            The topics, ``None`` for all, and how many are left out.
+        """
+        state, bridge = self._core.state(), self._bridge.topics
+        idle: set[str] = set()
+        first, problems = set(state.subscribers), set()
+        for _, source, entry in yielding_to_data(list(bridge.imports)):
+            if entry.state is not RouteState.IDLE or entry.direct:
+                first.add(entry.topic)
+            elif not entry.shown or entry.problem or bridge.mismatches(source):
+                problems.add(entry.topic)
+            else:
+                idle.add(entry.topic)
+        first.update(source.topic for source in yielding_to_data(bridge.exports.offered))
+        others = idle | problems
+        first.update(name for name in yielding_to_data(state.publishers) if name not in others)
+        problems -= first
+        idle -= first | problems
+        beyond = {topic for _, topic, _ in yielding_to_data(bridge.imports.left_out())} - first - problems - idle
+        room = max(0, most - len(first))
+        if len(problems) + len(idle) + len(beyond) <= room:
+            return None, 0
+        rest = chain(*(sorted_yielding(part) for part in (problems, beyond, idle)))
+        return first | set(islice(rest, room)), len(problems) + len(idle) + len(beyond) - room
 
     def _decision(self, name: str, type_name: str, node: str) -> PolicyDecision:
         """Whether a topic of this module may cross."""

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rmpa.observe.peer_agent import PeerAgent
-    from rmpa.observe.snapshot import LinkInfo, PeerInfo, Snapshot
+    from rmpa.observe.peer_info import LinkInfo, PeerInfo
+    from rmpa.observe.snapshot import Snapshot
 
 _BUSY: Final = 90.0
 """Percent of a core from which on an agent counts as busy: it has one thread for all messages."""

@@ -35,7 +35,8 @@ from rmpa.ros import limits as ros_limits
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.observe.snapshot import PeerInfo, RouteInfo, Snapshot
+    from rmpa.observe.peer_info import PeerInfo
+    from rmpa.observe.snapshot import RouteInfo, Snapshot
     from rmpa.observe.why.diagnosis import BothEnds, PublisherReport, TopicAtSubscriber
 
 

@@ -53,10 +53,18 @@ SERVICES_SHOWN: Final = 2000
 """Services in a state; further ones are counted."""
 NODES_SHOWN: Final = 2000
 """Nodes in a state; further ones are counted."""
+LEFT_OUT_NAMES: Final = 256
+"""Topics and services beyond these that the agent is asked for at one time, because pages look at them."""
+NAMES_FOUND: Final = 40
+"""Names of topics and services that a search of the server finds: as many as a page lists."""
+SEARCH_CHARACTERS: Final = 512
+"""Characters of a search; a name has no more."""
 PARAMETER_NAMES_SHOWN: Final = 5000
 """Names of parameters that a search is given."""
 MODULES_SHOWN: Final = 256
 """Modules in a state; further ones are counted. A ring of more could not be read."""
+RING_MODULES: Final = 64
+"""From so many modules on, the ring shows those that are not parked: the names of more overlap."""
 FLOW_TOPICS: Final = 8
 """Topics that a flow names; the busiest first."""
 ALARMS_KEPT: Final = 200
@@ -70,7 +78,8 @@ SILENT_AFTER: Final = 1.0
 SILENT_AFTER_REST: Final = 8.0
 """The same for a link at rest, whose keepalives come every 5 s."""
 AWAY_AFTER: Final = 7.0
-"""Time without a beacon after which a module without a link is shown as away. Heartbeats come every 5 s."""
+"""Time without a beacon, or a packet of the failure detector, after which a module without a link is shown as away.
+Heartbeats come every 5 s; in a large mesh they are rarer, and probes come."""
 FORGET_AFTER: Final = 600.0
 """Time for which a module that has left the roster keeps its place in the ring."""
 STEADY: Final = 0.03
@@ -101,3 +110,5 @@ STATE_PAUSE_MAX: Final = 0.5
 """The longest pause between two snapshots."""
 HISTORY_PERIOD: Final = 2.0
 """Time between two snapshots while no page is open: the history tells the changes of links."""
+HISTORY_PERIOD_MAX: Final = 10.0
+"""The same in a large mesh, where it is twenty times as long as a snapshot takes."""

@@ -48,6 +48,7 @@ QUESTIONS: Mapping[str, str] = {
     "describe": "",
     "agent": "",
     "contract": "",
+    "find": "",
     "node": "",
     "param_names": "read_params",
     "params": "read_params",

@@ -23,15 +23,8 @@ from rmpa.web.monitor.steady import Steady, steady_figure
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from rmpa.observe.snapshot import (
-        LinkInfo,
-        PeerInfo,
-        RouteInfo,
-        ServiceInfo,
-        Snapshot,
-        SubscriberTransport,
-        TopicInfo,
-    )
+    from rmpa.observe.peer_info import LinkInfo, PeerInfo
+    from rmpa.observe.snapshot import RouteInfo, ServiceInfo, Snapshot, SubscriberTransport, TopicInfo
     from rmpa.web.monitor.resources import ResourceFacts
 
 _STATES = {"refused": "refused", "conflict": "refused", "relayed": "relayed", "parked": "parked"}
@@ -46,7 +39,8 @@ def module_state(peer: PeerInfo) -> str:
         return "silent" if peer.link.heard_ago > after else "up"
     if peer.state in _STATES:
         return _STATES[peer.state]
-    return "away" if peer.beacon_ago is None or peer.beacon_ago > limits.AWAY_AFTER else "linking"
+    heard = [peer.beacon_ago, peer.probes.heard_ago if peer.probes is not None else None]
+    return "linking" if any(ago is not None and ago <= limits.AWAY_AFTER for ago in heard) else "away"
 
 
 class _ByteRates:
@@ -112,6 +106,14 @@ class _KnownTopic(NamedTuple):
 _UNKNOWN_FIGURES: _Figures = (None, None, None)
 
 
+def _first_peers(peers: tuple[PeerInfo, ...]) -> Sequence[PeerInfo]:
+    """The peers that are shown, by name: of very many, parked ones only where there is room."""
+    if len(peers) <= limits.MODULES_SHOWN:
+        return peers
+    first = sorted(peers, key=lambda peer: peer.state == "parked")[: limits.MODULES_SHOWN]
+    return sorted(first, key=lambda peer: peer.name)
+
+
 class StateBuilder:
     """Makes the state of each snapshot.
 
@@ -149,9 +151,10 @@ class StateBuilder:
             parameters: How often the parameters of this module's core have changed.
         """
         taken = snapshot.taken
-        peers = snapshot.peers[: limits.MODULES_SHOWN]
+        peers = _first_peers(snapshot.peers)
         self._bytes.keep(peer.name for peer in peers)
-        self._places.update((peer.name for peer in peers), taken)
+        many = len(snapshot.peers) >= limits.RING_MODULES
+        self._places.update((peer.name for peer in peers if not many or peer.state != "parked"), taken)
         topics, flows = self._topics_and_flows(snapshot.topics)
         nodes = self._nodes.build(snapshot)
         state: Tree = {
@@ -168,20 +171,29 @@ class StateBuilder:
                 str(alarm.get("id", index)): {**alarm, "module": alarm.get("module") or self.own}
                 for index, alarm in enumerate(alarms)
             },
+            "parked": sum(peer.state == "parked" for peer in snapshot.peers),
             "recorded": recorded,
             "parameters": parameters,
             "notes": list(snapshot.notes[:100]),
             "unreachable": [str(each) for each in snapshot.unreachable[:100]],
         }
         hidden = {
-            "topics": len(snapshot.topics) - limits.TOPICS_SHOWN,
-            "services": len(snapshot.services) - limits.SERVICES_SHOWN,
+            "topics": max(0, len(snapshot.topics) - limits.TOPICS_SHOWN) + snapshot.topics_left,
+            "services": max(0, len(snapshot.services) - limits.SERVICES_SHOWN) + snapshot.services_left,
             "modules": len(snapshot.peers) - limits.MODULES_SHOWN,
             "nodes": len(nodes) - limits.NODES_SHOWN,
         }
         state["hidden"] = {kind: count for kind, count in hidden.items() if count > 0}
         self._steady.sweep()
         return self._shared(state)
+
+    def entry(self, snapshot: Snapshot, kind: str, name: str) -> Tree | None:
+        """What the state would say of a topic or service that it leaves out."""
+        if kind == "topic":
+            topic = next((topic for topic in snapshot.topics if topic.name == name), None)
+            return self._topic(topic, None).entry if topic is not None else None
+        service = next((each for each in snapshot.services if service_key(each) == name), None)
+        return _service(service) if service is not None else None
 
     def unreachable(self, since: float, error: str, remedy: str) -> Tree:
         """The state while the agent does not answer: what was last known, marked as such."""
@@ -230,7 +242,7 @@ class StateBuilder:
         yield self.own, {"state": "here", "since": round(snapshot.agent.started, 1)}
         for peer in peers:
             yield peer.name, self._module(peer, snapshot.taken)
-        for name in self._places.absent(peer.name for peer in peers):
+        for name in self._places.absent(peer.name for peer in snapshot.peers):
             yield name, {"state": "away", "error": "has left the roster: no beacon and no link"}
 
     def _module(self, peer: PeerInfo, taken: float) -> Tree:

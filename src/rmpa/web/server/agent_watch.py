@@ -7,6 +7,7 @@ import logging
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 from rmpa.core.errors import RmpaError, UnreachableError
@@ -16,7 +17,7 @@ from rmpa.observe.snapshot_decoder import SnapshotDecoder
 from rmpa.web import limits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from rmpa.observe.snapshot import Snapshot
 
@@ -46,10 +47,22 @@ class AgentWatch:
     Args:
         read: Asks the agent; may block, and raises ``RmpaError`` where it does not answer.
         clock: Monotonic seconds.
+        read_whole: Asks for a snapshot of which nothing is left out, where ``read`` may leave out what is not used.
+        read_named: Asks for a snapshot of some topics and services, likewise.
     """
 
-    def __init__(self, read: Callable[[], Snapshot], clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        read: Callable[[], Snapshot],
+        clock: Callable[[], float] = time.monotonic,
+        read_whole: Callable[[], Snapshot] | None = None,
+        read_named: Callable[[Sequence[str], Sequence[str]], Snapshot] | None = None,
+    ) -> None:
         self._read = read
+        self._read_named = read_named
+        self._read_whole = read_whole
+        self._whole: Reading | None = None
+        self._pending_whole: asyncio.Task[Reading] | None = None
         self._clock = clock
         self._thread = ThreadPoolExecutor(1, "rmpa-agent-watch")
         self._last: Reading | None = None
@@ -68,10 +81,46 @@ class AgentWatch:
             self._pending = asyncio.create_task(self._ask(), name="agent watch")
         return await asyncio.shield(self._pending)  # a client that leaves must not end it for the others
 
+    async def whole(self) -> Reading:
+        """As ``reading``, with all topics and services also where the usual reading leaves some out."""
+        reading = await self.reading()
+        snapshot = reading.snapshot
+        read = self._read_whole
+        if read is None or snapshot is None or not (snapshot.topics_left or snapshot.services_left):
+            return reading
+        whole = self._whole
+        if whole is None or self._clock() - whole.taken >= limits.WEB_WHOLE_AGE:
+            if self._pending_whole is None:
+                self._pending_whole = asyncio.create_task(self._ask_whole(read), name="agent watch, whole")
+            whole = await asyncio.shield(self._pending_whole)
+        return whole
+
+    async def named(self, topics: Sequence[str], services: Sequence[str]) -> Reading:
+        """The topics and services of these names, also where the usual reading leaves them out; no peers."""
+        if self._read_named is None:
+            return await self.reading()
+        read = partial(self._read_named, topics, services)
+        snapshot, problem = await asyncio.get_running_loop().run_in_executor(self._thread, self._read_safely, read)
+        self.reads += 1
+        return Reading(self.reads, self._clock(), snapshot, problem)
+
+    async def _ask_whole(self, read: Callable[[], Snapshot]) -> Reading:
+        try:
+            snapshot, problem = await asyncio.get_running_loop().run_in_executor(
+                self._thread, self._read_safely, read
+            )
+        finally:
+            self._pending_whole = None
+        self.reads += 1
+        self._whole = Reading(self.reads, self._clock(), snapshot, problem)
+        return self._whole
+
     async def _ask(self) -> Reading:
         began = self._clock()
         try:
-            snapshot, problem = await asyncio.get_running_loop().run_in_executor(self._thread, self._read_safely)
+            snapshot, problem = await asyncio.get_running_loop().run_in_executor(
+                self._thread, self._read_safely, self._read
+            )
         finally:
             self._pending = None
         now = self._clock()
@@ -81,9 +130,10 @@ class AgentWatch:
         self._last = Reading(self.reads, now, snapshot, problem)
         return self._last
 
-    def _read_safely(self) -> tuple[Snapshot | None, str]:
+    @staticmethod
+    def _read_safely(read: Callable[[], Snapshot]) -> tuple[Snapshot | None, str]:
         try:
-            return self._read(), ""
+            return read(), ""
         except RmpaError as error:
             return None, str(error)
 
@@ -96,8 +146,8 @@ class AgentWatch:
 
     async def close(self) -> None:
         """Wait for a question under way, at most ``limits.WEB_AGENT_TIMEOUT``, and end the thread."""
-        if self._pending is not None:
-            await asyncio.wait([self._pending])
+        if pending := [task for task in (self._pending, self._pending_whole) if task is not None]:
+            await asyncio.wait(pending)
         self._thread.shutdown()
 
 
@@ -119,15 +169,29 @@ class ControlReader:
         """Whether the agent is to ask nodes for the figures of their direct connections."""
 
     def __call__(self) -> Snapshot:
-        """Ask for a snapshot.
+        """Ask for a snapshot, with ``limits.WEB_TOPICS`` topics and services if most of them are not used.
 
         Raises:
             RmpaError: No agent answers, or several run and none is named.
         """
+        return self._read(most=limits.WEB_TOPICS)
+
+    def read_whole(self) -> Snapshot:
+        """Ask for a snapshot of which nothing is left out; raises as a call."""
+        with ControlClient(choose_agent(self._environ, self._name).path, limits.WEB_WHOLE_TIMEOUT) as client:
+            return client.snapshot()
+
+    def read_named(self, topics: Sequence[str], services: Sequence[str]) -> Snapshot:
+        """Ask for a snapshot of these topics and services alone; raises as a call."""
+        with ControlClient(choose_agent(self._environ, self._name).path, limits.WEB_WHOLE_TIMEOUT) as client:
+            figures = "newest" if self.figures else False
+            return client.snapshot(topics=topics, services=services, peers=False, figures=figures)
+
+    def _read(self, **args: object) -> Snapshot:
         began = time.monotonic()
         if self._client is not None and began - self._used < observe_limits.CONTROL_IDLE_TIMEOUT / 2:
             try:
-                return self._ask(self._client)
+                return self._ask(self._client, args)
             except UnreachableError:
                 if time.monotonic() - began >= limits.WEB_AGENT_TIMEOUT:
                     raise  # the agent hangs; another connection would wait as long
@@ -136,11 +200,11 @@ class ControlReader:
         agent = choose_agent(self._environ, self._name)
         self._name = agent.name
         self._client = ControlClient(agent.path, limits.WEB_AGENT_TIMEOUT)
-        return self._ask(self._client)
+        return self._ask(self._client, args)
 
-    def _ask(self, client: ControlClient) -> Snapshot:
+    def _ask(self, client: ControlClient, args: dict[str, object]) -> Snapshot:
         try:
-            snapshot = client.snapshot(self._decoder, **({"figures": "newest"} if self.figures else {}))
+            snapshot = client.snapshot(self._decoder, **args, **({"figures": "newest"} if self.figures else {}))
         except RmpaError:
             self.close()
             raise

@@ -246,7 +246,7 @@ class Routes:
         path = request.rel_url.raw_path
         if path == rest.OPENAPI_PATH:
             return await self._openapi(request)
-        reading = await self._watch.reading()
+        reading = await self._watch.whole()
         return _response(rest.respond("GET", path, reading.snapshot, reading.problem))
 
     async def _metrics(self, request: web.Request) -> web.Response:

@@ -176,7 +176,7 @@ async def serve(
         loop.add_signal_handler(number, stop.set)
     web = setup.settings.web
     reader = ControlReader(os.environ, agent)
-    watch = AgentWatch(reader)
+    watch = AgentWatch(reader, read_whole=reader.read_whole, read_named=reader.read_named)
     hub = make_hub(watch, web.port)
 
     def watched(is_open: bool) -> None:

@@ -221,15 +221,18 @@ const FlowRow = memo(({ from, to, flow }) => html`<tr><th scope="row">${from} �
 export function Mandala({ state, connection }) {
   const current = connection.phase !== "lost" && section(state, "reach").ok !== false;
   const modules = entries(state, "modules"), resources = entries(state, "resources");
-  const up = modules.filter(([, one]) => one.state === "up" || one.state === "here").length;
+  const up = modules.filter(([, one]) => one.state === "up" || one.state === "here").length + (state.parked || 0);
+  const total = modules.length + (section(state, "hidden").modules || 0);
+  const marks = ["up", "parked", "relayed", "silent", "linking", "refused", "away"].filter((each) => (each !== "parked" && each !== "relayed") || modules.some(([, one]) => one.state === each));
   const places = section(section(state, "ring"), "places");
   const ordered = modules.sort(([a], [b]) => (places[a] ?? 1e9) - (places[b] ?? 1e9));
-  return html`<${Page} title="Mesh" kind=${`Domain ${section(state, "agent").domain ?? "–"} · ${up} of ${modules.length} modules up${current ? "" : " when last heard of"}`}>
+  return html`<${Page} title="Mesh" kind=${`Domain ${section(state, "agent").domain ?? "–"} · ${up} of ${total} modules up${state.parked ? `, ${state.parked} of them parked` : ""}${current ? "" : " when last heard of"}`}>
     <div class="overview"><div class="stage-area"><${Ring} state=${state} />
-      <p class="legend" aria-hidden="true">${["up", "silent", "linking", "refused", "away"].map((each) => html`<${Mark} key=${each} state=${each} />`)}<span class="mark flowkey"><svg viewBox="0 0 26 16"><path d="M1 8h22" /></svg>messages</span></p></div>
+      <p class="legend" aria-hidden="true">${marks.map((each) => html`<${Mark} key=${each} state=${each} />`)}<span class="mark flowkey"><svg viewBox="0 0 26 16"><path d="M1 8h22" /></svg>messages</span></p></div>
     <div class="beside">
       <${Panel} title="What is wrong"><${Concerns} state=${state} connection=${connection} /><//>
-      <${Panel} title="Modules"><${Table} caption="Modules" columns=${["Module", "Link", "#Round trip", "#In", "#Out", "Profile"]}>${ordered.map(([name, module]) => html`<${Row} key=${name} name=${name} module=${module} resources=${same(`row ${name}`, resources.filter(([, one]) => one.module === name))} />`)}<//><//>
+      <${Panel} title="Modules"><${Table} caption="Modules" columns=${["Module", "Link", "#Round trip", "#In", "#Out", "Profile"]}>${ordered.map(([name, module]) => html`<${Row} key=${name} name=${name} module=${module} resources=${same(`row ${name}`, resources.filter(([, one]) => one.module === name))} />`)}<//>
+        ${total > modules.length && html`<p class="empty">The server leaves out ${total - modules.length} further modules.</p>`}<//>
       <${Panel} title="Flows"><${Table} caption="Flows between modules" columns=${["From → to", "#Messages", "#Bytes", "Topics"]} empty="No messages cross at present.">${entries(state, "flows").map(([key, flow]) => { const [from, to] = key.split(">"); return html`<${FlowRow} key=${key} from=${from} to=${to} flow=${flow} />`; })}<//><//>
     </div></div><//>`;
 }

@@ -22,8 +22,10 @@ from rmpa.observe.doctor.exposed_nodes import judge_exposed_nodes
 from rmpa.observe.doctor.io import machine, network
 from rmpa.observe.doctor.io.exposed_nodes import exposed_nodes
 from rmpa.observe.doctor.io.firewall import check_firewall
+from rmpa.observe.doctor.io.kernel_limits import read_kernel_limits
 from rmpa.observe.doctor.io.multicast import hear_ourselves
 from rmpa.observe.doctor.io.programs import resolve
+from rmpa.observe.doctor.kernel_limits import judge_kernel_limits, mesh_size
 from rmpa.observe.doctor.machine import judge_clock, judge_rights
 from rmpa.observe.doctor.network import (
     judge_interfaces,
@@ -97,7 +99,7 @@ def look_at(environ: Mapping[str, str], config: str | None = None) -> DoctorInpu
     for found in find_agents(environ):
         try:
             with ControlClient(found.path) as client:
-                agents[found.name] = client.snapshot()
+                agents[found.name] = client.snapshot(most=0)  # topics in use
         except RmpaError as error:
             agents[found.name] = str(error)
     return DoctorInput(environ, settings, checks, agents, network.read_interfaces(settings.interfaces))
@@ -200,6 +202,11 @@ def _rights(given: DoctorInput) -> Iterable[Check]:
     return judge_rights(rights)
 
 
+def _kernel_limits(given: DoctorInput) -> Iterable[Check]:
+    snapshots = given.snapshots.values()
+    return judge_kernel_limits(read_kernel_limits(snapshots), mesh_size(given.settings, snapshots, given.interfaces))
+
+
 def _stale_connections(given: DoctorInput) -> Iterable[Check]:
     told = {name: shown.agent.end_connections for name, shown in given.snapshots.items()}
     return judge_stale_connections(told, may_end_connections(), direct=given.settings.allows_direct)
@@ -228,6 +235,7 @@ CHECKS: Final = (
     DoctorCheck("ROS", _shell),
     DoctorCheck("clock", lambda _: judge_clock(machine.read_clock())),
     DoctorCheck("realtime", _rights),
+    DoctorCheck("kernel limits", _kernel_limits),
     DoctorCheck("stale connections", _stale_connections),
     DoctorCheck("exposed nodes", _exposed_nodes),
 )

@@ -104,7 +104,7 @@ class GroupReceiver(_Socket):
         except OSError as error:
             problem = f"cannot be opened ({error.strerror})"
             raise StartError(f"UDP port {port}", problem, "`ss -ulnp` shows who has it") from None
-        self._members = GroupMembership(self._sock, group)
+        self._members = GroupMembership([self._sock], group)
         self._names: dict[int, str] = {}
 
     def join(self, interfaces: Iterable[Interface]) -> dict[str, str]:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.topics.remote_topic import RemoteTopic
     from rmpa.config.settings import Settings
     from rmpa.observe.io.snapshot_builder import SnapshotBuilder
-    from rmpa.observe.snapshot import PeerInfo
+    from rmpa.observe.peer_info import PeerInfo
     from rmpa.ros.core.api import Core
 
 

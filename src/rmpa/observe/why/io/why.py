@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.observe.io.site_requests import SiteRequests
     from rmpa.observe.io.snapshot_builder import SnapshotBuilder
-    from rmpa.observe.snapshot import PeerInfo
+    from rmpa.observe.peer_info import PeerInfo
     from rmpa.ros.core.api import Core
 
 _T = TypeVar("_T")
@@ -214,7 +214,7 @@ class WhyService:
         return session is not None and bool(self._topics.here(session, peer, topic).proxies)
 
     async def _nowhere(self, topic: str, linked: list[str]) -> Diagnosis:
-        here = self._snapshots.build(frozenset()).agent.name
+        here = self._snapshots.build((), peers=False).agent.name
         if self._topics.own(topic):
             text, remedy = "no peer is linked that it could go to", "`rmpa peer list` tells of the peers"
             return Diagnosis.of((Check("peer", FAIL, text, remedy),), name=topic, peer=here, to="")
@@ -300,7 +300,7 @@ class WhyService:
             )
             served = tuple(diagnosis for diagnosis in found if diagnosis.node)
             served = served or tuple(diagnosis for diagnosis in found if _is_denied(diagnosis))
-            here = self._snapshots.build(frozenset()).agent.name
+            here = self._snapshots.build((), peers=False).agent.name
             return served or (await self._services.nowhere(here, service, [p.name for p in peers]),)
         return (await self._calls(name, service),)
 

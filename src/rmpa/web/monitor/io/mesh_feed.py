@@ -9,6 +9,7 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from rmpa.web.monitor import limits
+from rmpa.web.monitor.io.left_out import LeftOut
 from rmpa.web.monitor.view import StateBuilder, details
 
 if TYPE_CHECKING:
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 _LEVELS: Final = {"here": "OK", "up": "OK", "relayed": "OK", "parked": "OK", "refused": "ERROR"}
 """Levels of the history by the state of a link; all others are warnings."""
+_PARKING: Final = frozenset({"up", "parked"})
+"""States between which a module changes when its link is parked, or made again: the history leaves that out."""
 WORDS: Final = {
     "up": "linked",
     "parked": "is parked",
@@ -66,6 +69,7 @@ class MeshFeed:
         self._task: asyncio.Task[None] | None = None
         self._wake = asyncio.Event()
         self._links: dict[str, str] = {}
+        self._left_out = LeftOut(watch, self._show)
 
     @property
     def agent(self) -> str:
@@ -99,6 +103,7 @@ class MeshFeed:
     async def close(self) -> None:
         """End."""
         self._pages.clear()
+        await self._left_out.close()
         if self._task is not None:
             self._task.cancel()
             await asyncio.wait([self._task])
@@ -109,7 +114,18 @@ class MeshFeed:
             return None
         if kind == "resource":
             self._resources.look(name)
-        return details(self._snapshot, self._resources.facts, kind, name)
+        found = details(self._snapshot, self._resources.facts, kind, name)
+        section = self._state.get(f"{kind}s") if kind in ("topic", "service") and self._state is not None else None
+        if not isinstance(section, dict) or name in section:
+            return found
+        snapshot: Snapshot | None = self._snapshot
+        if found is None:
+            left = self._snapshot.topics_left if kind == "topic" else self._snapshot.services_left
+            snapshot = self._left_out.look(kind, name[name.find("/") :]) if left else None
+            found = details(snapshot, {}, kind, name) if snapshot is not None else None
+        if found is not None and snapshot is not None and self._builder is not None:
+            found["entry"] = self._builder.entry(snapshot, kind, name)
+        return found
 
     async def _run(self) -> None:
         while True:
@@ -126,7 +142,7 @@ class MeshFeed:
                 continue
             self._wake.clear()
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(limits.HISTORY_PERIOD):
+                async with asyncio.timeout(max(limits.HISTORY_PERIOD, min(took * 20, limits.HISTORY_PERIOD_MAX))):
                     await self._wake.wait()
 
     def _take(self, reading: Reading) -> None:
@@ -148,8 +164,13 @@ class MeshFeed:
             standing, recorded = self._resources.alarms(), self._resources.recorded
             self._state = self._builder.build(reading.snapshot, facts, standing, recorded, self._parameters())
         self._record_links(self._state)
-        for show in [*self._pages.values()]:
-            show(self._state)
+        self._show()
+
+    def _show(self) -> None:
+        """Give all pages the state, with the details of what they look at."""
+        if self._state is not None:
+            for show in [*self._pages.values()]:
+                show(self._state)
 
     def _record_links(self, state: Tree) -> None:
         """Note in the history which links were lost, and which are back."""
@@ -159,7 +180,7 @@ class MeshFeed:
                 continue
             now, before = str(module.get("state", "")), self._links.get(name)
             self._links[name] = now
-            if before not in (None, now):
+            if before not in (None, now) and not {before, now} <= _PARKING:
                 error = str(module.get("error") or "")
                 text = f"{name}: {WORDS.get(now, now)}" + (f": {error}" if error else "")
                 self._resources.record(_LEVELS.get(now, "WARN"), text, module=name)

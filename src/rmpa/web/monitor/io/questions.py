@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from rmpa.ros.types.service_types import ServiceType
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.web.hub.hub import Hub
-    from rmpa.web.hub.requests import ParamValue
+    from rmpa.web.hub.requests import GraphService, ParamValue
     from rmpa.web.hub.rights import Rights
     from rmpa.web.monitor.io.resource_watch import ResourceWatch
     from rmpa.web.monitor.session import Question
@@ -81,6 +81,7 @@ class Answers:
             "describe": self._describe,
             "agent": self._agent_of,
             "contract": self._contract,
+            "find": self._find,
             "node": self._node,
             "param_names": self._param_names,
             "params": self._params,
@@ -139,6 +140,29 @@ class Answers:
 
     async def _contract(self, args: Args) -> Any:
         return await self._control_call("contract", topic=_name(args, "topic"), type_name=_text(args, "type"))
+
+    async def _find(self, args: Args) -> Any:
+        """Topics and services with all words of ``text`` in their name or type, also those that the state leaves out.
+
+        Names that end with the last word go first, then short ones.
+        """
+        words = _text(args, "text")[: limits.SEARCH_CHARACTERS].lower().split()
+        topics, services = list(self._hub.graph.topics.values()), list(self._hub.graph.services.values())
+
+        def find() -> list[Args]:
+            entries = [
+                *(("topic", each.name, each.name, " ".join(each.types)) for each in topics),
+                *(("service", each.name, _service_key(each), each.type) for each in services),
+            ]
+            found = []
+            for kind, name, key, type_ in entries if words else ():
+                about = f"{kind} {key} {type_}".lower()
+                if all(word in about for word in words):
+                    found.append((not name.lower().endswith(words[-1]), len(name), key, kind, type_))
+            first = sorted(found)[: limits.NAMES_FOUND]
+            return [{"kind": kind, "name": key, "type": type_} for _, _, key, kind, type_ in first]
+
+        return {"found": await asyncio.get_running_loop().run_in_executor(self._threads, find)}
 
     async def _node(self, args: Args) -> Any:
         """The facts about a node, with names of nodes as pages have them."""
@@ -313,6 +337,12 @@ class Answers:
     async def _type_of(self, service: str) -> ServiceType:
         found = await self._hub.calls.find(service)
         return await self._hub.types.find_service(found.type)
+
+
+def _service_key(service: GraphService) -> str:
+    """The service's key in the state (``view.service_key``)."""
+    peer = proxied_peer(service.providers[0]) if service.providers else None
+    return f"{peer}:{service.name}" if peer else service.name
 
 
 def _unknown_params() -> UnreachableError:

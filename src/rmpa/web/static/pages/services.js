@@ -13,17 +13,18 @@ const Row = memo(({ name, service, own }) => html`<tr><th scope="row"><${Link} p
 export function Services({ state }) {
   const [text, setText] = useState("");
   const all = entries(state, "services");
+  const hidden = section(state, "hidden").services;
   const shown = all.filter(([name, one]) => `${name} ${one.type || ""}`.toLowerCase().includes(text.toLowerCase()));
   return html`<${Page} title="Services" kind=${`${all.length} in all modules`}>
     <input class="filter" type="search" placeholder="Filter by name or type" aria-label="Filter by name or type" value=${text} onInput=${(event) => setText(event.target.value)} />
     <${Panel}><${Table} caption="Services" columns=${["Service", "Module", "Node", "Type", "State", "#Calls", "#Failed"]} empty="No service is like that.">${shown.slice(0, 300).map(([key, one]) => html`<${Row} key=${key} name=${key} service=${one} own=${section(state, "agent").name} />`)}<//>
-    ${shown.length > 300 && html`<p class="empty">${shown.length - 300} more: filter by name.</p>`}<//><//>`;
+    ${(shown.length > 300 || hidden) && html`<p class="empty">${shown.length > 300 ? `${shown.length - 300} more: filter by name. ` : ""}${hidden ? `${count(hidden)} more services are not listed: the search (/) finds them by name.` : ""}</p>`}<//><//>`;
 }
 
 export function ServicePage({ name, state, connection }) {
-  const service = section(state, "services")[name];
-  if (!service) return html`<${Page} title=${name} kind="Service"><${Gone} kind="service" name=${name} /><//>`;
   const detail = section(section(state, "detail"), `service:${name}`);
+  const service = section(state, "services")[name] || detail.entry; // of very many services, the state leaves some out
+  if (!service) return html`<${Page} title=${name} kind="Service"><${Gone} kind="service" name=${name} /><//>`;
   const latency = section(detail, "latency");
   return html`<${Page} title=${service.name} kind=${`Service of ${service.module || section(state, "agent").name}${service.type ? ` · ${service.type}` : ""}`}><div class="grid">
     <${Panel} title="Service"><${Facts} rows=${[["Node", html`<${NodeLink} name=${nodeKey(service.module, service.node)} />`], ["State", STATES[service.state] || service.state], ["Transport", service.transport], ["Relayed because", detail.relayed_because], ["Address", detail.address], ["Calls across the mesh", count(service.calls || 0)],

@@ -40,7 +40,7 @@ export function Topics({ state }) {
     <input class="filter" type="search" placeholder="Filter by name or type" aria-label="Filter by name or type" value=${text} onInput=${(event) => setText(event.target.value)} />
     <${Panel}><${Table} caption="Topics" columns=${COLUMNS} empty="No topic is like that.">${shown.slice(0, MOST).map(([name, one]) => html`<${TopicRow} key=${name} name=${name} topic=${one} />`)}<//>
     ${filter === "data" && all.length > shown.length && !text && html`<p class="empty">${all.length - shown.length} topics of the log and of Smart Resources about themselves are left out. <button type="button" onClick=${() => setFilter("all")}>Show all</button></p>`}
-    ${(shown.length > MOST || hidden) && html`<p class="empty">${shown.length > MOST ? `${shown.length - MOST} more: filter by name. ` : ""}${hidden ? `The server leaves out ${hidden} further topics.` : ""}</p>`}<//><//>`;
+    ${(shown.length > MOST || hidden) && html`<p class="empty">${shown.length > MOST ? `${shown.length - MOST} more: filter by name. ` : ""}${hidden ? `${count(hidden)} more topics are not listed: the search (/) finds them by name.` : ""}</p>`}<//><//>`;
 }
 
 const FIGURES = [["rate", "Rate", hertz], ["p50", "Latency, median", seconds], ["p99", "Latency, 99th percentile", seconds], ["jitter", "Jitter", seconds], ["bandwidth", "Bytes", bandwidth], ["lost", "Lost", count]];
@@ -49,9 +49,9 @@ const figureOf = (route, key) => (key === "p50" || key === "p99" ? section(route
 
 export function TopicPage({ name, state, connection }) {
   const [figure, setFigure] = useState("rate");
-  const topic = section(state, "topics")[name];
-  if (!topic) return html`<${Page} title=${name} kind="Topic"><${Gone} kind="topic" name=${name} /><${Panel} title="Why?"><${Why} connection=${connection} kind="topic" name=${name} /><//><//>`;
   const detail = section(section(state, "detail"), `topic:${name}`);
+  const topic = section(state, "topics")[name] || detail.entry; // of very many topics, the state leaves some out
+  if (!topic) return html`<${Page} title=${name} kind="Topic"><${Gone} kind="topic" name=${name} /><${Panel} title="Why?"><${Why} connection=${connection} kind="topic" name=${name} /><//><//>`;
   const routes = entries(detail, "routes");
   const own = section(state, "agent").name;
   const format = FIGURES.find(([key]) => key === figure)[2];

@@ -1,0 +1,139 @@
+"""The details of topics and services that the usual snapshot of a large graph leaves out."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any, ClassVar, cast
+
+import msgspec
+
+from rmpa.web import limits
+from rmpa.web.monitor.io.mesh_feed import MeshFeed
+from rmpa.web.monitor.view import service_key
+from rmpa.web.server.agent_watch import AgentWatch
+from tests.web.snapshots import FULL
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rmpa.observe.snapshot import Snapshot
+    from rmpa.web.monitor.io.resource_watch import ResourceWatch
+    from rmpa.web.monitor.patch import Tree
+
+PART = msgspec.structs.replace(
+    FULL, topics=(), services=(), topics_left=len(FULL.topics), services_left=len(FULL.services)
+)
+TOPIC, SERVICE = FULL.topics[0], FULL.services[0]
+
+
+class Resources:
+    """There are no Smart Resources."""
+
+    facts: ClassVar[dict[str, Any]] = {}
+    recorded = 0
+
+    def alarms(self) -> tuple[Tree, ...]:
+        return ()
+
+    def show_all(self, *, wanted: bool) -> None: ...
+
+
+class Feed:
+    """A feed of an agent that leaves everything out of its usual snapshot, with one page."""
+
+    def __init__(self, usual: Snapshot = PART) -> None:
+        self.now = 0.0
+        self.asked: list[tuple[Sequence[str], Sequence[str]]] = []
+        self.shown = asyncio.Event()
+        self.watch = AgentWatch(lambda: usual, read_named=self._named)
+        self.feed = MeshFeed(self.watch, cast("ResourceWatch", Resources()), lambda _: None)
+        self.feed._left_out._clock = lambda: self.now
+
+    def _named(self, topics: Sequence[str], services: Sequence[str]) -> Snapshot:
+        self.asked.append((topics, services))
+        return msgspec.structs.replace(
+            FULL,
+            topics=tuple(each for each in FULL.topics if each.name in topics),
+            services=tuple(each for each in FULL.services if each.name in services),
+            peers=(),
+        )
+
+    async def start(self) -> Tree:
+        """The first state."""
+        states: list[Tree] = []
+
+        def show(state: Tree) -> None:
+            states.append(state)
+            self.shown.set()
+
+        await self.feed.first()
+        self.feed.follow(self, show)
+        self.shown.clear()
+        return states[0]
+
+    async def answered(self) -> None:
+        """Wait until pages are shown what the agent was asked for."""
+        async with asyncio.timeout(30):
+            await self.shown.wait()
+        self.shown.clear()
+
+    async def close(self) -> None:
+        await self.feed.close()
+        await self.watch.close()
+
+
+async def test_the_page_of_a_topic_that_is_left_out_has_its_details() -> None:
+    feed = Feed()
+    state = await feed.start()
+    assert state["topics"] == {}
+    assert state["hidden"] == {"topics": len(FULL.topics), "services": len(FULL.services)}
+    assert feed.feed.details("topic", TOPIC.name) is None
+    await feed.answered()
+    found = feed.feed.details("topic", TOPIC.name)
+    assert found is not None
+    entry = found["entry"]
+    assert isinstance(entry, dict)
+    assert (found["name"], entry["type"], entry["from"]) == (TOPIC.name, TOPIC.type, ["arm"])
+    assert feed.asked == [([TOPIC.name], [])]
+    await feed.close()
+
+
+async def test_so_has_the_page_of_a_service() -> None:
+    feed = Feed()
+    await feed.start()
+    assert feed.feed.details("service", service_key(SERVICE)) is None
+    await feed.answered()
+    found = feed.feed.details("service", service_key(SERVICE))
+    assert found is not None
+    assert cast("Tree", found["entry"])["name"] == SERVICE.name
+    assert feed.asked == [([], [SERVICE.name])]
+    await feed.close()
+
+
+async def test_the_agent_is_asked_again_only_while_a_page_looks() -> None:
+    feed = Feed()
+    await feed.start()
+    for _ in range(3):
+        assert feed.feed.details("topic", TOPIC.name) is None
+    assert feed.feed.details("topic", "/none") is None
+    await feed.answered()
+    for _ in range(3):
+        assert feed.feed.details("topic", "/none") is None
+        assert feed.feed.details("topic", TOPIC.name) is not None
+    assert feed.asked == [(sorted([TOPIC.name, "/none"]), [])]
+    feed.now += limits.WEB_WHOLE_AGE
+    assert feed.feed.details("topic", TOPIC.name) is not None
+    await feed.answered()
+    assert len(feed.asked) == 2
+    await feed.close()
+
+
+async def test_a_snapshot_with_everything_needs_no_further_question() -> None:
+    feed = Feed(FULL)
+    await feed.start()
+    assert feed.feed.details("topic", "/none") is None
+    found = feed.feed.details("topic", TOPIC.name)
+    assert found is not None
+    assert "entry" not in found
+    assert feed.asked == []
+    await feed.close()
