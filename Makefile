@@ -5,7 +5,9 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := venv
-.PHONY: venv demo demo-sites demo-kill demo-start test test-bare tests style format types imports reference fuzz soak soak-web swim bench experiment wheel ros chromium clients clean
+# One apt at a time: a lock on this folder.
+APT := flock scripts
+.PHONY: packages checks venv demo demo-sites demo-kill demo-start test test-bare tests style format types imports reference fuzz soak soak-web soak-swim swim bench experiment wheel ros chromium clients clean
 
 $(STAMP): pyproject.toml constraints.txt scripts/bootstrap
 	scripts/bootstrap $(PYTHON) $(VENV)
@@ -22,19 +24,30 @@ demo-sites: $(STAMP)  ## the same modules at two sites, joined by gateways over 
 demo-kill demo-start: $(STAMP)  ## kill -9 a module of the running demo, start it again: make demo-kill MODULE=base
 	@$(BIN)/python examples/turtlebot/demo.py $(@:demo-%=%) $(or $(MODULE),$(error name one: make $@ MODULE=base))
 
-test: $(STAMP) ros chromium clients style types imports tests  ## everything, with Debian's ROS 1, Chromium, npm and promtool where they can be installed
+# Debian's packages and .venv are installed at one time, unless .venv itself needs packages of Debian.
+test:  ## everything, with Debian's ROS 1, Chromium, npm and promtool where they can be installed
+	$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || $(MAKE) venv
+	$(MAKE) --jobs=2 --output-sync=target packages checks
+	$(MAKE) tests
+
+packages:
+	$(APT) scripts/install-ros
+	$(APT) scripts/install-chromium
+	$(APT) scripts/install-clients
+
+checks: style types imports
 
 test-bare:  ## make test on a bare Debian in a chroot, which has almost nothing; some of it: make test-bare ARGS="make demo SECONDS=5"
 	scripts/test-in-chroot $(ARGS)
 
 chromium:  ## install Chromium for the tests of the monitor's pages (only where apt and root are there; else says so)
-	scripts/install-chromium
+	$(APT) scripts/install-chromium
 
 clients:  ## install npm and promtool for the tests of rmpa web against other people's clients (only where apt and root are there; else says so)
-	scripts/install-clients
+	$(APT) scripts/install-clients
 
 ros:  ## install Debian's ROS 1 for the interop tests (only where apt and root are there; else says so)
-	scripts/install-ros
+	$(APT) scripts/install-ros
 
 tests: $(STAMP)  ## all tests, several parts at a time; some of them: make tests ARGS="tests/core -k names"
 	$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),$(PYTHON) scripts/run-tests $(BIN)/python)
@@ -65,8 +78,11 @@ soak: $(STAMP) ros  ## disturb three modules for long and see that nothing leaks
 soak-web: $(STAMP) chromium  ## modules, topics, clients and pages of rmpa web come and go for an hour; nothing may leak: make soak-web [SECONDS=3600] [SEED=N]
 	$(BIN)/python -m tests.soak.web --seconds $(or $(SECONDS),3600) $(if $(SEED),--seed $(SEED))
 
-swim: $(STAMP)  ## figures of the failure detector at 1,000 simulated members, and 24 simulated hours at 1 % loss: make swim [ARGS="--members 200"]
+swim: $(STAMP)  ## figures of the failure detector at 1,000 simulated members: deaths, loss, pauses, cuts: make swim [ARGS="--members 200"]
 	$(BIN)/python -m tests.simulation.swim_figures $(ARGS)
+
+soak-swim: $(STAMP)  ## 24 simulated hours at 1 % packet loss, in which no module may be lost: make soak-swim [PEERS=32] [HOURS=24] [SEED=1]
+	$(BIN)/python -m tests.simulation --kind long --loss 0.01 --hours $(or $(HOURS),24) --peers $(or $(PEERS),32) --seed $(or $(SEED),1)
 
 bench: $(STAMP) ros  ## the measurements, as ratios in one run; results in lab/results
 	-$(BIN)/pip install -q -c constraints.txt -e '.[lab-peers,web-peers]'  # a peer that cannot be installed is left out

@@ -207,23 +207,21 @@ class Agent:
         rows = answer["peers"] if isinstance(answer, dict) else answer
         return {str(row["name"]): row for row in rows}
 
-    def wait_peer(self, name: str, timeout: float = DEADLINE) -> dict[str, object]:
-        """Wait until it has a live link to the peer of this name; return its row."""
+    def linked(self) -> set[str]:
+        """The names of the peers that it has a live link to, as it says by its control socket: no process is started.
 
-        def linked() -> dict[str, object] | None:
-            row = self.peers().get(name)
-            return row if row and is_linked(row) else None
+        Raises:
+            UnreachableError: It does not answer.
+        """
+        return {peer.name for peer in self.snapshot().peers if peer.state == "linked"}
 
-        return eventually(linked, timeout, what=f"{self.name} linked with {name}", every=0.2) or {}
+    def wait_peer(self, name: str, timeout: float = DEADLINE) -> None:
+        """Wait until it has a live link to the peer of this name."""
+        eventually(lambda: name in self.linked(), timeout, what=f"{self.name} linked with {name}")
 
     def wait_no_peer(self, name: str, timeout: float = DEADLINE) -> None:
         """Wait until it has no live link to the peer of this name."""
-
-        def gone() -> bool:
-            row = self.peers().get(name)
-            return row is None or not is_linked(row)
-
-        eventually(gone, timeout, what=f"{self.name} without {name}", every=0.2)
+        eventually(lambda: name not in self.linked(), timeout, what=f"{self.name} without {name}")
 
     def sockets(self) -> list[Path]:
         """The sockets that it left, or has, in its runtime directory."""
@@ -233,11 +231,6 @@ class Agent:
         if self._notify:
             self._notify.close()
             self._notify = None
-
-
-def is_linked(row: dict[str, object]) -> bool:
-    """Whether a row of ``rmpa peer list --json`` is of a peer with a live link."""
-    return row.get("state") == "linked"
 
 
 def last_link(snapshot: Snapshot | None, names: set[str], now: float) -> float | None:

@@ -302,14 +302,20 @@ def run(argv: Sequence[str | Path], *, env: Mapping[str, str] | None = None, tim
 def eventually(
     probe: Callable[[], T], timeout: float = DEADLINE, *, what: str = "a condition", every: float = 0.05
 ) -> T:
-    """Call ``probe`` until it returns something true, and return that."""
+    """Call ``probe`` until it returns something true, and return that.
+
+    A probe may start a process. The pause is ``every`` seconds, and at least as long as the probe took, which leaves
+    the processor to what is waited for.
+    """
     deadline = time.monotonic() + timeout
     while True:
+        began = time.monotonic()
         if result := probe():
             return result
-        if time.monotonic() > deadline:
+        now = time.monotonic()
+        if now > deadline:
             raise Deadline(f"waited {timeout} s for {what}; the last answer was {result!r}")
-        time.sleep(every)
+        time.sleep(max(every, min(now - began, deadline - now)))
 
 
 _alive: set[Process] = set()

@@ -14,19 +14,22 @@ Nodes take ``--word value`` pairs, given here as keyword arguments (``True`` bec
 
 from __future__ import annotations
 
+import fcntl
 import functools
 import hashlib
+import http.client
 import itertools
 import os
 import shutil
 import socket
 import subprocess
 import tempfile
+import xmlrpc.client
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Final, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
 
 from lab.bed.namespaces import MACHINE, Host
-from lab.bed.processes import DEADLINE, Process, run
+from lab.bed.processes import DEADLINE, BedError, Process, run
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -173,6 +176,16 @@ class Ros:
         start = self.rospy if kind == "rospy" else self.roscpp
         return start(program, *remaps, **options)  # type: ignore[arg-type]  # options are of the node, not of start
 
+    def graph_topics(self) -> set[str]:
+        """The topics with a publisher or a subscriber, as the master says by its API: no process is started."""
+        with MasterProxy(self.host, self.port) as master:
+            reply: Any = master.getSystemState("/test")
+        code, status, state = reply
+        if code != 1:
+            raise BedError(f"{self.uri}: getSystemState: {status}")
+        publishers, subscribers, _services = state
+        return {str(name) for name, _nodes in [*publishers, *subscribers]}
+
     def _wait_master(self) -> None:
         probe = (
             "import socket, sys, time\n"
@@ -182,6 +195,42 @@ class Ros:
             "sys.exit('no master answers')\n"
         )
         self.tool(PYTHON, "-c", probe, str(self.port), timeout=35.0)
+
+
+class _HostConnection(http.client.HTTPConnection):
+    """A connection from within a host's network."""
+
+    def __init__(self, host: Host, target: str) -> None:
+        super().__init__(target, timeout=DEADLINE)
+        self._from = host
+
+    def connect(self) -> None:
+        self.sock = self._from.open_socket()
+        self.sock.settimeout(self.timeout)
+        self.sock.connect((self.host, self.port))
+
+
+class _HostTransport(xmlrpc.client.Transport):
+    def __init__(self, host: Host) -> None:
+        super().__init__()
+        self._host = host
+
+    def make_connection(self, host: object) -> http.client.HTTPConnection:
+        made = _HostConnection(self._host, str(host))
+        self._connection = str(host), made  # what ``close`` closes
+        return made
+
+
+class MasterProxy(xmlrpc.client.ServerProxy):
+    """The API of the master on one host's loopback, called from this process.
+
+    Args:
+        host: The host.
+        port: The master's port.
+    """
+
+    def __init__(self, host: Host, port: int) -> None:
+        super().__init__(f"http://127.0.0.1:{port}/", transport=_HostTransport(host))
 
 
 @functools.cache
@@ -204,9 +253,12 @@ def compiled(program: str, nodes: Path = NODES, headers: Path = NODES) -> Path:
     binary = cache / f"{program}-{digest.hexdigest()[:12]}"
     if not binary.exists():
         cache.mkdir(parents=True, exist_ok=True)
-        unfinished = binary.with_suffix(f".{os.getpid()}")
-        run(["g++", *flags, source, "-o", unfinished, *libraries], timeout=180.0)
-        unfinished.replace(binary)
+        with (cache / f"{program}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # parts of the test run start at one time, and want the same programs
+            if not binary.exists():
+                unfinished = binary.with_suffix(f".{os.getpid()}")
+                run(["g++", *flags, source, "-o", unfinished, *libraries], timeout=180.0)
+                unfinished.replace(binary)
     return binary
 
 

@@ -23,6 +23,8 @@ from lab.bench import (
     idle,
     joining,
     load,
+    one_of_many,
+    parked,
     period,
     profile,
     roscore,
@@ -35,6 +37,7 @@ from lab.bench import (
     thousand,
     throughput,
     trust,
+    views,
     web,
 )
 from lab.bench.contenders import ENTRIES
@@ -102,7 +105,12 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
     ),
     "fleet": Measurement("2 to 64 modules: start, rest, a stream beside classic ROS, losses", fleet.measure),
     "fleet_graph": Measurement("what the topics of 999 peers cost one agent", fleet_graph.measure, needs=()),
+    "one_of_many": Measurement(
+        "one whole agent among 999 peers that are played", one_of_many.measure, (why_no_hosts, why_no_ros)
+    ),
     "idle": Measurement("what an agent costs while nothing happens", idle.measure),
+    "views": Measurement("what a user sees of a thousand modules, and its cost", views.measure, needs=()),
+    "parked": Measurement("how much later the first message of a parked peer arrives", parked.measure, needs=()),
     "thousand": Measurement("a mesh of up to a thousand modules, simulated", thousand.measure, needs=()),
     "tasks": Measurement(
         "how evenly a resource's task runs, beside loops of rospy and roscpp",

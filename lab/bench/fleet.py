@@ -38,7 +38,8 @@ if TYPE_CHECKING:
     from lab import samples
     from lab.bed.agents import Agent
     from lab.bed.ros import Ros
-    from rmpa.observe.snapshot import PeerInfo, Snapshot
+    from rmpa.observe.peer_info import PeerInfo
+    from rmpa.observe.snapshot import Snapshot
 
 _DEADLINE: Final = 300.0
 _LOOK: Final = 0.2
@@ -147,10 +148,10 @@ def _row(plan: FleetPlan, count: int) -> FleetRow:
     with Bed() as bed:
         agents, linked = _start(bed, count)
         shells = [bed.shell(agent.host, agent.core_port) for agent in agents]
-        registered = _populate(shells, plan.topics)
-        known = _when_all(agents, lambda found: _knows(found, count - 1, plan.topics)) - registered
+        registered = populate(shells, plan.topics)
+        known = _when_all(agents, lambda found: knows(found, count - 1, plan.topics)) - registered
         time.sleep(plan.settle)
-        cpu, wakes, rss, packets, traffic = _at_rest(agents, plan.idle)
+        cpu, wakes, rss, packets, traffic = at_rest(agents, plan.idle)
         way = schedule.Way("fleet", "two of the fleet", shells[0], shells[1], agents[:2], transport="relay")
         found = _stream(bed, way, plan)
         killed, cut_user, cut = _losses(agents)
@@ -187,7 +188,7 @@ def _start(bed: Bed, count: int) -> tuple[list[Agent], float]:
     return agents, whole - min(agent.process.started for agent in agents)
 
 
-def _populate(shells: Sequence[Ros], topics: int) -> float:
+def populate(shells: Sequence[Ros], topics: int) -> float:
     """Have each module publish some topics; return the monotonic time at which the last one was registered."""
     crowds = [shell.start(sys.executable, NODES / "crowd.py", name="crowd", commands=True) for shell in shells]
     for crowd in crowds:
@@ -197,7 +198,7 @@ def _populate(shells: Sequence[Ros], topics: int) -> float:
     return max(int(str(crowd.wait_event("registered", _DEADLINE)["at_ns"])) for crowd in crowds) / 1e9
 
 
-def _at_rest(
+def at_rest(
     agents: Sequence[Agent], seconds: float
 ) -> tuple[list[float], list[float], list[float], list[float], list[float]]:
     """Percent of a core, wake-ups a second, megabytes, packets and bytes a second, of each agent."""
@@ -239,7 +240,7 @@ def _classic(plan: FleetPlan, count: int) -> samples.Summary:
         for shell in shells:
             shell.env["ROS_MASTER_URI"] = f"http://{hosts[0].address}:{shells[0].port}"
         shells[0].master()
-        _populate(shells, plan.topics)
+        populate(shells, plan.topics)
         return _stream(bed, schedule.Way("classic", "classic ROS", shells[0], shells[1]), plan)
 
 
@@ -274,7 +275,7 @@ def _when_all(agents: Sequence[Agent], knows: Callable[[Snapshot], bool]) -> flo
     deadline = time.monotonic() + _DEADLINE
     latest = time.monotonic()
     for agent in agents:
-        while (found := _snapshot(agent)) is None or not knows(found):
+        while (found := snapshot_of(agent)) is None or not knows(found):
             if time.monotonic() > deadline:
                 raise Deadline(f"{agent.name} does not know all of the fleet after {_DEADLINE:g} s")
             time.sleep(_LOOK)
@@ -286,11 +287,11 @@ def _present(found: Snapshot) -> dict[str, PeerInfo]:
     return {peer.name: peer for peer in found.peers if peer.state in _PRESENT}
 
 
-def _knows(found: Snapshot, peers: int, topics: int) -> bool:
+def knows(found: Snapshot, peers: int, topics: int) -> bool:
     return sum(peer.topics_in >= topics for peer in _present(found).values()) >= peers
 
 
-def _snapshot(agent: Agent) -> Snapshot | None:
+def snapshot_of(agent: Agent) -> Snapshot | None:
     try:
         with ControlClient(agent.sockets()[0]) as client:
             return client.snapshot()

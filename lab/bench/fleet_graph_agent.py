@@ -103,7 +103,7 @@ class _Link:
         """Take what the bridge says of its use."""
 
 
-class _Holds:
+class Holds:
     """Notes the longest time between two looks at the data path, as processor time of the loop's thread."""
 
     def __init__(self, loop: AgentLoop) -> None:
@@ -111,6 +111,11 @@ class _Holds:
         self._looked = time.thread_time()
         self.longest = 0.0
         loop._poll_data = self._note  # noqa: SLF001
+
+    def take(self) -> float:
+        """The longest time since the last call, in milliseconds."""
+        longest, self.longest = 1e3 * self.longest, 0.0
+        return longest
 
     def _note(self) -> None:
         now = time.thread_time()
@@ -128,7 +133,7 @@ async def _measure(peers: int, topics: int) -> GraphCost:
     await bridge.start()
     collector = GarbageCollector(lambda: 0, Counters())
     collector.start()
-    empty, holds = _rss(), _Holds(loop)
+    empty, holds = _rss(), Holds(loop)
     links = [cast("PeerLink", _Link(number)) for number in range(peers)]
     begun = time.process_time()
     for link in links:

@@ -10,7 +10,8 @@ from pathlib import Path
 
 from tests.simulation.direct_scenario import DirectScenario
 from tests.simulation.lanes_scenario import LanesScenario
-from tests.simulation.large_scenario import LargeScenario
+from tests.simulation.large_scenario import PARTS, USUAL_PARTS, Figures, LargeScenario
+from tests.simulation.long_scenario import LongFigures, LongScenario
 from tests.simulation.mesh_scenario import MeshScenario
 from tests.simulation.reliable_scenario import ReliableScenario
 from tests.simulation.rests_scenario import RestsScenario
@@ -23,14 +24,21 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.simulation", description=__doc__)
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--peers", type=int, default=2, help="not with --kind reliable and direct")
-    kinds = ["rosters", "mesh", "lanes", "reliable", "direct", "swim", "rests", "thousand"]
+    kinds = ["rosters", "mesh", "lanes", "reliable", "direct", "swim", "rests", "thousand", "long"]
     parser.add_argument("--kind", choices=kinds, default="rosters")
-    parser.add_argument("--loss", type=float, default=0.01, help="thousand: share of datagrams that are lost")
-    parser.add_argument("--parts", default="", help="thousand: also churn, partition; comma-separated")
-    parser.add_argument("--json", type=Path, help="thousand: write the figures there")
+    parser.add_argument("--loss", type=float, default=0.01, help="thousand, long: share of datagrams that are lost")
+    parser.add_argument(
+        "--parts",
+        default=",".join(USUAL_PARTS),
+        help=f"thousand: of {','.join(PARTS)}; %(default)s",
+    )
+    parser.add_argument("--hours", type=float, default=24.0, help="long: simulated hours")
+    parser.add_argument("--json", type=Path, help="thousand, long: write the figures there")
     arguments = parser.parse_args()
     if arguments.kind == "thousand":
         return _play_large(arguments)
+    if arguments.kind == "long":
+        return _play_long(arguments)
     scenario: Scenario | ReliableScenario | DirectScenario | SwimScenario
     if arguments.kind == "direct":
         scenario = DirectScenario(arguments.seed, keep=True)
@@ -57,12 +65,27 @@ def main() -> int:
 def _play_large(arguments: argparse.Namespace) -> int:
     """Play a large mesh; print what it showed while it goes on."""
     parts = tuple(filter(None, arguments.parts.split(",")))
+    if unknown := set(parts) - set(PARTS):
+        print(f"no such parts: {', '.join(sorted(unknown))}; there are {', '.join(PARTS)}", file=sys.stderr)
+        return 2
     scenario = LargeScenario(arguments.seed, arguments.peers, loss=arguments.loss, parts=parts, say=_say)
-    text = json.dumps(asdict(scenario.play()), indent=1)
-    print(text)
-    if arguments.json is not None:
-        arguments.json.write_text(text + "\n")
+    _write(scenario.play(), arguments.json)
     return 0
+
+
+def _play_long(arguments: argparse.Namespace) -> int:
+    """Play a mesh for hours; 1 if a living module was held to have failed, or a killed one was not noticed."""
+    scenario = LongScenario(arguments.seed, arguments.peers, loss=arguments.loss, hours=arguments.hours, say=_say)
+    figures = scenario.play()
+    _write(figures, arguments.json)
+    return 1 if figures.lost_falsely or figures.missed else 0
+
+
+def _write(figures: Figures | LongFigures, file: Path | None) -> None:
+    text = json.dumps(asdict(figures), indent=1)
+    print(text)
+    if file is not None:
+        file.write_text(text + "\n")
 
 
 def _say(line: str) -> None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.clock import earliest
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
+from rmpa.core.links import Links
 from rmpa.discovery.beacon import Beacon
 from rmpa.discovery.events import PeerChanged, PeerFound, PeerLost, PeerRestarted, SendMulticast
 from rmpa.discovery.member_watch import MemberWatch
@@ -26,7 +27,7 @@ from tests.simulation.large_network import TCP_BYTES, Link
 
 if TYPE_CHECKING:
     from rmpa.discovery.beacon import Address
-    from rmpa.discovery.events import Event, LossReason
+    from rmpa.discovery.events import Event, LossReason, Output
     from rmpa.discovery.swim.packets import SwimPacket
     from rmpa.mesh.peering_events import PeeringOutput
     from tests.simulation.large_network import LargeNetwork
@@ -35,7 +36,10 @@ TOPICS: Final = 20
 """Topics that each module offers."""
 CATALOGUE_BYTES: Final = 2 * 24 + 80 * TOPICS + 2 * 52
 """Bytes of the catalogue over a link: two frames, some 80 bytes a topic, and their packets' headers."""
+UNCHANGED_BYTES: Final = 2 * 24 + 169 + 28 + 2 * 52
+"""Bytes of the word that the catalogue is the one that the hello named, and of its name in the hello."""
 HANDSHAKE_BYTES: Final = 2 * (24 + 60 + 52)
+_NEVER: Final = float("inf")
 OFFERS_SPREAD_MAX: Final = 5.0
 """Longest random delay before a parked peer is dialled for its newer offers."""
 
@@ -61,10 +65,12 @@ class Module:
         network: Where it lives.
         number: From 1; gives its address and name.
         tally: Shared by all modules.
+        demand: Whether links stand on demand whatever the number of modules.
     """
 
-    def __init__(self, network: LargeNetwork, number: int, tally: Tally) -> None:
+    def __init__(self, network: LargeNetwork, number: int, tally: Tally, *, demand: bool = False) -> None:
         self.network = network
+        self._links = Links.DEMAND if demand else Links.AUTO
         self.tally = tally
         self.name = f"module{number}"
         self.address: Address = (str(IPv4Address(0x0A000000 + number)), 40000)
@@ -83,7 +89,8 @@ class Module:
         self.metered = False
         self.cpu = 0.0
         """Processor time of this module's machines in seconds, if ``metered``."""
-        self._armed: float | None = None
+        self._armed = _NEVER
+        """When the earliest wake-up comes that is planned; ``_NEVER``: none is."""
         self._flushing = False
         self._ids = 0
 
@@ -102,14 +109,16 @@ class Module:
         now = self.network.now
         self.identity = Identity(Guid.of(*self.address, self.run), rng.randbytes(16), self.name)
         self.detector = FailureDetector(self.identity, rng=rng.random)
+        self.detector.set_version(self.offers, now)
         self.membership = MembershipProtocol(self.identity, rng=rng.random, vouches=self.detector.vouches)
         self.member_watch = MemberWatch(self.detector, self.membership)
         self.peering = Peering(self.identity, rng=rng.random, alive=self._is_alive)
-        self.mode = MeshMode()
+        self.mode = MeshMode(self._links)
         self.rng = rng
-        self._armed = None
+        self._armed = _NEVER
         self.network.join(self)
         self.membership.start(now)
+        self._take_mode()
         self.flush()
 
     def _is_alive(self, number: int) -> bool:
@@ -161,14 +170,25 @@ class Module:
     # --- packets ----------------------------------------------------------------------------------------------
 
     def hear_beacon(self, beacon: Beacon, source: Address, *, multicast: bool) -> None:
-        """A beacon came."""
+        """A beacon came: nine of ten packets of a large mesh, after which the other machines have nothing to do."""
         if not self.alive:
             return
-        began = time.process_time() if self.metered else 0.0
-        self.membership.receive(beacon, source, self.network.now, multicast=multicast)
-        self.flush()
         if self.metered:
+            began = time.process_time()
+            self._take_beacon(beacon, source, multicast)
             self.cpu += time.process_time() - began
+        else:
+            self._take_beacon(beacon, source, multicast)
+
+    def _take_beacon(self, beacon: Beacon, source: Address, multicast: bool) -> None:
+        """Take in a beacon. A heartbeat of a known peer changes nothing for the other machines: they are spared."""
+        membership = self.membership
+        membership.receive(beacon, source, self.network.now, multicast=multicast)
+        outputs, events = membership.outputs(), membership.events()
+        if outputs or events:
+            self._deliver(outputs, events)
+        else:
+            self._arm(membership.next_timer())
 
     def hear_unicast(self, packet: Beacon | SwimPacket, source: Address) -> None:
         """A datagram came to this module's own port."""
@@ -185,13 +205,16 @@ class Module:
 
     def flush(self) -> None:
         """Do what the machines ask for, until they are quiet; set the timer."""
-        if self._flushing:
-            return
+        if not self._flushing:
+            self._deliver(self.membership.outputs(), self.membership.events())
+
+    def _deliver(self, outputs: list[Output], events: list[Event]) -> None:
+        """Begin with these of the membership protocol."""
         self._flushing = True
         busy = True
         while busy:
             busy = False
-            for output in self.membership.outputs():
+            for output in outputs:
                 size = len(output.beacon.serialize())
                 if isinstance(output, SendMulticast):
                     self.network.multicast(self, output.beacon, size)
@@ -199,7 +222,7 @@ class Module:
                     self.network.unicast(self, output.address, output.beacon, size, "beacon")
             for send in self.detector.outputs():
                 self.network.unicast(self, send.address, send.packet, len(send.packet.serialize()), "swim")
-            for event in self.membership.events():
+            for event in events:
                 busy = True
                 self._on_event(event)
             for heard in self.member_watch.events(self.network.now):
@@ -208,12 +231,14 @@ class Module:
             for order in self.peering.take():
                 busy = True
                 self._on_order(order)
+            outputs, events = self.membership.outputs(), self.membership.events()
+            busy = busy or bool(outputs or events)
         self._flushing = False
-        self._arm()
+        self._arm(earliest(self.membership.next_timer(), self.detector.next_timer(), self.peering.next_timer()))
 
-    def _arm(self) -> None:
-        when = earliest(self.membership.next_timer(), self.detector.next_timer(), self.peering.next_timer())
-        if when is None or (self._armed is not None and self._armed <= when):
+    def _arm(self, when: float | None) -> None:
+        """Plan a wake-up, unless an earlier one is planned. One that turns out to be too early does no harm."""
+        if when is None or when >= self._armed:
             return
         self._armed = when
         run = self.run
@@ -221,7 +246,7 @@ class Module:
 
     def _wake(self, when: float, run: int) -> None:
         if self._armed == when:
-            self._armed = None
+            self._armed = _NEVER
         if not self.alive or run != self.run:
             return
         began = time.process_time() if self.metered else 0.0
@@ -275,8 +300,11 @@ class Module:
 
     def _count_modules(self) -> None:
         if self.mode.count(self.membership.members + 1):
-            self.membership.set_demand(self.network.now, on=self.mode.demand)
-            self.detector.set_active(self.network.now, active=self.mode.demand)
+            self._take_mode()
+
+    def _take_mode(self) -> None:
+        self.membership.set_demand(self.network.now, on=self.mode.demand)
+        self.detector.set_active(self.network.now, active=self.mode.demand)
 
     def _on_swim(self, event: SwimEvent) -> None:
         match event:
@@ -326,9 +354,11 @@ class Module:
         if other is None or not self._reaches(other):
             self.network.world.after(mesh_limits.DIAL_TIMEOUT, lambda: self._unanswered(guid, run))
             return
+        if not self.peering.dial_opened(guid, now):
+            return
         hello = Hello.of(self.identity, lease=mesh_limits.EXPRESS_LEASE, expected=guid)
         self.network.count("link", HANDSHAKE_BYTES + TCP_BYTES, 1)
-        refuse = other.peering.judge(hello)
+        refuse = other.peering.judge(hello, now)
         if refuse is not None:
             self.peering.dial_refused(guid, refuse, now, endpoint)
             self.flush()
@@ -366,8 +396,10 @@ class Module:
         """A peer's catalogue came over the link."""
         if not (self.alive and other.alive):
             return
-        self.network.count("catalogue", CATALOGUE_BYTES, 1)
-        self.known[other.identity.guid.place] = (other.identity.instance, other.offers)
+        offers = (other.identity.instance, other.offers)
+        held = self.known.get(other.identity.guid.place) == offers
+        self.network.count("catalogue", UNCHANGED_BYTES if held else CATALOGUE_BYTES, 1)
+        self.known[other.identity.guid.place] = offers
         self.detector.learn_version(other.identity.guid, other.identity.instance, other.offers, self.network.now)
         self.flush()
 

@@ -25,6 +25,8 @@ REST_AFTER: Final = 75.0
 REST: Final = 20.0
 LOOK: Final = 0.1
 SINGLE_KILLS: Final = 3
+PARTS: Final = ("rest", "offers", "kills", "third", "churn", "partition")
+USUAL_PARTS: Final = PARTS[:4]
 CHANGED: Final = 10
 """Modules that change their offers at one time."""
 
@@ -72,7 +74,8 @@ class LargeScenario:
         count: How many modules.
         loss: Share of datagrams that are lost.
         say: Called with a line after each part.
-        parts: ``partition`` and ``churn`` are played only if they are named.
+        parts: Those of ``PARTS`` that are played after the flash start, in this order. Churn needs killed modules,
+            and so plays ``third`` too.
         settle: Seconds after the start until rest is measured.
     """
 
@@ -83,7 +86,7 @@ class LargeScenario:
         *,
         loss: float = 0.01,
         say: Callable[[str], None] = lambda _: None,
-        parts: tuple[str, ...] = ("partition", "churn"),
+        parts: tuple[str, ...] = USUAL_PARTS,
         settle: float = REST_AFTER,
     ) -> None:
         self.figures = Figures(count, seed, loss)
@@ -107,14 +110,18 @@ class LargeScenario:
     def _play(self) -> Figures:
         began = time.process_time()
         self._flash_start()
-        self._rest()
-        self._change_offers()
-        self._kill_some()
-        self._kill_a_third()
-        if "churn" in self._parts:
-            self._churn()
-        if "partition" in self._parts:
-            self._part()
+        play = {
+            "rest": self._rest,
+            "offers": self._change_offers,
+            "kills": self._kill_some,
+            "third": self._kill_a_third,
+            "churn": self._churn,
+            "partition": self._part,
+        }
+        self.world.run(max(self.world.now, 1000.0 + self._settle))
+        for part in PARTS:
+            if part in self._parts or (part == "third" and "churn" in self._parts):
+                play[part]()
         self.figures.lost_falsely = self.tally.lost_falsely
         self.figures.seconds = self.world.now - 1000.0
         self.figures.cpu = time.process_time() - began
@@ -144,7 +151,6 @@ class LargeScenario:
 
     def _rest(self) -> None:
         """Nothing happens; what does that cost?"""
-        self.world.run(max(self.world.now, 1000.0 + self._settle))
         metered = self.modules[len(self.modules) // 2]
         before, cpu = {kind: _copy(row) for kind, row in self.network.traffic.items()}, metered.cpu
         suspected = self.tally.suspected_falsely

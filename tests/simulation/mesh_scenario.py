@@ -134,9 +134,9 @@ class MeshScenario(Scenario):
         assert bulk_twin is not None, f"{other.name} has no bulk lane to {peer.name}"
         assert socket_of(bulk).other is socket_of(bulk_twin), f"{peer.name} and {other.name} mean different lanes"
         assert link.bulk.connected
-        if self.calm and peer.identity.guid < other.identity.guid:
-            assert link.dialled, f"{peer.name} did not dial {other.name}"
-            assert bulk.dialled, f"{peer.name} did not dial {other.name}'s bulk lane"
+        if self.calm:
+            assert link.dialled is not twin.dialled
+            assert bulk.dialled is link.dialled, f"the side that dialled {link.guid} did not dial the bulk lane"
 
     def _names(self, instances: list[bytes]) -> list[str]:
         return [peer.name for peer in self.peers for i in instances if peer.identity.instance == i]

@@ -16,7 +16,7 @@ MODULES = 70
 
 
 def play(seed: int, count: int = MODULES) -> Figures:
-    figures = LargeScenario(seed, count, parts=(), settle=30.0).play()
+    figures = LargeScenario(seed, count, settle=30.0).play()
     return replace(figures, cpu=0.0, start_cpu=0.0, rest_cpu_percent=0.0, rss_mb=0.0)
 
 

@@ -15,6 +15,8 @@ from tests.simulation.mesh_scenario import MeshScenario
 from tests.simulation.network import Weather
 from tests.simulation.rests_scenario import RestsScenario
 
+pytestmark = pytest.mark.timeout(300)  # seconds of computing, beside parts of the suite that compute too
+
 FACTOR = int(os.environ.get("RMPA_SIMULATION_SEEDS", "1"))
 BLOCK = 25
 BLOCKS = [(count, block) for count, blocks in ((2, 4), (3, 2), (4, 1), (5, 1)) for block in range(blocks * FACTOR)]
@@ -44,7 +46,7 @@ def test_a_network_of_thirty_is_linked_after_healing(seed: int) -> None:
 
 @pytest.mark.parametrize("count", [2, 3, 5])
 @pytest.mark.parametrize("seed", range(10))
-def test_where_both_can_dial_the_lower_guid_did(seed: int, count: int) -> None:
+def test_where_both_can_dial_one_side_dialled_both_lanes(seed: int, count: int) -> None:
     MeshScenario(seed, count, calm=True).play()
 
 

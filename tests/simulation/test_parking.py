@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import pytest
 
@@ -16,6 +16,7 @@ from tests.simulation.mesh_scenario import MeshScenario
 
 if TYPE_CHECKING:
     from rmpa.mesh.io.link import PeerLink
+    from rmpa.mesh.peering_events import LinkDown
 
 FACTOR = int(os.environ.get("RMPA_SIMULATION_SEEDS", "1"))
 SETTLES = 3 * limits.PARK_AFTER
@@ -50,6 +51,50 @@ class ParkingPeer(MeshPeer):
         return not link.held
 
 
+class RepeatingPeer(ParkingPeer):
+    """Sends what a parked link held back over the next one."""
+
+    def __init__(self, *args: object, **more: object) -> None:
+        super().__init__(*args, **more)
+        self.unsent: list[bytes] = []
+
+    @property
+    def holds(self) -> bool:
+        """Whether this side has agreed to part, and waits for the bye."""
+        return any(link.connection.holding for link in self.mesh.links())
+
+    def send_soon(self, payload: bytes, after: float) -> None:
+        """Send to the other peer after some seconds."""
+        self.world.after(after, lambda: self.process.run(self._send, payload))
+
+    def _send(self, payload: bytes) -> None:
+        if links := self.mesh.links():
+            links[0].send_control(payload)
+            links[0].need(needed=False, parks=True)
+        else:
+            self.unsent.append(payload)
+            self._want()
+
+    def _want(self) -> None:
+        for status in self.mesh.peers():
+            self.mesh.want(status.identity.guid)
+
+    def link_up(self, link: PeerLink) -> None:
+        """Send what waits."""
+        super().link_up(link)
+        unsent, self.unsent = self.unsent, []
+        for payload in unsent:
+            link.send_control(payload)
+        link.need(needed=False, parks=True)
+
+    def link_down(self, link: PeerLink, down: LinkDown) -> None:
+        """Have the link made again for what it held back."""
+        super().link_down(link, down)
+        if link.parked and link.held:
+            self.unsent += link.held
+            self.world.after(0, lambda: self.process.run(self._want))
+
+
 def states(scenario: MeshScenario) -> set[str]:
     return {status.state for peer in scenario.peers for status in peer.mesh.peers()}
 
@@ -75,7 +120,35 @@ def test_links_park_come_back_and_park_again(seed: int) -> None:
             world.run(world.now + world.rng.uniform(0.0, 1.5 * limits.PARK_AFTER))
         world.run(world.now + SETTLES)
         assert states(scenario) == {"parked"}
+        assert not any(peer.mesh.counters["link.replaced"] for peer in scenario.peers), "what it carried is lost"
         assert not any(process.failures for peer in scenario.peers for process in peer.processes)
+
+
+@pytest.mark.parametrize("seed", range(4 * FACTOR))
+def test_what_both_sides_send_while_the_link_is_parked_arrives_once_over_one_link(seed: int) -> None:
+    scenario = MeshScenario(seed, 2, keep=True, calm=True, make_peer=RepeatingPeer)
+    world = scenario.world
+    peers = [cast("RepeatingPeer", peer) for peer in scenario.peers]
+    with scenario.simulated():
+        for peer in peers:
+            world.after(0, peer.start)
+        world.run(world.now + SETTLES)
+        for number in range(16):
+            payload = b'{"n":%d}' % number
+            for peer in peers:
+                peer.send_soon(payload, world.rng.choice((0.0, world.rng.uniform(0.0, 0.01))))
+            world.run(world.now + limits.PARK_AFTER)
+            end = world.now + SETTLES
+            # Every second time the next payloads are sent while both sides agree to part.
+            while states(scenario) != {"parked"} and not (number % 2 and any(peer.holds for peer in peers)):
+                world.run(world.now + 0.001)
+                assert world.now < end, "the link is never parked"
+            if not number % 2:
+                world.run(world.now + 1.0)
+        world.run(world.now + SETTLES)
+        assert [peer.heard for peer in peers] == [[b'{"n":%d}' % number for number in range(16)]] * 2
+        assert not any(peer.mesh.counters["link.replaced"] for peer in peers), "what it carried is lost"
+        assert not any(process.failures for peer in peers for process in peer.processes)
 
 
 @pytest.mark.parametrize("seed", range(4 * FACTOR))

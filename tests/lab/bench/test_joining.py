@@ -13,7 +13,8 @@ import pytest
 
 from lab.bed.agents import last_link
 from lab.bed.ros import NODES
-from rmpa.observe.snapshot import AgentInfo, LinkInfo, PeerInfo, Snapshot
+from rmpa.observe.peer_info import LinkInfo, PeerInfo
+from rmpa.observe.snapshot import AgentInfo, Snapshot
 
 
 def snapshot(**links: float | None) -> Snapshot:
