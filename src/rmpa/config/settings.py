@@ -409,7 +409,7 @@ class Settings:
     links: Links = setting(
         Links.AUTO,
         LINKS,
-        "Which peers stay linked. full: all; demand: those that something is used of; auto: all up to "
+        "Which peers stay linked. full: all; demand: those of which something is used; auto: all up to "
         "mesh.full_mesh_up_to modules.",
         key="mesh.links",
         env="RMPA_LINKS",

@@ -23,4 +23,8 @@ class Clock(Protocol):
 
 def earliest(*timers: float | None) -> float | None:
     """The first of several timers; ``None`` means never."""
-    return min((t for t in timers if t is not None), default=None)
+    first = None
+    for timer in timers:
+        if timer is not None and (first is None or timer < first):
+            first = timer
+    return first

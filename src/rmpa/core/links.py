@@ -13,4 +13,4 @@ class Links(StrEnum):
     FULL = "full"
     """Always, to each peer (paper, section 4.2)."""
     DEMAND = "demand"
-    """While something depends on it; a peer that nothing is used of is *parked*."""
+    """While something depends on it; a peer of which nothing is used is *parked*: it has no link for now."""

@@ -64,8 +64,9 @@ STALE_AGE: Final = 0.1
 """Delay beyond which a best-effort message (held up by an outage) is dropped if a newer one of its topic follows."""
 DRAIN_TIMEOUT: Final = 1.0
 """How long an agent that ends waits for its last bytes to be sent."""
-MESH_BACKLOG: Final = 64
-"""Connections that the kernel holds until they are accepted: all peers of a restarted agent dial at once."""
+MESH_BACKLOG: Final = 256
+"""Connections that the kernel holds until they are accepted (``net.core.somaxconn`` bounds it): all peers of a
+restarted agent dial at once. As many as may be without a finished handshake then; a further peer dials again."""
 MESH_PORT_ATTEMPTS: Final = 32
 """Attempts to find a port number that is free for both TCP and UDP; the first one nearly always succeeds."""
 

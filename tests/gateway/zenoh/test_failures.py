@@ -60,6 +60,7 @@ async def test_a_site_that_dies_or_freezes_is_seen_soon(how: signal.Signals) -> 
         assert seen[-1][1] - at < (2.0 if how is signal.SIGKILL else limits.LEASE + 3.0)
 
 
+@pytest.mark.timeout(240)
 async def test_a_frozen_subscriber_holds_the_others_up_for_a_lease_at_most_and_nothing_is_lost_uncounted() -> None:
     async with bed() as net, far_end(net) as pid:
         sender, receiver = await net.session(), await net.session()
@@ -82,8 +83,9 @@ async def test_a_frozen_subscriber_holds_the_others_up_for_a_lease_at_most_and_n
             before = time.monotonic()
             await asyncio.sleep(0.01)
             stalled = max(stalled, time.monotonic() - before)
-        await until(lambda: not bulk.waiting and not quick.waiting)
-        await until(lambda: len(got) == bulk.sent and len(fast) == count)
+        await until(lambda: not bulk.waiting and not quick.waiting, 90.0)
+        await until(lambda: len(got) == bulk.sent and len(fast) == quick.sent, 90.0)
         assert bulk.sent + bulk.dropped == count
-        assert stalled < 1.0, "nothing holds the loop up"
+        assert quick.sent == count, "what has priority finds room"
+        assert stalled < limits.LEASE, "a put does not wait for the frozen subscriber"
         assert list(sender.endpoints) == [net.endpoint], "the sender's own link lives"

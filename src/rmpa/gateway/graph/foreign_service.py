@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from rmpa.bridge.messages import Source
 from rmpa.bridge.relay import service_place
-from rmpa.bridge.session.peer_proxies import ProxyCallbacks
 from rmpa.core.errors import RmpaError
+from rmpa.gateway.graph.foreign_source import ProxiedSource
 from rmpa.ros.node.service_server import ServiceEndpoint
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
-class ProxiedService:
+class ProxiedService(ProxiedSource):
     """A foreign service; see ``neighbour.ForeignService``.
 
     A graph has one server of each service: while another node has its name, it waits, and ``problem`` says so.
@@ -61,23 +61,11 @@ class ProxiedService:
         taken: Callable[[], str],
         on_closed: Callable[[], None],
     ) -> None:
-        self.source = source
-        self._origin = origin
-        self._number = number
-        self._core = core
-        self._relay = relay
-        self._proxies = proxies
+        super().__init__(source, origin, number, core=core, relay=relay, proxies=proxies, on_closed=on_closed)
         self._serve = serve
         self._taken = taken
-        self._on_closed = on_closed
         self._offered = Source(service_place(source.name, "")[0], proxies.name(origin.node))
-        self._key = f"service {source.name}"
-        self._node: SlaveNode | None = None
-        self._begun = False
-        self._refused = "another source of this node has its name here"
-        self._mismatch = ""
         self._calls: set[asyncio.Task[None]] = set()
-        self._closed = False
         self.endpoint = ServiceEndpoint(
             source.name,
             self._offered.node,
@@ -87,21 +75,6 @@ class ProxiedService:
             on_mismatch=self._mismatched,
         )
         """Takes the clients."""
-
-    def begin(self) -> None:
-        """Put it into the graph, in a later turn of the loop."""
-        self._begun = True
-        self._refused = ""
-        self._proxies.hold(self._origin.node, self._key, ProxyCallbacks(self._ready, self._left))
-
-    def refuse(self, text: str) -> None:
-        """Say why it cannot be in the graph."""
-        self._refused = text
-
-    @property
-    def problem(self) -> str:
-        """Why it is not in the graph, or why its last client was refused; empty for nothing."""
-        return self._refused or self._proxies.problems.get(self._origin.node, "") or self._mismatch
 
     def reconcile(self, services: Mapping[str, Mapping[str, str]]) -> None:
         """Register it if the core has lost it, or if its name has become free."""
@@ -115,17 +88,10 @@ class ProxiedService:
             self._unregister(self._node)
             self._register()
 
-    def close(self) -> None:
-        """Take it out of the graph in a later turn of the loop; calls under way get an error now."""
-        if self._closed:
-            return
-        self._closed = True
+    def _withdraw(self) -> None:
         self.endpoint.withdraw(f"service [{self.source.name}] of {self.source.site} has gone")
         for task in self._calls:
             task.cancel()
-        if self._begun:
-            self._proxies.release(self._origin.node, self._key)
-        self._on_closed()
 
     def _called(self, call: ServiceCall) -> None:
         task = asyncio.get_running_loop().create_task(self._answer(call), name=f"call {self.source.name}")
@@ -160,9 +126,7 @@ class ProxiedService:
             self._refused = f"{other} has a service of this name here"
             return
         code, status, _ = self._core.call("registerService", node.name, self.source.name, node.service_uri, node.uri)
-        self._refused = "" if code == 1 else f"the gateway's core does not take it: {status}"
-        if self._refused:
-            _log.error("! %s of %s: %s", self.source.name, node.name, self._refused)
+        self._registered(node, code, status)
 
     def _unregister(self, node: SlaveNode) -> None:
         self._core.call("unregisterService", node.name, self.source.name, node.service_uri)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.messages import Source
-from rmpa.bridge.session.peer_proxies import ProxyCallbacks
 from rmpa.core import limits as core_limits
+from rmpa.gateway.graph.foreign_source import ProxiedSource
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.wire.tcpros import LENGTH, printable
 
@@ -24,10 +23,8 @@ if TYPE_CHECKING:
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.tcpros import Buffer, TopicDescription
 
-_log = logging.getLogger(__name__)
 
-
-class ProxiedTopic:
+class ProxiedTopic(ProxiedSource):
     """A foreign topic; see ``neighbour.ForeignTopic``.
 
     Args:
@@ -53,22 +50,10 @@ class ProxiedTopic:
         on_demand: Callable[[bool], None],
         on_closed: Callable[[], None],
     ) -> None:
-        self.source = source
-        self._origin = origin
-        self._number = number
-        self._core = core
-        self._relay = relay
-        self._proxies = proxies
+        super().__init__(source, origin, number, core=core, relay=relay, proxies=proxies, on_closed=on_closed)
         self._on_demand = on_demand
-        self._on_closed = on_closed
         self._offered = Source(source.name, proxies.name(origin.node))
-        self._key = f"topic {source.name}"
-        self._node: SlaveNode | None = None
-        self._begun = False
-        self._refused = "another source of this node has its name here"
-        self._mismatch = ""
         self._wanted = False
-        self._closed = False
         self.publication = Publication(
             source.name,
             self._offered.node,
@@ -77,21 +62,6 @@ class ProxiedTopic:
             on_mismatch=self._mismatched,
         )
         """Its messages for subscribers, here and of the mesh."""
-
-    def begin(self) -> None:
-        """Put it into the graph, in a later turn of the loop."""
-        self._begun = True
-        self._refused = ""
-        self._proxies.hold(self._origin.node, self._key, ProxyCallbacks(self._ready, self._left))
-
-    def refuse(self, text: str) -> None:
-        """Say why it cannot be in the graph."""
-        self._refused = text
-
-    @property
-    def problem(self) -> str:
-        """Why it is not in the graph, or not understood by its subscribers; empty for nothing."""
-        return self._refused or self._proxies.problems.get(self._origin.node, "") or self._mismatch
 
     def describe(self, description: TopicDescription) -> None:
         """Set type, md5 sum, definition and latching; subscribers of another definition are disconnected."""
@@ -130,15 +100,8 @@ class ProxiedTopic:
         if node is not None and publishers.get(self.source.name, {}).get(node.name) != node.uri:
             self._register()
 
-    def close(self) -> None:
-        """Take it out of the graph in a later turn of the loop; its callbacks end now."""
-        if self._closed:
-            return
-        self._closed = True
+    def _withdraw(self) -> None:
         self.publication.withdraw()
-        if self._begun:
-            self._proxies.release(self._origin.node, self._key)
-        self._on_closed()
 
     def _demand(self, *, wanted: bool) -> None:
         if wanted != self._wanted and not self._closed:
@@ -161,9 +124,7 @@ class ProxiedTopic:
         code, status, _ = self._core.call(
             "registerPublisher", node.name, self.source.name, self.source.type, node.uri
         )
-        self._refused = "" if code == 1 else f"the gateway's core does not take it: {status}"
-        if self._refused:
-            _log.error("! %s of %s: %s", self.source.name, node.name, self._refused)
+        self._registered(node, code, status)
 
     def _left(self, node: SlaveNode) -> None:
         self._node = None

@@ -26,6 +26,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from rmpa.resource import limits
+from rmpa.runtime import sqlite_file
+from rmpa.runtime.sqlite_file import DamagedFileError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -59,7 +61,6 @@ _KEPT: Final = {
     "events": limits.STORE_EVENTS_MAX,
     "descriptors": limits.STORE_DESCRIPTORS_MAX,
 }
-_DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 _LOCK_RETRY: Final = 0.02
 """Seconds between attempts to take the lock."""
 
@@ -92,10 +93,6 @@ def read_state(path: Path) -> dict[Key, str]:
 def _state(connection: sqlite3.Connection) -> dict[Key, str]:
     rows = connection.execute("SELECT kind, name, value FROM state ORDER BY kind, name")
     return {(str(kind), str(name)): str(value) for kind, name, value in rows}
-
-
-class _DamagedError(Exception):
-    """The file is no store, is damaged, or has the format of a later release."""
 
 
 @dataclass
@@ -219,10 +216,10 @@ class ResourceStore:
         try:
             try:
                 self._write(work)
-            except _DamagedError as error:
+            except DamagedFileError as error:
                 self._set_aside(str(error))
                 self._write(work)
-        except (OSError, sqlite3.Error, _DamagedError) as error:
+        except (OSError, sqlite3.Error, DamagedFileError) as error:
             self._disconnect()
             self._set_problem(f"{type(error).__name__}: {error}" if not str(error) else str(error))
             return False
@@ -235,8 +232,8 @@ class ResourceStore:
             with connection:
                 self._insert(connection, work)
         except sqlite3.DatabaseError as error:
-            if getattr(error, "sqlite_errorcode", 0) & 0xFF in _DAMAGED:
-                raise _DamagedError(str(error)) from error
+            if sqlite_file.is_damaged(error):
+                raise DamagedFileError(str(error)) from error
             raise
         for key, value in work.state.items():
             if value is None:
@@ -270,10 +267,7 @@ class ResourceStore:
         connection = sqlite3.connect(self.path, timeout=1.0, check_same_thread=False)
         self._connection = connection
         connection.execute(f"PRAGMA max_page_count = {self._pages}")
-        if (version := connection.execute("PRAGMA user_version").fetchone()[0]) > _VERSION:
-            raise _DamagedError(f"it is of version {version}; this release reads {_VERSION}")
-        if (found := connection.execute("PRAGMA quick_check(1)").fetchone()[0]) != "ok":
-            raise _DamagedError(found)
+        sqlite_file.check(connection, _VERSION)
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = FULL")
         connection.executescript(_SCHEMA)
@@ -312,17 +306,12 @@ class ResourceStore:
 
     def _set_aside(self, why: str) -> None:
         self._disconnect()
-        aside = self.path.with_name(f"{self.path.name}.damaged")
+        aside = sqlite_file.set_aside(self.path)
         _log.warning("! %s is damaged (%s); it is set aside as %s and begun anew", self.path, why, aside.name)
-        self.path.replace(aside)
-        for suffix in ("-wal", "-shm"):
-            self.path.with_name(f"{self.path.name}{suffix}").unlink(missing_ok=True)
 
     def _disconnect(self) -> None:
         connection, self._connection = self._connection, None
-        if connection is not None:
-            with contextlib.suppress(sqlite3.Error):
-                connection.close()
+        sqlite_file.close(connection)
 
     def _set_problem(self, problem: str) -> None:
         """Log a problem when it begins and when it is over."""

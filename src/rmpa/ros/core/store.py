@@ -16,6 +16,8 @@ import sqlite3
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from rmpa.ros import limits
+from rmpa.runtime import sqlite_file
+from rmpa.runtime.sqlite_file import DamagedFileError
 from rmpa.runtime.threads import in_thread
 
 if TYPE_CHECKING:
@@ -35,7 +37,6 @@ CREATE TABLE IF NOT EXISTS kept (kind TEXT NOT NULL, name TEXT NOT NULL, value B
 PRAGMA application_id = {_APPLICATION};
 PRAGMA user_version = {_VERSION};
 """
-_DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 _PUT: Final = "INSERT INTO kept VALUES (?, ?, ?) ON CONFLICT (kind, name) DO UPDATE SET value = excluded.value"
 _REMEDIES: Final = {
     sqlite3.SQLITE_FULL: "make room on that disk",
@@ -48,10 +49,6 @@ _REMEDIES: Final = {
 def is_locked(error: OSError) -> bool:
     """Whether an error of a store means that another process has locked the file."""
     return getattr(error.__cause__, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_BUSY
-
-
-class _DamagedFileError(Exception):
-    """The file cannot be used: it is damaged, too large, of another program or of a newer release."""
 
 
 class CoreStore:
@@ -138,10 +135,10 @@ class CoreStore:
     def _open(self) -> list[Row]:
         try:
             return self._read()
-        except _DamagedFileError as error:
+        except DamagedFileError as error:
             why = str(error)
         except sqlite3.DatabaseError as error:
-            if getattr(error, "sqlite_errorcode", 0) & 0xFF not in _DAMAGED:
+            if not sqlite_file.is_damaged(error):
                 raise
             why = str(error)
         self._set_aside(why)
@@ -151,7 +148,7 @@ class CoreStore:
         connection = self._connected()
         rows = connection.execute("SELECT kind, name, value FROM kept ORDER BY rowid").fetchall()
         if not all(isinstance(kind, str) and isinstance(name, str) and type(v) is bytes for kind, name, v in rows):
-            raise _DamagedFileError("a row of it is of another kind")
+            raise DamagedFileError("a row of it is of another kind")
         return rows
 
     def _connected(self) -> sqlite3.Connection:
@@ -160,7 +157,7 @@ class CoreStore:
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         os.close(os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
         if self.path.stat().st_size > 2 * limits.CORE_STATE_BYTES:
-            raise _DamagedFileError("it is larger than a core's file can be")
+            raise DamagedFileError("it is larger than a core's file can be")
         connection = sqlite3.connect(self.path, timeout=limits.CORE_STATE_LOCKED, check_same_thread=False)
         self._connection = connection
         # The lock is held until the file is closed: it keeps other processes away, and SQLite needs no shared memory.
@@ -168,16 +165,13 @@ class CoreStore:
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = NORMAL")
         connection.execute(f"PRAGMA max_page_count = {2 * limits.CORE_STATE_BYTES // _PAGE}")
-        application, version, tables = (
+        application, tables = (
             int(connection.execute(query).fetchone()[0])
-            for query in ("PRAGMA application_id", "PRAGMA user_version", "SELECT count(*) FROM sqlite_master")
+            for query in ("PRAGMA application_id", "SELECT count(*) FROM sqlite_master")
         )
         if tables and application != _APPLICATION:
-            raise _DamagedFileError("it is another program's")
-        if version > _VERSION:
-            raise _DamagedFileError(f"it is of version {version}; this release reads {_VERSION}")
-        if (found := connection.execute("PRAGMA quick_check(1)").fetchone()[0]) != "ok":
-            raise _DamagedFileError(found)
+            raise DamagedFileError("it is another program's")
+        sqlite_file.check(connection, _VERSION)
         connection.executescript(_SCHEMA)
         self._inode = self.path.stat().st_ino
         return connection
@@ -210,16 +204,11 @@ class CoreStore:
 
     def _set_aside(self, why: str) -> None:
         self._disconnect()
-        aside = self.path.with_name(f"{self.path.name}.damaged")
+        aside = sqlite_file.set_aside(self.path)
         _log.warning(
             "! %s cannot be read (%s); it is set aside as %s, and the core begins empty", self.path, why, aside
         )
-        self.path.replace(aside)
-        for suffix in ("-wal", "-shm", "-journal"):
-            self.path.with_name(f"{self.path.name}{suffix}").unlink(missing_ok=True)
 
     def _disconnect(self) -> None:
         connection, self._connection = self._connection, None
-        if connection is not None:
-            with contextlib.suppress(sqlite3.Error):
-                connection.close()
+        sqlite_file.close(connection)

@@ -7,14 +7,11 @@ import secrets
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rmpa.bridge.naming import Names
-from rmpa.bridge.policy import Policy
-from rmpa.bridge.services.rules import ServiceRules
 from rmpa.config.permission_rules import Access
 from rmpa.core.errors import UnreachableError
 from rmpa.gateway import limits
 from rmpa.gateway.graph.own_graph import AgentGraph
-from rmpa.gateway.neighbour import SourceKind
+from rmpa.gateway.own_policy import OwnPolicy
 from rmpa.gateway.site_permissions import SitePermissions
 from rmpa.gateway.sites.history import SiteHistory
 from rmpa.gateway.sites.io.action_part import SiteActions
@@ -36,7 +33,6 @@ from rmpa.runtime.system_clock import SystemClock
 
 if TYPE_CHECKING:
     from rmpa.agent import Agent
-    from rmpa.bridge.policy import PolicyDecision
     from rmpa.config.settings import Settings
     from rmpa.gateway.neighbour import MeshSource, OwnGraph
     from rmpa.gateway.sites.part import SitePart
@@ -54,17 +50,10 @@ def make_site_neighbour(
         settings: The gateway's; ``settings.gateway.site`` is not empty.
         agent: The gateway's agent, which carries parameters and questions; ``None``: neither crosses.
     """
-    policy = Policy(settings.policy, settings.peers, settings.time)
-    services = ServiceRules(settings.services, policy, Names(settings.peers))
-
-    def judge(kind: SourceKind, name: str, type_name: str, node: str) -> PolicyDecision:
-        if kind is SourceKind.SERVICE:
-            return services.judge(name, node)
-        return policy.judge(name, type_name, node)
-
+    policy = OwnPolicy(settings)
     gateway, clock = settings.gateway, SystemClock()
     permissions = None if agent is None else SitePermissions(agent.bridge.gate)
-    rules = CrossingRules(gateway.rules, judge, permissions)
+    rules = CrossingRules(gateway.rules, policy.judge, permissions)
 
     def refusal(site: str, module: str, name: str) -> str:
         return rules.refusal(site, module, name)
@@ -80,7 +69,7 @@ def make_site_neighbour(
         SiteLastValues(gateway.site, session, graph, LastValueStore(store), rules.kept, refusal, clock.wall_ns),
         seen,
         SiteTopics(gateway.site, graph, session, rules, settings.make_contracts(), clock, seen.keep, counters),
-        SiteServices(gateway.site, session, graph, services.timeout, why_not, clock.wall_ns),
+        SiteServices(gateway.site, session, graph, policy.timeout, why_not, clock.wall_ns),
     ]
     own = SiteGateway(gateway.site, gateway.rank, secrets.token_hex(16))
     neighbour = SiteNeighbour(graph, session, own, rules, parts, counters)

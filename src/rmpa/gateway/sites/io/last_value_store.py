@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from rmpa.gateway import limits
 from rmpa.gateway.sites.last_values import LastValue, ValueHeader, ValueKey
+from rmpa.runtime import sqlite_file
+from rmpa.runtime.sqlite_file import DamagedFileError
 from rmpa.runtime.threads import in_thread
 
 if TYPE_CHECKING:
@@ -43,11 +45,6 @@ _INDEX: Final = (
 )
 _GET: Final = "SELECT body FROM last_values WHERE module = ? AND topic = ? AND node = ?"
 _DELETE: Final = "DELETE FROM last_values WHERE module = ? AND topic = ? AND node = ?"
-_DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
-
-
-class _UnusableError(Exception):
-    """The file is no store, is damaged, or has the format of a later release."""
 
 
 class LastValueStore:
@@ -228,10 +225,10 @@ class LastValueStore:
         try:
             try:
                 found = self._checked(work)
-            except _UnusableError as error:
+            except DamagedFileError as error:
                 self._set_aside(str(error))
                 found = self._checked(work)
-        except (OSError, sqlite3.Error, _UnusableError) as error:
+        except (OSError, sqlite3.Error, DamagedFileError) as error:
             self._disconnect()
             self._set_problem(str(error) or type(error).__name__)
             return None
@@ -242,8 +239,8 @@ class LastValueStore:
         try:
             return work()
         except sqlite3.DatabaseError as error:
-            if getattr(error, "sqlite_errorcode", 0) & 0xFF in _DAMAGED:
-                raise _UnusableError(str(error)) from error
+            if sqlite_file.is_damaged(error):
+                raise DamagedFileError(str(error)) from error
             raise
 
     def _read_index(self) -> dict[ValueKey, ValueHeader]:
@@ -286,10 +283,7 @@ class LastValueStore:
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         connection = sqlite3.connect(self.path, timeout=1.0, check_same_thread=False)
         self._connection = connection
-        if (version := connection.execute("PRAGMA user_version").fetchone()[0]) > _VERSION:
-            raise _UnusableError(f"it is of version {version}; this release reads {_VERSION}")
-        if (found := connection.execute("PRAGMA quick_check(1)").fetchone()[0]) != "ok":
-            raise _UnusableError(found)
+        sqlite_file.check(connection, _VERSION)
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = NORMAL")
         connection.executescript(_SCHEMA)
@@ -299,18 +293,13 @@ class LastValueStore:
     def _set_aside(self, why: str) -> None:
         assert self.path is not None  # noqa: S101 - as above
         self._disconnect()
-        aside = self.path.with_name(f"{self.path.name}.damaged")
-        _log.warning("! %s is damaged (%s); it is set aside as %s and begun anew", self.path, why, aside.name)
-        self.path.replace(aside)
+        aside = sqlite_file.set_aside(self.path)
         self._begun_anew = True
-        for suffix in ("-wal", "-shm"):
-            self.path.with_name(f"{self.path.name}{suffix}").unlink(missing_ok=True)
+        _log.warning("! %s is damaged (%s); it is set aside as %s and begun anew", self.path, why, aside.name)
 
     def _disconnect(self) -> None:
         connection, self._connection = self._connection, None
-        if connection is not None:
-            with contextlib.suppress(sqlite3.Error):
-                connection.close()
+        sqlite_file.close(connection)
 
     def _set_problem(self, problem: str) -> None:
         """Log a problem when it begins and when it is over."""
