@@ -13,15 +13,16 @@ from lab.bed.agents import Agent
 from lab.bed.namespaces import MACHINE, Host, Lab
 from tests.interop.modules import Module
 from tests.interop.ros import Ros, free_port
-from tests.interop.web import Web
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from tests.interop.web import Web
+
 ShellFactory = Callable[..., Ros]
 AgentFactory = Callable[..., Agent]
 ModuleFactory = Callable[..., list[Module]]
-WebFactory = Callable[..., Web]
+WebFactory = Callable[..., "Web"]
 
 
 @pytest.fixture(scope="session")
@@ -81,6 +82,8 @@ def modules(lab: Lab, shell: ShellFactory, agent: AgentFactory) -> ModuleFactory
 @pytest.fixture
 def web() -> Iterator[WebFactory]:
     """Start ``rmpa web`` beside agents of a lab: ``web(agent, "--control")`` returns when it listens."""
+    from tests.interop.web import Web
+
     with ExitStack() as stack:
 
         def make(agent: Agent, *flags: str, **options: int) -> Web:

@@ -31,12 +31,16 @@ class Module:
         return set(self.ros.tool("rostopic", "list").split())
 
     def wait_topic(self, topic: str, timeout: float = DEADLINE) -> None:
-        """Wait until ``rostopic list`` here shows a topic."""
-        eventually(lambda: topic in self.topics(), timeout, what=f"{topic} in the graph of {self.name}")
+        """Wait until the master here knows a topic; ``rostopic list`` then shows it."""
+        what = f"{topic} in the graph of {self.name}"
+        eventually(lambda: topic in self.ros.graph_topics(), timeout, what=what)
+        eventually(lambda: topic in self.topics(), timeout, what=what)
 
     def wait_no_topic(self, topic: str, timeout: float = DEADLINE) -> None:
-        """Wait until ``rostopic list`` here no longer shows a topic."""
-        eventually(lambda: topic not in self.topics(), timeout, what=f"{topic} out of the graph of {self.name}")
+        """Wait until the master here no longer knows a topic; ``rostopic list`` then does not show it."""
+        what = f"{topic} out of the graph of {self.name}"
+        eventually(lambda: topic not in self.ros.graph_topics(), timeout, what=what)
+        eventually(lambda: topic not in self.topics(), timeout, what=what)
 
 
 def whole(report: Event, count: int) -> None:

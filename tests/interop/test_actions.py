@@ -54,8 +54,9 @@ def fed_in_order(client: Process, goal: int, *, connected: bool, since: int = 0)
     Args:
         client: The action client.
         goal: How many feedbacks its server sends.
-        connected: Feedback has come before, so the first one counts too. Until then roscpp's client may miss the
-            first: its ``waitForServer`` counts a publisher from ``connect()`` on, before the TCPROS handshake ends.
+        connected: The first one counts too: it does with roscpp's client once feedback has come before. Until then
+            that client may miss the first, because its ``waitForServer`` counts a publisher from ``connect()`` on,
+            before the TCPROS handshake ends. rospy's client always may: see ``active_at_most_once``.
         since: A mark of the client's events.
     """
     values = [int(str(event["value"])) for event in client.events("feedback", since=since)]
@@ -63,6 +64,16 @@ def fed_in_order(client: Process, goal: int, *, connected: bool, since: int = 0)
     assert first <= 3
     assert 1 <= len(values) <= goal
     assert values == list(range(first, first + len(values)))
+
+
+def active_at_most_once(client: Process, kind: str) -> None:
+    """Fail unless the client was told that its one goal is active.
+
+    rospy's client may miss it: ``SimpleActionClient`` ignores what its other threads receive before ``send_goal`` has
+    stored the goal's handle ("Got a transition callback on a goal handle that we're not tracking").
+    """
+    told = len(client.events("active"))
+    assert told == 1 or (kind == "rospy" and told == 0)
 
 
 def client_in(module: Module, kind: str, name: str = "client") -> Process:
@@ -82,12 +93,12 @@ def test_goals_of_one_module_are_done_in_another(modules: ModuleFactory, client_
     since = client.mark_events()
     client.tell("send 20")
     assert ends(client, since=since) == ("SUCCEEDED", 20)
-    assert len(client.events("active")) == 1
-    fed_in_order(client, 20, connected=client_kind == "rospy")
+    active_at_most_once(client, client_kind)
+    fed_in_order(client, 20, connected=False)
     since = client.mark_events()
     client.tell("send 20")
     assert ends(client, since=since) == ("SUCCEEDED", 20)
-    fed_in_order(client, 20, connected=True, since=since)
+    fed_in_order(client, 20, connected=client_kind == "roscpp", since=since)
 
     # Cancelled by the client.
     since = client.mark_events()
@@ -139,7 +150,7 @@ def test_each_of_several_clients_gets_its_own_result(modules: ModuleFactory) -> 
     for client, goal in zip(clients, (4, 6), strict=True):
         client.tell(f"send {goal}")
         assert ends(client, since=0) == ("SUCCEEDED", goal)
-        fed_in_order(client, goal, connected=client is clients[0])
+        fed_in_order(client, goal, connected=False)
     assert [event["goal"] for event in server.events("goal")] == [4, 6]
     # The stock tools say who listens to a client's goals, and whose node it stands for.
     assert "/rmpa/a/client" in b.ros.tool("rostopic", "info", "/count/goal")

@@ -41,32 +41,36 @@ def lanes(module: Module, topic: str) -> list[str]:
 
 
 def test_commands_cross_a_cable_that_images_fill(modules: ModuleFactory, tmp_path: Path) -> None:
-    a, b = modules("a", "b")
+    a, b = modules("a", "b", config=RULES)
     for module in (a, b):
         module.host.shape(f"{MBIT}mbit", bands=True)
     images = b.ros.roscpp("listener", "__name:=eye", topic="/image", queue=2)
-    commands = b.ros.roscpp("recorder", topic="/command", nodelay=True, commands=True)
+    # The same commands on the lane of the images: what the express lane spares them, whatever else the machine does.
+    topics = ("/command", "/later")
+    recorders = [b.ros.roscpp("recorder", topic=topic, nodelay=True, commands=True) for topic in topics]
     # More than the cable carries, so that an image is always waiting.
     a.ros.roscpp("talker", "__name:=camera", topic="/image", size=IMAGE, rate=15, queue=2, wait=1)
-    before = flows(images, 3)
-    teller = a.ros.roscpp("teller", topic="/command", nodelay=True, wait=1, commands=True)
-    teller.wait_event("connected")
-    teller.tell(f"64 {COMMANDS} 100")
-    teller.wait_event("told")
-    wait_last(commands, COMMANDS)
+    flows(images, 3)
+    tellers = [a.ros.roscpp("teller", topic=topic, nodelay=True, wait=1, commands=True) for topic in topics]
+    for teller in tellers:
+        teller.wait_event("connected")
+    for teller in tellers:
+        teller.tell(f"64 {COMMANDS} 100")
+    for teller, recorder in zip(tellers, recorders, strict=True):
+        teller.wait_event("told")
+        wait_last(recorder, COMMANDS)
     after = images.events("report")[-1]
-    rows = recorded(commands, tmp_path)
+    rows, behind = (recorded(recorder, tmp_path) for recorder in recorders)
     in_order(rows, COMMANDS)
-    # Behind one image in one queue a command would wait for up to 84 ms, and for 42 ms on the average.
-    ages = sorted(row.age for row in rows)
-    assert ages[COMMANDS // 2] < 0.02
-    assert ages[COMMANDS * 9 // 10] < 0.04
+    # Behind one image in one queue a command waits for up to 84 ms, and for 42 ms on the average.
+    ages, late = (sorted(row.age for row in each) for each in (rows, behind))
+    assert late[len(late) // 2] > 0.02, "the cable is full"
+    assert ages[COMMANDS // 2] < late[len(late) // 2] / 2
+    assert ages[COMMANDS * 9 // 10] < late[len(late) * 9 // 10]
     assert after["bad"] == 0
-    carried = 8 * (int(str(after["bytes"])) - int(str(before["bytes"]))) / (COMMANDS / 100)
-    assert carried > 0.7 * MBIT * 1e6
     for module in (a, b):
         assert lanes(module, "/command") == ["express"]
-        assert lanes(module, "/image") == ["bulk"]
+        assert lanes(module, "/image") == lanes(module, "/later") == ["bulk"]
 
 
 def test_a_topic_of_small_and_large_messages_keeps_its_order(modules: ModuleFactory, tmp_path: Path) -> None:
@@ -99,10 +103,7 @@ def test_a_topic_of_small_and_large_messages_keeps_its_order(modules: ModuleFact
 
 
 def test_a_contract_decides_the_lane(modules: ModuleFactory) -> None:
-    rules = (
-        '[[contract]]\ntopics = ["/urgent"]\npriority = "high"\n[[contract]]\ntopics = ["/later"]\npriority = "low"\n'
-    )
-    a, b = modules("a", "b", config=rules)
+    a, b = modules("a", "b", config=RULES)
     for topic, size, lane in (("/urgent", 200_000, "express"), ("/later", 64, "bulk")):
         heard = b.ros.roscpp("listener", topic=topic)
         a.ros.roscpp("talker", topic=topic, size=size, rate=20, wait=1)

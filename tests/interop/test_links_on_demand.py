@@ -9,6 +9,7 @@ import pytest
 
 from lab.bed.processes import eventually
 from tests.interop.modules import Module, flows
+from tests.interop.ros import PYTHON, lacks
 
 if TYPE_CHECKING:
     from lab.bed.namespaces import Lab
@@ -17,6 +18,14 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(420)]
 
 CONFIG = "[mesh]\nfull_mesh_up_to = 2\n"
+SWITCH = """
+import rospy
+from std_srvs.srv import SetBool
+rospy.init_node("switch")
+service = rospy.Service("/switch", SetBool, lambda request: (request.data, "on"))
+print("up", flush=True)
+rospy.spin()
+"""
 SOON = 90.0
 """Seconds in which links that nothing needs are parked, on a busy machine too; the protocol takes 20 to 30."""
 
@@ -29,6 +38,16 @@ def states(module: Module) -> dict[str, str]:
 def all_parked(*modules: Module) -> bool:
     """Whether no two of these have a link, though each knows all others."""
     return all(states(one) == {other.name: "parked" for other in modules if other is not one} for one in modules)
+
+
+def offers(module: Module, service: str) -> bool:
+    """Whether the stock ``rosservice list`` shows a service here."""
+    return service in module.ros.tool("rosservice", "list").split()
+
+
+def address_of(module: Module, peer: str) -> str:
+    """The address of a peer as an agent knows it; empty if it does not know the peer."""
+    return next((str(row.guid).partition(":")[0] for row in module.agent.snapshot().peers if row.name == peer), "")
 
 
 def wait_parked(*modules: Module) -> None:
@@ -99,3 +118,45 @@ def test_a_parked_module_that_is_cut_off_goes_and_comes_back(modules: list[Modul
         module.wait_topic("/chatter", 60.0)
     flows(c.ros.node("roscpp", "listener", topic="/chatter"))
     assert states(b).keys() == {"a", "c", "d"}
+
+
+@pytest.mark.skipif(bool(lacks("actionlib")), reason=lacks("actionlib"))
+def test_services_actions_and_parameters_of_parked_peers_are_served_at_once(modules: list[Module]) -> None:
+    a, b, c, d = modules
+    switch = a.ros.start(PYTHON, "-c", SWITCH)
+    switch.wait_for("up")
+    d.ros.roscpp("action_server", name="server")
+    for module in (a, d):
+        module.ros.tool("rosparam", "set", "/wheels", module.name)
+    for module in (b, c):
+        module.wait_topic("/count/status")
+        eventually(partial(offers, module, "/switch"), what=f"/switch in the graph of {module.name}")
+    wait_parked(*modules)
+
+    client = b.ros.rospy("action_client", name="client", commands=True)
+    callers = [module.ros.start("rosservice", "call", "/switch", "true") for module in (b, c, c)]
+    assert c.agent.rmpa("param", "get", "--peer", "d", "/wheels") == (0, "d")
+    assert c.agent.rmpa("param", "get", "--peer", "a", "/wheels") == (0, "a")
+    for caller in callers:
+        assert caller.wait(SOON) == 0, caller.output
+        assert "success: True" in caller.output
+    client.tell("server 20")
+    assert client.wait_event("server", 30.0)["found"]
+    client.tell("send 3")
+    done = client.wait_event("done")
+    assert (done["state"], done["result"]) == ("SUCCEEDED", 3)
+
+
+def test_a_parked_peer_with_another_address_is_heard_at_once(modules: list[Module]) -> None:
+    """As after another lease of DHCP: its agent takes a new GUID, and says goodbye under the former one."""
+    a, b, c, _ = modules
+    a.ros.rospy("talker", topic="/chatter", rate=50)
+    for module in (b, c):
+        module.wait_topic("/chatter")
+    wait_parked(*modules)
+    interface = a.host.cables[0].interface
+    a.host.ip("address", "del", f"{a.host.address}/24", "dev", interface)
+    a.host.ip("address", "add", "10.77.0.77/24", "brd", "+", "dev", interface)
+    flows(b.ros.roscpp("listener", topic="/chatter"), 10, SOON)
+    eventually(lambda: address_of(c, "a") == "10.77.0.77", SOON, what="the new address is known everywhere")
+    assert "data:" in c.ros.tool("rostopic", "echo", "-n", "1", "/chatter")

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import json
-from contextlib import ExitStack
 from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from lab.bed.agents import Agent
-from lab.bed.gateways import ROUTER_PORT, GatewayProcess
-from lab.bed.namespaces import Lab
+from lab.bed.gateways import ROUTER_PORT
 from lab.bed.processes import eventually
 from rmpa.gateway.ros2.action_pair import ActionPair
 from rmpa.gateway.ros2.mapping import ActionRule
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.ros.types.messages import MessageType
-from tests.interop.modules import Module
-from tests.interop.ros import Ros, lacks
-from tests.interop.test_ros2_neighbour import CONFIG, Hall, OtherEnd
+from tests.interop.ros import lacks
+from tests.interop.ros2_hall import LONG, Hall, OtherEnd, running_hall
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -32,26 +28,14 @@ pytestmark = [
     pytest.mark.timeout(120),
     pytest.mark.skipif(bool(lacks("actionlib")), reason=lacks("actionlib")),
 ]
-LONG: Final = 30.0
 KINDS: Final = ["rospy", "roscpp"]
 
 
 @pytest.fixture(scope="module")
 def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
     """The gateway is a Zenoh router, on the robot's own host."""
-    with ExitStack() as stack:
-        lab = stack.enter_context(Lab())
-        home = tmp_path_factory.mktemp("hall")
-        robot, other = lab.hosts("robot", "other")
-        agent = stack.enter_context(Agent(robot, home, name="robot"))
-        gateway = stack.enter_context(GatewayProcess(robot, home, name="gate", config=CONFIG))
-        for one in (agent, gateway):
-            one.start()
-        for one in (agent, gateway):
-            one.wait_ready()
-        agent.wait_peer(gateway.name)
-        module = Module(robot, agent, stack.enter_context(Ros(robot, home, 11311)))
-        yield Hall(module, gateway, other, home, stack)
+    with running_hall(tmp_path_factory.mktemp("hall")) as hall:
+        yield hall
 
 
 def hashes() -> str:

@@ -6,101 +6,32 @@ The other ends are ``zenoh-ros2-sdk`` and plain eclipse-zenoh: they have no code
 from __future__ import annotations
 
 import json
-import sys
-from contextlib import ExitStack
-from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
-from lab.bed.agents import Agent
-from lab.bed.gateways import ROUTER_PORT, GatewayProcess
-from lab.bed.namespaces import Lab
-from lab.bed.processes import Event, Process, eventually
-from tests.interop.modules import Module
-from tests.interop.ros import NODES, Ros
+from lab.bed.gateways import ROUTER_PORT
+from lab.bed.processes import Process, eventually
+from tests.interop.ros2_hall import LONG, Hall, OtherEnd, running_hall
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
-    from lab.bed.namespaces import Host
 
 pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 needs_sdk = pytest.mark.skipif(find_spec("zenoh_ros2_sdk") is None, reason="zenoh-ros2-sdk is not installed")
 
-LONG: Final = 30.0
-CONFIG: Final = f"""
-[gateway]
-site = "hall"
-router = true
-listen = ["tcp/0.0.0.0:{ROUTER_PORT}"]
-insecure = true
-ros1_bridge = true
-
-[gateway.ros2]
-enabled = true
-"""
 STRING: Final = b"std_msgs/String".hex() + "/992ce8a1687cec8c8bd883ec73ca41d1"
 SET_BOOL: Final = b"std_srvs/SetBool".hex() + "/09fb03525b03e7ea1fd3992bafd87e16"
-
-
-@dataclass(frozen=True, slots=True)
-class OtherEnd:
-    """A program of another world that does what lines of JSON say."""
-
-    process: Process
-
-    def do(self, what: str, **words: object) -> None:
-        """Let it do something; return when it is done."""
-        since = self.process.mark_events()
-        self.process.tell(json.dumps({"do": what, **words}))
-        self.process.wait_event("done", LONG, since=since)
-
-    def ask(self, what: str, event: str, **words: object) -> Event:
-        """Let it do something; return the event that it says of it."""
-        since = self.process.mark_events()
-        self.do(what, **words)
-        return self.process.wait_event(event, since=since)
-
-
-@dataclass(frozen=True, slots=True)
-class Hall:
-    """One module, its gateway, and a host for the other ends."""
-
-    robot: Module
-    gateway: GatewayProcess
-    other: Host
-    home: Path
-    stack: ExitStack
-
-    def end(self, program: str, *words: str) -> OtherEnd:
-        """Start a program of ``nodes/`` on the other host."""
-        env = {"PATH": "/usr/bin:/bin", "HOME": str(self.home), "PYTHONPATH": f"{NODES}:{NODES.parents[2]}/lab/nodes"}
-        argv = self.other.command([sys.executable, NODES / f"{program}.py", *words])
-        process = self.stack.enter_context(Process(argv, env=env, name=program, commands=True))
-        process.wait_event("up", LONG)
-        return OtherEnd(process)
 
 
 @pytest.fixture(scope="module")
 def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
     """The gateway is a Zenoh router, on the robot's own host."""
-    with ExitStack() as stack:
-        lab = stack.enter_context(Lab())
-        home = tmp_path_factory.mktemp("hall")
-        robot, other = lab.hosts("robot", "other")
-        agent = stack.enter_context(Agent(robot, home, name="robot"))
-        gateway = stack.enter_context(GatewayProcess(robot, home, name="gate", config=CONFIG))
-        for one in (agent, gateway):
-            one.start()
-        for one in (agent, gateway):
-            one.wait_ready()
-        agent.wait_peer(gateway.name)
-        module = Module(robot, agent, stack.enter_context(Ros(robot, home, 11311)))
-        yield Hall(module, gateway, other, home, stack)
+    with running_hall(tmp_path_factory.mktemp("hall")) as hall:
+        yield hall
 
 
 @pytest.fixture(scope="module")

@@ -2,43 +2,26 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from lab.bed.agents import Agent
-from lab.bed.gateways import ROUTER_PORT, GatewayProcess
-from lab.bed.namespaces import Lab
+from lab.bed.gateways import ROUTER_PORT
 from lab.bed.processes import eventually
-from tests.interop.modules import Module
-from tests.interop.ros import Ros
-from tests.interop.test_ros2_neighbour import CONFIG, Hall, OtherEnd
+from tests.interop.ros2_hall import LONG, Hall, OtherEnd, running_hall
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
-LONG: Final = 30.0
 
 
 @pytest.fixture(scope="module")
 def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
     """The gateway is a Zenoh router, on the robot's own host; the robot may not be told of /fixed."""
-    with ExitStack() as stack:
-        lab = stack.enter_context(Lab())
-        home = tmp_path_factory.mktemp("hall")
-        robot, other = lab.hosts("robot", "other")
-        agent = stack.enter_context(Agent(robot, home, name="robot", config='[params]\nremote_set = ["/gains/**"]\n'))
-        gateway = stack.enter_context(GatewayProcess(robot, home, name="gate", config=CONFIG))
-        for one in (agent, gateway):
-            one.start()
-        for one in (agent, gateway):
-            one.wait_ready()
-        agent.wait_peer(gateway.name)
-        module = Module(robot, agent, stack.enter_context(Ros(robot, home, 11311)))
-        yield Hall(module, gateway, other, home, stack)
+    with running_hall(tmp_path_factory.mktemp("hall"), '[params]\nremote_set = ["/gains/**"]\n') as hall:
+        yield hall
 
 
 @pytest.fixture(scope="module")

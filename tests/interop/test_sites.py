@@ -303,8 +303,13 @@ def test_why_and_site_tell_of_both_sites(joined: JoinedModules) -> None:
         joined.base.ros.rospy("listener", topic="/told") as listener,
     ):
         flows(listener, 5, LONG)
-        code, output = joined.base.agent.rmpa("why", "/told", timeout=LONG)
-        assert (code, "warehouse" in output) == (0, True), output
+
+        def explained() -> bool:
+            """Whether nothing is found wrong; messages may be late for a while on a busy machine."""
+            code, output = joined.base.agent.rmpa("why", "/told", timeout=LONG)
+            return code == 0 and "warehouse" in output
+
+        eventually(explained, LONG, what="rmpa why leads to the other site, and finds nothing wrong")
         wait_node(joined.base, "/rmpa/warehouse/arm/told")
     for site, other in ((joined.warehouse, "yard"), (joined.yard, "warehouse")):
         code, output = site.gateway.rmpa("site", "list", "--json")

@@ -1,0 +1,95 @@
+"""A module beside a gateway that is a Zenoh router, and a host with programs of other worlds."""
+
+from __future__ import annotations
+
+import json
+import sys
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from lab.bed.agents import Agent
+from lab.bed.gateways import ROUTER_PORT, GatewayProcess
+from lab.bed.namespaces import Lab
+from lab.bed.processes import Event, Process
+from tests.interop.modules import Module
+from tests.interop.ros import NODES, Ros
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from lab.bed.namespaces import Host
+
+LONG: Final = 30.0
+CONFIG: Final = f"""
+[gateway]
+site = "hall"
+router = true
+listen = ["tcp/0.0.0.0:{ROUTER_PORT}"]
+insecure = true
+ros1_bridge = true
+
+[gateway.ros2]
+enabled = true
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class OtherEnd:
+    """A program of another world that does what lines of JSON say."""
+
+    process: Process
+
+    def do(self, what: str, **words: object) -> None:
+        """Let it do something; return when it is done."""
+        since = self.process.mark_events()
+        self.process.tell(json.dumps({"do": what, **words}))
+        self.process.wait_event("done", LONG, since=since)
+
+    def ask(self, what: str, event: str, **words: object) -> Event:
+        """Let it do something; return the event that it says of it."""
+        since = self.process.mark_events()
+        self.do(what, **words)
+        return self.process.wait_event(event, since=since)
+
+
+@dataclass(frozen=True, slots=True)
+class Hall:
+    """One module, its gateway, and a host for the other ends."""
+
+    robot: Module
+    gateway: GatewayProcess
+    other: Host
+    home: Path
+    stack: ExitStack
+
+    def end(self, program: str, *words: str) -> OtherEnd:
+        """Start a program of ``nodes/`` on the other host."""
+        env = {"PATH": "/usr/bin:/bin", "HOME": str(self.home), "PYTHONPATH": f"{NODES}:{NODES.parents[2]}/lab/nodes"}
+        argv = self.other.command([sys.executable, NODES / f"{program}.py", *words])
+        process = self.stack.enter_context(Process(argv, env=env, name=program, commands=True))
+        process.wait_event("up", LONG)
+        return OtherEnd(process)
+
+
+@contextmanager
+def running_hall(home: Path, config: str = "") -> Iterator[Hall]:
+    """Start the module and its gateway, and join them.
+
+    Args:
+        home: Existing directory.
+        config: Text of the module's ``rmpa.toml``.
+    """
+    with ExitStack() as stack:
+        lab = stack.enter_context(Lab())
+        robot, other = lab.hosts("robot", "other")
+        agent = stack.enter_context(Agent(robot, home, name="robot", config=config))
+        gateway = stack.enter_context(GatewayProcess(robot, home, name="gate", config=CONFIG))
+        for one in (agent, gateway):
+            one.start()
+        for one in (agent, gateway):
+            one.wait_ready()
+        agent.wait_peer(gateway.name)
+        module = Module(robot, agent, stack.enter_context(Ros(robot, home, 11311)))
+        yield Hall(module, gateway, other, home, stack)
