@@ -351,12 +351,51 @@ def test_a_port_that_was_not_reached_delays_no_further_subscriber_until_it_is_tr
     assert ProbeNode(1, GRANT) in sut.replied(KEY, attempt, GRANT, later)
 
 
+PROBLEM = "Operation not permitted"
+
+
 def test_a_stuck_subscriber_that_may_be_direct_again_is_stuck_no_more() -> None:
     sut = Sut()
     sut.connected_directly()
     sut.consider(KEY, Transport.RELAY, RULE, 1.0)
     route = sut.get(KEY)
     assert route is not None
-    route.stuck = "it cannot be ended"
+    sut.stays(KEY, END, PROBLEM)
+    assert (sut.state(), route.stuck) == ((DirectState.RELAYED, Path.DIRECT), PROBLEM)
     sut.direct(now=2.0)
     assert (sut.state(), route.stuck) == ((DirectState.DIRECT, Path.DIRECT), "")
+
+
+@pytest.mark.parametrize("back_before_it_is_known", [False, True])
+def test_a_connection_that_outlasts_its_lost_link_is_direct_when_the_link_is_back(
+    back_before_it_is_known: bool,
+) -> None:
+    sut = Sut()
+    sut.connected_directly()
+    route = sut.get(KEY)
+    assert route is not None
+    assert HangUp(KEY, END) in sut.link_down(1, 5.0, crashed=False)
+    if not back_before_it_is_known:
+        sut.stays(KEY, END, PROBLEM)
+        assert (sut.state(), route.stuck) == ((DirectState.RELAYED, Path.DIRECT), PROBLEM)
+    sut.replied(KEY, asked(sut.link_up(1, 6.0)).attempt, GRANT, 6.0)
+    actions = sut.probed(1, GRANT.port, "", 6.0)
+    if back_before_it_is_known:
+        assert Move(KEY) in actions
+        sut.stays(KEY, END, PROBLEM)
+    assert (sut.state(), route.stuck) == ((DirectState.DIRECT, Path.DIRECT), "")
+    assert not sut.misplaced(KEY)
+
+
+def test_a_subscriber_that_cannot_leave_an_earlier_port_stays_stuck() -> None:
+    sut = Sut()
+    sut.connected_directly()
+    sut.link_down(1, 5.0, crashed=False)
+    sut.stays(KEY, END, PROBLEM)
+    moved = Grant(END[1] + 1, GRANT.node, GRANT.probe)
+    sut.replied(KEY, asked(sut.link_up(1, 6.0)).attempt, moved, 6.0)
+    assert Move(KEY) in sut.probed(1, END[1] + 1, "", 6.0)
+    sut.stays(KEY, END, PROBLEM)
+    route = sut.get(KEY)
+    assert route is not None
+    assert (route.path, route.stuck) == (Path.DIRECT, PROBLEM)

@@ -99,6 +99,12 @@ class DirectRoute:
     doubtful: bool = False
     stuck: str = ""
 
+    def allows(self, endpoint: tuple[str, int] | None) -> bool:
+        """Whether a direct connection to this address and port is what was decided."""
+        if self.state is not DirectState.DIRECT or self.grant is None or endpoint is None:
+            return False
+        return endpoint[1] == self.grant.port
+
 
 @dataclass(frozen=True, slots=True)
 class Ask:

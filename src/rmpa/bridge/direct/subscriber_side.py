@@ -185,14 +185,31 @@ class DirectSubscriptions:
             return route.stranded
         if route.state is DirectState.RELAYED:
             return route.path is Path.DIRECT
-        granted = route.grant.port if route.grant is not None else 0
-        return route.endpoint is None or route.endpoint[1] != granted
+        return not route.allows(route.endpoint)
 
     def hung_up(self, key: DirectKey) -> None:
         """Note that a subscriber has no connection to the source any more, and waits for being called back."""
         route = self._routes.get(key)
         if route is not None:
             route.path, route.endpoint, route.stranded = Path.NONE, None, True
+
+    def stays(self, key: DirectKey, endpoint: tuple[str, int], problem: str) -> None:
+        """Note that a direct connection of a subscriber could not be ended.
+
+        A rospy subscriber does not ask again while it is connected, so it is not stranded either.
+
+        Args:
+            key: The subscriber.
+            endpoint: The address and port of its connection.
+            problem: Why it cannot be ended.
+        """
+        route = self._routes.get(key)
+        if route is None:
+            return
+        if route.path is Path.NONE:
+            route.path, route.endpoint, route.stranded = Path.DIRECT, endpoint, False
+        # The peer may have allowed this connection meanwhile.
+        route.stuck = "" if route.endpoint == endpoint and route.allows(endpoint) else problem
 
     def left(self, key: DirectKey, now: float) -> list[DirectAction]:
         """Note that a subscriber has closed its connection to the proxy; a latched source may be direct now."""
@@ -440,8 +457,8 @@ class DirectSubscriptions:
         if route.path is Path.RELAY and self._is_latched(key):
             return self._relay(key, route, _TWICE, now)
         self._enter(route, DirectState.DIRECT, now)
-        if route.path is Path.DIRECT and route.grant is not None and route.endpoint is not None:
-            same = route.endpoint[1] == route.grant.port
+        if route.path is Path.DIRECT:
+            same = route.allows(route.endpoint)
             route.stuck = "" if same else route.stuck  # it may stay now
         else:
             same = route.path is Path.NONE and not route.stranded

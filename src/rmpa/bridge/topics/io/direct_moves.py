@@ -118,9 +118,7 @@ class SubscriberMoves:
             problem: Why.
         """
         self._mark_stuck(key, stuck=True)
-        route = self._routes.get(key)
-        if route is not None:
-            route.stuck = problem
+        self._routes.stays(key, endpoint, problem)
         text = (
             f"{key.source}: {key.subscriber} stays connected to {endpoint[0]}:{endpoint[1]}: a rospy subscriber "
             f"leaves only when its connection is ended, and this agent may not do that ({problem}); see rmpa doctor"
