@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 from blockbuster import blockbuster_ctx
+from hypothesis import HealthCheck, settings
 
 from lab.bed import namespaces
 from tests import probes
@@ -33,6 +34,10 @@ _TESTS: Final = Path(__file__).parent
 _ROOMS: Final = {"core", "runtime", "discovery", "mesh", "ros", "bridge", "resource"}
 """Rooms whose coroutine tests fail when code of rmpa blocks the event loop."""
 _numbers = itertools.count(1)
+# Hypothesis has chosen its profile by now ("ci" where the variable CI is set), and tests take the rest from it. On a
+# loaded machine an example takes any time: pytest's time-out bounds a test.
+settings.register_profile("rmpa", settings(), deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("rmpa")
 _SETTLE_ROUNDS: Final = 10
 """Turns of the loop that cancelled tasks and closed transports get before they count as leaked."""
 

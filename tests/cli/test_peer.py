@@ -71,6 +71,7 @@ def test_no_peers_says_where_it_looks(place: Place, agent: Agent) -> None:
     [
         (OffersInfo(version=3, right=True), "version 3 is here as the peer told it\n"),
         (OffersInfo(version=3), "version 3 is here, not compared\n"),
+        (OffersInfo(), "no version is held yet (a peer of an earlier release tells none)\n"),
         (
             OffersInfo(version=3, right=True, differed=2),
             "version 3 is here as the peer told it; differed and was fetched again so far: 2\n",

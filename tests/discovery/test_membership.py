@@ -28,6 +28,7 @@ from rmpa.discovery.events import (
     SendMulticast,
     SendUnicast,
 )
+from rmpa.discovery.goodbye_checks import GoodbyeChecks
 from rmpa.discovery.membership import MembershipProtocol
 
 T0 = 1000.0
@@ -210,6 +211,89 @@ def test_goodbye_of_a_linked_peer_waits_for_its_link(one: Harness) -> None:
     assert one.present() == ["peer2"]
     one.membership.link_down(who(2).guid, one.now)
     assert one.membership.events()[-1] == PeerLost(who(2), LossReason.GOODBYE)
+
+
+def parked(one: Harness) -> Speaker:
+    """Peer 2, which had a link."""
+    speaker = Speaker(who(2))
+    one.hear(speaker())
+    one.membership.link_up(who(2), one.now)
+    one.membership.link_down(who(2).guid, one.now)
+    one.membership.events()
+    return speaker
+
+
+@pytest.mark.parametrize("ahead", [1, 1000])
+def test_a_forged_goodbye_is_refuted_by_the_next_heartbeat(one: Harness, ahead: int) -> None:
+    speaker = Speaker(who(2))
+    one.hear(speaker())
+    one.hear(Speaker(who(2), speaker.sequence + ahead)(BeaconKind.GOODBYE))
+    assert one.membership.events()[-1] == PeerLost(who(2), LossReason.GOODBYE)
+    one.run(limits.GOODBYE_LATE)
+    one.hear(speaker())
+    assert [type(event) for event in one.membership.events()] == [PeerFound]
+    one.run(5.0)
+    one.hear(speaker())
+    assert one.present() == ["peer2"]
+
+
+def test_a_peer_that_was_linked_is_asked_whether_it_said_goodbye(one: Harness) -> None:
+    speaker = parked(one)
+    forger = ("10.0.0.66", 6666)
+    one.hear(Speaker(who(2), 1000)(BeaconKind.GOODBYE), source=forger, multicast=False)
+    assert one.present() == []
+    asked = one.run(limits.GOODBYE_CHECK)
+    assert unicasts(asked, BeaconKind.ANNOUNCE) == [who(2).guid.endpoint]
+    one.hear(speaker(BeaconKind.ANSWER), multicast=False)
+    assert one.present() == ["peer2"]
+    assert unicasts(one.run(10.0), BeaconKind.ANNOUNCE) == [], "one announcement is enough"
+
+
+def test_news_that_a_peer_has_left_is_checked(one: Harness) -> None:
+    speaker = parked(one)
+    one.membership.peer_failed(who(2).guid, who(2).instance, one.now, LossReason.GOODBYE)
+    assert one.present() == []
+    assert unicasts(one.run(limits.GOODBYE_CHECK), BeaconKind.ANNOUNCE) == [who(2).guid.endpoint]
+    one.hear(speaker(BeaconKind.ANSWER), multicast=False)
+    assert one.present() == ["peer2"]
+
+
+def test_peers_that_were_never_linked_are_not_asked(one: Harness) -> None:
+    speaker = Speaker(who(2))
+    one.hear(speaker())
+    one.hear(speaker(BeaconKind.GOODBYE))
+    assert unicasts(one.run(30.0), BeaconKind.ANNOUNCE) == []
+
+
+def test_checks_of_goodbyes_are_bounded() -> None:
+    checks = GoodbyeChecks(lambda: 0.5)
+    for number in range(1000):
+        checks.add((("10.0.0.2", number),), 10, T0)
+    assert len(checks.take(T0 + limits.GOODBYE_CHECK)) == limits.GOODBYE_CHECKS_BURST
+    checks.add((("10.0.0.2", 1),), 2 * limits.GOODBYE_CHECKS, T0 + 60.0)
+    assert checks.at is None, "of many members some others ask"
+
+
+def test_a_forged_goodbye_of_a_linked_peer_is_forgotten_with_its_next_heartbeat(one: Harness) -> None:
+    speaker = Speaker(who(2))
+    one.hear(speaker())
+    one.membership.link_up(who(2), one.now)
+    one.hear(Speaker(who(2), 1000)(BeaconKind.GOODBYE))
+    assert one.membership.events()[-1] == RunDoubted(who(2)), "a link at rest is to show whether it works"
+    one.run(1.0)
+    one.hear(speaker())
+    one.membership.link_down(who(2).guid, one.now)
+    assert one.present() == ["peer2"], "as after any lost link, its lease begins"
+
+
+def test_a_repeated_goodbye_puts_off_nothing(one: Harness) -> None:
+    speaker, forger = Speaker(who(2)), Speaker(who(2), 1000)
+    one.hear(speaker())
+    for _ in range(3):
+        one.hear(forger(BeaconKind.GOODBYE))
+        one.run(limits.GOODBYE_LATE / 2)
+    one.hear(speaker())
+    assert one.present() == ["peer2"]
 
 
 def test_a_stranger_that_says_goodbye_is_not_met(one: Harness) -> None:

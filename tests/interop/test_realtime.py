@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import resource
 import shutil
@@ -58,9 +59,13 @@ def status(pid: int) -> dict[str, int]:
 
 
 def threads(pid: int) -> dict[int, tuple[int, int]]:
-    """Policy and priority of each thread."""
-    ids = [int(path.name) for path in Path(f"/proc/{pid}/task").iterdir()]
-    return {tid: (os.sched_getscheduler(tid), os.sched_getparam(tid).sched_priority) for tid in ids}
+    """Policy and priority of each thread; of those that end meanwhile, none."""
+    found = {}
+    for path in Path(f"/proc/{pid}/task").iterdir():
+        with contextlib.suppress(ProcessLookupError):
+            tid = int(path.name)
+            found[tid] = os.sched_getscheduler(tid), os.sched_getparam(tid).sched_priority
+    return found
 
 
 def may(*capabilities: int) -> bool:

@@ -15,10 +15,11 @@ if TYPE_CHECKING:
 
 
 @contextlib.contextmanager
-def descriptors_left(count: int) -> Iterator[None]:
+def descriptors_left(count: int) -> Iterator[int]:
     """Within this, ``count`` new descriptors can be had: the lowest free numbers, others are taken by duplicates.
 
-    So many are taken that the reserve is a whole one, however few files the process that runs the tests was given.
+    Yields the lowest of these numbers. So many are taken that the reserve is a whole one, however few files the
+    process that runs the tests was given.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     top = max(int(entry.name) for entry in Path("/proc/self/fd").iterdir()) + 1
@@ -29,7 +30,7 @@ def descriptors_left(count: int) -> Iterator[None]:
             filled.append(fd)
         os.close(fd)
         resource.setrlimit(resource.RLIMIT_NOFILE, (fd + count, hard))
-        yield
+        yield fd
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
         for fd in filled:

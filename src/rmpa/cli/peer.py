@@ -229,7 +229,7 @@ def _facts(info: PeerInfo) -> list[tuple[str, str]]:
     ]
     if info.probes is not None:
         facts.append(("Probes", _probes_text(info.probes)))
-    if info.offers is not None and info.offers.version:
+    if info.offers is not None:
         facts.append(("Offers", offers_text(info.offers)))
     link = info.link
     if link is not None:
@@ -262,7 +262,9 @@ def _facts(info: PeerInfo) -> list[tuple[str, str]]:
 
 
 def offers_text(offers: OffersInfo) -> str:
-    """``version 3 is here as the peer told it``, and how often it was not."""
+    """``version 3 is here as the peer told it``, and how often it was not; or that none is held."""
+    if offers.version is None:
+        return "no version is held yet (a peer of an earlier release tells none)"
     state = {
         True: "is here as the peer told it",
         False: "differs here from what the peer told",
@@ -276,9 +278,8 @@ def _probes_text(probes: ProbesInfo) -> str:
     """``alive, heard 0.4 s ago, round trip 0.8 ms, refuted 0 suspicions, version 3 of its offers``."""
     heard = f"heard {duration(probes.heard_ago)} ago" if probes.heard_ago is not None else "not heard yet"
     trip = f", round trip {duration(probes.rtt)}" if probes.rtt is not None else ""
-    return (
-        f"{probes.state}, {heard}{trip}, refuted {probes.refuted} suspicions, version {probes.version} of its offers"
-    )
+    offers = f", version {probes.version} of its offers" if probes.version is not None else ""
+    return f"{probes.state}, {heard}{trip}, refuted {probes.refuted} suspicions{offers}"
 
 
 @click.command(epilog="\b\nExamples:\n  rmpa peer ping base\n  rmpa peer ping base -c 10 -i 0.1\n")

@@ -42,6 +42,19 @@ ADDRESS_SHARED_AFTER: Final = 5.0
 conflict."""
 ADDRESS_SHARED_MARGIN: Final = 1.0
 """Seconds after the end of a peer's link in which its beacon may still be one from before."""
+GOODBYE_LATE: Final = 0.2
+"""Seconds after a goodbye in which beacons that were sent before it may still come, or be read from another socket. A
+beacon that comes later refutes the goodbye."""
+GOODBYE_CHECK: Final = 0.25
+"""Seconds from a goodbye to the announcement that asks whether it was forged: the answer comes after
+``GOODBYE_LATE``."""
+GOODBYE_CHECKS: Final = 16
+"""Members that ask so, on average: in larger meshes each decides by chance, and the failure detector spreads the
+refutation. A goodbye then costs the network no more than this many packets."""
+GOODBYE_CHECKS_PER_SECOND: Final = 25.0
+"""Goodbyes a second that one agent checks; those beyond it are refuted by the next heartbeat."""
+GOODBYE_CHECKS_BURST: Final = 64
+"""Goodbyes that wait for their check at one time, and that are checked at once."""
 ANSWER_INTERVAL: Final = 0.2
 """The shortest time between two unicast answers to one address."""
 INTERFACE_SETTLE: Final = 0.2

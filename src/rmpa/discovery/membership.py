@@ -34,6 +34,7 @@ from rmpa.discovery.events import (
     PeerRestarted,
     RunDoubted,
 )
+from rmpa.discovery.goodbye_checks import GoodbyeChecks
 from rmpa.discovery.gossip import GossipCandidates
 from rmpa.discovery.pacing import BeaconPace, LateAnswers, is_many
 from rmpa.discovery.unicast import UnicastHeartbeats
@@ -81,6 +82,7 @@ class MembershipProtocol:
         self._reported_names: set[frozenset[bytes]] = set()
         self._late_answers = LateAnswers(rng)
         self._candidates = GossipCandidates(rng)
+        self._goodbye_checks = GoodbyeChecks(rng)
         self._seeds: tuple[Address, ...] = ()
         self._burst: list[float] = []
         self._heartbeat_at: float | None = None
@@ -205,6 +207,8 @@ class MembershipProtocol:
             return
         self._peer_lost(endpoint, reason)
         endpoint.remove_current()
+        if reason is LossReason.GOODBYE:
+            self._check_goodbye(peer, now)
         self._clear_conflict(endpoint, now)
         self._endpoints.changed(guid.place)
         self._remove_if_empty(guid.place)
@@ -251,6 +255,7 @@ class MembershipProtocol:
             self._unicast_heartbeats.at,
             self._burst[0] if self._burst else None,
             self._candidates.next_timer(),
+            self._goodbye_checks.at,
             self._endpoints.next_timer(),
         )
 
@@ -280,7 +285,7 @@ class MembershipProtocol:
             gossip = self._sender.gossip(self._endpoints.present(), peer, now)
             for address in peer.addresses:
                 self._sender.send(BeaconKind.HEARTBEAT, address, gossip)
-        for address in self._candidates.take_due(now):
+        for address in (*self._candidates.take_due(now), *self._goodbye_checks.take(now)):
             self._sender.send(BeaconKind.ANNOUNCE, address)
 
     # --- outputs and views ------------------------------------------------------------------------------------
@@ -351,11 +356,8 @@ class MembershipProtocol:
                 self._schedule_dissemination(now)
             elif not endpoint.conflict:
                 self._peer_found(endpoint, now)
-        elif change is EndpointChange.LEAVING and not current.linked:
-            self._peer_lost(endpoint, LossReason.GOODBYE)
-            endpoint.remove_current()
-            self._clear_conflict(endpoint, now)
-            self._endpoints.changed(current.identity.guid.place)
+        elif change is EndpointChange.LEAVING:
+            self._run_leaves(endpoint, current, now)
         elif change is EndpointChange.CONFLICT:
             kind = ConflictKind.OWN_GUID if endpoint.own else ConflictKind.GUID
             rival = max(endpoint.rivals(), key=lambda v: v.heard)
@@ -364,6 +366,22 @@ class MembershipProtocol:
                 self._peer_lost(endpoint, LossReason.CONFLICT)
         elif change is EndpointChange.WAITING:
             self._run_waits(endpoint, current, now)
+
+    def _run_leaves(self, endpoint: Endpoint, current: PeerInstance, now: float) -> None:
+        """The current run said goodbye; its link, while it stands, is stronger evidence than a packet."""
+        if current.linked:
+            self._events.append(RunDoubted(current.identity))
+            return
+        self._peer_lost(endpoint, LossReason.GOODBYE)
+        endpoint.remove_current()
+        self._check_goodbye(current, now)
+        self._clear_conflict(endpoint, now)
+        self._endpoints.changed(current.identity.guid.place)
+
+    def _check_goodbye(self, peer: PeerInstance, now: float) -> None:
+        """Ask a peer that is lost by a goodbye whether it is there, if it was linked: others may be forged too."""
+        if peer.verified:
+            self._goodbye_checks.add(peer.addresses, self.members, now)
 
     def _run_waits(self, endpoint: Endpoint, current: PeerInstance, now: float) -> None:
         if current.linked and not endpoint.own:

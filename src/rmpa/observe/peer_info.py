@@ -97,27 +97,27 @@ class ProbesInfo(msgspec.Struct, kw_only=True, frozen=True):
         heard_ago: Seconds since its last packet; ``None`` if none came.
         rtt: The last round trip of a probe in seconds; ``None`` before the first.
         refuted: How often it was suspected and refuted that.
-        version: The version of what it offers.
+        version: The version of what it offers; ``None`` while none was heard of.
     """
 
     state: str
     heard_ago: float | None = None
     rtt: float | None = None
     refuted: int = 0
-    version: int = 0
+    version: int | None = None
 
 
 class OffersInfo(msgspec.Struct, kw_only=True, frozen=True):
     """This module's copy of what a peer offers.
 
     Attributes:
-        version: The version that it has completely; 0 if none.
+        version: The version that it has completely; ``None`` while it has none.
         right: Whether its digests are those that the peer said; ``None`` while that is not known, as with a peer of
             an earlier release.
         differed: How often they were not, and the peer's topics and services were fetched again.
     """
 
-    version: int = 0
+    version: int | None = None
     right: bool | None = None
     differed: int = 0
 

@@ -90,7 +90,7 @@ class PeersSection:
                     beyond=beyond,
                     direct_in=to_it,
                     direct_out=from_it,
-                    offers=OffersInfo(version=session.offers_held or 0, right=copy.right, differed=copy.differed),
+                    offers=OffersInfo(version=session.offers_held, right=copy.right, differed=copy.differed),
                 )
             probed = endpoint.discovery.member(guid, bytes.fromhex(info.instance)) if detecting else None
             if probed is not None:
@@ -184,7 +184,7 @@ def _probes(member: MemberView, now: float) -> ProbesInfo:
         heard_ago=now - member.heard if member.heard is not None else None,
         rtt=member.rtt,
         refuted=member.incarnation,
-        version=member.version,
+        version=member.version or None,  # versions begin with 1
     )
 
 
