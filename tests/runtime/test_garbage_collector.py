@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import sys
 from typing import TYPE_CHECKING, ClassVar
 
 import pytest
@@ -67,6 +68,22 @@ async def until_no_more_than(knots: int) -> None:
 )
 def test_what_is_due(young: int, grown: int, quiet: bool, collection: Collection) -> None:
     assert choose_collection(young, grown, quiet=quiet) is collection
+
+
+@pytest.mark.parametrize(
+    ("factor", "rests", "collection"),
+    [
+        (1.9, True, Collection.FULL),
+        (2.0, True, Collection.THOROUGH),
+        (2.0, False, Collection.FULL),
+        (3.9, False, Collection.FULL),
+        (4.0, False, Collection.THOROUGH),
+    ],
+)
+def test_frozen_objects_are_scanned_at_rest_or_when_the_heap_is_four_times_as_large(
+    factor: float, rests: bool, collection: Collection
+) -> None:
+    assert choose_collection(0, limits.COLLECT_GROWTH, quiet=True, factor=factor, rests=rests) is collection
 
 
 async def test_it_takes_over_and_gives_back(collector: GarbageCollector) -> None:
@@ -172,6 +189,40 @@ async def test_garbage_that_grew_old_waits_no_longer_when_it_is_much(
             await until_no_more_than(0)
         assert counters["collector.full"] == 1
         assert "objects of all ages in" in caplog.text
+    finally:
+        collector.close()
+
+
+async def test_frozen_garbage_is_collected_at_rest_and_not_before(
+    counters: Counters, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(limits, "COLLECT_LOOK", 0.02)
+    monkeypatch.setattr(limits, "COLLECT_REST", 0.1)
+    monkeypatch.setattr(limits, "COLLECT_GROWTH", 20_000)
+    carried, step = 0, 1_000_000
+
+    def carry() -> int:
+        nonlocal carried
+        carried += step
+        return carried
+
+    Knot.alive = 0
+    collector = GarbageCollector(carry, counters)
+    collector.start()
+    try:
+        blocks = sys.getallocatedblocks()
+        knots = [Knot() for _ in range(10_000)]
+        gc.freeze()  # as a full collection does with what survives it
+        graph = [object() for _ in range(int(1.5 * blocks))]
+        knots.clear()
+        with caplog.at_level("INFO"):
+            await asyncio.sleep(0.3)
+            assert Knot.alive == 10_000, "data flows"
+            step = 0
+            await until_no_more_than(0)
+        assert "the frozen ones included" in caplog.text
+        assert gc.get_freeze_count() > 0
+        assert len(graph) > blocks
     finally:
         collector.close()
 
