@@ -14,9 +14,9 @@ leave garbage for a pause of 6 ms. If only the timer collects, a thousand topics
 Old objects that become garbage are only found by a full collection. It waits until no data flows, unless the heap has
 grown too much. What survives it is frozen too, so that its time depends on what came since and not on the size of the
 graph: to scan all objects of 1,000 peers takes 0.1 to 0.25 s. Garbage among frozen objects is rare, because what has
-survived a full collection is mostly the graph, which makes no cycles. So all objects are scanned only when the heap has
-doubled, and only at rest: while nothing flows and nothing joins. An agent that never rests scans them when its heap is
-four times as large as after the last such scan.
+survived a full collection is mostly the graph, which makes no cycles. So all objects are scanned only when the heap
+has doubled, and only at rest: while nothing flows and nothing joins. An agent that never rests scans them when its
+heap is four times as large as after the last such scan.
 """
 
 from __future__ import annotations
