@@ -449,6 +449,25 @@ def test_another_run_at_the_place_of_a_linked_peer_has_its_link_checked(one: Har
     assert [type(e) for e in one.membership.events()] == [PeerRestarted]
 
 
+def test_a_restarted_peer_is_no_rival_of_its_dead_run_however_late_its_link_falls(one: Harness) -> None:
+    """The link of the dead run was idle, and is found dead long after the new run's first beacons."""
+    one.hear(Speaker(who(2))())
+    one.membership.link_up(who(2), one.now)
+    one.membership.events()
+    new = Speaker(who(2, run=2))
+    for _ in range(3):
+        one.run(2.5)
+        one.hear(new())
+        assert one.membership.events() == [RunDoubted(who(2))]
+    one.membership.link_up(who(2, run=2), one.now)
+    assert [type(e) for e in one.membership.events()] == [PeerRestarted]
+    one.run(1)
+    one.membership.link_down(who(2).guid, one.now, who(2, run=2).instance)  # parked
+    one.run(1)
+    assert one.membership.events() == []
+    assert one.present() == ["peer2"]
+
+
 def test_somebody_else_with_our_guid(one: Harness) -> None:
     twin = Speaker(who(1, run=9, name="twin"))
     one.hear(twin())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import random
 import time
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.core.links import Links
 from rmpa.discovery.beacon import Beacon
-from rmpa.discovery.events import PeerChanged, PeerFound, PeerLost, PeerRestarted, SendMulticast
+from rmpa.discovery.events import PeerChanged, PeerFound, PeerLost, PeerRestarted, RunDoubted, SendMulticast
 from rmpa.discovery.member_watch import MemberWatch
 from rmpa.discovery.membership import MembershipProtocol
 from rmpa.discovery.swim.events import MemberOffers, MemberSuspected, SwimEvent
@@ -278,8 +279,17 @@ class Module:
                 self.peering.peer_gone(identity.guid, now)
                 self._forget(identity)
                 self._count_modules()
+            case RunDoubted(identity=identity):
+                self._check_link(identity)
             case _:
                 pass
+
+    def _check_link(self, identity: Identity) -> None:
+        """Wake a link whose other end may be gone: it ends if that end does not answer."""
+        for number, link in list(self.links.items()):
+            if link.other(self).place == identity.guid.place and not self._is_alive(number):
+                ended = functools.partial(self.link_ended, number, "silent", self.run, silent=True)
+                self.network.world.after(mesh_limits.WAKE_TIMEOUT, ended)
 
     def _judge_loss(self, identity: Identity, reason: LossReason) -> None:
         if self.watch:

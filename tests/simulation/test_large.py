@@ -37,5 +37,16 @@ def test_a_large_mesh_agrees_soon_and_costs_little_at_rest() -> None:
 
 
 @pytest.mark.timeout(600)
+def test_restarts_and_a_partition_take_no_living_module_away() -> None:
+    figures = LargeScenario(1, MODULES, settle=30.0, parts=("churn", "partition")).play()
+    assert figures.lost_falsely == 0
+    assert figures.churn_after is not None
+    assert figures.churn_after < 16, "10 s of restarts, and what the last one takes"
+    assert figures.parted_lost is not None
+    assert figures.healed_after is not None
+    assert figures.healed_after < 10
+
+
+@pytest.mark.timeout(600)
 def test_one_seed_gives_one_run() -> None:
     assert play(3, 12) == play(3, 12) != play(4, 12)

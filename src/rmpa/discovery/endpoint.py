@@ -250,6 +250,9 @@ class Endpoint:
             return self._promote(peer, now, EndpointChange.NEW)
         if self.conflict or now - peer.superseded_at < limits.CONFLICT_AFTER:
             return EndpointChange.WAITING
+        if self.current.linked and not self.own and self.current.heard <= peer.since:
+            # The current run was not heard since. Its link may lead to a machine without power; it is checked.
+            return EndpointChange.WAITING
         if self.current.linked or now - self.current.heard <= limits.HEARTBEAT_LATE:
             self.conflict = True
             return EndpointChange.CONFLICT
