@@ -262,6 +262,26 @@ async def test_trap_16_listeners_leave_a_withdrawn_topic_and_find_it_again(
     assert (report["gaps"], report["doubled"], report["last"]) == (0, 0, 20)
 
 
+@pytest.mark.trap(16)
+async def test_a_listener_that_was_stopped_finds_a_topic_that_was_gone_meanwhile(node: Node, ros: Ros) -> None:
+    """rospy has much to read before the end of its connection, and gets the list with the same publisher first."""
+    listener = ros.node("rospy", "listener")
+    pattern = Pattern(100)
+    for _ in range(3):
+        publisher = await node.advertise("/chatter", BYTES, queue_messages=10_000)
+        await asyncio.wait_for(publisher.wait_for_subscriber(), DEADLINE)
+        os.kill(listener.pid, signal.SIGSTOP)
+        try:
+            for sequence in range(1, 5001):  # fits the kernel's buffers
+                publisher.publish_raw(framed(pattern.payload(1, sequence)))
+            await publisher.close()
+            publisher = await node.advertise("/chatter", BYTES)
+        finally:
+            os.kill(listener.pid, signal.SIGCONT)
+        await asyncio.wait_for(publisher.wait_for_subscriber(), DEADLINE)
+        await publisher.close()
+
+
 @libraries
 async def test_a_killed_talker_is_heard_again_when_it_is_back(node: Node, ros: Ros, library: str) -> None:
     got: list[Received] = []

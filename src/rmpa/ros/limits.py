@@ -193,6 +193,13 @@ NOTIFY_RETRY_FIRST: Final = 0.2
 """Pause before an update is sent again to a node that did not answer."""
 NOTIFY_RETRY_MAX: Final = 3.0
 """The longest pause between attempts, while the node is registered."""
+WITHDRAWN_LATELY: Final = 5.0
+"""Seconds within which a publisher that was withdrawn and is registered again, with the same URI, has its topic's
+list of publishers repeated: a busy subscriber may not have read yet that its old connection ended."""
+PUBLISHERS_AGAIN: Final = 2.0
+"""Seconds from its return until the list is repeated, with those of the topics that return meanwhile."""
+WITHDRAWN_KEPT: Final = 16_384
+"""Withdrawn publishers that are remembered; the oldest is forgotten first."""
 ROSOUT_QUEUE: Final = 1000
 """Log messages queued for a slow reader of /rosout_agg."""
 ROSOUT_RESPAWN: Final = 0.5

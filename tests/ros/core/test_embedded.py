@@ -270,6 +270,51 @@ async def test_a_dead_node_is_purged_when_suspected(core: RosCore, monkeypatch: 
         assert core.counters["node.dead"] == 1
 
 
+def lists_of(slave: Slave) -> list[XmlRpcValue]:
+    """The lists of publishers that a slave was told."""
+    return [params[2] for method, params in slave.calls if method == "publisherUpdate"]
+
+
+@pytest.mark.trap(16)
+async def test_a_publisher_that_is_soon_back_is_told_twice(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
+    """rospy takes itself for connected while it has not read the end of its old connection."""
+    monkeypatch.setattr(limits, "PUBLISHERS_AGAIN", 0.05)
+    uri = "http://127.0.0.1:1/"
+    async with Slave() as subscriber:
+        core.call("registerSubscriber", "/s", "/t", STRING, subscriber.uri)
+        core.call("registerPublisher", "/p", "/t", STRING, uri)
+        await subscriber.wait(lambda: lists_of(subscriber) == [[uri]])
+        core.call("unregisterPublisher", "/p", "/t", uri)
+        await subscriber.wait(lambda: lists_of(subscriber) == [[uri], []])
+        core.call("registerPublisher", "/p", "/t", STRING, uri)
+        await subscriber.wait(lambda: lists_of(subscriber) == [[uri], [], [uri], [uri]])
+
+
+async def test_a_publisher_that_is_back_later_is_told_once(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "PUBLISHERS_AGAIN", 0.0)
+    monkeypatch.setattr(limits, "WITHDRAWN_LATELY", -1.0)
+    uri = "http://127.0.0.1:1/"
+    async with Slave() as subscriber:
+        core.call("registerSubscriber", "/s", "/t", STRING, subscriber.uri)
+        for method in ("registerPublisher", "unregisterPublisher", "registerPublisher"):
+            params = (STRING, uri) if method == "registerPublisher" else (uri,)
+            core.call(method, "/p", "/t", *params)
+        core.call("registerPublisher", "/q", "/u", STRING, uri)
+        core.call("registerSubscriber", "/s", "/u", STRING, subscriber.uri)
+        core.call("registerPublisher", "/r", "/u", STRING, "http://127.0.0.1:2/")
+        await subscriber.wait(lambda: len(subscriber.calls) == 2)
+        assert lists_of(subscriber)[0] == [uri]
+        assert core._returned._timer is None
+
+
+async def test_withdrawn_publishers_are_forgotten(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "WITHDRAWN_KEPT", 10)
+    for number in range(100):
+        core.call("registerPublisher", "/p", f"/t{number}", STRING, "http://127.0.0.1:1/")
+        core.call("unregisterPublisher", "/p", f"/t{number}", "http://127.0.0.1:1/")
+    assert len(core._returned._withdrawn) == 10
+
+
 async def test_a_live_node_survives_suspicion(core: RosCore) -> None:
     async with Slave() as alive:
         core.call("registerPublisher", "/alive", "/t", STRING, alive.uri)

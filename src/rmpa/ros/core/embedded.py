@@ -17,6 +17,7 @@ from rmpa.ros.core.listeners import GraphListeners
 from rmpa.ros.core.liveness import Liveness
 from rmpa.ros.core.notifier import Notifier
 from rmpa.ros.core.persistence import CorePersistence
+from rmpa.ros.core.returned_publishers import ReturnedPublishers
 from rmpa.ros.core.rosout import NODE, Rosout
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.master.effects import RegistrationKind
@@ -83,6 +84,8 @@ class RosCore(Core):
         self._with_rosout = rosout
         self._rosout: Rosout | None = None
         self._listeners = GraphListeners()
+        self._returned = ReturnedPublishers(self._repeat_publishers)
+        self.on_change(self._returned.graph_changed)
         self.persistence: CorePersistence | None = None
         """Stores the state for the next run, if ``state`` is given."""
         if state is not None:
@@ -142,6 +145,7 @@ class RosCore(Core):
             await rosout.close()
         if self.persistence is not None:
             await self.persistence.stop_verification()
+        self._returned.close()
         if self._notifier is not None:
             await self._notifier.close()
         if self._liveness is not None:
@@ -241,6 +245,11 @@ class RosCore(Core):
             for effect in effects:
                 self._notifier.add(effect)
         self._listeners.notify(changes)
+
+    def _repeat_publishers(self, topics: list[str]) -> None:
+        for topic in topics:
+            self._api.registrations.repeat_publishers(topic)
+        self._carry_out()
 
     def _unreachable(self, api: str) -> None:
         for node in self._api.registrations.nodes_at(api):

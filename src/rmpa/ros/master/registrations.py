@@ -135,6 +135,10 @@ class Registrations:
         self._register(RegistrationKind.PUBLISHER, topic, node, api, retyped=retyped)
         self._notify_subscribers(topic)
 
+    def repeat_publishers(self, topic: str) -> None:
+        """Send the subscribers of a topic its list of publishers once more."""
+        self._notify_subscribers(topic)
+
     def register_subscriber(self, topic: str, topic_type: str, node: str, api: str) -> None:
         """Add a subscriber; its type counts only while the topic has none."""
         retyped = topic not in self._types and topic_type != ANY_TYPE
