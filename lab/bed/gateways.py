@@ -15,7 +15,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from lab.bed.agents import RMPA, Agent
-from lab.bed.processes import CommandFailed, Process
+from lab.bed.processes import CommandFailed, Process, eventually
+from rmpa.observe.control import GATEWAY_REPORT
+from rmpa.observe.io.control_client import ControlClient, choose_agent
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -40,6 +42,15 @@ class GatewayProcess(Agent):
     def command(self) -> list[str]:
         """The command of rmpa that it runs; a gateway's core has any free port."""
         return ["gateway"]
+
+    def report(self) -> dict[str, object]:
+        """What it joins, and its session.
+
+        Raises:
+            UnreachableError: It does not answer.
+        """
+        with ControlClient(choose_agent(self.env, self.name).path) as client:
+            return client.call(GATEWAY_REPORT, dict[str, object])
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +157,17 @@ class JoinedSites:
                 agent.wait_ready()  # others join at it
         for agent in started[1:]:
             agent.wait_ready()
+        if secured is not None:
+            self._wait_settled()
+
+    def _wait_settled(self) -> None:
+        """Wait until the router's session names all that have joined: it is opened anew for that, and links fall."""
+
+        def settled() -> bool:
+            report = self.router.report()
+            return report["zid"] != "" and not report["stale"]
+
+        eventually(settled, what="a session of the router that names all members")
 
     @property
     def endpoint(self) -> str:

@@ -9,8 +9,9 @@ import pytest
 
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
+from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
-from rmpa.discovery.events import Event, LossReason, PeerFound, PeerLost
+from rmpa.discovery.events import Event, LossReason, PeerFound, PeerLost, SendUnicast
 from rmpa.discovery.member_watch import MemberWatch
 from rmpa.discovery.membership import MembershipProtocol
 from rmpa.discovery.swim.failure_detector import FailureDetector
@@ -176,6 +177,29 @@ def test_a_goodbye_ends_the_watch(how: str) -> None:
         agent.hears(OTHER, News(PEER.guid, PEER.instance[:8], MemberState.LEFT, 0, 0))
     assert agent.events[-1] == PeerLost(PEER, LossReason.GOODBYE)
     assert not agent.watched(PEER)
+
+
+@pytest.mark.parametrize("how", ["beacon", "news"])
+def test_a_member_that_did_not_say_goodbye_is_back_with_its_answer(how: str) -> None:
+    agent = Agent()
+    agent.beacon(PEER)
+    agent.meet(PEER)
+    agent.meet(OTHER)
+    if how == "beacon":
+        agent.beacon(PEER, BeaconKind.GOODBYE, 100)
+    else:
+        agent.hears(OTHER, News(PEER.guid, PEER.instance[:8], MemberState.LEFT, 0, 0))
+    agent.membership.outputs()
+    agent.detector.outputs()
+    agent.now += limits.GOODBYE_CHECK
+    agent.membership.handle_timer(agent.now)
+    asked = [one for one in agent.membership.outputs() if isinstance(one, SendUnicast)]
+    assert (PEER.guid.endpoint, BeaconKind.ANNOUNCE) in [(one.address, one.beacon.kind) for one in asked]
+    agent.beacon(PEER, BeaconKind.ANSWER, 2)
+    assert isinstance(agent.events[-1], PeerFound)
+    assert agent.watched(PEER)
+    probes = [one.address for one in agent.detector.outputs() if one.packet.kind is SwimKind.PROBE]
+    assert probes == [PEER.guid.endpoint], "it hears that it is said to have left, and refutes that everywhere"
 
 
 def test_news_of_an_unknown_member_leads_to_an_announcement() -> None:

@@ -142,7 +142,9 @@ async def test_a_session_whose_certificate_was_renewed_is_opened_anew_with_its_n
     bed = Bed(settings("g"), CONNECT)
     async with started(bed) as gateway:
         bed.sessions[0].stale = True
+        assert gateway.report()["stale"]
         await until(lambda: len(bed.events) == 4)
+        assert not gateway.report()["stale"]
         assert bed.events == ["started in g", "closed", "session closed", "started in g"]
         assert gateway.session is bed.sessions[1]
     assert bed.events[4:] == ["closed", "session closed"]

@@ -99,7 +99,7 @@ def test_a_server_that_is_killed_in_the_middle_of_a_call(modules: ModuleFactory)
     done = _calls(caller, "die 0 10 1 once")
     assert done["ok"] == 0
     assert "in the middle of the call" in str(done["errors"])
-    assert time.monotonic() - began < 5.0
+    assert time.monotonic() - began < 20.0, "long before the call's time-out of 60 s"
     worker.wait()
     _wait_services(b.ros, "/work", there=False)
     assert "unavailable" in str(_calls(caller, "echo 0 10 1 once")["errors"])  # rospy's own words

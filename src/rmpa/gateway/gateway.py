@@ -188,6 +188,7 @@ class Gateway:
             "zid": session.zid if session is not None else "",
             "endpoints": session.endpoints if session is not None else (),
             "problem": self._problem,
+            "stale": session.stale if session is not None else False,
             "sources": len(self.graph.sources),
             "neighbours": {name: neighbour.report() for name, neighbour in self.neighbours.items()},
         }
