@@ -10,6 +10,7 @@ import pytest
 from rmpa.core.counters import Counters
 from rmpa.runtime import limits
 from rmpa.runtime.event_loop import AgentLoop, yielding_to_data
+from rmpa.runtime.free_memory import FreeMemory
 from rmpa.runtime.garbage_collector import Collection, GarbageCollector, choose_collection
 
 if TYPE_CHECKING:
@@ -223,6 +224,37 @@ async def test_frozen_garbage_is_collected_at_rest_and_not_before(
         assert "the frozen ones included" in caplog.text
         assert gc.get_freeze_count() > 0
         assert len(graph) > blocks
+    finally:
+        collector.close()
+
+
+async def test_free_memory_is_returned_at_rest_and_not_before(
+    counters: Counters, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(limits, "COLLECT_LOOK", 0.02)
+    monkeypatch.setattr(limits, "COLLECT_REST", 0.1)
+    carried, step = 0, 1_000_000
+
+    def carry() -> int:
+        nonlocal carried
+        carried += step
+        return carried
+
+    resident = 50_000_000
+    collector = GarbageCollector(carry, counters, FreeMemory(lambda: resident, lambda: True))
+    collector.start()
+    try:
+        resident += limits.TRIM_GROWTH
+        await asyncio.sleep(0.3)
+        assert counters["collector.trim"] == 0, "data flows"
+        step = 0
+        with caplog.at_level("INFO"):
+            async with asyncio.timeout(20):
+                while counters["collector.trim"] == 0:
+                    await asyncio.sleep(0.01)
+        assert "of free memory to the kernel" in caplog.text
+        await asyncio.sleep(0.3)
+        assert counters["collector.trim"] == 1, "nothing has grown since"
     finally:
         collector.close()
 

@@ -38,6 +38,7 @@ from rmpa.observe.io.site_requests import SiteRequests
 from rmpa.observe.io.snapshot_builder import SnapshotBuilder, SnapshotSources
 from rmpa.observe.why.io.why import WhyService
 from rmpa.ros.node.logger_services import LoggerServices
+from rmpa.runtime.free_memory import FreeMemory
 from rmpa.runtime.garbage_collector import GarbageCollector
 from rmpa.runtime.system_clock import SystemClock
 from rmpa.trust.permissions import Permissions
@@ -129,7 +130,9 @@ class Agent:
         self.other_notes: list[Callable[[], Iterable[str]]] = []
         """What else the snapshot's notes tell: of parts that the agent does not make itself."""
         counters = Counters()
-        self._collector = GarbageCollector(self._bytes_carried, counters)
+        # Memory that is locked stays; and what is returned would have to be read in again in the midst of data.
+        free_memory = None if settings.realtime.enabled else FreeMemory()
+        self._collector = GarbageCollector(self._bytes_carried, counters, free_memory)
         self._clocks = PeerClocks(self.bridge)
         sources = SnapshotSources(
             core=self.core,

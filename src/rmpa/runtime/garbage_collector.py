@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.core.counters import Counters
+    from rmpa.runtime.free_memory import FreeMemory
 
 _log = logging.getLogger(__name__)
 
@@ -81,12 +82,14 @@ class GarbageCollector:
 
     Args:
         traffic: Returns the bytes that all present links have carried, in and out; so it shrinks when a link falls.
-        counters: Gets ``collector.young`` and ``collector.full``.
+        counters: Gets ``collector.young``, ``collector.full`` and ``collector.trim``.
+        free_memory: Returns free memory to the kernel at rest; ``None``: nothing does.
     """
 
-    def __init__(self, traffic: Callable[[], int], counters: Counters) -> None:
+    def __init__(self, traffic: Callable[[], int], counters: Counters, free_memory: FreeMemory | None = None) -> None:
         self._traffic = traffic
         self._counters = counters
+        self._free_memory = free_memory
         self._timer: asyncio.TimerHandle | None = None
         self._enabled = False
         self._heap_blocks = 0
@@ -112,6 +115,8 @@ class GarbageCollector:
         self._heap_blocks = self._scanned_blocks = sys.getallocatedblocks()
         self._last_check = self._now()
         self._busy_at = self._last_check[0]
+        if self._free_memory is not None:
+            self._free_memory.start()
         self._loop = asyncio.get_running_loop()
         if isinstance(self._loop, AgentLoop):
             self._loop.set_yield_hook(self._check_during_work)
@@ -156,17 +161,29 @@ class GarbageCollector:
         quiet = 0 <= traffic_now - traffic < limits.COLLECT_QUIET_BYTES * (now - checked_at)
         if not quiet or self._young >= limits.COLLECT_YOUNG:
             self._busy_at = now
+        rests = now - self._busy_at >= limits.COLLECT_REST
         blocks = sys.getallocatedblocks()
         collection = choose_collection(
             min(before, self._young),
             blocks - self._heap_blocks,
             quiet=quiet,
             factor=blocks / self._scanned_blocks,
-            rests=now - self._busy_at >= limits.COLLECT_REST,
+            rests=rests,
         )
         if collection is not Collection.NOTHING:
             self._collect(collection)
+        elif rests and self._free_memory is not None:
+            self._release(self._free_memory)
         self._schedule_next()
+
+    def _release(self, memory: FreeMemory) -> None:
+        begin = time.perf_counter()
+        released = memory.release()
+        if released is None:
+            return
+        self._counters.add("collector.trim")
+        took = time.perf_counter() - begin
+        _log.info("= returned %.1f MB of free memory to the kernel in %.1f ms", released / 1e6, took * 1e3)
 
     def _check_during_work(self) -> None:
         """Collect at a yield of long work, if the work has made many objects; check soon, if it has made some."""
