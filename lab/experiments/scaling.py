@@ -86,6 +86,10 @@ agents and RMPA direct, from node to node, in turns:
 * **nothing** happens: what agents or the master use of the processors, and what crosses each module's cable;
 * a **probe flow** of 64 B at 100 Hz runs from the first module to the second: its latency, from when each message was
   due.
+
+Larger meshes are simulated with the agents' real protocol machines, up to a thousand modules (`make bench
+ARGS=thousand`): how soon they agree, what rest costs, and how soon the loss of one and of a third is known is in
+`docs/networks.md`, *How many modules*.
 """
 
 
@@ -391,7 +395,7 @@ def _notes(steps: Steps) -> Iterable[str]:
         if one == RMPA and sum(step.idle) > _BUSY:
             yield (
                 f"With {count} modules the agents together use {sum(step.idle):.0f} % of a core while nothing"
-                " happens: each pair of them keeps a link alive, four times a second. The probe flow waits for"
+                " happens: each pair of them keeps a link. The probe flow waits for"
                 f" those processors; its figure is of this machine, and {statistics.fmean(step.idle):.2g} % is what"
                 " each module would notice."
             )
