@@ -247,7 +247,7 @@ class RosCore(Core):
         self._listeners.notify(changes)
 
     def _repeat_publishers(self, topics: list[str]) -> None:
-        for topic in topics:
+        for topic in yielding_to_data(topics):  # a thousand peers that return have 20,000
             self._api.registrations.repeat_publishers(topic)
         self._carry_out()
 
