@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Final
 import psutil
 
 from lab.bed.bench import Bed
-from lab.bed.processes import Deadline
+from lab.bed.neighbours import room_for
+from lab.bed.processes import CommandFailed, Deadline
 from lab.bed.ros import NODES
 from lab.bench import schedule
 from lab.findings import Claim
@@ -128,15 +129,29 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
     """Measure, print the table, write the file; return the result."""
     plan = QUICK if quick else FULL
     rows: dict[int, FleetRow] = {}
+    failed: dict[int, str] = {}
     for count in plan.modules:
         if psutil.virtual_memory().available < count * _MODULE_BYTES:
             console.print(f"{count} modules do not fit into this machine's memory", style="yellow")
             continue
         console.print(f"{count} modules", style="dim")
-        rows[count] = _row(plan, count)
+        try:
+            with room_for(count):
+                rows[count] = _row(plan, count)
+        except (CommandFailed, Deadline) as error:
+            failed[count] = str(error)
+            console.print(f"{count} modules: {error}", style="red")
+    if not rows:
+        raise CommandFailed("; ".join(failed.values()) or "no fleet fits into this machine's memory")
     console.print(_table(rows, plan))
-    result: dict[str, object] = {"modules": {str(count): asdict(row) for count, row in rows.items()}}
-    return finish(console, "fleet", asdict(plan), result, json, claims=list(_claims(rows)))
+    result: dict[str, object] = {
+        "modules": {str(count): asdict(row) for count, row in rows.items()},
+        "failed": {str(count): text for count, text in failed.items()},
+    }
+    result = finish(console, "fleet", asdict(plan), result, json, claims=list(_claims(rows)))
+    if failed:
+        raise CommandFailed("; ".join(failed.values()))
+    return result
 
 
 # --- one number of modules ------------------------------------------------------------------------------------
