@@ -280,14 +280,14 @@ class Module:
                 self._forget(identity)
                 self._count_modules()
             case RunDoubted(identity=identity):
-                self._check_link(identity)
+                self._check_link(identity.guid.place)
             case _:
                 pass
 
-    def _check_link(self, identity: Identity) -> None:
+    def _check_link(self, place: int) -> None:
         """Wake a link whose other end may be gone: it ends if that end does not answer."""
         for number, link in list(self.links.items()):
-            if link.other(self).place == identity.guid.place and not self._is_alive(number):
+            if link.other(self).place == place and not self._is_alive(number):
                 ended = functools.partial(self.link_ended, number, "silent", self.run, silent=True)
                 self.network.world.after(mesh_limits.WAKE_TIMEOUT, ended)
 
@@ -323,6 +323,7 @@ class Module:
                 module = self.network.modules.get(guid.endpoint)
                 alive = module is not None and module.identity.instance == instance and self._reaches(module)
                 self.tally.suspected_falsely += alive
+                self._check_link(guid.place)
             case MemberOffers(guid=guid, instance=instance, version=version):
                 known = self.known.get(guid.place)
                 if known is not None and known[0] == instance and known[1] < version:
@@ -414,7 +415,9 @@ class Module:
         self.flush()
 
     def _rest(self, link: Link) -> None:
-        """Nothing depended on the link for long: it is parked if both sides link on demand."""
+        """Nothing depended on the link for long: it is parked if both sides link on demand, and can agree on it."""
+        if not self._reaches(link.other(self)):
+            return  # its lease ends it
         if link.up and not link.used and all(end.mode.demand for end in link.ends):
             self._end(link, "parked", parked=True)
         elif link.up and not link.used:

@@ -193,6 +193,9 @@ SWIM_LATE_GRACE: Final = 0.25
 """All time-outs are prolonged by this beyond such a pause: packets that came meanwhile are read first."""
 SWIM_DEAF: Final = 5.0
 """An agent that has heard no member for this long does not renew the leases of any: it may itself be cut off."""
+SWIM_LINGER: Final = 10.0
+"""Seconds after the last failure in which an agent still probes, though so many members failed that it keeps a link
+to each of the others from now on. Members that died together are found within this."""
 GOSSIP_INTERVAL: Final = 0.2
 """Time between two rounds of news while there is any (memberlist has the same)."""
 GOSSIP_FANOUT: Final = 3

@@ -240,6 +240,42 @@ def test_an_inactive_detector_answers_probes_and_sends_nothing_else() -> None:
         assert not of(mesh.events[n], MemberSuspected)
 
 
+def test_a_detector_that_failures_switch_off_finds_the_other_dead_first() -> None:
+    mesh = Mesh(20)
+    mesh.run(5)
+    mesh.dead = set(range(8, 20))
+    living = range(8)
+    switched_off: set[int] = set()
+    for _ in range(200):
+        mesh.run(0.1)
+        for n in set(living) - switched_off:
+            if of(mesh.events[n], MemberFailed):
+                mesh.detectors[n].set_active(mesh.now, active=False)
+                switched_off.add(n)
+    assert switched_off == set(living)
+    for n in living:
+        assert len(of(mesh.events[n], MemberFailed)) == 12, f"member {n} was switched off with dead ones unfound"
+    mesh.run(limits.SWIM_LINGER)
+    before = len(mesh.sent)
+    mesh.run(5)
+    assert not any(mesh.detectors[n].view().active for n in living)
+    assert len(mesh.sent) == before, "nothing is probed after that"
+
+
+def test_a_detector_that_is_switched_on_again_in_time_goes_on() -> None:
+    mesh = Mesh(6)
+    mesh.run(5)
+    mesh.dead = {5}
+    mesh.run(8)
+    for n in range(5):
+        mesh.detectors[n].set_active(mesh.now, active=False)
+    mesh.run(1)
+    for n in range(5):
+        mesh.detectors[n].set_active(mesh.now, active=True)
+    mesh.run(2 * limits.SWIM_LINGER)
+    assert all(mesh.detectors[n].view().active for n in range(5))
+
+
 def test_a_member_that_is_heard_of_alone_is_reported_and_not_probed() -> None:
     mesh = Mesh(4)
     stranger = Identity(Guid.of("10.0.0.99", 40000), bytes(range(16)), "x")

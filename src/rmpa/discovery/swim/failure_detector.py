@@ -75,25 +75,42 @@ class FailureDetector:
         self._turn = 0
         self._active = self._closed = False
         self._probe_at: float | None = None
-        self._heard_at = self._changed_at = self._synced_at = _NEVER
+        self._stop_at: float | None = None
+        self._heard_at = self._changed_at = self._synced_at = self._failed_at = _NEVER
         self._events: list[SwimEvent] = []
 
     # --- inputs -----------------------------------------------------------------------------------------------
 
     def set_active(self, now: float, *, active: bool) -> None:
-        """Begin to probe, or stop; probes of others are answered in any case."""
-        if active == self._active or self._closed:
+        """Begin to probe, or stop; probes of others are answered in any case.
+
+        When members have failed lately, or are suspected, it stops ``limits.SWIM_LINGER`` seconds later: often the
+        failures are why the mesh has become so small, and more members that are dead are still to be found.
+        """
+        if self._closed:
             return
-        self._active = self._news.active = active
-        self._probe_at = now + self._rng() * limits.PROBE_INTERVAL if active else None
+        self._stop_at = None
+        if active == self._active:
+            return
+        if active:
+            self._active = self._news.active = True
+            self._probe_at = now + self._rng() * limits.PROBE_INTERVAL
+            self._synced_at = now
+        elif len(self._suspicions) or now - self._failed_at < limits.SWIM_LINGER:
+            self._stop_at = now + limits.SWIM_LINGER
+        else:
+            self._stop(now)
+
+    def _stop(self, now: float) -> None:
+        self._active = self._news.active = False
+        self._probe_at = self._stop_at = None
         self._synced_at = now
-        if not active:
-            self._news.stop()
-            self._probing.clear()
-            for member in self._table:
-                self._suspicions.set(member.guid.place, None)
-                member.state = MemberState.ALIVE
-                member.accusers = ()
+        self._news.stop()
+        self._probing.clear()
+        for member in self._table:
+            self._suspicions.set(member.guid.place, None)
+            member.state = MemberState.ALIVE
+            member.accusers = ()
 
     def add(self, identity: Identity, now: float, address: Address | None = None, *, linked: bool = False) -> None:
         """Watch a member that is known to answer probes; or update what is known of it.
@@ -193,7 +210,8 @@ class FailureDetector:
         """When to call ``handle_timer``, in seconds of the clock; ``None``: never."""
         if self._closed:
             return None
-        return earliest(self._probe_at, self._news.at, self._probing.next_timer(), self._suspicions.next())
+        timers = (self._probe_at, self._news.at, self._probing.next_timer(), self._suspicions.next(), self._stop_at)
+        return earliest(*timers)
 
     def handle_timer(self, now: float) -> None:
         """Do what is due."""
@@ -208,6 +226,8 @@ class FailureDetector:
             self._no_answer(sequence, now)
         for place in self._suspicions.take(now):
             self._suspicion_over(place, now)
+        if self._stop_at is not None and self._stop_at <= now:
+            self._stop(now)
         if self._probe_at is not None and self._probe_at <= now:
             self._probe_at = now + limits.PROBE_INTERVAL * (1 + self._health)
             self._turn ^= 1
@@ -531,6 +551,9 @@ class FailureDetector:
         self._gone.add(news, now)
         self._news.spread(news, now)
         failed = state is MemberState.FAILED
+        if failed:
+            self._failed_at = now
+            self._stop_at = now + limits.SWIM_LINGER if self._stop_at is not None else None
         self.counters.add("swim.failed" if failed else "swim.left")
         event = MemberFailed if failed else MemberLeft
         self._events.append(event(member.guid, member.instance))
