@@ -14,6 +14,7 @@ class Process:
     def __init__(self, resident: int, *, can_trim: bool = True) -> None:
         self.resident = resident
         self.free = 0
+        self.blocks = 100_000
         self.trims = 0
         self._can_trim = can_trim
 
@@ -25,7 +26,7 @@ class Process:
         return self._can_trim
 
     def memory(self) -> FreeMemory:
-        made = FreeMemory(lambda: self.resident, self.trim)
+        made = FreeMemory(lambda: self.resident, self.trim, lambda: self.blocks)
         made.start()
         return made
 
@@ -42,6 +43,17 @@ def test_free_memory_is_returned_once_after_growth() -> None:
     process.resident += limits.TRIM_GROWTH
     assert memory.release() == 0
     assert process.trims == 2
+
+
+def test_what_is_freed_after_a_rest_among_links_is_returned_at_a_later_one() -> None:
+    process = Process(50_000_000)
+    memory = process.memory()
+    process.resident, process.blocks = 200_000_000, 1_000_000
+    assert memory.release() == 0, "all links of the start stand"
+    process.free, process.blocks = 60_000_000, 1_000_000 - limits.TRIM_FREED
+    assert memory.release() == 60_000_000
+    process.blocks -= limits.TRIM_FREED - 1
+    assert memory.release() is None
 
 
 def test_growth_counts_from_the_least_since_the_last_time() -> None:

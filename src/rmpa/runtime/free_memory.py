@@ -9,6 +9,7 @@ keeps the freed memory between what is still in use: it returns by itself only w
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -45,22 +46,36 @@ def trim() -> bool:
 
 
 class FreeMemory:
-    """Decides when free memory is returned: at rest, after resident memory has grown.
+    """Decides when free memory is returned: at rest, after resident memory has grown, or much of the heap was freed.
+
+    Growth alone does not tell it: an agent may rest once while the links of a start still stand. What they take is
+    freed later, in the midst of the heap, and resident memory stays as it is.
 
     Args:
         resident: Returns resident memory in bytes.
         trim: Returns free memory to the kernel, and whether it can.
+        blocks: Returns the number of memory blocks in use.
     """
 
-    def __init__(self, resident: Callable[[], int] = resident_memory, trim: Callable[[], bool] = trim) -> None:
+    def __init__(
+        self,
+        resident: Callable[[], int] = resident_memory,
+        trim: Callable[[], bool] = trim,
+        blocks: Callable[[], int] = sys.getallocatedblocks,
+    ) -> None:
         self._resident = resident
         self._trim = trim
+        self._can = True
+        self._blocks = blocks
+        self._most_blocks = 0
+        """The most blocks in use that were seen since the start or the last trim."""
         self._kept = 0
         """Resident memory after the start or the last trim, the smaller one of what was seen since."""
 
     def start(self) -> None:
         """Measure growth from now on."""
         self._kept = self._resident()
+        self._most_blocks = self._blocks()
 
     def release(self) -> int | None:
         """Return free memory if there may be some.
@@ -68,12 +83,14 @@ class FreeMemory:
         Returns:
             The bytes by which resident memory shrank; ``None``: it was not tried.
         """
-        before = self._resident()
+        before, blocks = self._resident(), self._blocks()
         self._kept = min(self._kept, before)
-        if before - self._kept < limits.TRIM_GROWTH:
+        self._most_blocks = max(self._most_blocks, blocks)
+        grown, freed = before - self._kept, self._most_blocks - blocks
+        if not self._can or (grown < limits.TRIM_GROWTH and freed < limits.TRIM_FREED):
             return None
-        if not self._trim():
-            self._resident = lambda: 0
+        self._can = self._trim()
+        if not self._can:
             return None
-        self._kept = self._resident()
+        self._kept, self._most_blocks = self._resident(), blocks
         return before - self._kept

@@ -54,6 +54,8 @@ COLLECT_REST: Final = 2.0
 """Seconds without data and with few new objects, after which all objects may be scanned (0.1 s at 20,000 topics)."""
 TRIM_GROWTH: Final = 8 * MIB
 """Growth of resident memory after which free memory is returned to the kernel at rest (19 MB took 3 ms)."""
+TRIM_FREED: Final = 20_000
+"""Memory blocks freed, some 2 MB, after which free memory is returned too: a hundred links that were parked."""
 COLLECT_QUIET_BYTES: Final = 16 * KIB
 """Bytes a second, over all links, below which the agent counts as idle: keepalives or very slow streams."""
 
