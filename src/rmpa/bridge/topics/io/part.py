@@ -24,7 +24,6 @@ from rmpa.bridge.messages import (
     RouteClosed,
     RouteOpened,
     Source,
-    TopicOffer,
 )
 from rmpa.bridge.naming import Names
 from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
@@ -32,6 +31,7 @@ from rmpa.bridge.policy import Policy, is_own
 from rmpa.bridge.relay import LinkedPeer
 from rmpa.bridge.session.graph_driver import GraphDriver
 from rmpa.bridge.session.part import Part
+from rmpa.bridge.session.part_catalogue import PartCatalogue
 from rmpa.bridge.session.unchanged_graph import UnchangedGraph
 from rmpa.bridge.topics.claims import ClaimDeadlines
 from rmpa.bridge.topics.exports import Exports
@@ -153,6 +153,7 @@ class Topics(Part):
             on_idle=self._settled,
         )
         self._act = self._driver.act
+        sessions.offers.add(PartCatalogue(self.exports, self.imports, self._driver))
         self._absent = AbsentPeers(lambda peer: self._act(self.exports.unclaimed(peer)), self.outbound.forget, gate)
         self._claims = ClaimDeadlines()
         self._unchanged = UnchangedGraph()
@@ -348,35 +349,6 @@ class Topics(Part):
             if flow.contract.priority is not Priority.HIGH:
                 flow.torn()
         self.outbound.lane_lost(session.peer)
-
-    # --- both sides' catalogues (SharedCatalogue) ----------------------------------------------------------------
-
-    @property
-    def changes(self) -> int:
-        """Counts the changes of what is offered to any peer."""
-        return self.exports.changes
-
-    @property
-    def pending(self) -> bool:
-        """Whether a linked peer was not told all changes."""
-        return self.exports.pending
-
-    def told_digest(self, session: PeerSession) -> int | None:
-        """The digest of the topics that a linked peer was told."""
-        return self.exports.digest(session.peer)
-
-    def held_offers(self, session: PeerSession) -> list[TopicOffer] | None:
-        """The topics that a peer offers, as they were received."""
-        return self.imports.held(session.peer)
-
-    def waits(self, session: PeerSession) -> bool:
-        """Whether an advertisement of a peer is not applied yet."""
-        return self._driver.waits(session)
-
-    def tell_again(self, session: PeerSession) -> None:
-        """Begins the advertisement to a linked peer once more."""
-        self._act(self.exports.again(session.peer))
-        self._driver.schedule()
 
     # --- messages ----------------------------------------------------------------------------------------------
 
