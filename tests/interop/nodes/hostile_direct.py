@@ -45,6 +45,8 @@ def controls(link: Link, seconds: float) -> Iterator[dict[str, Any]]:
             frame = link.frame()
         except TimeoutError:
             return
+        finally:
+            link.sock.settimeout(20.0)  # what is sent next may wait for a busy agent
         if frame.kind is FrameKind.CONTROL:
             yield json.loads(frame.payload)
         elif frame.kind is FrameKind.PING:
