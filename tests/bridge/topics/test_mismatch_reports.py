@@ -43,8 +43,7 @@ class Reports(MismatchReports):
         self.done += actions
 
     def hear(self, text: str, subscriber: str = "/viewer") -> None:
-        session = SimpleNamespace(peer=BASE, link=SimpleNamespace(name="base"))
-        self.reported(cast("Any", session), Mismatch(CMD.topic, CMD.node, subscriber, text))
+        self.reported(BASE, "base", Mismatch(CMD.topic, CMD.node, subscriber, text))
 
 
 @pytest.fixture

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.actions import Action
     from rmpa.bridge.messages import Source
-    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.bridge.topics.exports import Exports
     from rmpa.bridge.topics.imports import Imports
 
@@ -50,17 +49,17 @@ class MismatchReports:
         self._mismatches.add(source, subscriber, text)
         self._act(self._imports.mismatched(peer, source, subscriber, text))
 
-    def reported(self, session: PeerSession, message: Mismatch) -> None:
+    def reported(self, peer: int, name: str, message: Mismatch) -> None:
         """A peer reports that a subscriber there does not fit a local source; an empty text: that it fits now."""
-        source = self._exports.local(session.peer, message.source)
+        source = self._exports.local(peer, message.source)
         if source is None:
             return  # it went meanwhile
-        subscriber = f"{session.link.name}{message.subscriber}"
+        subscriber = f"{name}{message.subscriber}"
         if not message.text:
             self._mismatches.mended(source, subscriber)
             return
         self._mismatches.add(source, subscriber, message.text)
-        where = f"{session.link.name}: {source}"
+        where = f"{name}: {source}"
         self._on_warning("mismatch.remote", where, f"{where}: {message.text}")
 
     def registration_changed(self, topic: str, subscriber: str) -> None:

@@ -374,7 +374,7 @@ class Topics(Part):
                     _log.info("< %s closes route %d: %s", session.link.name, message.route, message.reason)
                     self._act(actions)
             case Mismatch():
-                self._mismatches.reported(session, message)
+                self._mismatches.reported(peer, session.link.name, message)
             case _:
                 return self._subscribers.message(session, message)
         return True
