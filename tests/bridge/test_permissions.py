@@ -22,7 +22,8 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.naming import Names
 from rmpa.bridge.permission_gate import PermissionGate
 from rmpa.bridge.policy import Policy
-from rmpa.bridge.services.exports import EndRoute, LocalService, ServiceAbout, ServiceExports
+from rmpa.bridge.services.actions import EndRoute, LocalService, ServiceAbout
+from rmpa.bridge.services.exports import ServiceExports
 from rmpa.bridge.services.imports import ServiceImports
 from rmpa.bridge.services.rules import ServiceRules
 from rmpa.bridge.topics.exports import Exports, LocalSource

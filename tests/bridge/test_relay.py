@@ -17,8 +17,9 @@ from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, Source, d
 from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.relay import LinkedPeer, Relay, RelayPaths, may_have
-from rmpa.bridge.services.exports import ExportAction, LocalService, ServiceExports
-from rmpa.bridge.services.imports import ImportAction, Provide, ServiceImports, Withdraw
+from rmpa.bridge.services.actions import ExportAction, ImportAction, LocalService, Provide, Withdraw
+from rmpa.bridge.services.exports import ServiceExports
+from rmpa.bridge.services.imports import ServiceImports
 from rmpa.bridge.services.rules import ServiceRules
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.bridge.topics.imports import Imports

@@ -14,8 +14,9 @@ from rmpa.bridge.catalogue.peer_limits import Beyond, NodePlaces, Surplus, from_
 from rmpa.bridge.messages import Advertise, AdvertiseServices, ServiceOffer, Source, TopicOffer
 from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy
-from rmpa.bridge.services.exports import LocalService, ServiceExports
-from rmpa.bridge.services.imports import ImportAction, Provide, ServiceImports, Withdraw
+from rmpa.bridge.services.actions import ImportAction, LocalService, Provide, Withdraw
+from rmpa.bridge.services.exports import ServiceExports
+from rmpa.bridge.services.imports import ServiceImports
 from rmpa.bridge.topics.imports import Imports
 from rmpa.config.settings import LimitSettings, PolicySettings, ServiceSettings
 from rmpa.core.contract import Contracts

@@ -14,15 +14,8 @@ from rmpa.bridge.messages import (
     ServiceOffer,
     ServiceOpened,
 )
-from rmpa.bridge.services.exports import (
-    EndRoute,
-    LocalService,
-    Probe,
-    ServerGone,
-    ServeRoute,
-    ServiceAbout,
-    ServiceExports,
-)
+from rmpa.bridge.services.actions import EndRoute, LocalService, Probe, ServerGone, ServeRoute, ServiceAbout
+from rmpa.bridge.services.exports import ServiceExports
 from rmpa.config import limits as config_limits
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings
 from rmpa.core.errors import RemoteProtocolError

@@ -16,15 +16,8 @@ from rmpa.bridge.messages import (
     ServiceOffer,
     ServiceOpened,
 )
-from rmpa.bridge.services.exports import ServiceAbout
-from rmpa.bridge.services.imports import (
-    EndedService,
-    ForgetAbout,
-    OpenedService,
-    Provide,
-    ServiceImports,
-    Withdraw,
-)
+from rmpa.bridge.services.actions import EndedService, ForgetAbout, OpenedService, Provide, ServiceAbout, Withdraw
+from rmpa.bridge.services.imports import ServiceImports
 from rmpa.bridge.services.remote_service import ServiceRouteState
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError

@@ -21,25 +21,23 @@ from rmpa.bridge.messages import (
     decode,
     encode,
 )
-from rmpa.bridge.services.exports import (
+from rmpa.bridge.services.actions import (
+    EndedService,
     EndRoute,
     ExportAction,
+    ForgetAbout,
+    ImportAction,
     LocalService,
+    OpenedService,
     Probe,
+    Provide,
     ServerGone,
     ServeRoute,
     ServiceAbout,
-    ServiceExports,
-)
-from rmpa.bridge.services.imports import (
-    EndedService,
-    ForgetAbout,
-    ImportAction,
-    OpenedService,
-    Provide,
-    ServiceImports,
     Withdraw,
 )
+from rmpa.bridge.services.exports import ServiceExports
+from rmpa.bridge.services.imports import ServiceImports
 from rmpa.bridge.services.remote_service import ServiceRouteState
 from rmpa.config.settings import ServiceSettings
 from rmpa.core.errors import RemoteProtocolError

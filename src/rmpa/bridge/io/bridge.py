@@ -114,7 +114,6 @@ class Bridge:
         )
         self.add(self.topics)
         self.sessions.offers.listen(self.rpc, RefusalLog(_log, self.counters))
-        self.sessions.offers.add(self.topics)
         self._reconciler: asyncio.TimerHandle | None = None
 
     def add(self, part: Part) -> None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.actions import Send, Warn
+from rmpa.bridge.actions import Send
 from rmpa.bridge.catalogue.offers import CataloguePeer, OfferCatalogue, Portion
 from rmpa.bridge.messages import (
     AdvertiseServices,
@@ -27,6 +27,15 @@ from rmpa.bridge.messages import (
 )
 from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.relay import may_have
+from rmpa.bridge.services.actions import (
+    EndRoute,
+    ExportAction,
+    LocalService,
+    Probe,
+    ServerGone,
+    ServeRoute,
+    ServiceAbout,
+)
 from rmpa.config.permission_rules import Access
 from rmpa.config.settings import LimitSettings
 from rmpa.core.errors import RemoteProtocolError
@@ -35,75 +44,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from rmpa.bridge.catalogue.peer_limits import Beyond
-    from rmpa.bridge.messages import Origin
     from rmpa.bridge.services.rules import ServiceRules
-
-
-@dataclass(frozen=True, slots=True)
-class LocalService:
-    """A service's server in the local graph: its node, its ``rosrpc://`` address, and its origin if relayed."""
-
-    node: str
-    uri: str
-    origin: Origin | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class ServiceAbout:
-    """The type, MD5 sum, request type and response type of a service, as its server states them."""
-
-    type: str
-    md5: str
-    request_type: str = ""
-    response_type: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Probe:
-    """Ask a local server for its ``ServiceAbout``; the answer goes to ``described`` or ``refused``."""
-
-    service: str
-    server: LocalService
-
-
-@dataclass(frozen=True, slots=True)
-class ServeRoute:
-    """Serve a peer's calls: requests come in on the route ``requests``, replies go out on ``route``.
-
-    Args:
-        peer: The number of the calling peer.
-        route: The route of replies; the calling peer has chosen its number.
-        requests: The route of requests; this module has chosen its number.
-        service: The service's local name.
-        server: The service's server in the local graph.
-        timeout: Seconds that the calling peer waits for each reply.
-    """
-
-    peer: int
-    route: int
-    requests: int
-    service: str
-    server: LocalService
-    timeout: float
-
-
-@dataclass(frozen=True, slots=True)
-class EndRoute:
-    """End an open route: no more requests come, and replies of calls under way are dropped."""
-
-    peer: int
-    route: int
-    requests: int
-
-
-@dataclass(frozen=True, slots=True)
-class ServerGone:
-    """The server of a service left or was replaced: close the connections to it."""
-
-    service: str
-
-
-ExportAction = Send | Warn | Probe | ServeRoute | EndRoute | ServerGone
 
 
 @dataclass(slots=True)

@@ -38,7 +38,15 @@ from rmpa.bridge.messages import (
 )
 from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.relay import LinkedPeer, RelayPaths, is_outside
-from rmpa.bridge.services.exports import ServiceAbout
+from rmpa.bridge.services.actions import (
+    EndedService,
+    ForgetAbout,
+    ImportAction,
+    OpenedService,
+    Provide,
+    ServiceAbout,
+    Withdraw,
+)
 from rmpa.bridge.services.remote_service import TRANSITIONS, RemoteService, ServiceRouteState
 from rmpa.config.permission_rules import Access
 from rmpa.config.settings import LimitSettings
@@ -50,64 +58,6 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.catalogue.peer_offers import Change
     from rmpa.bridge.services.rules import ServiceRules
-
-
-@dataclass(frozen=True, slots=True)
-class Provide:
-    """Register a peer's service in the local graph, at the proxy of the node that provides it.
-
-    Args:
-        peer: The peer's number.
-        service: The service's name here.
-        node: Its node, in the peer's graph.
-    """
-
-    peer: int
-    service: str
-    node: str
-
-
-@dataclass(frozen=True, slots=True)
-class Withdraw:
-    """Remove a peer's service from the local graph; its waiting calls fail with the reason."""
-
-    peer: int
-    service: str
-    node: str
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class OpenedService:
-    """A service can be called: requests go out on ``requests``, replies come in on ``route``."""
-
-    peer: int
-    service: str
-    route: int
-    requests: int
-    about: ServiceAbout
-
-
-@dataclass(frozen=True, slots=True)
-class EndedService:
-    """A service cannot be called, or no longer: its calls fail with the reason; ``route`` was that of its replies."""
-
-    peer: int
-    service: str
-    route: int
-    requests: int
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class ForgetAbout:
-    """What is known of a shown service may no longer be true."""
-
-    peer: int
-    service: str
-
-
-ImportAction = Send | Warn | Provide | Withdraw | OpenedService | EndedService | ForgetAbout
 
 
 @dataclass(slots=True, kw_only=True)

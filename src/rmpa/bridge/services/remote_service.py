@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rmpa.bridge.messages import Origin
-    from rmpa.bridge.services.exports import ServiceAbout
+    from rmpa.bridge.services.actions import ServiceAbout
 
 
 class ServiceRouteState(Enum):

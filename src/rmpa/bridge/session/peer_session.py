@@ -48,7 +48,7 @@ class OfferCopy:
         said: The digests of topics and services that the peer said; ``None`` while it has told more since.
         right: Whether the copy has these digests; ``None`` while it was not compared.
         differed: How often it did not, and was fetched again.
-        in_a_row: How often of late, without being right in between.
+        in_a_row: How often it differed since it was last right.
         due: Monotonic seconds before which it is not fetched again.
         sent_again: Monotonic seconds at which this module last sent the peer its own offers again.
     """

@@ -29,21 +29,21 @@ class Mismatches:
         """The texts about one source."""
         return tuple(self._texts.get(source, {}).values())
 
-    def add(self, source: Source, who: str, text: str) -> None:
+    def add(self, source: Source, subscriber: str, text: str) -> None:
         """Remember a mismatch, or replace its text; dropped beyond ``limits.MISMATCHES_MAX`` for one source."""
         known = self._texts.setdefault(source, {})
-        if who in known or len(known) < limits.MISMATCHES_MAX:
-            known[who] = text
+        if subscriber in known or len(known) < limits.MISMATCHES_MAX:
+            known[subscriber] = text
 
-    def mended(self, source: Source, who: str) -> bool:
+    def mended(self, source: Source, subscriber: str) -> bool:
         """Forget a subscriber that fits now or has gone; return whether it was remembered."""
-        return self._texts.get(source, {}).pop(who, None) is not None
+        return self._texts.get(source, {}).pop(subscriber, None) is not None
 
     def peer_gone(self, name: str) -> None:
         """Forget all subscribers at a peer that is gone."""
         for known in self._texts.values():
-            for who in [who for who in known if who == name or who.startswith(name + "/")]:
-                del known[who]
+            for subscriber in [one for one in known if one == name or one.startswith(name + "/")]:
+                del known[subscriber]
 
     def keep(self, wanted: Callable[[Source], bool]) -> None:
         """Forget the sources for which ``wanted`` is false."""

@@ -17,7 +17,7 @@ from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.messages import is_crossing_name, is_crossing_type
 from rmpa.bridge.policy import OWN_NODE
 from rmpa.bridge.relay import is_outside
-from rmpa.bridge.services.exports import LocalService
+from rmpa.bridge.services.actions import LocalService
 from rmpa.bridge.services.io.connection_pool import ServicePool
 from rmpa.bridge.session.part import Part
 from rmpa.bridge.session.peer_proxies import PeerProxies

@@ -11,7 +11,7 @@ from rmpa.runtime.event_loop import sorted_yielding, yield_to_data, yielding_to_
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from rmpa.bridge.services.exports import LocalService
+    from rmpa.bridge.services.actions import LocalService
     from rmpa.bridge.services.io.calls import CallStats
     from rmpa.bridge.services.io.part import Services
     from rmpa.bridge.services.remote_service import RemoteService

@@ -18,7 +18,7 @@ from rmpa.core.counters import Counters
 from rmpa.trust.permissions import Permissions
 
 if TYPE_CHECKING:
-    from rmpa.bridge.services.exports import LocalService
+    from rmpa.bridge.services.actions import LocalService
 
 URI, RESTARTED = "rosrpc://10.0.0.1:45000", "rosrpc://10.0.0.1:45001"
 

@@ -15,7 +15,7 @@ from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.wire.services import ServiceDescription
 
 if TYPE_CHECKING:
-    from rmpa.bridge.services.exports import ServiceAbout
+    from rmpa.bridge.services.actions import ServiceAbout
     from rmpa.bridge.services.io.bodies import BodyLink
     from rmpa.bridge.services.io.connection_pool import ServicePool
     from rmpa.ros.node.service_server import ServiceCall

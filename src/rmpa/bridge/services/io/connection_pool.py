@@ -16,7 +16,7 @@ from rmpa.core.errors import LocalProtocolError, RmpaError
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
 
 if TYPE_CHECKING:
-    from rmpa.bridge.services.exports import LocalService
+    from rmpa.bridge.services.actions import LocalService
     from rmpa.ros.wire.services import ServiceDescription
     from rmpa.runtime.buffers import Buffer
 

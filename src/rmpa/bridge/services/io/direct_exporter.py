@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from rmpa.bridge.direct.server_side import ServerAction
-    from rmpa.bridge.services.exports import LocalService, ServiceExports
+    from rmpa.bridge.services.actions import LocalService
+    from rmpa.bridge.services.exports import ServiceExports
     from rmpa.bridge.services.rules import ServiceRules
     from rmpa.bridge.session.peer_rpc import PeerRpc
     from rmpa.bridge.session.peer_session import PeerSession

@@ -21,7 +21,6 @@ from rmpa.bridge.messages import (
     CloseService,
     OpenService,
     ServiceClosed,
-    ServiceOffer,
     ServiceOpened,
     Source,
 )
@@ -29,16 +28,18 @@ from rmpa.bridge.naming import Names
 from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.policy import Policy, is_own
 from rmpa.bridge.relay import service_place
-from rmpa.bridge.services.exports import ExportAction, LocalService, ServiceExports
-from rmpa.bridge.services.imports import (
+from rmpa.bridge.services.actions import (
     EndedService,
+    ExportAction,
     ForgetAbout,
     ImportAction,
+    LocalService,
     OpenedService,
     Provide,
-    ServiceImports,
     Withdraw,
 )
+from rmpa.bridge.services.exports import ServiceExports
+from rmpa.bridge.services.imports import ServiceImports
 from rmpa.bridge.services.io.calls import Budgets, Caller, CallStats, description_of
 from rmpa.bridge.services.io.direct_exporter import DirectServiceExporter
 from rmpa.bridge.services.io.direct_importer import DirectServiceImporter
@@ -47,6 +48,7 @@ from rmpa.bridge.services.remote_service import ServiceRouteState
 from rmpa.bridge.services.rules import ServiceRules
 from rmpa.bridge.session.graph_driver import GraphDriver
 from rmpa.bridge.session.part import Part
+from rmpa.bridge.session.part_catalogue import PartCatalogue
 from rmpa.bridge.session.peer_proxies import ProxyCallbacks
 from rmpa.bridge.session.peer_session import PeerState
 from rmpa.bridge.session.unchanged_graph import UnchangedGraph
@@ -180,7 +182,7 @@ class Services(Part):
             gate=gate,
         )
         """Direct calls of local nodes to peers' servers."""
-        sessions.offers.add(self)
+        sessions.offers.add(PartCatalogue(self.exports, self.imports, self._driver))
         rpc.on_notification(_MISMATCH, self._told_of_mismatch)
 
     def __iter__(self) -> Iterator[ShownService]:
@@ -289,33 +291,6 @@ class Services(Part):
         self._act(self.imports.unlinked(session.peer))
         self._budgets.pop(session.peer, None)
         self._driver.gone(session)
-
-    @property
-    def changes(self) -> int:
-        """The number of changes of what is offered to any peer."""
-        return self.exports.changes
-
-    @property
-    def pending(self) -> bool:
-        """Whether a linked peer was not told all changes."""
-        return self.exports.pending
-
-    def told_digest(self, session: PeerSession) -> int | None:
-        """The digest of the services that a linked peer was told."""
-        return self.exports.digest(session.peer)
-
-    def held_offers(self, session: PeerSession) -> list[ServiceOffer] | None:
-        """The services that a peer offers, as they were received."""
-        return self.imports.held(session.peer)
-
-    def waits(self, session: PeerSession) -> bool:
-        """Whether an advertisement of a peer is not applied yet."""
-        return self._driver.waits(session)
-
-    def tell_again(self, session: PeerSession) -> None:
-        """Begin the advertisement to a linked peer once more."""
-        self._act(self.exports.again(session.peer))
-        self._driver.schedule()
 
     def advertised(self, session: PeerSession, payload: bytes) -> None:
         """Queue an advertisement of a peer's services."""

@@ -7,7 +7,7 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.services.exports import (
+from rmpa.bridge.services.actions import (
     EndRoute,
     ExportAction,
     LocalService,
@@ -15,7 +15,6 @@ from rmpa.bridge.services.exports import (
     ServerGone,
     ServeRoute,
     ServiceAbout,
-    ServiceExports,
 )
 from rmpa.bridge.services.io.calls import Budgets, CallStats, Server
 from rmpa.bridge.services.io.connection_pool import ServicePool
@@ -31,6 +30,7 @@ from rmpa.runtime.event_loop import yielding_to_data
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Coroutine, Mapping
 
+    from rmpa.bridge.services.exports import ServiceExports
     from rmpa.bridge.session.peer_sessions import PeerSessions
     from rmpa.ros.core.api import Core
 

@@ -24,7 +24,6 @@ from rmpa.bridge.messages import (
     RouteClosed,
     RouteOpened,
     Source,
-    TopicOffer,
 )
 from rmpa.bridge.naming import Names
 from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
@@ -32,6 +31,7 @@ from rmpa.bridge.policy import Policy, is_own
 from rmpa.bridge.relay import LinkedPeer
 from rmpa.bridge.session.graph_driver import GraphDriver
 from rmpa.bridge.session.part import Part
+from rmpa.bridge.session.part_catalogue import PartCatalogue
 from rmpa.bridge.session.unchanged_graph import UnchangedGraph
 from rmpa.bridge.topics.claims import ClaimDeadlines
 from rmpa.bridge.topics.exports import Exports
@@ -43,7 +43,7 @@ from rmpa.bridge.topics.io.local_subscriptions import LocalSubscriptions
 from rmpa.bridge.topics.io.loss_reports import LossReports
 from rmpa.bridge.topics.io.peer_topics import PeerTopics
 from rmpa.bridge.topics.io.remote_subscribers import RemoteSubscribers
-from rmpa.bridge.topics.mismatches import Mismatches
+from rmpa.bridge.topics.mismatch_reports import MismatchReports
 from rmpa.core.contract import Contracts, Priority
 from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import RemoteProtocolError
@@ -153,11 +153,12 @@ class Topics(Part):
             on_idle=self._settled,
         )
         self._act = self._driver.act
+        sessions.offers.add(PartCatalogue(self.exports, self.imports, self._driver))
         self._absent = AbsentPeers(lambda peer: self._act(self.exports.unclaimed(peer)), self.outbound.forget, gate)
         self._claims = ClaimDeadlines()
         self._unchanged = UnchangedGraph()
         self._claims_timer = MachineTimer(self._claims.next_timer, self._claims_over)
-        self._mismatches = Mismatches()
+        self._mismatches = MismatchReports(self.exports, self.imports, self._act, self._driver.warn)
         self.losses = LossReports(self.exports, sessions, self._peers, self._absent, rpc, counters, refusals)
         """Reports messages that do not reach their listeners."""
         self._subscribers = RemoteSubscribers(self.exports, self.imports, sessions, self._peers, refusals, gate)
@@ -268,7 +269,7 @@ class Topics(Part):
             session,
             counters=self._counters,
             on_demand=lambda source, wanted: self._demand(peer, source, wanted=wanted),
-            on_mismatch=lambda source, subscriber, text: self._mismatched(peer, source, subscriber, text),
+            on_mismatch=lambda source, subscriber, text: self._mismatches.refused(peer, source, subscriber, text),
             on_occurred=lambda source, occurred: self._occurred(session, source, occurred),
             on_listeners=lambda source: self._listeners_changed(peer, source),
             on_request=lambda source, caller: self.direct_imports.request(peer, source, caller),
@@ -349,35 +350,6 @@ class Topics(Part):
                 flow.torn()
         self.outbound.lane_lost(session.peer)
 
-    # --- both sides' catalogues (SharedCatalogue) ----------------------------------------------------------------
-
-    @property
-    def changes(self) -> int:
-        """Counts the changes of what is offered to any peer."""
-        return self.exports.changes
-
-    @property
-    def pending(self) -> bool:
-        """Whether a linked peer was not told all changes."""
-        return self.exports.pending
-
-    def told_digest(self, session: PeerSession) -> int | None:
-        """The digest of the topics that a linked peer was told."""
-        return self.exports.digest(session.peer)
-
-    def held_offers(self, session: PeerSession) -> list[TopicOffer] | None:
-        """The topics that a peer offers, as they were received."""
-        return self.imports.held(session.peer)
-
-    def waits(self, session: PeerSession) -> bool:
-        """Whether an advertisement of a peer is not applied yet."""
-        return self._driver.waits(session)
-
-    def tell_again(self, session: PeerSession) -> None:
-        """Begins the advertisement to a linked peer once more."""
-        self._act(self.exports.again(session.peer))
-        self._driver.schedule()
-
     # --- messages ----------------------------------------------------------------------------------------------
 
     def advertised(self, session: PeerSession, payload: bytes) -> None:
@@ -402,7 +374,7 @@ class Topics(Part):
                     _log.info("< %s closes route %d: %s", session.link.name, message.route, message.reason)
                     self._act(actions)
             case Mismatch():
-                self._mismatched_there(session, message)
+                self._mismatches.reported(peer, session.link.name, message)
             case _:
                 return self._subscribers.message(session, message)
         return True
@@ -453,8 +425,8 @@ class Topics(Part):
         self._local.changed(change)
         self.direct_exports.graph_changed(change)
         self.direct_imports.graph_changed(change)
-        if change.kind is RegistrationKind.SUBSCRIBER and self._mismatches:
-            self._forget_mismatch(change.name, change.node)
+        if change.kind is RegistrationKind.SUBSCRIBER:
+            self._mismatches.registration_changed(change.name, change.node)
         if change.kind is not RegistrationKind.SERVICE:
             self._driver.look((change.name,))
 
@@ -495,44 +467,15 @@ class Topics(Part):
         text = f"{session.link.name}: {source}: {occurred.text}"
         self._driver.warn(f"contract.{occurred.kind.value}", f"{session.peer} {source}", text)
 
-    # --- definitions that do not fit -----------------------------------------------------------------------------
-
-    def _mismatched(self, peer: int, source: Source, subscriber: str, text: str) -> None:
-        self._mismatches.add(source, subscriber, text)
-        self._act(self.imports.mismatched(peer, source, subscriber, text))
-
-    def _mismatched_there(self, session: PeerSession, message: Mismatch) -> None:
-        source = self.exports.local(session.peer, message.source)
-        if source is None:
-            return  # it went meanwhile
-        subscriber = f"{session.link.name}{message.subscriber}"
-        if not message.text:
-            self._mismatches.mended(source, subscriber)
-            return
-        self._mismatches.add(source, subscriber, message.text)
-        where = f"{session.link.name}: {source}"
-        self._driver.warn("mismatch.remote", where, f"{where}: {message.text}")
-
-    def _forget_mismatch(self, topic: str, subscriber: str) -> None:
-        """Forgets a local subscriber's mismatch, here and at the peers: it has gone or has registered again."""
-        for peer, source in list(self.imports.at(topic)):
-            if self._mismatches.mended(source, subscriber):
-                self._act([act.Send(peer, Mismatch(source.topic, source.node, subscriber, ""))])
-
     def _listeners_changed(self, peer: int, source: Source) -> None:
         self._subscribers.changed(peer, source)
         self.direct_imports.listeners_changed(peer, source)
 
     def _settled(self) -> None:
         """Drops what belongs to sources that are gone, or that new rules keep home."""
-        self._forget_mismatches()
+        self._mismatches.forget_gone()
         self.direct_exports.policy_changed()
         self._sessions.offers.changed()
-
-    def _forget_mismatches(self) -> None:
-        """Forgets the mismatches of sources that are gone."""
-        if self._mismatches:
-            self._mismatches.keep(lambda source: source in self.exports.offered or self.imports.knows(source))
 
     # --- carrying out ------------------------------------------------------------------------------------------
 

@@ -1,0 +1,100 @@
+"""What a mismatch of definitions says here, and what the agent at the other end hears of it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
+
+import pytest
+
+from rmpa.bridge.actions import Send
+from rmpa.bridge.messages import Mismatch, Source
+from rmpa.bridge.topics.mismatch_reports import MismatchReports
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rmpa.bridge.actions import Action
+
+CMD = Source("/cmd", "/joy")
+BASE = 1
+
+
+class Reports(MismatchReports):
+    """Reports of a module that offers ``/cmd`` to the peer *base*, or has it of that peer."""
+
+    def __init__(self) -> None:
+        self.done: list[Action] = []
+        self.warnings: list[str] = []
+        self.offered = {CMD}
+        exports = SimpleNamespace(
+            offered=self.offered, local=lambda _peer, source: source if source in self.offered else None
+        )
+        imports = SimpleNamespace(
+            at=lambda topic: [(BASE, CMD)] if topic == CMD.topic else [],
+            knows=lambda _: False,
+            mismatched=lambda peer, source, who, text: [Send(peer, Mismatch(source.topic, source.node, who, text))],
+        )
+        super().__init__(
+            cast("Any", exports), cast("Any", imports), self.act, lambda *args: self.warnings.append(args[2])
+        )
+
+    def act(self, actions: Sequence[Action]) -> None:
+        self.done += actions
+
+    def hear(self, text: str, subscriber: str = "/viewer") -> None:
+        self.reported(BASE, "base", Mismatch(CMD.topic, CMD.node, subscriber, text))
+
+
+@pytest.fixture
+def reports() -> Reports:
+    return Reports()
+
+
+def test_a_refused_subscriber_is_shown_here_and_told_to_the_peer(reports: Reports) -> None:
+    reports.refused(BASE, CMD, "/viewer", "other md5")
+    assert reports.texts(CMD) == ("other md5",)
+    assert reports.done == [Send(BASE, Mismatch("/cmd", "/joy", "/viewer", "other md5"))]
+
+
+def test_a_subscriber_that_registers_again_is_mended_at_the_peer_too_and_once(reports: Reports) -> None:
+    reports.refused(BASE, CMD, "/viewer", "other md5")
+    reports.done.clear()
+    for _ in range(2):
+        reports.registration_changed("/cmd", "/viewer")
+    assert reports.texts(CMD) == ()
+    assert reports.done == [Send(BASE, Mismatch("/cmd", "/joy", "/viewer", ""))]
+
+
+def test_another_subscriber_of_the_topic_mends_nothing(reports: Reports) -> None:
+    reports.refused(BASE, CMD, "/viewer", "other md5")
+    reports.done.clear()
+    reports.registration_changed("/cmd", "/recorder")
+    assert (reports.texts(CMD), reports.done) == (("other md5",), [])
+
+
+def test_a_peers_report_is_a_warning_that_names_the_peer(reports: Reports) -> None:
+    reports.hear("other md5")
+    assert reports.texts(CMD) == ("other md5",)
+    assert reports.warnings == [f"base: {CMD}: other md5"]
+
+
+def test_a_peers_report_ends_with_an_empty_text_or_with_the_peer(reports: Reports) -> None:
+    reports.hear("other md5")
+    reports.hear("")
+    assert reports.texts(CMD) == ()
+    reports.hear("other md5")
+    reports.peer_gone("base")
+    assert reports.texts(CMD) == ()
+    assert len(reports.warnings) == 2, "an end is no warning"
+
+
+def test_a_source_that_is_gone_has_no_mismatches(reports: Reports) -> None:
+    reports.hear("other md5")
+    reports.forget_gone()
+    assert reports.texts(CMD) == ("other md5",)
+    reports.offered.clear()
+    reports.forget_gone()
+    assert reports.texts(CMD) == ()
+    reports.hear("late")
+    assert reports.texts(CMD) == (), "the report crossed the withdrawal"
