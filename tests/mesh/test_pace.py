@@ -13,6 +13,7 @@ from rmpa.mesh.connection import ConnectionRole, ConnectionState
 from rmpa.mesh.connection_events import ConnectionClosed, PongReceived
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Feature, Hello
+from rmpa.mesh.keepalive import RestPace
 from tests.mesh.worlds import HIGH, LOW, Side, Time, deliver, exchange, pair, pass_time, side
 
 if TYPE_CHECKING:
@@ -125,6 +126,61 @@ def test_silence_at_rest_ends_the_link_by_the_longer_lease() -> None:
     assert dialler.link.state is ConnectionState.UP
     pass_time(dialler.link, time, 0.02)
     assert dialler.last() == ConnectionClosed("high was silent for its lease of 16 s", orderly=False)
+
+
+@pytest.mark.parametrize(
+    ("peers", "interval", "lease"), [(3, 5.0, 16.0), (50, 5.0, 16.0), (63, 6.3, 19.9), (999, 19.0, 58.0)]
+)
+def test_keepalives_at_rest_are_rarer_with_more_peers(peers: int, interval: float, lease: float) -> None:
+    pace = RestPace()
+    pace.count(peers)
+    assert pace.interval == pytest.approx(interval)
+    assert pace.lease == pytest.approx(lease)
+    assert pace.lease <= limits.LINK_LEASE_MAX
+    assert 2 * pace.interval * limits.ACCEPTOR_KEEPALIVE_FACTOR < pace.lease
+
+
+def test_a_link_at_rest_takes_the_pace_of_a_mesh_that_grows_and_shrinks() -> None:
+    """The lease is promised before the side is silent for so long; a link in use stays as it is."""
+    time, paces = Time(), (RestPace(), RestPace())
+    dialler = side(ConnectionRole.DIALLER, LOW, time, expected=HIGH.guid, rest=paces[0])
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time, rest=paces[1])
+    deliver(dialler.link.take_output(), acceptor.link, time.now)
+    acceptor.link.accept(time.now)
+    exchange(dialler, acceptor, time)
+    rest(dialler, acceptor, time)
+    few = run(dialler, acceptor, time, 600.0)
+    for pace in paces:
+        pace.count(999)
+    run(dialler, acceptor, time, 20.0)
+    assert dialler.link.remote_lease == acceptor.link.remote_lease == 58.0
+    many = run(dialler, acceptor, time, 600.0)
+    assert many * 3 < few
+    assert dialler.link.state is acceptor.link.state is ConnectionState.UP
+    dialler.link.need(time.now, needed=True)
+    exchange(dialler, acceptor, time)
+    assert dialler.link.remote_lease == acceptor.link.remote_lease == limits.EXPRESS_LEASE
+    rest(dialler, acceptor, time)
+    for pace in paces:
+        pace.count(2)
+    run(dialler, acceptor, time, 60.0)
+    assert dialler.link.remote_lease == acceptor.link.remote_lease == limits.IDLE_LEASE
+    assert few - 2 <= run(dialler, acceptor, time, 600.0) <= few + 2
+
+
+def test_two_sides_with_different_numbers_of_peers_keep_their_own_promises() -> None:
+    """As with an earlier release, whose pace does not change with the number."""
+    time, many = Time(), RestPace()
+    many.count(999)
+    dialler = side(ConnectionRole.DIALLER, LOW, time, expected=HIGH.guid, rest=many)
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
+    deliver(dialler.link.take_output(), acceptor.link, time.now)
+    acceptor.link.accept(time.now)
+    exchange(dialler, acceptor, time)
+    rest(dialler, acceptor, time)
+    run(dialler, acceptor, time, 600.0)
+    assert dialler.link.state is acceptor.link.state is ConnectionState.UP
+    assert (dialler.link.remote_lease, acceptor.link.remote_lease) == (limits.IDLE_LEASE, 58.0)
 
 
 @pytest.mark.parametrize("who", [0, 1])

@@ -13,6 +13,7 @@ from rmpa.mesh.handshake import Lane
 
 if TYPE_CHECKING:
     from rmpa.mesh.connection_events import ConnectionEvent
+    from rmpa.mesh.keepalive import RestPace
 
 LOW = Identity(Guid.of("10.0.0.1", 40001, 1), b"L" * 16, "low")
 HIGH = Identity(Guid.of("10.0.0.2", 40002, 1), b"H" * 16, "high")
@@ -78,6 +79,7 @@ def side(
     expected: Guid | None = None,
     lease: float = 1.0,
     lane: Lane = Lane.EXPRESS,
+    rest: RestPace | None = None,
 ) -> Side:
     events: list[ConnectionEvent] = []
     data: list[tuple[int, int, int, bytes]] = []
@@ -93,6 +95,7 @@ def side(
         expected=expected,
         lane=lane,
         lease=lease,
+        rest=rest,
     )
     return Side(link, events, data, parts)
 

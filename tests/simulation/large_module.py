@@ -21,6 +21,7 @@ from rmpa.discovery.swim.events import MemberOffers, MemberSuspected, SwimEvent
 from rmpa.discovery.swim.failure_detector import FailureDetector
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.handshake import Hello
+from rmpa.mesh.keepalive import RestPace
 from rmpa.mesh.mode import MeshMode
 from rmpa.mesh.peering import Peering
 from rmpa.mesh.peering_events import CloseLink, Dial, LinkDown, LinkUp
@@ -135,26 +136,33 @@ class Module:
         self.alive = False
         self.network.leave(self)
         self.tally.members -= len(self._present())
-        self.known = {}
         for link in self.links.values():
             self._find_dead(link)
-        self.links = {}
+        self.known, self.links = {}, {}
 
     def _find_dead(self, link: Link) -> None:
         """The other end notices by its lease; sooner where something depends on the link."""
         other = link.other(self)
-        lease = mesh_limits.EXPRESS_LEASE if link.used else mesh_limits.IDLE_LEASE
+        lease = self._lease(link)
         at = 0 if link.ends[0] is other else 1
         self.tally.links -= link.up
         link.up = False
         run = other.run
         self.network.world.after(lease, lambda: other.link_ended(link.ids[at], "silent", run, silent=True))
 
+    def _lease(self, link: Link) -> float:
+        """Seconds of silence after which the other end of a link counts it as lost."""
+        if link.used:
+            return mesh_limits.EXPRESS_LEASE
+        pace = RestPace()
+        pace.count(len(self.known))
+        return pace.lease
+
     def part(self, link: Link) -> None:
         """The path of a link that leads across a partition is gone: both ends notice by their leases."""
         if self._reaches(link.other(self)) or not link.up:
             return
-        lease = mesh_limits.EXPRESS_LEASE if link.used else mesh_limits.IDLE_LEASE
+        lease = self._lease(link)
         self.network.world.after(lease, lambda: self._end(link, "silent", parked=False, silent=True))
 
     def _present(self) -> set[int]:

@@ -141,6 +141,7 @@ class NetworkEndpoint:
     def _count(self, guid: Guid, *, present: bool) -> None:
         """Take in that a peer has become a member, or is none any more; the number decides on the mode."""
         (self._members.add if present else self._members.discard)(guid)
+        self.mesh.count_peers(len(self._members))
         if self.mode.count(1 + len(self._members)):
             _log.info("= %s", self.mode)
             self.discovery.set_demand(on=self.mode.demand)

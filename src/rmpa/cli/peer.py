@@ -22,7 +22,7 @@ from rmpa.observe.snapshot import PingReply
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rmpa.observe.peer_info import LaneInfo, OffersInfo, PeerInfo, ProbesInfo
+    from rmpa.observe.peer_info import LaneInfo, LinkInfo, OffersInfo, PeerInfo, ProbesInfo
     from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo
 
 _COLOURS: Final = {
@@ -45,7 +45,6 @@ _ROUTES: Final = (
 )
 
 _PARKED = "none: nothing needs it; it is made on demand, and probes notice within seconds if the peer is gone"
-_AT_REST = "at rest: nothing depends on the link, and its silence is noticed after 16 s"
 
 
 def connect(agent: str | None) -> ControlClient:
@@ -74,7 +73,8 @@ def list_(
 ) -> None:
     """List the peers, all or those with names like PATTERN, and how their links are.
 
-    A link is "at rest" while nothing depends on it: its silence is then noticed after 16 s in place of 1 s.
+    A link is "at rest" while nothing depends on it: its silence is then noticed after 16 s in place of 1 s, with more
+    than 50 peers later.
 
     CLOCK is the peer's wall clock less ours, with the bound of its error. Of very many peers a terminal shows a
     summary and the first ones: those with a problem, then those with most traffic.
@@ -215,6 +215,12 @@ def _lane_state(lane: LaneInfo) -> str:
     return "connected when a message wants it" if lane.unneeded else "no connection"
 
 
+def _pace_text(link: LinkInfo) -> str:
+    if link.rests:
+        return f"at rest: nothing depends on the link, and its silence is noticed after {link.lease:.0f} s"
+    return "in use: its silence is noticed within 1 s"
+
+
 def _facts(info: PeerInfo) -> list[tuple[str, str]]:
     if info.via:
         topics = f"{info.topics_in} topics that it publishes"
@@ -237,7 +243,7 @@ def _facts(info: PeerInfo) -> list[tuple[str, str]]:
         clock = "-" if link.clock_offset is None else f"{duration(link.clock_offset)} ± {duration(link.clock_error)}"
         facts += [
             ("Link", f"{link.remote}, {who}, up for {duration(link.up_ago)}, heard {duration(link.heard_ago)} ago"),
-            ("Pace", _AT_REST if link.rests else "in use: its silence is noticed within 1 s"),
+            ("Pace", _pace_text(link)),
             *(("Lane", f"{lane.name}: {_lane_state(lane)}") for lane in link.lanes),
             ("Round trip", duration(link.rtt)),
             ("Clock", f"{clock} (its clock less ours)"),

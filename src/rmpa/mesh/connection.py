@@ -40,7 +40,7 @@ from rmpa.mesh.connection_events import (
 )
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Feature, HandshakeError, Hello, Lane, Refuse, judge_welcome
-from rmpa.mesh.keepalive import Keepalive
+from rmpa.mesh.keepalive import Keepalive, RestPace
 from rmpa.mesh.parting import Parting, PartingStep
 from rmpa.mesh.remote_clock import RemoteClock
 from rmpa.runtime import limits as runtime_limits
@@ -143,6 +143,7 @@ class ConnectionProtocol:
         expected: Dialler: the GUID that was dialled; ``None`` if only the address is known.
         lane: Dialler: what the connection is for.
         lease: Seconds after which the silence of this side means that it is dead.
+        rest: The pace of all resting links of this agent.
         label: For log lines, until the remote side's name is known.
         prove: Judges whether the remote side is the module that its hello or welcome says; ``None`` accepts it.
         held: ``(guid)``: what this side holds of a peer's offers, for the hello or welcome of an express lane.
@@ -161,6 +162,7 @@ class ConnectionProtocol:
         expected: Guid | None = None,
         lane: Lane = Lane.EXPRESS,
         lease: float = limits.EXPRESS_LEASE,
+        rest: RestPace | None = None,
         label: str = "?",
         prove: Callable[[Hello], Refuse | None] | None = None,
         held: Callable[[Guid], bytes] = lambda _: b"",
@@ -184,7 +186,7 @@ class ConnectionProtocol:
         self._label = label
         self._state = ConnectionState.HANDSHAKING
         phase = int.from_bytes(ours.instance[:2], "big") / 65536 * limits.IDLE_KEEPALIVE_INTERVAL
-        self._keepalive = Keepalive(lease, now, acceptor=role is ConnectionRole.ACCEPTOR, phase=phase)
+        self._keepalive = Keepalive(lease, now, acceptor=role is ConnectionRole.ACCEPTOR, phase=phase, rest=rest)
         self._parting = Parting(self._keepalive, dialler=role is ConnectionRole.DIALLER)
         self._deadline = now + limits.HANDSHAKE_TIMEOUT
         self._reason = ""
@@ -357,6 +359,11 @@ class ConnectionProtocol:
         return self._state is ConnectionState.UP and self._keepalive.rests
 
     @property
+    def remote_lease(self) -> float:
+        """Seconds after which the silence of the remote side ends the connection."""
+        return self._keepalive.remote_lease
+
+    @property
     def remote_parks(self) -> bool:
         """Whether the remote side would end the link for now, because nothing there needs it."""
         return self._keepalive.remote_parks
@@ -396,7 +403,7 @@ class ConnectionProtocol:
             excused = keepalive.excused
             ours = f", our own pauses of {excused:.2g} s not counted" if excused else ""
             self._end(f"{self._name} was silent for its lease of {keepalive.awaited_lease:g} s{ours}")
-        elif self._parting.ask(now):
+        elif self._parting.ask(now) or (not self._parting.holding and keepalive.renew()):
             self._send_pace(now)
         else:
             self._ping(now)

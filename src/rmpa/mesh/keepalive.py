@@ -8,6 +8,30 @@ from rmpa.mesh import limits
 from rmpa.mesh.frames import PaceFlag
 
 
+class RestPace:
+    """How often an agent pings on its links at rest, and what it promises there: the more peers, the more rarely.
+
+    So an agent that keeps its links to all peers of a mesh of 200, as a relay does, has no more keepalives a second
+    than one with 50 peers.
+    """
+
+    __slots__ = ("interval",)
+
+    def __init__(self) -> None:
+        self.interval = limits.IDLE_KEEPALIVE_INTERVAL
+        """Seconds between two pings of one link."""
+
+    def count(self, peers: int) -> None:
+        """Take the number of peers that are present."""
+        interval = max(limits.IDLE_KEEPALIVE_INTERVAL, peers / limits.IDLE_KEEPALIVES_PER_SECOND)
+        self.interval = min(interval, limits.IDLE_KEEPALIVE_INTERVAL_MAX)
+
+    @property
+    def lease(self) -> float:
+        """Seconds of silence that it promises: two pings may be late, and the third a second."""
+        return max(limits.IDLE_LEASE, 3 * self.interval + 1)
+
+
 class Keepalive:
     """Keepalive and lease of one connection; pure, all times in monotonic seconds.
 
@@ -22,9 +46,11 @@ class Keepalive:
         lease: Seconds that this side promises.
         now: When the connection was established.
         phase: When the keepalives of all resting links of this agent fall: at this time plus multiples of
-            ``limits.IDLE_KEEPALIVE_INTERVAL``, so that the agent wakes once for all of them.
+            ``limits.IDLE_KEEPALIVE_INTERVAL`` (of ``limits.IDLE_KEEPALIVE_GRID`` where they come more rarely), so
+            that the agent wakes once for all of them.
         acceptor: Whether the remote side dialled. The acceptor pings a little later than the dialler, so that on an
             idle connection it sends only pongs.
+        rest: The pace of all resting links of this agent.
     """
 
     __slots__ = (
@@ -37,6 +63,7 @@ class Keepalive:
         "_phase",
         "_pinged",
         "_remote_lease",
+        "_rest",
         "_short",
         "_up_at",
         "_within",
@@ -50,8 +77,11 @@ class Keepalive:
         "sent",
     )
 
-    def __init__(self, lease: float, now: float, *, acceptor: bool, phase: float = 0.0) -> None:
+    def __init__(
+        self, lease: float, now: float, *, acceptor: bool, phase: float = 0.0, rest: RestPace | None = None
+    ) -> None:
         self._acceptor = acceptor
+        self._rest = rest if rest is not None else RestPace()
         self._phase = phase
         self.promise(lease)
         self.needed = self.remote_needs = True
@@ -88,10 +118,17 @@ class Keepalive:
         if self.needed or self.remote_needs:
             self._hold(self._short, self._short * limits.KEEPALIVE_INTERVAL / limits.EXPRESS_LEASE)
         else:
-            self._hold(limits.IDLE_LEASE, limits.IDLE_KEEPALIVE_INTERVAL)
+            self._hold(self._rest.lease, self._rest.interval)
         if self.lease < before:
             self._burst = limits.WAKE_PINGS  # the estimate of the remote clock is as old as the rest
         return self.lease != before
+
+    def renew(self) -> bool:
+        """At rest: promise the lease that fits the number of peers now, if it differs by a tenth; return whether."""
+        if not self.rests or abs(self._rest.lease - self.lease) < self.lease / 10:
+            return False
+        self._hold(self._rest.lease, self._rest.interval)
+        return True
 
     def wake(self, now: float, within: float) -> None:
         """Begin to need a link at rest: the remote side has to send its pace frame within ``within`` seconds."""
@@ -114,6 +151,11 @@ class Keepalive:
     def rests(self) -> bool:
         """Whether this side pings seldom, because nothing depends on the link."""
         return self.lease != self._short
+
+    @property
+    def remote_lease(self) -> float:
+        """Seconds of silence that the remote side promised last."""
+        return self._remote_lease
 
     @property
     def quiet_after(self) -> float:
@@ -151,7 +193,8 @@ class Keepalive:
 
         The acceptor's may be late, because it seldom pings: the pongs that it sends are signs of life too.
         """
-        grid = limits.IDLE_KEEPALIVE_INTERVAL
+        rare = self._rest.interval > limits.IDLE_KEEPALIVE_INTERVAL
+        grid = limits.IDLE_KEEPALIVE_GRID if rare else limits.IDLE_KEEPALIVE_INTERVAL
         turns = (due - self._phase) / grid
         return self._phase + grid * (math.ceil(turns) if self._acceptor else math.floor(turns + 1e-9))
 

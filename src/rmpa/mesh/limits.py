@@ -20,9 +20,19 @@ KEEPALIVE_INTERVAL: Final = 0.25
 """Interval of the keepalives, a quarter of the lease: three of them may be late before the link falls."""
 IDLE_LEASE: Final = 16.0
 """The lease of a link at rest: no route, no call and no request depends on it. Its silence is noticed later, and it
-costs a twentieth of the packets. Both ends agree on it; an earlier release never does."""
+costs a twentieth of the packets. Both ends agree on it; an earlier release never does. With more than 50 peers it is
+longer (``mesh.keepalive.RestPace``)."""
 IDLE_KEEPALIVE_INTERVAL: Final = 5.0
 """Interval of the keepalives of a link at rest: two of them may be late before the link falls."""
+IDLE_KEEPALIVES_PER_SECOND: Final = 10.0
+"""Keepalives a second on all links at rest of one agent that keeps a link to each peer: some 3 KB/s. With more than
+50 peers each link has them more rarely, and a longer lease."""
+IDLE_KEEPALIVE_INTERVAL_MAX: Final = 19.0
+"""Interval of the keepalives of a link at rest at most; it is reached with 190 peers. Three of them and a second fit
+into ``LINK_LEASE_MAX``."""
+IDLE_KEEPALIVE_GRID: Final = 1.0
+"""Where keepalives at rest come more rarely than every ``IDLE_KEEPALIVE_INTERVAL``, an agent sends those of all its
+links at common times so far apart."""
 WAKE_TIMEOUT: Final = 1.5
 """A peer at rest that does not answer for this long (or three round trips) when the link is needed again is gone."""
 WAKE_PINGS: Final = 5

@@ -45,8 +45,9 @@ class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
         queued: Bytes in its send queues.
         dropped: Messages dropped because the link was too slow.
         heard_ago: Seconds since anything arrived.
-        rests: Whether the link is at rest: nothing depends on it, keepalives come every 5 s, silence is noticed after
-            16 s.
+        rests: Whether the link is at rest: nothing depends on it, and keepalives come every 5 s, with more than 50
+            peers more rarely.
+        lease: Seconds of silence after which the link counts as lost.
         packet: Bytes of the largest packets that are sent, headers included.
         path_problem: What is wrong with the network path, ready to read; empty if nothing is known.
         path_remedy: What to do about that.
@@ -65,6 +66,7 @@ class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
     dropped: int = 0
     heard_ago: float | None = None
     rests: bool = False
+    lease: float = 1.0
     packet: int | None = None
     path_problem: str = ""
     path_remedy: str = ""

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from rmpa.mesh.connection import OnData, OnPart
     from rmpa.mesh.handshake import Hello, Refuse
     from rmpa.mesh.io.securing import SecuredSocket
+    from rmpa.mesh.keepalive import RestPace
     from rmpa.mesh.remote_clock import RemoteClock
 
     OnMark = Callable[[FrameKind, int, int], None]
@@ -135,6 +136,7 @@ class Connection:
         lane: What this side dials for; on an accepted connection the remote side's hello says it.
         segment: Bytes that one packet may carry; ``None`` for as many as the kernel chooses.
         secured: What encrypts ``sock``, and the remote side's certificate; ``None`` in a mesh without trust.
+        rest: The pace of all resting links of this agent.
     """
 
     def __init__(
@@ -151,6 +153,7 @@ class Connection:
         lane: Lane = Lane.EXPRESS,
         segment: int | None = None,
         secured: SecuredSocket | None = None,
+        rest: RestPace | None = None,
     ) -> None:
         self.id = connection_id
         self.sock = sock
@@ -209,6 +212,7 @@ class Connection:
             label=f"{endpoint[0]}:{endpoint[1]}",
             prove=None if secured is None else partial(owner.connection_prove, self),
             held=owner.connection_held,
+            rest=rest,
         )
         self._timer = MachineTimer(self._machine.next_timer, self._due, now=clock.now)
         self._send_output()
@@ -307,6 +311,11 @@ class Connection:
     def rests(self) -> bool:
         """Whether the connection is at rest: its keepalives are rare, and silence is noticed later."""
         return self._machine.rests
+
+    @property
+    def remote_lease(self) -> float:
+        """Seconds after which the silence of the remote side ends the connection."""
+        return self._machine.remote_lease
 
     @property
     def remote_parks(self) -> bool:

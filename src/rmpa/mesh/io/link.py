@@ -171,8 +171,13 @@ class PeerLink:
 
     @property
     def rests(self) -> bool:
-        """Whether the link is at rest: keepalives are rare, and silence is noticed within ``limits.IDLE_LEASE``."""
+        """Whether the link is at rest: keepalives are rare, and silence is noticed within ``lease``."""
         return self.connection.rests
+
+    @property
+    def lease(self) -> float:
+        """Seconds of silence after which the link counts as lost."""
+        return self.connection.remote_lease
 
     @property
     def held(self) -> list[bytes]:

@@ -23,6 +23,7 @@ from rmpa.mesh.io.path_monitor import PathMonitor
 from rmpa.mesh.io.redials import Redials, is_over
 from rmpa.mesh.io.securing import Securing, SecuringError, prove, secure_dialled
 from rmpa.mesh.io.sockets import tune_bulk, tune_express
+from rmpa.mesh.keepalive import RestPace
 from rmpa.mesh.peering import Peering
 from rmpa.mesh.peering_events import (
     CloseLink,
@@ -153,6 +154,7 @@ class Mesh:
         self._bulk_lanes = BulkLanes(
             self._connect_bulk, self._start, clock=self._clock, rng=rng, counters=self.counters
         )
+        self._rest_pace = RestPace()
         self._ids = count(1)
         self._acting = False
         self._running = False
@@ -217,6 +219,10 @@ class Mesh:
         """Link with all parked peers again, within some ``spread`` seconds."""
         self._peering.unpark(self._clock.now(), spread)
         self._act()
+
+    def count_peers(self, peers: int) -> None:
+        """Take the number of peers that are present: it decides how rare the keepalives of links at rest are."""
+        self._rest_pace.count(peers)
 
     def peers(self) -> list[PeerStatus]:
         """The status of all known peers: linked, or why not and when the next attempt is due."""
@@ -557,6 +563,7 @@ class Mesh:
             lane=lane,
             segment=self.paths.segment(endpoint[0]),
             secured=secured,
+            rest=self._rest_pace,
         )
 
     def _accepted(self, sock: socket.socket, address: SocketAddress) -> None:

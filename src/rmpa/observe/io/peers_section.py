@@ -165,6 +165,7 @@ class PeersSection:
             dropped=link.dropped,
             heard_ago=now - link.heard_at,
             rests=link.rests,
+            lease=link.lease,
             packet=paths.packet_bytes(link),
             path_problem=problem.text if problem is not None else "",
             path_remedy=problem.remedy if problem is not None else "",

@@ -18,7 +18,6 @@ from rmpa.bridge.relay import OUTSIDE_GUID
 from rmpa.config import limits as config_limits
 from rmpa.config.permission_rules import Access
 from rmpa.config.values import did_you_mean
-from rmpa.mesh import limits as mesh_limits
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check
 from rmpa.observe.why.diagnosis import (
@@ -108,8 +107,7 @@ def _linked(peer: PeerInfo) -> Check:
     text = f"linked by {link.remote} for {link.up_ago:.0f} s"
     if link.rtt is not None:
         text += f", round trip {link.rtt * 1e3:.1f} ms"
-    lease = mesh_limits.IDLE_LEASE if link.rests else mesh_limits.EXPRESS_LEASE
-    if link.heard_ago is not None and link.heard_ago > lease / 2:
+    if link.heard_ago is not None and link.heard_ago > link.lease / 2:
         text += f"; silent for {link.heard_ago:.1f} s"
         return Check("link", WARN, text, "if it stays so, the cable or the radio is the place to look at")
     if link.path_problem:
