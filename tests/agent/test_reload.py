@@ -161,13 +161,16 @@ def test_an_agent_whose_terminal_is_closed_ends(tmp_path: Path, unused_tcp_port:
         os.close(its)
         assert process.stderr is not None
         seen = ""
-        while "ROS_MASTER_URI" not in seen and (line := process.stderr.readline()):
-            seen += line
-        process.send_signal(signal.SIGHUP)  # the terminal is there: it reads its settings
-        while "settings read again" not in seen and (line := process.stderr.readline()):
-            seen += line
-        os.close(ours)
-        rest = process.stderr.read()
-        assert process.wait(20) == 0
+        try:
+            while "ROS_MASTER_URI" not in seen and (line := process.stderr.readline()):
+                seen += line
+            process.send_signal(signal.SIGHUP)  # the terminal is there: it reads its settings
+            while "settings read again" not in seen and (line := process.stderr.readline()):
+                seen += line
+            os.close(ours)
+            rest = process.stderr.read()
+            assert process.wait(20) == 0
+        finally:
+            process.kill()  # else the end of the block would wait for it
     assert "settings read again: nothing has changed" in seen
     assert "the terminal is gone" in rest
