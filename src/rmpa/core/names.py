@@ -64,10 +64,12 @@ def resolve_name(name: str, namespace: str = "/", node: str = "") -> str:
 
 @lru_cache(maxsize=4096)
 def _compile_glob(pattern: str) -> re.Pattern[str]:
-    # "/**/" also fits a single slash: any number of parts in between, or none.
+    # "/**/" also fits a single slash: any number of parts in between, or none. "/**" at the end fits no part, too.
     wild = {"/**/": "/(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
-    pieces = re.split(r"(/\*\*/|\*\*|\*|\?)", pattern)
-    return re.compile("".join(wild.get(piece) or re.escape(piece) for piece in pieces))
+    pattern = re.sub(r"(?:/\*\*)+(?=/|$)", "/**", pattern)
+    begin, end = (pattern[:-3], "(?:/.*)?") if pattern.endswith("/**") and pattern != "/**" else (pattern, "")
+    pieces = re.split(r"(/\*\*/|\*\*|\*|\?)", begin)
+    return re.compile("".join(wild.get(piece) or re.escape(piece) for piece in pieces) + end)
 
 
 def matches(pattern: str, name: str) -> bool:
@@ -76,6 +78,4 @@ def matches(pattern: str, name: str) -> bool:
     ``/camera/**`` also fits ``/camera`` itself, as people expect of a namespace; likewise ``/**/cmd_vel`` fits
     ``/cmd_vel``, and ``/a/**/b`` fits ``/a/b``.
     """
-    if pattern.endswith("/**") and pattern[:-3] and _compile_glob(pattern[:-3]).fullmatch(name):
-        return True
     return _compile_glob(pattern).fullmatch(name) is not None

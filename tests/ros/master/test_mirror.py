@@ -316,6 +316,22 @@ def test_whatever_a_master_answers_is_a_survey_or_an_error(answer: list[XmlRpcVa
     assert set(mirror.state().nodes) <= set(survey.uris)
 
 
+def test_what_a_survey_shows_of_a_node_between_two_of_its_registrations_goes_again(pair: Pair) -> None:
+    """The call that unregisters is lost, or the survey began before it: the node is taken for a stranger's."""
+    pair.call("registerPublisher", "/rmpa", "/b", STRING, OURS)
+    pair.flush()
+    pair.look()
+    pair.call("unregisterPublisher", "/rmpa", "/b", OURS)
+    pair.writes.clear()
+    pair.look()
+    pair.call("registerPublisher", "/rmpa", "/a", STRING, OURS)
+    pair.flush()
+    pair.look()
+    pair.flush()
+    assert pair.look() == []
+    assert set(pair.mirror.state().publishers) == set(pair.master.registrations.state().publishers) == {"/a"}
+
+
 NAMES: Final = st.sampled_from(["/a", "/b"])
 APIS: Final = st.sampled_from([THEIRS, MOVED])
 METHODS: Final = st.sampled_from(

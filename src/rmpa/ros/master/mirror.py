@@ -227,9 +227,10 @@ class Mirror:
         listed = survey.nodes()
         self._orphans = {node: api for node, api in self._orphans.items() if node not in listed}
         self._dead = {node: api for node, api in self._dead.items() if survey.uris.get(node) == api}
-        passed = {*ignored, *(node for _, _, node in self._own), *self._dead}
+        ours = {node for _, _, node in self._own}
+        passed = {*ignored, *ours, *self._dead}
         for kind, table in survey.holders.items():
-            self._drop_gone(kind, table, passed, survey)
+            self._drop_gone(kind, table, ours, passed, survey)
         for kind, table in survey.holders.items():
             self._add_new(kind, table, passed, survey, seen)
         self._update_types(survey, passed)
@@ -243,14 +244,21 @@ class Mirror:
         return [own.call for (kind, _, _), own in self._own.items() if kind is RegistrationKind.PARAM]
 
     def _drop_gone(
-        self, kind: RegistrationKind, table: Mapping[str, Sequence[str]], passed: set[str], survey: Survey
+        self,
+        kind: RegistrationKind,
+        table: Mapping[str, Sequence[str]],
+        ours: set[str],
+        passed: set[str],
+        survey: Survey,
     ) -> None:
         for key, nodes in self._yielder(self._known.providers(kind)):
             there = table.get(key, ())
             for node, api in nodes.items():
-                if node in passed or self._orphans.get(node) == api:
+                # A survey showed what a node of ours had before, while it had no registration by which it was known.
+                leftover = node in ours and (kind, key, node) not in self._own
+                if not leftover and (node in passed or self._orphans.get(node) == api):
                     continue
-                if node not in there or survey.uris.get(node) != api:
+                if leftover or node not in there or survey.uris.get(node) != api:
                     if kind is RegistrationKind.SERVICE:
                         uri = self._known.service_uri(key)
                         self._known.unregister_service(key, uri or "", node)
