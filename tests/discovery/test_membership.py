@@ -146,6 +146,24 @@ def test_forged_beacons_do_not_make_an_amplifier(one: Harness) -> None:
     assert len(unicasts(one.membership.outputs(), BeaconKind.ANSWER)) <= limits.ANSWERS_PER_SECOND
 
 
+def test_a_recognised_module_is_told_where_we_are_and_changes_nothing(one: Harness) -> None:
+    """It has an older group key: it was away, or it was revoked and lies about itself and about others."""
+    one.hear(Speaker(who(2))())
+    one.run(1.0)
+    one.membership.events()
+    before, liars = one.membership.peers(), [Speaker(who(n), 1 << 20) for n in range(2, 100)]
+    for liar in liars:
+        for kind in BeaconKind:
+            one.membership.recognise(liar(kind, who(200).guid), ("10.0.0.99", 4000), 7)
+    sent = one.membership.outputs()
+    assert len(sent) == 2 * len(liars), "an announcement and a heartbeat are answered"
+    for output in sent:
+        assert isinstance(output, SendUnicast)
+        assert (output.beacon.kind, output.beacon.gossip, output.key) == (BeaconKind.ANSWER, (), 7)
+    assert one.membership.peers() == before
+    assert one.membership.events() == []
+
+
 def test_our_own_echo_is_ignored(one: Harness) -> None:
     one.hear(Speaker(who(1))())
     assert (one.membership.events(), one.membership.outputs()) == ([], [])

@@ -16,7 +16,7 @@ def fuzz(data: bytes) -> None:
     """Whatever comes in: nothing is admitted but what a member signed, or a holder of the token."""
     guard = PrefaceGuard(KeyRing([_KEY], 0.0), {b"token-id": bytes(32)}.get)
     try:
-        preface = guard.admit(data, 1.0, 1_790_000_000.0)
+        preface, _ = guard.admit(data, 1.0, 1_790_000_000.0)
     except PrefaceError as error:
         str(error)
         return

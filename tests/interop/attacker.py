@@ -29,6 +29,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
+from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.discovery.beacon import Beacon, BeaconKind
@@ -196,7 +197,7 @@ def secured(sock: socket.socket, context: ssl.SSLContext, then: bytes) -> dict[s
 def udp_socket() -> socket.socket:
     """A socket whose multicasts leave by the host's cable: it has no default route."""
     made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    (own,) = [each.address for each in psutil.net_if_addrs()["eth0"] if each.family is socket.AF_INET]
+    own, *_ = [each.address for each in psutil.net_if_addrs()["eth0"] if each.family is socket.AF_INET]
     made.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(own))
     return made
 
@@ -375,6 +376,52 @@ def tell_beacon(given: Arguments) -> None:
     say("done")
 
 
+def former(given: Arguments) -> None:
+    """Be a member that was revoked: ``key`` (the group key before), ``cert``, ``private``, ``addresses`` (its own).
+
+    For ``seconds`` it invents modules at ``here``, says goodbye in the names of the modules that it hears, and dials
+    ``address``, ``port`` from each of its addresses, with the key alone and with its certificate too.
+    """
+    key, end = bytes.fromhex(given["key"]), time.monotonic() + given["seconds"]
+    udp, ears = udp_socket(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    ears.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    ears.bind((given["group"], given["udp"]))
+    group = socket.inet_aton(given["group"]) + socket.inet_aton(given["here"])
+    ears.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group)
+    ears.setblocking(False)
+    context = tls_context(given["cert"], given["private"])
+    held: list[socket.socket] = []
+    heard: dict[bytes, Beacon] = {}
+    number = 0
+    say("ready")
+    while time.monotonic() < end:
+        with contextlib.suppress(OSError, RemoteProtocolError):
+            beacon = Beacon.parse(ears.recv(4096), 0)
+            heard[beacon.identity.instance] = beacon
+        number += 1
+        guid = Guid.of(given["here"], 2000 + number % 60_000, 1)
+        lies = [Beacon(BeaconKind.ANNOUNCE, Identity(guid, os.urandom(16), f"ghost{number}", 0), 60_000, 1)]
+        for beacon in heard.values():
+            sequence = (beacon.sequence + 500 + number) & 0xFFFFFFFF
+            lies.append(Beacon(BeaconKind.GOODBYE, beacon.identity, 60_000, sequence))
+        for lie in lies:
+            packet = with_trailer(lie.serialize(extended=True), key, number)
+            udp.sendto(packet, (given["group"], given["udp"]))
+        sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        sock.settimeout(0.2)
+        with contextlib.suppress(OSError):
+            sock.bind((given["addresses"][number % len(given["addresses"])], 0))
+            sock.connect((given["address"], given["port"]))
+            sock.sendall(preface(preface_key(key)))
+            if number % 4 == 0:  # and no hello behind the handshake
+                sock = context.wrap_socket(sock)
+        held.append(sock)
+        while len(held) > 300:
+            held.pop(0).close()
+        time.sleep(0.002)
+    say("done", lies=number, heard=len(heard))
+
+
 # --- joins ------------------------------------------------------------------------------------------------------
 
 
@@ -504,7 +551,8 @@ def middle(given: Arguments) -> None:
 
 
 MODES: dict[str, Callable[[Arguments], None]] = {
-    each.__name__: each for each in (record, replay, plain, lure, flood, slow, insider, tell_beacon, join, middle)
+    each.__name__: each
+    for each in (record, replay, plain, lure, flood, slow, insider, tell_beacon, former, join, middle)
 }
 
 if __name__ == "__main__":

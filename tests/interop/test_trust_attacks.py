@@ -328,5 +328,43 @@ def test_a_revoked_member_is_gone_everywhere_within_a_second(
     assert trust_limits.KEY_SPREAD > 0
 
 
+def test_a_former_member_holds_no_module_out_and_is_believed_nothing(
+    tmp_path: Path, modules: ModuleFactory, lab: Lab, agent: AgentFactory, shell: ShellFactory
+) -> None:
+    """It has all group keys up to the last one, and its certificate."""
+    fortress = Fortress(tmp_path, modules, lab)
+    traffic = Traffic(fortress)
+    fortress.mesh.add("eve")
+    store, old_key = fortress.mesh.store("eve"), fortress.mesh.group_key
+    away = lab.host("away", 0)
+    fortress.mesh.add("away")  # has the group key before, and no fault
+    control(fortress.a.agent, "revoke", name="eve", force=True)
+    addresses = [fortress.eve.address]
+    for octet in range(201, 213):
+        addresses.append(f"{fortress.eve.address.rsplit('.', 1)[0]}.{octet}")
+        fortress.eve.ip("address", "add", f"{addresses[-1]}/24", "dev", "eth0")
+    files = {"cert": str(store.path(CERTIFICATE)), "private": str(store.path(KEY))}
+    with start_attack(
+        fortress.eve, "former", **fortress.target, **files, key=old_key, group=GROUP, udp=UDP_PORT,
+        here=fortress.eve.address, addresses=addresses, seconds=25,
+    ) as attacking:  # fmt: skip
+        attacking.wait_event("ready", 20.0)
+        eventually(lambda: counter(fortress.a.agent, "beacon.old_key") > 50, what="the lies arrive")
+        for module in (fortress.a, fortress.b):
+            assert len(module.agent.snapshot().peers) == 1, [peer.name for peer in module.agent.snapshot().peers]
+        traffic.held()
+        fortress.b.agent.kill()
+        fortress.b.agent.restart()
+        fortress.b.agent.wait_peer("a", 10.0)
+        late = Module(away, agent(away, name="away", config=OPEN, log_level="info"), shell(away))
+        late.agent.wait_peer("a")  # in time, with so many others that have its key
+        done = attacking.wait_event("done", 60.0)
+    assert int(str(done["heard"])) >= 2
+    assert counter(fortress.a.agent, "link.refused.revoked") > 0
+    for module in (fortress.a, fortress.b):
+        assert {peer.name for peer in module.agent.snapshot().peers} <= {"a", "b", "away"}
+        assert "Traceback" not in module.agent.process.output
+
+
 def _is_gone(module: Module, name: str) -> bool:
     return not any(peer.name == name and peer.link is not None for peer in module.agent.snapshot().peers)

@@ -29,7 +29,7 @@ from tests.trust.authority import WALL, Authority, new_key
 LAB = Authority()
 PUBLIC = LAB.key.public_key()
 DENY = DenyList(7, (DenyEntry("arm", 1_790_000_000), DenyEntry("base", 5)))
-KEYS = KeyList.of(3, [GroupKey(2, b"a" * 32), GroupKey(3, b"b" * 32)], "base")
+KEYS = KeyList.of(3, [GroupKey(2, b"a" * 32), GroupKey(3, b"b" * 32)], "base", proves_from=3, made=1_790_000_000)
 
 
 def _signed(text: str, label: bytes = b"rmpa deny 1", key: ec.EllipticCurvePrivateKey = LAB.key) -> bytes:
@@ -52,7 +52,8 @@ def test_the_text_is_golden() -> None:
     assert read_deny_list(_signed(envelope["signed"]), PUBLIC) == DENY
     assert msgspec.json.decode(sign(KEYS, LAB.key))["signed"] == (
         '{"number":3,"keys":[{"number":2,"key":"YWFhYWFhYWFhYWFhYWFhYWFhYWFhYWFhYWFhYWFhYWE="},'
-        '{"number":3,"key":"YmJiYmJiYmJiYmJiYmJiYmJiYmJiYmJiYmJiYmJiYmI="}],"authority":"base"}'
+        '{"number":3,"key":"YmJiYmJiYmJiYmJiYmJiYmJiYmJiYmJiYmJiYmJiYmI="}],"authority":"base",'
+        '"proves_from":3,"made":1790000000}'
     )
 
 

@@ -50,7 +50,7 @@ def test_the_newest_key_of_the_files_signs_at_once() -> None:
 
 def test_two_keys_verify_during_a_rotation() -> None:
     ring = KeyRing([key(1)], 0.0)
-    assert ring.add(key(2), 10.0)
+    ring.take([key(2)], 10.0)
     signs = 10.0 + limits.KEY_SPREAD
     assert ring.signing(signs - 0.1) == key(1)
     assert ring.signing(signs) == key(2)
@@ -61,10 +61,28 @@ def test_two_keys_verify_during_a_rotation() -> None:
     assert ring.find(1) == key(1)
 
 
+def test_after_a_revocation_the_new_key_signs_and_older_ones_recognise_at_once() -> None:
+    ring = KeyRing([key(1)], 0.0)
+    ring.take([key(2)], 5.0)
+    ring.take([key(2), key(3)], 10.0, proves_from=3)
+    assert ring.signing(10.0) == key(3)
+    assert not ring.verifies(key(1), 10.0)
+    assert not ring.verifies(key(2), 10.0)
+    assert ring.find(2) == key(2)
+
+
+def test_a_member_that_was_away_during_two_rotations_takes_the_revocation_among_them() -> None:
+    ring = KeyRing([key(1)], 0.0)
+    ring.take([key(1), key(2), key(3)], 10.0, proves_from=2, age=limits.KEY_SPREAD - 10)
+    assert not ring.verifies(key(1), 10.0)
+    assert ring.signing(10.0) == key(2)
+    assert ring.signing(20.0) == key(3)
+
+
 def test_members_that_learn_a_key_at_different_times_understand_each_other() -> None:
     early, late = KeyRing([key(1)], 0.0), KeyRing([key(1)], 0.0)
-    early.add(key(2), 0.0)
-    late.add(key(2), limits.KEY_SPREAD - 1)
+    early.take([key(2)], 0.0)
+    late.take([key(2)], limits.KEY_SPREAD - 1)
     for now in (0.0, 29.0, 31.0, 60.0, 600.0):
         for sender, receiver in ((early, late), (late, early)):
             signing = sender.signing(now)
@@ -75,15 +93,14 @@ def test_members_that_learn_a_key_at_different_times_understand_each_other() -> 
 
 def test_an_older_or_known_key_is_ignored() -> None:
     ring = KeyRing([key(5)], 0.0)
-    assert not ring.add(key(5), 1.0)
-    assert not ring.add(key(4), 1.0)
+    ring.take([key(5), key(4)], 1.0, proves_from=5)
     assert ring.keys == (key(5),)
 
 
 def test_the_oldest_key_is_forgotten() -> None:
     ring = KeyRing([key(1)], 0.0)
     for number in range(2, 20):
-        ring.add(key(number), float(number))
+        ring.take([key(number)], float(number))
     assert [k.number for k in ring.keys] == list(range(20 - limits.KEYS_MAX, 20))
     assert ring.find(1) is None
 

@@ -57,7 +57,7 @@ def test_golden_bytes_both_ways() -> None:
     assert len(wire) == PREFACE_BYTES == 56
     assert Preface.parse(wire + b"a ClientHello") == PREFACE
     assert signed_with(wire + b"a ClientHello", SIGNING)
-    assert _guard().admit(wire, NOW, WALL) == PREFACE
+    assert _guard().admit(wire, NOW, WALL) == (PREFACE, False)
 
 
 def test_the_reasons_continue_the_refusals() -> None:
@@ -123,7 +123,7 @@ def test_clocks_that_are_set_must_agree() -> None:
 def test_a_token_admits_to_joining_alone() -> None:
     guard = _guard()
     join = Preface(Purpose.JOIN, 0, 0, bytes(16), TOKEN_ID)
-    assert guard.admit(join.serialize(TOKEN_KEY), NOW, WALL).purpose is Purpose.JOIN
+    assert guard.admit(join.serialize(TOKEN_KEY), NOW, WALL) == (join, False)
     unknown = Preface(Purpose.JOIN, 0, 0, bytes(16), b"another!").serialize(TOKEN_KEY)
     assert _refused(guard, unknown) is TrustReason.KEY
     assert _refused(guard, join.serialize(SIGNING)) is TrustReason.KEY
@@ -132,8 +132,8 @@ def test_a_token_admits_to_joining_alone() -> None:
 
 def test_old_keys_are_admitted_at_a_low_rate() -> None:
     guard = _guard(KEY, GroupKey(4, b"n" * 32))
-    for nonce in range(int(limits.OLD_KEY_PACKETS_RATE)):
-        guard.admit(_link(nonce), NOW, WALL)
+    for nonce in range(int(limits.OLD_KEY_DIALS_PER_ADDRESS)):
+        assert guard.admit(_link(nonce), NOW, WALL)[1]
     assert _refused(guard, _link(99)) is TrustReason.FLOOD
     guard.admit(_link(100), NOW + 1, WALL)
 
@@ -164,14 +164,31 @@ def test_old_keys_are_bounded_over_all_addresses() -> None:
     assert len(guard._old_keys_there) == limits.OLD_KEYS_MAX
 
 
+def test_a_former_member_uses_up_no_place_of_a_member_or_a_joining_module() -> None:
+    """After a revocation, from as many addresses as it likes and for as long as nonces are kept."""
+    new = GroupKey(4, b"n" * 32)
+    ring = KeyRing([KEY], 0.0)
+    guard = PrefaceGuard(ring, {TOKEN_ID: TOKEN_KEY}.get)
+    ring.take([new], NOW, proves_from=4)
+    for nonce in range(3 * limits.NONCES_MAX):
+        with contextlib.suppress(PrefaceError):
+            guard.admit(_link(nonce), NOW + nonce / 200, WALL, f"10.0.{nonce % 40}.1")
+    now = NOW + 3 * limits.NONCES_MAX / 200
+    for nonce in range(limits.NONCES_PER_ADDRESS):
+        member = Preface(Purpose.LINK, 4, 0, nonce.to_bytes(16, "little"))
+        assert not guard.admit(member.serialize(new.key_for(KeyPurpose.PREFACE)), now, WALL, "10.1.0.1")[1]
+        join = Preface(Purpose.JOIN, 0, 0, nonce.to_bytes(16, "little"), TOKEN_ID)
+        guard.admit(join.serialize(TOKEN_KEY), now, WALL, "10.1.0.2")
+
+
 def test_nonces_are_bounded_and_forgotten() -> None:
     guard = _guard()
     for nonce in range(limits.NONCES_MAX):
         guard.admit(_link(nonce), NOW, WALL, f"10.0.0.{nonce % 9}")
     assert _refused(guard, _link(limits.NONCES_MAX)) is TrustReason.FLOOD
     guard.admit(_link(limits.NONCES_MAX), NOW + limits.NONCE_KEPT, WALL)
-    assert len(guard._nonces) == 1
-    assert guard._nonces_there.total() == len(guard._nonces_there) == 1
+    assert len(guard._members) == 1
+    assert guard._members._there.total() == len(guard._members._there) == 1
 
 
 def test_one_address_leaves_places_to_others() -> None:
@@ -187,7 +204,7 @@ def test_refused_prefaces_leave_no_nonce() -> None:
     wire = _link(1)
     _refused(guard, wire[:-1] + bytes([wire[-1] ^ 1]))
     _refused(guard, _link(2), wall=WALL + 60)
-    assert not guard._nonces
+    assert not len(guard._members)
 
 
 @pytest.mark.parametrize(

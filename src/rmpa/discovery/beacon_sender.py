@@ -57,10 +57,10 @@ class BeaconSender:
         taken, self._outputs = self._outputs, []
         return taken
 
-    def send(self, kind: BeaconKind, address: Address, gossip: tuple[Guid, ...] = ()) -> None:
-        """Send a unicast."""
+    def send(self, kind: BeaconKind, address: Address, gossip: tuple[Guid, ...] = (), *, key: int = 0) -> None:
+        """Send a unicast; ``key`` as for ``SendUnicast``."""
         if not self.closed:
-            self._outputs.append(SendUnicast(self._beacon(kind, gossip), address))
+            self._outputs.append(SendUnicast(self._beacon(kind, gossip), address, key))
 
     def send_multicast(self, kind: BeaconKind, now: float) -> None:
         """Send to the group, with gossip about the peers that multicast does not reach."""

@@ -157,10 +157,18 @@ class SendMulticast:
 
 @dataclass(frozen=True, slots=True)
 class SendUnicast:
-    """Send to one address."""
+    """Send to one address.
+
+    Args:
+        beacon: What is sent.
+        address: Where to.
+        key: Of a secured mesh: the number of the older group key that the receiver has (its low 16 bits); 0: the
+            present one.
+    """
 
     beacon: Beacon
     address: Address
+    key: int = 0
 
 
 Output = SendMulticast | SendUnicast

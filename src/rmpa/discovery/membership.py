@@ -145,6 +145,22 @@ class MembershipProtocol:
                 self._apply_gossip(beacon, now)
         self._remove_if_empty(key)
 
+    def recognise(self, beacon: Beacon, source: Address, key: int) -> None:
+        """Tell a module that has only an older group key of a secured mesh where this agent is.
+
+        It was away, or it was revoked, which its certificate shows when it dials. Until then nothing is known of it
+        here: what it says of itself and of others counts nowhere.
+
+        Args:
+            beacon: What it sent.
+            source: The packet's source address and port.
+            key: The low 16 bits of the number of its group key, by which the answer is signed.
+        """
+        if beacon.identity.instance == self._sender.identity.instance:
+            self.counters.add("beacon.echo")
+        elif beacon.kind in {BeaconKind.ANNOUNCE, BeaconKind.HEARTBEAT}:
+            self._sender.send(BeaconKind.ANSWER, source, key=key)
+
     def link_up(self, identity: Identity, now: float, source: Address | None = None) -> None:
         """Take in a peer whose link is up: it is a member for as long as the link is up, even if it is silent.
 

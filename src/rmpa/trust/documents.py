@@ -110,16 +110,23 @@ class KeyList(msgspec.Struct, frozen=True):
         number: Grows with each change.
         keys: By number.
         authority: The name of the authority, so that no other member can pass for it; empty: not known.
+        proves_from: The number of the key that the last revocation made: a revoked module has those before.
+        made: When the newest key was made, by the authority's clock in seconds since 1970; 0: it was not set.
     """
 
     number: int
     keys: tuple[_KeyEntry, ...]
     authority: str = ""
+    proves_from: int = 0
+    made: int = 0
 
     @classmethod
-    def of(cls, number: int, keys: Iterable[GroupKey], authority: str = "") -> KeyList:
+    def of(
+        cls, number: int, keys: Iterable[GroupKey], authority: str = "", *, proves_from: int = 0, made: int = 0
+    ) -> KeyList:
         """The list of these keys; arguments as for the class."""
-        return cls(number, tuple(_KeyEntry(key.number, key.secret) for key in keys), authority)
+        entries = tuple(_KeyEntry(key.number, key.secret) for key in keys)
+        return cls(number, entries, authority, proves_from, made)
 
     @property
     def group_keys(self) -> tuple[GroupKey, ...]:

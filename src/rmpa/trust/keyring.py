@@ -2,7 +2,8 @@
 
 A new key verifies at once and signs ``limits.KEY_SPREAD`` later, when it has reached every linked module. The key
 before verifies for ``limits.KEY_OVERLAP`` more; older ones are still known, so that a module that was away is
-recognised.
+recognised. The key that a revocation makes signs at once, and all before it only recognise from then on: the module
+that was revoked has them.
 """
 
 from __future__ import annotations
@@ -78,20 +79,25 @@ class KeyRing:
     """The group keys that one agent has.
 
     Args:
-        keys: Those of its files; the one with the highest number signs at once, the others only recognise.
+        keys: Those of its files.
         now: Monotonic seconds.
+        proves_from: As for ``take``.
+        age: Likewise; by default so long ago that the newest key signs.
 
     Raises:
         ValueError: There is no key.
     """
 
-    def __init__(self, keys: Iterable[GroupKey], now: float) -> None:
-        self._keys = sorted({key.number: key for key in keys}.values(), key=lambda key: key.number)
-        if not self._keys:
+    def __init__(
+        self, keys: Iterable[GroupKey], now: float, *, proves_from: int = 0, age: float = float("inf")
+    ) -> None:
+        found = sorted({key.number: key for key in keys}.values(), key=lambda key: key.number)
+        if not found:
             raise ValueError("a key ring has at least one key")
-        self._keys = self._keys[-limits.KEYS_MAX :]
-        self._terms = {key.number: _Term(now, _NEVER) for key in self._keys}
-        self._terms[self._keys[-1].number] = _Term(now)
+        self._keys = found[:1]
+        self._terms = {found[0].number: _Term(_NEVER)}
+        self.take(found[1:-1], now, proves_from=proves_from, age=float("inf"))  # when they were made is not known
+        self.take(found[-1:], now, proves_from=proves_from, age=age)
 
     @property
     def newest(self) -> GroupKey:
@@ -103,19 +109,27 @@ class KeyRing:
         """All keys, by number."""
         return tuple(self._keys)
 
-    def add(self, key: GroupKey, now: float) -> bool:
-        """Take in a new key; return whether it is newer than all others (else it is ignored)."""
-        if key.number <= self.newest.number:
-            return False
-        signs_from = now + limits.KEY_SPREAD
-        for term in self._terms.values():
-            term.verifies_until = min(term.verifies_until, signs_from + limits.KEY_OVERLAP)
-        self._keys.append(key)
-        self._terms[key.number] = _Term(signs_from)
+    def take(self, keys: Iterable[GroupKey], now: float, *, proves_from: int = 0, age: float = 0.0) -> None:
+        """Take in the keys that are newer than all others; the others are ignored.
+
+        Args:
+            keys: A list of the authority.
+            now: Monotonic seconds.
+            proves_from: The number of the key that the last revocation made: older ones only recognise.
+            age: Seconds since the newest of them was made.
+        """
+        for key in sorted(keys, key=lambda key: key.number):
+            if key.number <= self.newest.number:
+                continue
+            signs_from = now if key.number <= proves_from else now - age + limits.KEY_SPREAD
+            for number, term in self._terms.items():
+                until = _NEVER if number < proves_from else signs_from + limits.KEY_OVERLAP
+                term.verifies_until = min(term.verifies_until, until)
+            self._keys.append(key)
+            self._terms[key.number] = _Term(signs_from)
         for old in self._keys[: -limits.KEYS_MAX]:
             del self._terms[old.number]
         del self._keys[: -limits.KEYS_MAX]
-        return True
 
     def signing(self, now: float) -> GroupKey:
         """The key that signs at ``now``."""

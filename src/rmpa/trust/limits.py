@@ -43,14 +43,16 @@ KEYS_MAX: Final = 8
 """Group keys that are known: the one that signs, the next, and older ones, with which a module that was away is
 recognised."""
 KEY_SPREAD: Final = 30.0
-"""A new group key signs this long after it was made; by then it has reached every linked module."""
+"""A new group key signs this long after it was made; by then it has reached every linked module. One that a
+revocation made signs at once."""
 KEY_OVERLAP: Final = 3600.0
-"""The group key before verifies for this long after the next one began to sign."""
+"""The group key before verifies for this long after the next one began to sign, unless a revocation made that one."""
 OLD_KEYS_MAX: Final = 256
 """Addresses, and runs, of modules with an older group key that are remembered; beyond it they are forgotten, and
 heard again."""
-OLD_KEY_PACKETS_RATE: Final = 5.0
-"""Packets a second with an older group key that are accepted, over all senders: each leads to one dial, 3 ms."""
+OLD_KEY_PACKETS_RATE: Final = 50.0
+"""Packets a second with an older group key that are read, over all senders: each leads to one packet as an answer,
+0.2 ms in all."""
 
 # --- connections ------------------------------------------------------------------------------------------------
 PREFACE_NONCE_BYTES: Final = 16
@@ -59,14 +61,16 @@ NONCE_KEPT: Final = 2 * CLOCK_TOLERANCE
 """The nonce of a preface is remembered this long: from a clock that is as far ahead as is allowed to one that is as
 far behind."""
 NONCES_MAX: Final = 4096
-"""Nonces that are remembered: 68 handshakes a second for a minute, 512 members that dial twice and again. Beyond it
-prefaces are refused; only members and holders of tokens come so far."""
+"""Nonces that are remembered of members, of modules with an older group key, and of holders of tokens, each: 68
+handshakes a second for a minute, 512 members that dial twice and again. Beyond it prefaces of that kind are
+refused."""
 NONCES_PER_ADDRESS: Final = 512
 """Nonces of one address that are remembered, an eighth of all: one member cannot keep the others from linking. A
 machine with 128 modules, each of which dials both lanes twice in a minute, needs as many."""
 OLD_KEY_DIALS_RATE: Final = 50.0
-"""Connections a second with an older group key that may begin TLS, over all addresses: 15 % of a core. Those of one
-address: ``OLD_KEY_PACKETS_RATE``."""
+"""Connections a second with an older group key that may begin TLS, over all addresses: 15 % of a core."""
+OLD_KEY_DIALS_PER_ADDRESS: Final = 5.0
+"""Such connections a second of one address: both lanes of a module that was away, twice."""
 
 # --- joining ----------------------------------------------------------------------------------------------------
 TOKEN_SECRET_BYTES: Final = 16

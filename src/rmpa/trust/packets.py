@@ -48,7 +48,7 @@ class Verdict(StrEnum):
     ACCEPTED = "accepted"
     """A member sent it, just now."""
     OLD_KEY = "old_key"
-    """A module with an older group key sent it: it was away, and may be dialled, nothing more."""
+    """A module with an older group key sent it: it was away, or revoked. It is told where this one is."""
     UNTAGGED = "untagged"
     """It has no trailer that this version knows."""
     UNKNOWN_KEY = "unknown_key"
@@ -79,7 +79,7 @@ class Verification:
     """The result for one packet.
 
     Args:
-        verdict: Only of an accepted packet (or one with an older key) anything may be used.
+        verdict: Only of an accepted packet anything may be used.
         size: Bytes of the packet without its trailer.
         key: The low 16 bits of the number of its group key, if its tag is right.
         skew: By how many seconds the sender's clock is ahead of ours; 0 if either is not set.
@@ -102,7 +102,7 @@ class PacketSigner:
         self._ring = ring
         self._number = 0
 
-    def sign(self, packet: bytes, purpose: KeyPurpose, now: float, wall: float | None) -> bytes:
+    def sign(self, packet: bytes, purpose: KeyPurpose, now: float, wall: float | None, *, key: int = 0) -> bytes:
         """The packet with its trailer.
 
         Args:
@@ -110,12 +110,13 @@ class PacketSigner:
             purpose: What kind of packet it is.
             now: Monotonic seconds.
             wall: Seconds since 1970; ``None`` if this machine's clock is not set.
+            key: The key for a module that has only an older one: the low 16 bits of its number; 0: the present key.
         """
-        key = self._ring.signing(now)
+        signing = (self._ring.find(key) if key else None) or self._ring.signing(now)
         self._number += 1
         flags, time = (0, 0) if wall is None else (CLOCK_SET, int(wall) & _TIME_MASK)
-        body = packet + _HEAD.pack(FORMAT, flags, key.short, self._number, time)
-        return body + hmac.digest(key.key_for(purpose), body, hashlib.sha256)[:_TAG]
+        body = packet + _HEAD.pack(FORMAT, flags, signing.short, self._number, time)
+        return body + hmac.digest(signing.key_for(purpose), body, hashlib.sha256)[:_TAG]
 
 
 class PacketVerifier:
@@ -183,14 +184,3 @@ class PacketTrust:
     signer: PacketSigner
     verifier: PacketVerifier
     wall: Callable[[], float | None]
-    old_keys: dict[str, int] = field(default_factory=dict)
-    """By address: the group key of a module that was away, so that it is dialled with one that it knows."""
-
-    def heard(self, host: str, found: Verification) -> None:
-        """Remember which key the sender of a usable packet has."""
-        if found.verdict is Verdict.OLD_KEY:
-            if len(self.old_keys) >= limits.OLD_KEYS_MAX:
-                self.old_keys.clear()
-            self.old_keys[host] = found.key
-        elif self.old_keys:
-            self.old_keys.pop(host, None)

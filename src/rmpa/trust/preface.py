@@ -136,6 +136,37 @@ def _tag(key: bytes, head: bytes) -> bytes:
     return hmac.digest(key, head, hashlib.sha256)[: limits.TAG_BYTES]
 
 
+class _Nonces:
+    """The nonces of one kind of dialler: those of another kind cannot use up its places."""
+
+    def __init__(self) -> None:
+        self._seen: set[bytes] = set()
+        self._there: Counter[str] = Counter()
+        self._order: deque[tuple[float, bytes, str]] = deque()
+
+    def __len__(self) -> int:
+        return len(self._seen)
+
+    def check(self, nonce: bytes, now: float, host: str) -> None:
+        """Raise ``PrefaceError`` if a nonce came before, or there is no place for it."""
+        while self._order and self._order[0][0] <= now:
+            _, old, there = self._order.popleft()
+            self._seen.discard(old)
+            self._there[there] -= 1
+            if not self._there[there]:
+                del self._there[there]
+        if nonce in self._seen:
+            raise PrefaceError(TrustReason.FLOOD, "the same preface came before")
+        if len(self._seen) >= limits.NONCES_MAX or self._there[host] >= limits.NONCES_PER_ADDRESS:
+            raise PrefaceError(TrustReason.FLOOD, "too many handshakes at present")
+
+    def keep(self, nonce: bytes, now: float, host: str) -> None:
+        """Remember a nonce that was checked."""
+        self._seen.add(nonce)
+        self._there[host] += 1
+        self._order.append((now + limits.NONCE_KEPT, nonce, host))
+
+
 class PrefaceGuard:
     """Decides which accepted connections may begin a TLS handshake.
 
@@ -147,14 +178,12 @@ class PrefaceGuard:
     def __init__(self, ring: KeyRing, token_key: Callable[[bytes], bytes | None] = lambda _: None) -> None:
         self._ring = ring
         self._token_key = token_key
-        self._nonces: set[bytes] = set()
-        self._nonces_there: Counter[str] = Counter()
-        self._order: deque[tuple[float, bytes, str]] = deque()
+        self._members, self._recognised, self._invited = _Nonces(), _Nonces(), _Nonces()
         self._old_keys = TokenBucket(limits.OLD_KEY_DIALS_RATE, limits.OLD_KEY_DIALS_RATE)
         self._old_keys_there: OrderedDict[str, TokenBucket] = OrderedDict()
 
-    def admit(self, data: Buffer, now: float, wall: float | None, host: str = "") -> Preface:
-        """The preface of a connection that may go on.
+    def admit(self, data: Buffer, now: float, wall: float | None, host: str = "") -> tuple[Preface, bool]:
+        """The preface of a connection that may go on, and whether it shows a group key that only recognises.
 
         Args:
             data: Its first bytes, ``PREFACE_BYTES`` or more.
@@ -174,13 +203,13 @@ class PrefaceGuard:
                 raise PrefaceError(
                     TrustReason.CLOCK, f"the dialler's clock is {abs(skew):.0f} s {ahead} the acceptor's"
                 )
-        self._check_nonce(preface.nonce, now, host)
+        join = preface.purpose is Purpose.JOIN
+        nonces = self._invited if join else self._recognised if old else self._members
+        nonces.check(preface.nonce, now, host)
         if old and not self._take_old(host, now):
             raise PrefaceError(TrustReason.FLOOD, "too many connections with an old group key")
-        self._nonces.add(preface.nonce)
-        self._nonces_there[host] += 1
-        self._order.append((now + limits.NONCE_KEPT, preface.nonce, host))
-        return preface
+        nonces.keep(preface.nonce, now, host)
+        return preface, old
 
     def _check_tag(self, preface: Preface, data: Buffer, now: float) -> bool:
         """Check the tag, and return whether it is of a group key that only recognises."""
@@ -200,21 +229,9 @@ class PrefaceGuard:
         """Whether one more connection with an old group key is within the rates of its address and of all."""
         there = self._old_keys_there.get(host)
         if there is None:
-            there = TokenBucket(limits.OLD_KEY_PACKETS_RATE, limits.OLD_KEY_PACKETS_RATE)
+            there = TokenBucket(limits.OLD_KEY_DIALS_PER_ADDRESS, limits.OLD_KEY_DIALS_PER_ADDRESS)
             self._old_keys_there[host] = there
             if len(self._old_keys_there) > limits.OLD_KEYS_MAX:
                 self._old_keys_there.popitem(last=False)
         self._old_keys_there.move_to_end(host)
         return there.take(now) and self._old_keys.take(now)
-
-    def _check_nonce(self, nonce: bytes, now: float, host: str) -> None:
-        while self._order and self._order[0][0] <= now:
-            _, old, there = self._order.popleft()
-            self._nonces.discard(old)
-            self._nonces_there[there] -= 1
-            if not self._nonces_there[there]:
-                del self._nonces_there[there]
-        if nonce in self._nonces:
-            raise PrefaceError(TrustReason.FLOOD, "the same preface came before")
-        if len(self._nonces) >= limits.NONCES_MAX or self._nonces_there[host] >= limits.NONCES_PER_ADDRESS:
-            raise PrefaceError(TrustReason.FLOOD, "too many handshakes at present")

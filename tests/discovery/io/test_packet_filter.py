@@ -10,8 +10,9 @@ from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
-from rmpa.discovery.io.packet_filter import PacketFilter
+from rmpa.discovery.io.packet_filter import PacketFilter, Recognised
 from rmpa.discovery.swim.packets import SwimKind, SwimPacket
+from rmpa.trust import limits as trust_limits
 from rmpa.trust.keyring import GroupKey, KeyPurpose, KeyRing
 from rmpa.trust.packets import PacketSigner, PacketTrust, PacketVerifier
 
@@ -167,6 +168,27 @@ def test_a_secured_mesh_hears_nothing_else() -> None:
         assert not door.hears(data)
         assert door.counters[f"beacon.{reason}"] == 1
     assert door.counters["beacon.in"] == 0
+
+
+def test_a_module_with_an_older_group_key_is_recognised_and_counts_for_no_limit() -> None:
+    """It was away, or it was revoked; it sends more than a member may, from a member's address."""
+    ring = KeyRing([GroupKey(1, b"k" * 32), GroupKey(2, b"n" * 32)], 0.0)
+    counters = Counters()
+    door = PacketFilter(0, counters, trust=PacketTrust(PacketSigner(ring), PacketVerifier(ring), lambda: WALL))
+    old, member = PacketSigner(KeyRing([GroupKey(1, b"k" * 32)], 0.0)), PacketSigner(ring)
+
+    def found(signer: PacketSigner, number: int, now: float) -> object:
+        beacon = Beacon(BeaconKind.HEARTBEAT, FRIEND, 16_000, number).serialize(extended=True)
+        data = signer.sign(beacon, KeyPurpose.BEACON, now, WALL)
+        return door.parse(data, ("10.0.0.2", 4000), now, multicast=True, interface=1)
+
+    recognised = [found(old, n, 10.0 + n / 1000) for n in range(1, 1000)]
+    beacons = {type(each) for each in recognised}
+    assert beacons == {Recognised, type(None)}
+    assert sum(each is not None for each in recognised) < 2 * trust_limits.OLD_KEY_PACKETS_RATE
+    assert isinstance(found(member, 7, 11.0), Beacon)
+    assert counters["beacon.in"] == 1
+    assert counters["beacon.flood"] == counters["beacon.unlinked_limited"] == 0
 
 
 def test_packets_of_the_failure_detector_have_a_key_of_their_own() -> None:

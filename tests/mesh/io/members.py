@@ -68,12 +68,9 @@ class Member:
     def wall(self) -> float | None:
         return time.time() + self.ahead
 
-    def preface(self, purpose: Purpose, host: str = "") -> bytes:
+    def preface(self, purpose: Purpose) -> bytes:
         preface = Preface(purpose, self.group_key.short, int((time.time() + self.ahead) * 1000), os.urandom(16))
         return preface.serialize(self.group_key.key_for(KeyPurpose.PREFACE))
-
-    def dial_failed(self, host: str) -> None:
-        pass
 
     def judge_member(self, certificate: Mapping[str, Any] | bytes, claimed: str | None) -> None:
         assert not isinstance(certificate, bytes)

@@ -88,7 +88,7 @@ class Lab:
         while len(preface) < PREFACE_BYTES:
             preface += await asyncio.get_running_loop().sock_recv(sock, PREFACE_BYTES - len(preface))
         try:
-            found = self.base.guard.admit(preface, self.clock.now(), self.base.wall())
+            found, _ = self.base.guard.admit(preface, self.clock.now(), self.base.wall())
         except PrefaceError as error:
             sock.sendall(b"plain " + str(error).encode())
             sock.close()

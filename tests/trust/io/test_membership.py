@@ -16,8 +16,8 @@ from rmpa.trust.documents import DenyList, DocumentError, DocumentKind, KeyList,
 from rmpa.trust.io import store as files_of
 from rmpa.trust.io.membership import Membership
 from rmpa.trust.keyring import GroupKey, KeyPurpose
-from rmpa.trust.packets import Verdict, Verification
-from rmpa.trust.preface import Preface, PrefaceError, Purpose
+from rmpa.trust.packets import Verdict
+from rmpa.trust.preface import PrefaceError, Purpose
 from rmpa.trust.reasons import TrustError, TrustReason
 from tests.trust.authority import WALL
 from tests.trust.io.member_files import KEYS, SecuredMesh
@@ -100,32 +100,12 @@ def test_a_clock_is_set_if_it_is_behind_the_begin_of_the_own_certificate(mesh: S
     mesh.clock.wall_seconds = begin - 1
     assert base.wall() is None
     base.judge_member(mesh.authority.module("arm", WALL - 30 * DAY), "arm")  # its time cannot be judged
-    assert Purpose.LINK is base.guard.admit(base.preface(Purpose.LINK), 1.0, WALL + DAY).purpose
+    assert Purpose.LINK is base.guard.admit(base.preface(Purpose.LINK), 1.0, WALL + DAY)[0].purpose
     mesh.clock.wall_seconds = begin + 1
     assert base.wall() == begin + 1
     assert reason_of(base, mesh.authority.module("arm", WALL - 30 * DAY), "arm") is TrustReason.EXPIRED
     with pytest.raises(PrefaceError, match="behind the acceptor's"):
         base.guard.admit(base.preface(Purpose.LINK), 1.0, WALL + DAY)
-
-
-def test_a_beacon_with_an_old_key_does_not_decide_the_key_of_every_dial(mesh: SecuredMesh) -> None:
-    """A revoked module can send such beacons from the address of a member, again and again."""
-    base = mesh.member("base")
-    old, newer, host = base.ring.newest.short, GroupKey(base.ring.newest.number + 1, b"n" * 32), "10.0.0.2"
-    base.ring.add(newer, -2 * limits.KEY_OVERLAP)
-    base.packets.heard(host, Verification(Verdict.OLD_KEY, key=old))
-
-    def keys(failures: int) -> list[int]:
-        found = []
-        for _ in range(failures):
-            base.packets.heard(host, Verification(Verdict.OLD_KEY, key=old))
-            found.append(Preface.parse(base.preface(Purpose.LINK, host)).key)
-            base.dial_failed(host)
-        return found
-
-    assert keys(4) == [old, newer.short] * 2
-    base.dial_failed("10.0.0.3")
-    assert Preface.parse(base.preface(Purpose.LINK, "10.0.0.3")).key == newer.short
 
 
 def test_a_newer_deny_list_holds_at_once_and_after_a_restart(mesh: SecuredMesh) -> None:
@@ -169,6 +149,41 @@ def test_a_new_group_key_is_taken_without_a_pause(mesh: SecuredMesh) -> None:
     assert arm.accept_document(DocumentKind.KEYS, data)
     assert heard_by_arm() is Verdict.ACCEPTED
     assert Membership.load(arm.store, mesh.clock, mesh.clock.wall).ring.newest.number == 2
+
+
+def test_a_member_that_restarts_during_a_rotation_goes_on_as_the_others(mesh: SecuredMesh) -> None:
+    """The others sign with the key before for half a minute, and some have not heard of the new one."""
+    base, arm = mesh.member("base"), mesh.member("arm")
+    rotated = KeyList.of(2, [*KEYS.group_keys, GroupKey(2, b"n" * 32)], made=int(WALL))
+    assert base.accept_document(DocumentKind.KEYS, sign(rotated, mesh.authority.key))
+    mesh.clock.seconds += 10
+    mesh.clock.wall_seconds = WALL + 10
+    again = Membership.load(base.store, mesh.clock, mesh.clock.wall)
+
+    def heard(sender: Membership, receiver: Membership) -> Verdict:
+        now, wall = mesh.clock.now(), mesh.clock.wall()
+        packet = sender.packets.signer.sign(PACKET, KeyPurpose.BEACON, now, wall)
+        return receiver.packets.verifier.verify(packet, KeyPurpose.BEACON, (0, 8), now, wall).verdict
+
+    assert heard(again, arm) is heard(arm, again) is Verdict.ACCEPTED
+    mesh.clock.seconds += 21
+    assert again.ring.signing(mesh.clock.now()).number == 2
+    assert heard(arm, again) is Verdict.ACCEPTED
+
+
+def test_after_a_revocation_the_key_before_recognises_alone_also_after_a_restart(mesh: SecuredMesh) -> None:
+    base, revoked = mesh.member("base"), mesh.member("eve")
+    keys = [*KEYS.group_keys, GroupKey(2, b"n" * 32)]
+    for number, made in enumerate((keys, [*keys, GroupKey(3, b"o" * 32)]), 2):  # a rotation of the usual kind follows
+        listed = KeyList.of(number, made, proves_from=2, made=int(WALL))
+        assert base.accept_document(DocumentKind.KEYS, sign(listed, mesh.authority.key))
+        for member in (base, Membership.load(base.store, mesh.clock, mesh.clock.wall)):
+            now = mesh.clock.now()
+            packet = revoked.packets.signer.sign(PACKET, KeyPurpose.BEACON, now, WALL)
+            heard = member.packets.verifier.verify(packet, KeyPurpose.BEACON, (0, 8), now, WALL)
+            assert heard.verdict is Verdict.OLD_KEY
+            assert member.guard.admit(revoked.preface(Purpose.LINK), now, WALL)[1]
+            assert member.ring.signing(now).number == 2, "a key of a revocation signs at once"
 
 
 def test_a_renewed_certificate_is_used_and_kept(mesh: SecuredMesh) -> None:

@@ -24,7 +24,7 @@ from rmpa.discovery.io.interfaces import (
     unknown_names,
 )
 from rmpa.discovery.io.kernel_filter import PacketSelection
-from rmpa.discovery.io.packet_filter import PacketFilter
+from rmpa.discovery.io.packet_filter import PacketFilter, Recognised
 from rmpa.discovery.io.seeds import SeedResolver, resolve_ipv4
 from rmpa.discovery.member_watch import MemberWatch
 from rmpa.discovery.membership import MembershipProtocol
@@ -303,6 +303,8 @@ class Discovery:
                 _log.debug("< %s:%d (interface %d): %s", *source, index, packet)
                 if isinstance(packet, Beacon):
                     self._membership.receive(packet, source, now, multicast=multicast)
+                elif isinstance(packet, Recognised):
+                    self._membership.recognise(packet.beacon, source, packet.key)
                 else:
                     self._detector.receive(packet, source, now)
             elif self._filter.overrun:
@@ -431,13 +433,12 @@ class Discovery:
     def _send(self, outputs: list[Output]) -> None:
         for output in outputs:
             yield_to_data()
-            data = self._packet(output.beacon)
             if isinstance(output, SendMulticast):
                 _log.debug("> group: %s", output.beacon)
-                self._sender.multicast(data, self._interfaces)
+                self._sender.multicast(self._packet(output.beacon), self._interfaces)
             else:
                 _log.debug("> %s:%d: %s", *output.address, output.beacon)
-                self._sender.unicast(data, output.address)
+                self._sender.unicast(self._packet(output.beacon, output.key), output.address)
 
     def _send_packets(self, outputs: list[SendSwim]) -> None:
         trust = self._trust
@@ -449,13 +450,13 @@ class Discovery:
             _log.debug("> %s:%d: %s", *output.address, output.packet)
             self._sender.unicast(data, output.address, count="swim.out")
 
-    def _packet(self, beacon: Beacon) -> bytes:
-        """The bytes of a beacon, signed in a secured mesh."""
+    def _packet(self, beacon: Beacon, key: int = 0) -> bytes:
+        """The bytes of a beacon, signed in a secured mesh; ``key`` as for ``SendUnicast``."""
         trust = self._trust
         if trust is None:
             return beacon.serialize()
         packet = beacon.serialize(extended=True)
-        return trust.signer.sign(packet, KeyPurpose.BEACON, self._clock.now(), trust.wall())
+        return trust.signer.sign(packet, KeyPurpose.BEACON, self._clock.now(), trust.wall(), key=key)
 
     def _deliver(self, event: Event) -> None:
         if isinstance(event, PeerConflict):

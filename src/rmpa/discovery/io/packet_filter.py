@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import OrderedDict
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.counters import RefusalLog
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _INTERFACES: Final = 256
-_USABLE: Final = frozenset({Verdict.ACCEPTED, Verdict.OLD_KEY})
 _NOT_JOINED: Final = "it has not joined this mesh: rmpa trust invite at the authority, rmpa trust join there"
 _REFUSED: Final = {
     Verdict.UNTAGGED: f"sends beacons without a proof; {_NOT_JOINED}",
@@ -35,6 +35,19 @@ _REFUSED: Final = {
     Verdict.FORGED: "sends beacons with a wrong proof: it is of another mesh, or they are forged",
 }
 """What is logged of packets that are refused; repeats are only counted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recognised:
+    """A beacon whose sender has only an older group key: nothing in it is proved.
+
+    Args:
+        beacon: What it says.
+        key: The low 16 bits of the key's number.
+    """
+
+    beacon: Beacon
+    key: int
 
 
 class PacketFilter:
@@ -76,7 +89,7 @@ class PacketFilter:
 
     def parse(
         self, data: bytes, source: Address, now: float, *, multicast: bool, interface: int = 0
-    ) -> Beacon | SwimPacket | None:
+    ) -> Beacon | SwimPacket | Recognised | None:
         """What a packet contains; ``None`` if it is dropped, which is counted and, where it helps, logged.
 
         Other domains have other ports, so their multicasts are ignored silently. A unicast of another domain is
@@ -91,8 +104,10 @@ class PacketFilter:
         """
         host, _ = source
         # First, where there is a proof: packets with the forged source of a member must not count as its flood.
-        if self._trust is not None and not self._is_proved(self._trust, data, host, now):
-            return None
+        if self._trust is not None:
+            proof = self._verify(self._trust, data, host, now)
+            if proof is None or proof.verdict is Verdict.OLD_KEY:
+                return self._recognise(data, proof.key) if proof is not None else None
         if self._is_flood(host, now):
             self._refusals.refuse(
                 now, "beacon.flood", host, f"{host} sends too many packets to the discovery port; the rest is ignored"
@@ -100,11 +115,16 @@ class PacketFilter:
             return None
         if self._trust is None and not self._is_new(data):
             return None
-        if (beacon := self._heartbeats.find(data)) is not None and self._is_verified(
-            beacon.identity.guid, beacon.identity.instance
-        ):
+        beacon = self._heartbeats.find(data)
+        if beacon is not None and self._is_verified(beacon.identity.guid, beacon.identity.instance):
             self._counters.add("beacon.in")
             return beacon
+        return self._read(data, host, now, multicast=multicast, interface=interface)
+
+    def _read(
+        self, data: bytes, host: str, now: float, *, multicast: bool, interface: int
+    ) -> Beacon | SwimPacket | None:
+        """Parse a packet within the limits of its sender."""
         swim = is_swim(data)
         name = "swim" if swim else "beacon"
         try:
@@ -140,31 +160,37 @@ class PacketFilter:
                 self._recent.popitem(last=False)
         return True
 
-    def _is_proved(self, trust: PacketTrust, data: bytes, host: str, now: float) -> bool:
-        """Whether a member of the secured mesh sent a packet, just now and for the first time.
+    def _verify(self, trust: PacketTrust, data: bytes, host: str, now: float) -> Verification | None:
+        """The proof of a packet that a member of the secured mesh sent just now, or a module that was one.
 
         Nothing is remembered of other packets, so that forged ones cannot push out what is remembered of real ones.
         """
         if len(data) > limits.BEACON_MAX_BYTES:
             self._counters.add("beacon.malformed")
-            return False
+            return None
         swim = is_swim(data)
         purpose = KeyPurpose.SWIM if swim else KeyPurpose.BEACON
         found = trust.verifier.verify(data, purpose, RUN_AT, now, trust.wall())
-        if swim and found.verdict is Verdict.OLD_KEY:
-            # A link with its sender is allowed; its news of other members is not believed.
-            self._counters.add("swim.old_key")
-            return False
-        if found.verdict in _USABLE:
-            trust.heard(host, found)
-            return True
+        if found.verdict is Verdict.OLD_KEY:
+            self._counters.add("swim.old_key" if swim else "beacon.old_key")
+            return None if swim else found
+        if found.verdict is Verdict.ACCEPTED:
+            return found
         self.overrun = not self._unproved.take(now)
         text = _refusal(found)
         if text:
             self._refusals.refuse(now, f"beacon.{found.verdict}", host, f"{host} {text}")
         else:
             self._counters.add(f"beacon.{found.verdict}")
-        return False
+        return None
+
+    def _recognise(self, data: bytes, key: int) -> Recognised | None:
+        """The beacon of a module with an older group key."""
+        try:
+            return Recognised(Beacon.parse(data, self._domain), key)
+        except RemoteProtocolError:
+            self._counters.add("beacon.malformed")
+            return None
 
     def _within_limits(self, interface: int, now: float, *, swim: bool, verified: bool) -> bool:
         """Whether one more packet may be read; one that may not is counted."""

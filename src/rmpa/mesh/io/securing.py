@@ -15,6 +15,7 @@ import ssl
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from rmpa.core.errors import RemoteProtocolError
@@ -100,12 +101,8 @@ class MeshSecurity(Protocol):
         """Seconds since 1970; ``None`` while the machine's clock is not set."""
         ...
 
-    def preface(self, purpose: Purpose, host: str = "") -> bytes:
-        """The first bytes of a connection that is dialled, to a module at this address."""
-        ...
-
-    def dial_failed(self, host: str) -> None:
-        """Note that the TLS handshake of a connection to this address failed, perhaps by the key of its preface."""
+    def preface(self, purpose: Purpose) -> bytes:
+        """The first bytes of a connection that is dialled."""
         ...
 
     def judge_member(self, certificate: Certificate | bytes, claimed: str | None) -> None:
@@ -200,20 +197,15 @@ async def secure_dialled(sock: socket.socket, security: MeshSecurity) -> Secured
     handshake = TlsHandshake(security.client_context, server_side=False)
     handshake.receive(b"")
     loop = asyncio.get_running_loop()
-    host = sock.getpeername()[0]
     try:
         async with asyncio.timeout(limits.SECURING_TIMEOUT):
-            preface = security.preface(Purpose.LINK, host)
-            await loop.sock_sendall(sock, preface + handshake.take_output())
+            await loop.sock_sendall(sock, security.preface(Purpose.LINK) + handshake.take_output())
             first = await _received(sock)
             if first[0] not in _TLS_RECORDS:
                 raise await _plain_refusal(sock, first)
             await _shake(sock, handshake, first)
-    except OSError as error:
-        security.dial_failed(host)
-        if isinstance(error, TimeoutError):
-            raise TimeoutError(f"no end of the TLS handshake within {limits.SECURING_TIMEOUT:g} s") from None
-        raise
+    except TimeoutError:
+        raise TimeoutError(f"no end of the TLS handshake within {limits.SECURING_TIMEOUT:g} s") from None
     return _secured(sock, handshake)
 
 
@@ -323,6 +315,8 @@ class Securing:
         """By file descriptor, the oldest first."""
         self._unproven_there: Counter[str] = Counter()
         self._handshakes: dict[asyncio.Task[None], str] = {}
+        self._recognised: dict[asyncio.Task[None], str] = {}
+        """Those of modules with an older group key, among which a module that was revoked may be."""
         self._answers = TokenBucket(limits.PLAIN_ANSWERS_RATE, limits.PLAIN_ANSWERS_RATE)
         self._timer: asyncio.TimerHandle | None = None
 
@@ -348,7 +342,7 @@ class Securing:
         for one in list(self._unproven.values()):
             self._forget(one)
             one.sock.close()
-        tasks = list(self._handshakes)
+        tasks = [*self._handshakes, *self._recognised]
         for task in tasks:
             task.cancel()
         return tasks
@@ -411,7 +405,7 @@ class Securing:
     def _judge(self, one: _Unproven) -> None:
         host = one.address[0]
         try:
-            preface = self._security.guard.admit(one.data, self._clock.now(), self._security.wall(), host)
+            preface, old = self._security.guard.admit(one.data, self._clock.now(), self._security.wall(), host)
         except PrefaceError as error:
             self._refuse(one.sock, host, refusal(error.reason, str(error)))
             return
@@ -421,13 +415,14 @@ class Securing:
             else:
                 self._on_join(one.sock, preface)
             return
-        there = sum(address == host for address in self._handshakes.values())
-        if len(self._handshakes) >= limits.PENDING_CONNECTIONS_MAX or there >= limits.HANDSHAKES_PER_ADDRESS:
+        handshakes = self._recognised if old else self._handshakes
+        there = sum(address == host for address in handshakes.values())
+        if len(handshakes) >= limits.PENDING_CONNECTIONS_MAX or there >= limits.HANDSHAKES_PER_ADDRESS:
             self._refuse(one.sock, host, refusal(TrustReason.FLOOD, "too many TLS handshakes at present"))
             return
         task = asyncio.get_running_loop().create_task(self._secure(one), name=f"secure {host}")
-        self._handshakes[task] = host
-        task.add_done_callback(self._handshake_ended)
+        handshakes[task] = host
+        task.add_done_callback(partial(_handshake_ended, handshakes))
         # A task that is cancelled before it begins runs no ``finally``.
         task.add_done_callback(lambda done: one.sock.close() if done.cancelled() else None)
 
@@ -470,7 +465,9 @@ class Securing:
         try:
             async with asyncio.timeout(limits.SECURING_TIMEOUT):
                 await _shake(sock, handshake)
-            secured = _secured(sock, handshake)
+            proved = _secured(sock, handshake)
+            self._judge_certificate(proved)
+            secured = proved
         except SecuringError as error:
             text = f"{'refused a link with' if error.by_us else 'no link with'} {host}: {error}"
             self._refusals.refuse(self._clock.now(), f"link.refused.{error.refuse.label}", host, text)
@@ -485,10 +482,21 @@ class Securing:
         if secured is not None:
             self._on_secured(sock, one.address, secured)
 
-    def _handshake_ended(self, task: asyncio.Task[None]) -> None:
-        del self._handshakes[task]
-        if not task.cancelled() and (error := task.exception()) is not None:
-            _log.error("! %s failed", task.get_name(), exc_info=error)
+    def _judge_certificate(self, proved: SecuredSocket) -> None:
+        """Refuse a revoked module before its hello, which it could hold back: none waits in a place of a member."""
+        try:
+            self._security.judge_member(proved.certificate, None)
+        except TrustError as error:
+            refuse = refusal(error.reason, str(error))
+            with contextlib.suppress(OSError):
+                proved.socket.sendmsg([Frame(FrameKind.REFUSE, refuse.serialize()).serialize()])
+            raise SecuringError(refuse, by_us=True) from None
+
+
+def _handshake_ended(handshakes: dict[asyncio.Task[None], str], task: asyncio.Task[None]) -> None:
+    del handshakes[task]
+    if not task.cancelled() and (error := task.exception()) is not None:
+        _log.error("! %s failed", task.get_name(), exc_info=error)
 
 
 async def _linger(sock: socket.socket) -> None:

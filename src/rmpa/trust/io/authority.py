@@ -267,7 +267,7 @@ class MeshAuthority:
         deny = self._membership.deny.with_name(name, max(self.wall(), last.issued if last is not None else 0.0))
         self._membership.accept_document(DocumentKind.DENY, sign(deny, self._ca_key))
         self._issued.pop(name, None)
-        self.rotate()  # before files are written: a full disk must not leave the old key in use
+        self.rotate(revoking=True)  # before files are written: a full disk must not leave the old key in use
         for call in tuple(self.on_revoked):
             call(name)
         unused = [each for each in self.book.invitations if not each.used_by]
@@ -283,13 +283,23 @@ class MeshAuthority:
             _log.error("! %s is revoked, but not all files are written: %s", name, error)
         return deny
 
-    def rotate(self) -> int:
-        """Make a new group key, which signs ``limits.KEY_SPREAD`` later; return its number."""
-        ring = self._membership.ring
+    def rotate(self, *, revoking: bool = False) -> int:
+        """Make a new group key; return its number.
+
+        Args:
+            revoking: Whether a module that has the keys before was revoked: from now on they only recognise.
+        """
+        member = self._membership
+        ring, wall = member.ring, member.wall()
         key = GroupKey(ring.newest.number + 1, os.urandom(limits.GROUP_KEY_BYTES))
-        number = self._membership.numbers[DocumentKind.KEYS] + 1
-        keys = KeyList.of(number, [*ring.keys, key][-limits.KEYS_MAX :], self._membership.name)
-        self._membership.accept_document(DocumentKind.KEYS, sign(keys, self._ca_key))
+        keys = KeyList.of(
+            member.numbers[DocumentKind.KEYS] + 1,
+            [*ring.keys, key][-limits.KEYS_MAX :],
+            member.name,
+            proves_from=key.number if revoking else member.proves_from,
+            made=0 if wall is None else int(wall),
+        )
+        member.accept_document(DocumentKind.KEYS, sign(keys, self._ca_key))
         return key.number
 
 

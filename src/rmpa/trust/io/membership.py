@@ -60,7 +60,8 @@ class Membership:
             self._keys = read_key_list(files.keys, self._ca_key)
         with _named(store, files_of.DENY):
             self._deny = read_deny_list(files.deny, self._ca_key) if files.deny else DenyList()
-        self.ring = KeyRing(self._keys.group_keys, clock.now())
+        proves_from, age = self._keys.proves_from, self._age(self._keys, limits.KEY_SPREAD)
+        self.ring = KeyRing(self._keys.group_keys, clock.now(), proves_from=proves_from, age=age)
         self.tokens = TokenBook()
         """The open tokens; the authority puts its own here."""
         self.guard = PrefaceGuard(self.ring, self._token_key)
@@ -69,8 +70,6 @@ class Membership:
         """Called after a newer deny list holds: links that match end at once."""
         self.save: Callable[[str, bytes], None] = store.write
         """Writes one file of the store."""
-        self._old_failed: set[str] = set()
-        """Addresses that are dialled with the present group key next, though their beacons have an older one."""
         self._contexts: dict[tuple[bool, bool], ssl.SSLContext] = {}
         self._context(server_side=True)  # a key of another certificate is an error of the start
 
@@ -92,6 +91,11 @@ class Membership:
     def authority(self) -> str:
         """The name of the authority, as the signed list of group keys has it; empty: the list does not say."""
         return self._keys.authority
+
+    @property
+    def proves_from(self) -> int:
+        """The number of the group key that the last revocation made; older ones only recognise."""
+        return self._keys.proves_from
 
     @property
     def deny(self) -> DenyList:
@@ -126,32 +130,13 @@ class Membership:
         """For links that are dialled."""
         return self._context(server_side=False)
 
-    def preface(self, purpose: Purpose, host: str = "") -> bytes:
-        """The first bytes of a connection that is dialled, signed by the group key that signs now.
-
-        Args:
-            purpose: What the connection is for.
-            host: The address that is dialled. A module there whose beacons have an older key was away, and does not
-                know the present one: the connection is signed with the older key, and TLS proves the rest. If that
-                fails the present key is next, for anything with the older key can send beacons from that address.
-        """
+    def preface(self, purpose: Purpose) -> bytes:
+        """The first bytes of a connection that is dialled, signed by the group key that signs now."""
         key = self.ring.signing(self._clock.now())
-        old = self.packets.old_keys.get(host)
-        if old and host not in self._old_failed:
-            key = self.ring.find(old) or key
         wall = self.wall()
         nonce = os.urandom(limits.PREFACE_NONCE_BYTES)
         preface = Preface(purpose, key.short, 0 if wall is None else int(wall * 1000), nonce)
         return preface.serialize(key.key_for(KeyPurpose.PREFACE))
-
-    def dial_failed(self, host: str) -> None:
-        """Note that the TLS handshake with a module at this address failed: the other group key is next."""
-        if host in self._old_failed:
-            self._old_failed.discard(host)
-        elif host in self.packets.old_keys:
-            if len(self._old_failed) >= limits.OLD_KEYS_MAX:
-                self._old_failed.clear()
-            self._old_failed.add(host)
 
     def judge_member(self, certificate: Mapping[str, Any] | bytes, claimed: str | None) -> None:
         """Check the other end's certificate behind a TLS handshake, which has checked the chain.
@@ -189,8 +174,8 @@ class Membership:
     def accept_document(self, kind: DocumentKind, data: bytes) -> bool:
         """Take a signed document if it is newer than the one that holds; return whether it is.
 
-        A new group key signs ``limits.KEY_SPREAD`` later. A document that cannot be written holds all the same,
-        until the agent ends.
+        A new group key signs ``limits.KEY_SPREAD`` after it was made, or at once if a revocation made it. A document
+        that cannot be written holds all the same, until the agent ends.
 
         Raises:
             LimitExceeded: It is too long.
@@ -231,11 +216,15 @@ class Membership:
         return self.tokens.key_of(token_id)
 
     def _take_keys(self, keys: KeyList, data: bytes) -> None:
-        now = self._clock.now()
-        for key in sorted(keys.group_keys, key=lambda each: each.number):
-            self.ring.add(key, now)
+        age = self._age(keys, 0.0)
+        self.ring.take(keys.group_keys, self._clock.now(), proves_from=keys.proves_from, age=age)
         self._keys = keys
         self.files = replace(self.files, keys=data)
+
+    def _age(self, keys: KeyList, unknown: float) -> float:
+        """Seconds since the newest group key was made; ``unknown`` where a clock is not set."""
+        wall = self.wall()
+        return unknown if wall is None or not keys.made else max(0.0, wall - keys.made)
 
     def _write(self, name: str, data: bytes) -> None:
         try:
