@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 .DEFAULT_GOAL := venv
 # One apt at a time: a lock on this folder.
 APT := flock scripts
-.PHONY: packages checks venv demo demo-sites demo-kill demo-start test test-bare tests style format types imports reference fuzz soak soak-web soak-swim swim bench experiment wheel ros chromium clients clean
+.PHONY: packages checks venv demo demo-sites demo-kill demo-start test test-bare tests style format types imports reference fuzz soak soak-services soak-web soak-swim swim bench experiment wheel ros chromium clients clean
 
 $(STAMP): pyproject.toml constraints.txt scripts/bootstrap
 	scripts/bootstrap $(PYTHON) $(VENV)
@@ -74,6 +74,9 @@ fuzz: $(STAMP)  ## every fuzz target for longer: make fuzz [SECONDS=60]
 
 soak: $(STAMP) ros  ## disturb three modules for long and see that nothing leaks: make soak [SECONDS=600] [SEED=N]
 	$(BIN)/python -m tests.soak --seconds $(or $(SECONDS),600) $(if $(SEED),--seed $(SEED))
+
+soak-services: $(STAMP)  ## callers of a peer's services come and go at random; each must get an answer or an end: make soak-services [SECONDS=60] [SEED=N]
+	$(BIN)/python -m tests.agent.service_storm --seconds $(or $(SECONDS),60) $(if $(SEED),--seed $(SEED))
 
 soak-web: $(STAMP) chromium  ## modules, topics, clients and pages of rmpa web come and go for an hour; nothing may leak: make soak-web [SECONDS=3600] [SEED=N]
 	$(BIN)/python -m tests.soak.web --seconds $(or $(SECONDS),3600) $(if $(SEED),--seed $(SEED))

@@ -1,14 +1,17 @@
-"""The formats of log records: one line of text, or one JSON object a line. Rooms only use ``logging``."""
+"""The formats of log records: one line of text, or one JSON object a line; and failures that are only logged."""
 
 from __future__ import annotations
 
 import codecs
 import json
 import logging
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from _typeshed import SupportsWrite
 
 # Looked up at import: without a free file descriptor the codec's file could not be opened to log the shortage.
@@ -19,6 +22,23 @@ def room_of(logger: str) -> str:
     """The room that a logger belongs to: ``rmpa.mesh.io.mesh`` gives ``mesh``."""
     parts = logger.split(".")
     return parts[1] if parts[0] == "rmpa" and len(parts) > 1 else parts[0]
+
+
+@contextmanager
+def logged_failure(log: logging.Logger, text: str, *args: object) -> Iterator[None]:
+    """Log an exception of the block, and go on behind it.
+
+    For one of several that are called in turn: the failure of one must not keep the others from being called.
+
+    Args:
+        log: The caller's logger.
+        text: What failed, as a format of ``logging``.
+        args: For ``text``.
+    """
+    try:
+        yield
+    except Exception:
+        log.exception("! " + text, *args)  # noqa: G003 - the mark in front of the caller's own format
 
 
 def _one_line(text: str) -> str:

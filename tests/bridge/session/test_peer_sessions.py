@@ -20,7 +20,7 @@ from rmpa.trust.permissions import Permissions
 from tests.bridge.io.virtual import VirtualLoop, run
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine
+    from collections.abc import Callable, Coroutine, Sequence
 
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.wire.xmlrpc import RosReply
@@ -69,11 +69,13 @@ class Link:
 class Scene:
     """The sessions of one bridge with one part."""
 
-    def __init__(self, *outages: float) -> None:
+    def __init__(self, *outages: float, before: Sequence[Part] = ()) -> None:
         self.part = Keeper(*outages)
         nodes, receiver = SimpleNamespace(), SimpleNamespace(link_up=lambda *_: None, link_down=lambda _: None)
         self.gate = PermissionGate()
-        self.sessions = PeerSessions([self.part], cast("Any", nodes), cast("Any", receiver), self._killed, self.gate)
+        self.sessions = PeerSessions(
+            [*before, self.part], cast("Any", nodes), cast("Any", receiver), self._killed, self.gate
+        )
 
     async def _killed(self, *_: object) -> RosReply:
         raise NotImplementedError
@@ -112,6 +114,32 @@ def test_a_short_silence_goes_unnoticed() -> None:
         assert made.states() == [PeerState.LINKED]
 
     assert play(scene) == ["up 1", "down", "up 1"]
+
+
+class Broken(Part):
+    """A part that fails whatever it is told."""
+
+    def link_up(self, session: PeerSession) -> None:
+        raise ZeroDivisionError
+
+    link_down = gone = lane_lost = link_up
+
+    def grace_over(self, session: PeerSession) -> bool:
+        raise ZeroDivisionError
+
+
+def test_a_part_that_fails_does_not_keep_the_next_ones_from_being_told(caplog: pytest.LogCaptureFixture) -> None:
+    made: list[Scene] = []
+
+    async def main() -> None:
+        made.append(Scene(before=[Broken()]))
+        made[0].sessions.link_down(made[0].link())
+        await asyncio.sleep(GRACE * 2)
+        await made[0].sessions.close()
+
+    run(main(), VirtualLoop())
+    assert made[0].part.told == ["up 1", "down", "grace over", "gone"]
+    assert "Broken failed" in caplog.text
 
 
 def test_another_module_that_claims_a_run_does_not_get_its_session() -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import asyncio
 import socket
 import struct
 from dataclasses import replace
@@ -121,6 +122,17 @@ async def test_a_held_subscriber_that_does_not_fit_is_refused_and_reported(held:
     assert held.said == ["first", f"refused /wrong: {error}"]
     wrong.close()
     right.close()
+
+
+async def test_a_held_subscriber_that_has_just_left_costs_no_other_the_topic(held: Owner) -> None:
+    gone, stays = await held.subscriber(callerid="/gone", tcp_nodelay="1"), await held.subscriber()
+    stream = held.publication._held[0].stream
+    gone.close()
+    while not stream.closed:  # at once, before the publication is told of the end
+        await asyncio.sleep(0)
+    held.publication.describe(STRING)
+    assert (await stays.header())["type"] == "std_msgs/String"
+    stays.close()
 
 
 async def test_demand_ends_when_all_held_subscribers_are_refused(held: Owner) -> None:

@@ -146,6 +146,54 @@ async def test_a_request_that_came_before_the_description_waits_for_it(node: Sla
     assert asked == 1
 
 
+@pytest.mark.trap(23)
+async def test_callers_behind_probes_that_have_just_left_are_answered(
+    node: SlaveNode, caplog: pytest.LogCaptureFixture
+) -> None:
+    known: asyncio.Future[ServiceDescription | str] = asyncio.get_running_loop().create_future()
+
+    async def describe() -> ServiceDescription | str:
+        return await asyncio.shield(known)
+
+    endpoint = serve(node, add, describe, description=None)
+    probes = [await RawClient.call(node, probe="1") for _ in range(3)]
+    await until(lambda: endpoint.connections == 3)
+    caller = await RawClient.call(node)
+    await until(lambda: endpoint.connections == 4)
+    await caller.send(TWO)
+    for probe in probes:
+        probe.close()
+    known.set_result(ADD)  # the probes' ends are read in the turn of the loop before the one that opens them
+    assert (await caller.header())["type"] == ADD.type
+    assert await caller.reply() == FORTY_TWO
+    caller.close()
+    await until(lambda: not endpoint.connections)
+    assert not caplog.records
+
+
+async def test_callers_behind_one_that_fails_are_answered(node: SlaveNode, caplog: pytest.LogCaptureFixture) -> None:
+    known: asyncio.Future[ServiceDescription | str] = asyncio.get_running_loop().create_future()
+
+    async def describe() -> ServiceDescription | str:
+        return await asyncio.shield(known)
+
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError
+
+    endpoint = serve(node, add, describe, description=None, on_mismatch=broken)
+    other = await RawClient.call(node, md5sum="0" * 32)
+    await until(lambda: endpoint.connections == 1)
+    caller = await RawClient.call(node)
+    await until(lambda: endpoint.connections == 2)
+    await caller.send(TWO)
+    known.set_result(ADD)
+    await caller.header()
+    assert await caller.reply() == FORTY_TWO
+    assert "could not be answered" in caplog.text
+    other.close()
+    caller.close()
+
+
 async def test_a_refused_description_is_asked_for_again(node: SlaveNode) -> None:
     answers: list[ServiceDescription | str] = [ADD, "the peer is away"]
 

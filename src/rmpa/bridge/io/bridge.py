@@ -13,6 +13,7 @@ from rmpa.bridge.naming import Names
 from rmpa.bridge.permission_gate import PermissionGate
 from rmpa.bridge.policy import OWN_NODE, Policy
 from rmpa.bridge.relay import Relay
+from rmpa.bridge.session.part import guarded
 from rmpa.bridge.session.peer_rpc import PeerRpc
 from rmpa.bridge.session.peer_sessions import PeerSessions
 from rmpa.bridge.session.proxy_nodes import ProxyNodes
@@ -131,7 +132,8 @@ class Bridge:
         """Take new settings; unchanged sources and routes go on, changes follow in later turns of the loop."""
         self.gate.reload(settings.trust)
         for part in self._parts:
-            part.reload(settings)
+            with guarded(part):
+                part.reload(settings)
 
     async def start(self) -> None:
         """Start the agent's node, the parts and the following of the local graph."""
@@ -148,7 +150,8 @@ class Bridge:
             self._reconciler.cancel()
         await self.sessions.close()
         for part in reversed(self._parts):
-            await part.close()
+            with guarded(part):
+                await part.close()
         await self.proxy_nodes.close()
         await self.node.close()
 
@@ -182,7 +185,8 @@ class Bridge:
 
     def _graph_changed(self, change: GraphChange) -> None:
         for part in self._parts:
-            part.graph_changed(change)
+            with guarded(part):
+                part.graph_changed(change)
 
     def _param_update(self, key: str, _value: XmlRpcValue) -> bool:
         return sum(part.param_update(key) for part in self._parts) > 0  # a sum, because every part must be called
@@ -195,4 +199,5 @@ class Bridge:
         self.sessions.reconcile()
         for part in self._parts:
             yield_to_data()
-            part.reconcile()
+            with guarded(part):
+                part.reconcile()

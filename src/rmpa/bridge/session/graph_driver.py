@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections import OrderedDict, deque
 from itertools import islice
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
@@ -12,6 +13,7 @@ from rmpa.bridge.actions import Send, Warn
 from rmpa.bridge.catalogue.pacing import Pacing
 from rmpa.bridge.messages import decode, encode
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+from rmpa.core.log import logged_failure
 from rmpa.runtime.event_loop import yield_to_data
 from rmpa.runtime.machine_timer import MachineTimer
 
@@ -21,6 +23,8 @@ if TYPE_CHECKING:
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.bridge.session.peer_sessions import PeerSessions
     from rmpa.core.counters import RefusalLog
+
+_log = logging.getLogger(__name__)
 
 ActionT = TypeVar("ActionT")
 AdvertisementT = TypeVar("AdvertisementT")
@@ -176,6 +180,14 @@ class GraphDriver(Generic[ActionT, AdvertisementT]):
 
     def _scan(self) -> None:
         self._scan_handle = None
+        try:
+            self._do_slice()
+        except Exception:  # noqa: BLE001 - the rest must not wait for the next change
+            _log.exception("! a slice of work failed; the rest goes on")
+            if self._changed or self._advertisements or self._freeing:  # of which each slice takes some: it ends
+                self.schedule()
+
+    def _do_slice(self) -> None:
         self._look_at(self._next_names())
         told = self._exports.advertise(self._may_tell)
         self.act(told)
@@ -248,7 +260,9 @@ class GraphDriver(Generic[ActionT, AdvertisementT]):
         self._acting = True
         try:
             while self._actions:
-                self._carry_out(self._actions.popleft())
+                action = self._actions.popleft()
+                with logged_failure(_log, "%s failed; what follows goes on", action):
+                    self._carry_out(action)
                 yield_to_data()
         finally:
             self._acting = False

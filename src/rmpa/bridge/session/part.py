@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING
 
+from rmpa.core.log import logged_failure
+
 if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
     from rmpa.bridge.messages import Message
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.core.identity import Identity
     from rmpa.ros.master.effects import GraphChange
+
+_log = logging.getLogger(__name__)
 
 
 class Part:
@@ -114,3 +121,8 @@ class Part:
 
     def reconcile(self) -> None:
         """Compare the actual state with the planned one, and mend it; called each ``limits.RECONCILE_INTERVAL``."""
+
+
+def guarded(part: Part) -> AbstractContextManager[None]:
+    """Log a failure of one part; the next parts are called all the same."""
+    return logged_failure(_log, "%s failed; the other parts go on", type(part).__name__)

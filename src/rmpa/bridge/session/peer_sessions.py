@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.session.offer_versions import OfferVersions
+from rmpa.bridge.session.part import guarded
 from rmpa.bridge.session.peer_proxies import PeerProxies
 from rmpa.bridge.session.peer_session import PeerSession, PeerState
 from rmpa.bridge.session.proxy_namespaces import ProxyNamespaces
@@ -120,7 +121,8 @@ class PeerSessions:
         self.offers.link_up(session, compares=compares, held=held)
         self._receiver.link_up(link, session.peer, session.handlers)
         for part in self._parts:
-            part.link_up(session)
+            with guarded(part):
+                part.link_up(session)
         for waiting in self._reaching.pop(session.peer, ()):
             if not waiting.done():
                 waiting.set_result(None)
@@ -161,7 +163,8 @@ class PeerSessions:
         session.away_since = asyncio.get_running_loop().time()
         session.state = PeerState.PARKED if link.parked else PeerState.SILENT
         for part in self._parts:
-            part.link_down(session)
+            with guarded(part):
+                part.link_down(session)
         session.handlers.clear()
         if link.parked:
             self.offers.parked(session)
@@ -224,8 +227,11 @@ class PeerSessions:
         for waiting in self._reaching.pop(session.peer, ()):
             if not waiting.done():
                 waiting.set_exception(self._unreachable(session))
-        waits = [part.grace_over(session) for part in self._parts]
-        if any(waits):
+        waits = False
+        for part in self._parts:
+            with guarded(part):
+                waits |= part.grace_over(session)
+        if waits:
             self._outlasted(session, asyncio.get_running_loop().time())
         else:
             self._end(session)
@@ -233,7 +239,10 @@ class PeerSessions:
     def _outlasted(self, session: PeerSession, now: float) -> None:
         """Lets the parts drop what has expired for an absent peer; ends the session if nothing is left."""
         seconds = max(now - session.away_since, session.wait or 0.0)
-        waits = [part.outlasted(session, seconds) for part in self._parts]
+        waits: list[float | None] = []
+        for part in self._parts:
+            with guarded(part):
+                waits.append(part.outlasted(session, seconds))
         session.wait = min((wait for wait in waits if wait is not None), default=None)
         if session.wait is None:
             self._end(session)
@@ -266,9 +275,11 @@ class PeerSessions:
         if self._by_link.pop(session.link, None) is not None:
             self._receiver.link_down(session.link)
             for part in self._parts:
-                part.link_down(session)
+                with guarded(part):
+                    part.link_down(session)
         for part in self._parts:
-            part.gone(session)
+            with guarded(part):
+                part.gone(session)
         self._namespaces.remove(session.peer)
         task = asyncio.create_task(session.proxies.close(), name=f"retract {session.proxies.prefix}")
         self._closing.add(task)
@@ -281,7 +292,7 @@ class PeerSessions:
         for session in self:
             self._end(session)
         if self._closing:
-            await asyncio.gather(*self._closing)
+            await asyncio.gather(*self._closing, return_exceptions=True)
 
     # --- the rest ------------------------------------------------------------------------------------------------
 
@@ -290,7 +301,8 @@ class PeerSessions:
         session = self._by_link.get(link)
         if session is not None:
             for part in self._parts:
-                part.lane_lost(session)
+                with guarded(part):
+                    part.lane_lost(session)
 
     def clock(self, link: PeerLink) -> None:
         """Take a link's new estimate of its peer's clock."""

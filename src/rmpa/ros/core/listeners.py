@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
+from rmpa.core.log import logged_failure
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
@@ -28,7 +30,5 @@ class GraphListeners:
         for change in changes:
             _log.info("= %s %s %s of %s", "+" if change.added else "-", change.kind.value, change.name, change.node)
             for callback in self._callbacks:
-                try:
+                with logged_failure(_log, "a listener failed at %s", change):
                     callback(change)
-                except Exception:  # noqa: BLE001 - a listener's mistake must not reach the node
-                    _log.exception("! a listener failed at %s", change)

@@ -87,7 +87,7 @@ class AcceptedConnection:
     def accept(
         self, header: Mapping[str, str], queue_messages: int, queue_bytes: int, *, nodelay: bool = False
     ) -> None:
-        """Answer with the reply header; messages may follow.
+        """Answer with the reply header; messages may follow. Does nothing if the connection has ended already.
 
         Args:
             header: The reply header.
@@ -95,6 +95,8 @@ class AcceptedConnection:
             queue_bytes: The most bytes in the queue; one message always fits.
             nodelay: Whether TCP_NODELAY is set even if the other side did not ask for it.
         """
+        if self.stream.closed:  # while it was held; ``on_end`` follows
+            return
         if nodelay or self.fields.get("tcp_nodelay") == "1":
             self._sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._outbox.set_bounds(queue_messages, queue_bytes)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Protocol, TypeAlias
 
+from rmpa.core.log import logged_failure
 from rmpa.ros import limits
 from rmpa.ros.wire.slave_api import OUTBOUND, BusConnection
 from rmpa.ros.wire.tcpros import TopicDescription, check_subscriber, printable, publisher_header
@@ -256,10 +257,11 @@ class Publication:
         self._reply = reply
         for connection in self._held:
             problem = check_subscriber(connection.fields, self.topic, self.caller_id, description)
-            if problem is None:
-                self._serve(connection)
-            else:
-                self._refuse(connection, problem)
+            with logged_failure(_log, "%s: subscriber %s failed", self.topic, printable(connection.caller_id)):
+                if problem is None:
+                    self._serve(connection)
+                else:
+                    self._refuse(connection, problem)
             self._held = tuple(other for other in self._held if other is not connection)
         if before and not self.subscribers:
             self.events.last_subscriber()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.config import limits as config_limits
 from rmpa.core.errors import LimitExceeded, RmpaError
+from rmpa.core.log import logged_failure
 from rmpa.core.sizes import KIB
 from rmpa.ros import limits
 from rmpa.ros.node.service_stream import BODIES, INLINE, send_large
@@ -26,7 +27,7 @@ from rmpa.ros.wire.tcpros import LENGTH, printable
 from rmpa.runtime import limits as runtime_limits
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from rmpa.ros.node.accepted_connection import AcceptedConnection
     from rmpa.ros.wire.tcpros import Buffer
@@ -85,10 +86,8 @@ class ServiceCall:
         self._client = None
         on_gone, self.on_gone = self.on_gone, None
         if on_gone is not None:
-            try:
+            with logged_failure(_log, "%s: the end of a call failed", self.service):
                 on_gone()
-            except Exception:  # noqa: BLE001 - a handler's mistake must not reach the connection
-                _log.exception("! %s: the end of a call failed", self.service)
 
 
 class ServiceEndpoint:
@@ -159,8 +158,7 @@ class ServiceEndpoint:
         if self._describing is not None:
             self._describing.cancel()
         self._refuse_waiting(text)
-        for client in tuple(self._clients):
-            client.withdraw(text)
+        self._each(tuple(self._clients), lambda client: client.withdraw(text))
 
     async def closed(self) -> None:
         """After ``withdraw``: wait until the last replies are sent, at most ``runtime.limits.DRAIN_TIMEOUT``."""
@@ -195,8 +193,7 @@ class ServiceEndpoint:
             return
         self.description = answer
         waiting, self._waiting = self._waiting, []
-        for client in waiting:
-            client.open(answer)
+        self._each(waiting, lambda client: client.open(answer))
 
     async def _call_describe(self) -> ServiceDescription | str:
         if self._describe is None:
@@ -214,8 +211,16 @@ class ServiceEndpoint:
 
     def _refuse_waiting(self, text: str) -> None:
         waiting, self._waiting = self._waiting, []
-        for client in waiting:
-            client.refuse(text)
+        self._each(waiting, lambda client: client.refuse(text))
+
+    def _each(self, clients: Iterable[_ClientConnection], answer: Callable[[_ClientConnection], None]) -> None:
+        """Answers clients; one whose answer fails loses its connection, and the next ones get theirs."""
+        for client in clients:
+            try:
+                answer(client)
+            except Exception:  # noqa: BLE001 - one client must not cost the others their answers
+                _log.exception("! %s: %s could not be answered", self.service, printable(client.caller_id))
+                client.close()
 
 
 class _ClientConnection:
@@ -239,6 +244,11 @@ class _ClientConnection:
         self._seen = 0
         connection.on_bytes = self._take
         connection.on_end = self._left
+
+    @property
+    def caller_id(self) -> str:
+        """The client's node."""
+        return self._connection.caller_id
 
     def open(self, description: ServiceDescription, *, resume: bool = True) -> None:
         """Answer the client's header, or refuse it if the md5 sums differ.

@@ -307,8 +307,8 @@ class LocalSubscriptions:
         _log.log(logging.DEBUG if short else logging.INFO, "= %s: %s", source, reason)
         if connection.malformed:
             self._on_malformed(source, reason)
+        self._drop(source)  # first: what follows may connect the source anew
         self._on_lost(source, reason[: limits.CONTROL_TEXT_MAX])
-        self._drop(source)
         if not short:
             self._core.suspect(source.node)
 
