@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+import subprocess
 from typing import TYPE_CHECKING, Final
 
 import pytest
@@ -10,7 +12,9 @@ import pytest
 from lab.bed.agents import RMPA
 from lab.bed.processes import run
 from rmpa.ros.types.definitions import known_text
-from tests.interop.ros import PYTHON
+from rmpa.ros.types.find import find_message_type, find_service_type
+from tests.interop.ros import NODES, PYTHON
+from tests.ros.types.genmsg_cases import MESSAGES, SERVICES, VALUES, VALUES_OF
 from tests.ros.types.workspaces import package
 
 if TYPE_CHECKING:
@@ -19,9 +23,10 @@ if TYPE_CHECKING:
     from tests.interop.conftest import ModuleFactory
     from tests.interop.modules import Module
 
-pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
 
 LONG: Final = 40.0
+PACKAGES: Final = "/usr/lib/python3/dist-packages"
 GENPY: Final = "/usr/lib/genpy/genmsg_py.py"
 TWICE: Final = """\
 from rmpa.resource import Resource
@@ -63,6 +68,38 @@ def hears(module: Module, topic: str, text: str, env: dict[str, str]) -> None:
     assert re.search(text, echo.output), echo.output
 
 
+def test_all_installed_definitions_and_the_hard_ones_are_read_as_by_genmsg() -> None:
+    asked = {
+        "messages": list(MESSAGES),
+        "services": list(SERVICES),
+        "values_of": VALUES_OF,
+        "values": [values for values, _ in VALUES],
+    }
+    script = [PYTHON, str(NODES / "genmsg_answers.py")]
+    done = subprocess.run(script, input=json.dumps(asked), capture_output=True, text=True, check=True, timeout=LONG)
+    answers = json.loads(done.stdout)
+    assert answers["messages"] == MESSAGES
+    assert answers["services"] == {text: list(answer) for text, answer in SERVICES.items()}
+    assert answers["values"] == [raw for _, raw in VALUES]
+
+    installed: dict[str, list[str]] = answers["installed"]
+    services = {name for name in installed if f"{name}Request" in installed}
+    halves = {f"{name}{half}" for name in services for half in ("Request", "Response")}
+    assert len(installed) > 100
+    for environ in ({}, {"PYTHONPATH": PACKAGES}):  # as they come with rmpa, and as they are read here
+        ours: dict[str, list[str]] = {}
+        for name in installed.keys() - services - halves:
+            message = find_message_type(name, environ=environ)
+            ours[name] = [message.md5sum, message.definition]
+        for name in services:
+            service = find_service_type(name, environ=environ)
+            ours[name] = [service.md5sum, ""]
+            for part in (service.request, service.response):
+                ours[part.name] = [part.md5sum, part.definition]
+        assert ours == installed
+
+
+@pytest.mark.netns
 def test_types_of_the_robot_work_without_its_package(modules: ModuleFactory, tmp_path: Path) -> None:
     robot, pc = modules("robot", "pc")
     env = workspace(tmp_path / "ws")

@@ -25,7 +25,7 @@ MAPPING = TypeMapping()
 INTEGERS = {
     **{f"int{bits}": (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) for bits in (8, 16, 32, 64)},
     **{f"uint{bits}": (0, 2**bits - 1) for bits in (8, 16, 32, 64)},
-    "byte": (0, 127),
+    "byte": (-128, 127),
     "char": (0, 255),
 }
 PAIRS = {name: pair for name in known_types() if (pair := MAPPING.message(name, JAZZY)) is not None}
@@ -64,7 +64,10 @@ def scalar(kind: MessageType, name: str, rng: random.Random, depth: int) -> Any:
     if name == "string":
         return "".join(rng.choice("aZ/ _é世🤖") for _ in range(rng.randint(0, 9)))
     if name in ("time", "duration"):
-        return {"secs": rng.randint(0 if name == "time" else -(2**31), 2**31 - 1), "nsecs": rng.randint(0, 10**9 - 1)}
+        return {
+            "secs": rng.randint(*((0, 2**32 - 1) if name == "time" else (-(2**31), 2**31 - 1))),
+            "nsecs": rng.randint(0, 10**9 - 1),
+        }
     return values(kind, name, rng, depth + 1)
 
 
@@ -167,6 +170,22 @@ def test_a_rule_with_paths_says_what_goes_where() -> None:
     assert (read.header.stamp.sec, read.header.frame_id, read.range) == (9, "", 2.5)
     back = kind.to_plain(kind.deserialize(conversion.to_ros1(cdr)))
     assert back["distance"] == 2.5
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("std_msgs/Byte", {"data": -56}),
+        ("std_msgs/ByteMultiArray", {"data": [-128, -56, 127]}),
+        ("std_msgs/Header", {"stamp": {"secs": 2**32 - 1, "nsecs": 5}}),
+    ],
+)
+def test_bytes_and_late_times_keep_their_bits_by_objects_too(name: str, values: dict[str, Any]) -> None:
+    kind = MessageType(name)
+    conversion = Conversion(kind, name.replace("/", "/msg/"), JAZZY, {field: field for field in values})
+    assert not conversion.direct
+    raw = kind.serialize(kind.make(values))
+    assert conversion.to_ros1(conversion.to_ros2(raw)) == raw
 
 
 def test_a_path_to_a_field_that_is_not_there_is_refused() -> None:

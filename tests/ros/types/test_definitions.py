@@ -17,6 +17,7 @@ from rmpa.ros.types.definitions import (
     md5sum,
     parse_definition,
 )
+from tests.ros.types.genmsg_cases import MESSAGES
 
 
 def test_a_text_is_read() -> None:
@@ -54,6 +55,20 @@ def test_a_text_is_read() -> None:
 )
 def test_the_sums_that_ros_knows(name: str, sum_: str) -> None:
     assert md5sum(name, known_specifications(name)) == sum_
+
+
+@pytest.mark.parametrize(("text", "sum_"), MESSAGES.items())
+def test_a_text_has_the_sum_of_genmsg(text: str, sum_: str) -> None:
+    known = parse_definition("my_msgs/Case", text)
+    assert md5sum("my_msgs/Case", known) == sum_
+    assert full_text("my_msgs/Case", known) == text
+
+
+def test_an_array_of_no_elements_is_not_one_of_any_length() -> None:
+    none, any_ = Specification.parse("p/T", "int32[0] none\nint32[] any").fields
+    assert (none.size, any_.size) == (0, None)
+    with pytest.raises(DefinitionError, match="neither a field nor a constant"):
+        Specification.parse("p/T", "int32[9999999999] many")
 
 
 @pytest.mark.parametrize("name", known_types())

@@ -9,6 +9,7 @@ import pytest
 
 from rmpa.ros.types.definitions import SEPARATOR, known_types
 from rmpa.ros.types.messages import MessageError, MessageType, Plain
+from tests.ros.types.genmsg_cases import VALUES, VALUES_OF
 
 JOY: Plain = {
     "header": {"seq": 3, "stamp": {"secs": 1, "nsecs": 500_000_000}, "frame_id": "pad"},
@@ -159,8 +160,69 @@ def test_bytes_that_are_no_message(raw: bytes) -> None:
 
 
 def test_an_object_that_is_no_message() -> None:
-    with pytest.raises(MessageError, match="cannot serialize a sensor_msgs/Joy"):
+    with pytest.raises(MessageError, match="sensor_msgs/Joy is a message of sensor_msgs/Joy, not 'joy'"):
         MessageType("sensor_msgs/Joy").serialize("joy")
+
+
+@pytest.mark.parametrize(("values", "raw"), VALUES)
+def test_values_have_the_bytes_of_genpy(values: dict[str, Any], raw: str) -> None:
+    kind = MessageType.learn("my_msgs/Case", VALUES_OF)
+    if not raw:
+        with pytest.raises(MessageError, match=f"^{min(values)}.* does not fit "):
+            kind.make(values)
+        return
+    assert kind.serialize(kind.make(values)).hex() == raw
+    read = kind.to_plain(kind.deserialize(bytes.fromhex(raw)))
+    assert repr({name: read[name] for name in values}) == repr(values), "repr tells 0.0 from -0.0"
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "error"),
+    [
+        ("small", 200, "small: 200 does not fit byte (-128 to 127)"),
+        ("small", "x", "small is a byte, not 'x'"),
+        ("many", [200], "many: 200 does not fit byte (-128 to 127)"),
+        ("many", np.array([200]), "many: 200 to 200 do not fit byte (-128 to 127)"),
+        ("two", np.zeros(1, np.int8), "two has 2 elements, not 1"),
+        ("short", 10**400, f"short: 1{'0' * 79}… does not fit float32"),
+        ("short", -1e39, "short: -1e+39 does not fit float32"),
+        ("at", 1e300, "at is a time, {secs: 0, nsecs: 0} or seconds, not 1e+300"),
+        ("at", float("nan"), "at is a time, {secs: 0, nsecs: 0} or seconds, not nan"),
+        ("at", -1, "at.secs: -1 does not fit time (0 to 4294967295)"),
+        ("text", "\ud800", "text has half of a surrogate pair, which is no character"),
+        ("reals", np.array([1e39]), "reals: 1e+39 to 1e+39 do not fit float32"),
+    ],
+)
+def test_a_wrong_value_is_named_when_it_is_given_and_when_it_was_set(field: str, value: Any, error: str) -> None:
+    kind = MessageType.learn("my_msgs/Case", VALUES_OF + "string text\nfloat32[] reals\n")
+    made = kind.make()
+    setattr(made, field, value)
+    for attempt in (lambda: kind.make({field: value}), lambda: kind.serialize(made)):
+        with pytest.raises(MessageError) as caught:
+            attempt()
+        assert str(caught.value) == error
+
+
+def test_a_number_of_thousands_of_digits_is_refused_like_any_other() -> None:
+    with pytest.raises(MessageError, match="data: a number of too many digits does not fit byte"):
+        MessageType("std_msgs/ByteMultiArray").make({"data": [10**5000]})
+    with pytest.raises(MessageError, match="data is a string, not a number of too many digits"):
+        MessageType("std_msgs/String").make({"data": 10**5000})
+
+
+def test_a_program_may_set_lists_and_seconds() -> None:
+    kind = MessageType("sensor_msgs/Joy")
+    made = kind.make()
+    made.axes, made.buttons, made.header.stamp = [0.5, 1], (1,), 2.5
+    plain = kind.to_plain(kind.deserialize(kind.serialize(made)))
+    header = {"seq": 0, "stamp": {"secs": 2, "nsecs": 500_000_000}, "frame_id": ""}
+    assert plain == {"header": header, "axes": [0.5, 1.0], "buttons": [1]}
+    made.header.seq = -1
+    with pytest.raises(MessageError, match=r"^header.seq: -1 does not fit uint32"):
+        kind.serialize(made)
+    made.header = "map"
+    with pytest.raises(MessageError, match=r"^header is made of the fields seq, stamp, frame_id, not of 'map'"):
+        kind.serialize(made)
 
 
 def test_sums_are_those_of_rosbags() -> None:

@@ -4,6 +4,7 @@ import pytest
 
 from rmpa.ros.types.definitions import DefinitionError
 from rmpa.ros.types.service_types import ServiceType, known_services
+from tests.ros.types.genmsg_cases import SERVICES
 
 
 @pytest.mark.parametrize(
@@ -23,6 +24,16 @@ from rmpa.ros.types.service_types import ServiceType, known_services
 )
 def test_the_sums_that_ros_knows(name: str, md5sum: str) -> None:
     assert ServiceType(name).md5sum == md5sum
+
+
+@pytest.mark.parametrize(("text", "answer"), SERVICES.items())
+def test_a_text_is_split_as_by_genmsg(text: str, answer: tuple[str, str, str]) -> None:
+    if not answer[0]:
+        with pytest.raises(DefinitionError):
+            ServiceType("my_msgs/Case", text)
+        return
+    kind = ServiceType("my_msgs/Case", text)
+    assert (kind.md5sum, kind.request.definition, kind.response.definition) == answer
 
 
 @pytest.mark.parametrize("name", known_services())
@@ -47,8 +58,6 @@ def test_a_request_in_bytes() -> None:
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("int64 a", "has 0 lines '---' instead of one"),
-        ("int64 a\n---\nint64 b\n---\n", "has 2 lines '---'"),
         ("int64\n---\n", "'int64' is neither a field nor a constant"),
         ("Thing a\n---\n", "message type p/Thing: is not known here, and p/TRequest embeds it"),
     ],

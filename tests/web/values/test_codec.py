@@ -17,6 +17,7 @@ from rmpa.ros.types.definitions import SEPARATOR, DefinitionError, known_specifi
 from rmpa.ros.types.messages import MessageError, MessageType
 from rmpa.web.values import limits
 from rmpa.web.values.codec import MessageCodec, codec_for
+from tests.ros.types.genmsg_cases import VALUES, VALUES_OF
 from tests.web.values.filled import filled
 
 if TYPE_CHECKING:
@@ -255,6 +256,17 @@ def test_byte_arrays_are_taken_as_base64_lists_and_bytes() -> None:
     raw = b"\x03\0\0\0\x01\x02\xff"
     for value in (base64.b64encode(raw[4:]).decode(), [1, 2, 255], raw[4:], cbor2.CBORTag(64, raw[4:])):
         assert codec.write({"a": value}, 0).payload == raw
+
+
+@pytest.mark.parametrize(("values", "raw"), VALUES)
+def test_values_have_the_bytes_of_genpy(values: dict[str, Any], raw: str) -> None:
+    codec = _codec(VALUES_OF)
+    if not raw:
+        with pytest.raises(MessageError, match=f": {min(values)}.*: does not fit"):
+            codec.write(values, 0)
+        return
+    assert codec.write(values, 0).payload.hex() == raw
+    assert codec.write(_cbor(codec, bytes.fromhex(raw)), 0).payload.hex() == raw
 
 
 def test_null_is_not_a_number() -> None:

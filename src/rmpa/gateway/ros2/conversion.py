@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.tcpros import Buffer
 
 _EMPTY_MEMBER: Final = "structure_needs_at_least_one_member"
+_UNSIGNED: Final = ("uint8", "char")
 _LITTLE_ENDIAN: Final = b"\x00\x01"
 
 
@@ -148,7 +149,9 @@ class Conversion:
         if field.array:
             inner = desc[1][0]
             if desc[0] == Nodetype.ARRAY and field.size != desc[1][1]:
-                raise NoConversion(f"{where} has {field.size or 'any number of'} elements, or {desc[1][1]}")
+                raise NoConversion(
+                    f"{where} has {'any number of' if field.size is None else field.size} elements, or {desc[1][1]}"
+                )
         if inner[0] == Nodetype.NAME:
             if field.primitive and TIMES.get(field.type) != inner[1]:
                 raise NoConversion(f"{where} is a {field.type}, or a {inner[1]}")
@@ -207,6 +210,8 @@ class Conversion:
         inner, count = desc[1]
         if desc[0] == Nodetype.SEQUENCE and count and len(value) > count:
             raise ConversionError(f"{where} has {len(value)} elements; ROS 2 allows {count}")
+        if field.type == "byte" and inner[1][0] != "int8":
+            value = value.view("uint8")
         if inner[0] == Nodetype.BASE and inner[1][0] != "string":
             return _as_array(value, inner[1][0], where)
         return [self._scalar2(field, inner, item, where) for item in value]
@@ -224,7 +229,7 @@ class Conversion:
             if bound and len(value.encode()) > bound:
                 raise ConversionError(f"{where} has {len(value.encode())} bytes; ROS 2 allows {bound}")
             return value
-        if field.type == "byte":  # signed in ROS 1 (wiki.ros.org/msg), an octet in ROS 2
+        if field.type == "byte" and base in _UNSIGNED:  # signed in ROS 1 (wiki.ros.org/msg), an octet in ROS 2
             value &= 0xFF
         return _as_number(value, base, where)
 
@@ -272,12 +277,14 @@ class Conversion:
         if not field.array:
             return self._scalar1(field, desc, value)
         if desc[1][0][0] == Nodetype.BASE:
-            return value
+            return value.view("int8") if field.type == "byte" and value.dtype == "uint8" else value
         return [self._scalar1(field, desc[1][0], item) for item in value]
 
     def _scalar1(self, field: Field, desc: Any, value: Any) -> Any:
         if desc[0] != Nodetype.NAME:
-            return value - 256 if field.type == "byte" and value > 127 else value
+            if field.type == "byte":
+                return value - 256 if value > 127 else value
+            return value & 0xFF if desc[1][0] == "byte" and field.type in _UNSIGNED else value
         if not field.primitive:
             return self._values(field.type, desc[1], value)
         sec = int(value.sec)
@@ -327,7 +334,9 @@ def _as_number(value: Any, base: str, where: str) -> Any:
         return float(value)
     import numpy as np  # noqa: PLC0415 - see above
 
-    bounds = np.iinfo(np.dtype(_dtype(base)))
+    if base == "byte" and isinstance(value, int) and 127 < value < 256:
+        value -= 256  # rosbags has one byte signed, and an array of them unsigned
+    bounds = np.iinfo(np.dtype("int8" if base == "byte" else _dtype(base)))
     if not isinstance(value, int) or not bounds.min <= value <= bounds.max:
         raise ConversionError(f"{where}: {value} does not fit {base} ({bounds.min} to {bounds.max})")
     return int(value)

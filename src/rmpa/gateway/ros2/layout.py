@@ -69,13 +69,13 @@ class Layouts:
         """The parts of a field that both sides have."""
         if not field.array:
             return self._scalar(field, desc)
-        if desc[0] != (Nodetype.ARRAY if field.size else Nodetype.SEQUENCE):
+        if desc[0] != (Nodetype.SEQUENCE if field.size is None else Nodetype.ARRAY):
             return None
         inner, count = desc[1]
         parts = self._scalar(field, inner)
-        if parts is None or (field.size and field.size != count):
+        if parts is None or (field.size is not None and field.size != count):
             return None
-        return (_array(parts, field.size or None, 0 if field.size else count, field.name),)
+        return (_array(parts, field.size, count if field.size is None else 0, field.name),)
 
     def _scalar(self, field: Field, desc: Any) -> tuple[Part, ...] | None:
         if desc[0] == Nodetype.NAME:
@@ -96,7 +96,7 @@ class Layouts:
             parts: tuple[Part, ...] = (Text() if field.type == "string" else number,)
         else:
             parts = tuple(part for each in self._ros1[field.type].fields for part in self._only1(each))
-        return (_array(parts, field.size or None),) if field.array else parts
+        return (_array(parts, field.size),) if field.array else parts
 
     def _only2(self, desc: Any) -> tuple[Part, ...]:
         if desc[0] == Nodetype.NAME:

@@ -192,7 +192,7 @@ def _field(field: Field) -> tuple[str, Any]:
     else:
         kind = (Nodetype.NAME, ros2_name(field.type))
     if field.array:
-        kind = (Nodetype.ARRAY if field.size else Nodetype.SEQUENCE, (kind, field.size))
+        kind = (Nodetype.SEQUENCE if field.size is None else Nodetype.ARRAY, (kind, field.size or 0))
     return snake_case(field.name), kind
 
 

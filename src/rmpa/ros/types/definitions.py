@@ -38,7 +38,7 @@ _NUMBERS: Final = (
 PRIMITIVES: Final = frozenset((*_NUMBERS, "string", "time", "duration", "char", "byte"))
 _HEADER: Final = "std_msgs/Header"
 _FIELD_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-_FIELD_TYPE: Final = re.compile(r"(?P<base>[A-Za-z0-9_/]+)(?P<array>\[(?P<size>[0-9]*)\])?")
+_FIELD_TYPE: Final = re.compile(r"(?P<base>[A-Za-z0-9_/]+)(?P<array>\[(?P<size>0|[1-9][0-9]{0,8})?\])?")
 
 
 @dataclass
@@ -72,13 +72,13 @@ class Field:
         name: The name, as written.
         type: A primitive, or ``package/Name``.
         array: Whether it is an array.
-        size: The length of a fixed-size array; 0 for one of any length.
+        size: The length of a fixed-size array, which may be 0; ``None`` for one of any length.
     """
 
     name: str
     type: str
     array: bool = False
-    size: int = 0
+    size: int | None = None
 
     @property
     def primitive(self) -> bool:
@@ -87,7 +87,7 @@ class Field:
 
     def __str__(self) -> str:
         """The type with its brackets."""
-        return f"{self.type}[{self.size or ''}]" if self.array else self.type
+        return f"{self.type}[{'' if self.size is None else self.size}]" if self.array else self.type
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,9 +139,10 @@ def _constant(name: str, line: str, clean: str) -> str:
     if kind not in PRIMITIVES or kind in ("time", "duration"):
         raise DefinitionError(name, f"{clean[:80]!r} is not a constant")
     if kind == "string":
-        # The value of a string constant is all text after its "=", a "#" included.
+        # genmsg reads the line as written: the name is behind its first blank (and has the type in it, where blanks
+        # indent the line), and the value is all behind the first "=", a "#" included.
         left, _, value = line.partition("=")
-        return f"string {left.strip().partition(' ')[2]}={value.strip()}"
+        return f"string {left.partition(' ')[2].strip()}={value.strip()}"
     constant, _, value = rest.partition("=")
     return f"{kind} {constant.strip()}={value.strip()}"
 
@@ -152,14 +153,13 @@ def _field(name: str, clean: str) -> Field:
     if len(parts) != 2 or match is None or not _FIELD_NAME.fullmatch(parts[1]):
         raise DefinitionError(name, f"{clean[:80]!r} is neither a field nor a constant")
     base = match["base"]
-    if base == "Header":
+    if base == "Header" and match["array"] is None:
         base = _HEADER
     elif base not in PRIMITIVES and "/" not in base:
         base = f"{name.partition('/')[0]}/{base}"
     if base not in PRIMITIVES and not is_type_name(base):
         raise DefinitionError(name, f"{base[:80]!r} is not a type")
-    size = int(match["size"] or 0) if match["array"] and len(match["size"]) < 10 else 0
-    return Field(parts[1], base, match["array"] is not None, size)
+    return Field(parts[1], base, match["array"] is not None, int(match["size"]) if match["size"] else None)
 
 
 def parse_definition(name: str, text: str) -> dict[str, Specification]:

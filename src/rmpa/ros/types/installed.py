@@ -141,7 +141,9 @@ def find_services(name: str, path: SearchPath, *, sourced: bool) -> Iterator[Fou
         if f"{base}Request" in texts and f"{base}Response" in texts:
             request, inner = _split(texts[f"{base}Request"])
             response, more = _split(texts[f"{base}Response"])
-            yield Found(f"{request}\n---\n{response}", inner | more, where)
+            mark = "---\n" if request.endswith("\n") or not request else "\n---\n"
+            # genmsg has added a line feed to the last line of each half.
+            yield Found(f"{request}{mark}{response}".removesuffix("\n"), inner | more, where)
 
 
 def definitions_of(package: str, path: SearchPath, kind: str) -> tuple[list[Path], list[str]]:

@@ -7,6 +7,8 @@ without them. MD5 sums and definitions need neither.
 from __future__ import annotations
 
 import functools
+import math
+import struct
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, Union
 
@@ -38,7 +40,7 @@ _NANO: Final = 1_000_000_000
 _FLOATS: Final = frozenset(("float32", "float64"))
 _SHOWN: Final = 80
 """Characters of a wrong value in an error."""
-_DTYPES: Final = {"bool": "bool_", "byte": "uint8", "char": "uint8"}
+_DTYPES: Final = {"bool": "bool_", "byte": "int8", "char": "uint8"}
 
 
 class MessageError(RmpaError):
@@ -104,13 +106,13 @@ class MessageType:
         """Serialize a message object, without a length in front.
 
         Raises:
-            MessageError: A field has a value that its type does not allow.
+            MessageError: A field has a value that its type does not allow; the text names it.
         """
         try:
             return bytes(self._store.serialize_ros1(message, _inner(self.name)))
-        except Exception as error:
-            # rosbags does not check values: the exception depends on the field.
-            raise MessageError(f"cannot serialize a {self.name}: {type(error).__name__}: {error}") from error
+        except Exception:  # noqa: BLE001 - rosbags does not check values: the exception depends on the field
+            checked = self.make(self._given(self.name, message, ""))
+            return bytes(self._store.serialize_ros1(checked, _inner(self.name)))
 
     def deserialize(self, raw: Buffer) -> Any:
         """Deserialize bytes to a message object, with numpy arrays for arrays of numbers.
@@ -164,9 +166,9 @@ class MessageType:
         elif len(fields) == 1:
             given = {fields[0].name: values}
         else:
-            raise MessageError(f"{path or name} is made of the fields {_names(fields)}, not of {values!r}")
+            raise MessageError(f"{path or name} is made of the fields {_names(fields)}, not of {_short(values)}")
         if given and (unknown := given.keys() - {field.name for field in fields}):
-            raise MessageError(f"{path or name} has no field {min(unknown)!r}; it has {_names(fields)}")
+            raise MessageError(f"{path or name} has no field {min(map(_short, unknown))}; it has {_names(fields)}")
         within = f"{path}." if path else ""
         made = {
             _python_name(field.name): self._value(field, given.get(field.name), within + field.name)
@@ -176,11 +178,35 @@ class MessageType:
             made["structure_needs_at_least_one_member"] = 0
         return self._class(name)(**made)
 
+    def _given(self, name: str, message: object, path: str) -> dict[str, object]:
+        """The values of a message object, as its program set them: lists in place of arrays, mappings in it."""
+        values: dict[str, object] = {}
+        for field in self._specifications[name].fields:
+            try:
+                value = getattr(message, _python_name(field.name))
+            except AttributeError:
+                raise MessageError(f"{path or name} is a message of {name}, not {_short(message)}") from None
+            within = f"{path}.{field.name}" if path else field.name
+            if field.primitive and field.type not in _TIMES:
+                values[field.name] = value
+            elif field.array and isinstance(value, list | tuple):
+                values[field.name] = [self._given_one(field, item, within) for item in value]
+            else:
+                values[field.name] = self._given_one(field, value, within)
+        return values
+
+    def _given_one(self, field: Field, value: Any, path: str) -> object:
+        if not hasattr(value, "__msgtype__"):
+            return value
+        if field.type in _TIMES:
+            return {"secs": value.sec, "nsecs": value.nanosec}
+        return self._given(field.type, value, path)
+
     def _value(self, field: Field, value: Any, path: str) -> object:
         if not field.array:
             return self._scalar(field, value, path)
         if isinstance(value, str) and field.type in ("uint8", "char"):
-            value = list(value.encode())
+            value = list(_text(value, path).encode())
         if not isinstance(value, list | str | None):
             value = _sequence(field, value, path)
             if not isinstance(value, list):
@@ -192,7 +218,7 @@ class MessageType:
             return _zeros(field.type, field.size or 0)
         if field.size and not items:
             items = [None] * field.size
-        if field.size and len(items) != field.size:
+        if field.size is not None and len(items) != field.size:
             raise MessageError(f"{path} has {field.size} elements, not {len(items)}")
         made = [self._scalar(field, item, path) for item in items]
         if field.type in ("string", *_TIMES) or not field.primitive:
@@ -205,7 +231,7 @@ class MessageType:
         if field.type in _TIMES:
             if getattr(value, "__msgtype__", None) == _TIMES[field.type]:
                 return value
-            secs, nsecs = _time(value, path)
+            secs, nsecs = _time(field.type, value, path)
             return self._store.types[_TIMES[field.type]](sec=secs, nanosec=nsecs)
         if not field.primitive:
             if getattr(value, "__msgtype__", None) == _inner(field.type):
@@ -240,29 +266,55 @@ _RANGES: Final = {
     f"{sign}int{bits}": (0, (1 << bits) - 1) if sign else (-(1 << bits - 1), (1 << bits - 1) - 1)
     for sign in ("u", "")
     for bits in (8, 16, 32, 64)
-} | {"byte": (0, 255), "char": (0, 255)}
-_NUMBERS: Final = _FLOATS | _RANGES.keys()
+} | {"byte": (-128, 127), "char": (0, 255), "time": (0, (1 << 32) - 1), "duration": (-(1 << 31), (1 << 31) - 1)}
+"""The integers of each type; of times the seconds, and the nanoseconds likewise."""
+_NUMBERS: Final = _FLOATS | _RANGES.keys() - _TIMES.keys()
+_FLOAT32: Final = struct.Struct("<f").pack
 
 
 def _primitive(kind: str, value: Plain, path: str) -> bool | float | str:
     if kind == "string":
         if value is None or isinstance(value, str | int | float):
-            return "" if value is None else str(value)
+            return "" if value is None else _text(value, path)
     elif kind == "bool":
         if value is None or isinstance(value, bool | int):
             return bool(value)
     elif kind in _FLOATS:
         if value is None or isinstance(value, int | float):
-            return float(value or 0.0)
+            return _float(kind, 0 if value is None else value, path)
         if isinstance(value, str) and value.lstrip("+-.").lower() in ("nan", "inf"):
             return float(value.replace(".", ""))
-    else:
-        low, high = _RANGES[kind]
-        if value is None or (isinstance(value, int) and low <= value <= high):
-            return int(value or 0)
-        if isinstance(value, int):
-            raise MessageError(f"{path}: {value} does not fit {kind} ({low} to {high})")
-    raise MessageError(f"{path} is a {kind}, not {value!r}")
+    elif value is None or isinstance(value, int):
+        return _integer(kind, value or 0, path)
+    raise MessageError(f"{path} is a {kind}, not {_short(value)}")
+
+
+def _integer(kind: str, value: int, path: str) -> int:
+    low, high = _RANGES[kind]
+    if low <= value <= high:
+        return int(value)
+    raise MessageError(f"{path}: {_short(value)} does not fit {kind} ({low} to {high})")
+
+
+def _float(kind: str, value: float, path: str) -> float:
+    try:
+        number = float(value)
+        if kind == "float32":
+            _FLOAT32(number)
+    except OverflowError:
+        raise MessageError(f"{path}: {_short(value)} does not fit {kind}") from None
+    return number
+
+
+def _text(value: str | float, path: str) -> str:
+    try:
+        text = str(value)
+        text.encode()
+    except UnicodeEncodeError:
+        raise MessageError(f"{path} has half of a surrogate pair, which is no character") from None
+    except ValueError:
+        raise MessageError(f"{path} is a string, not {_short(value)}") from None
+    return text
 
 
 def _sequence(field: Field, value: Any, path: str) -> Any:
@@ -283,7 +335,7 @@ def _sequence(field: Field, value: Any, path: str) -> Any:
     kind = np.dtype(_DTYPES.get(field.type, field.type))
     # A copy: the caller may change its array later.
     given = np.frombuffer(value, kind).copy() if raw else np.asarray(value).ravel()
-    if field.size and given.size != field.size:
+    if field.size is not None and given.size != field.size:
         raise MessageError(f"{path} has {field.size} elements, not {given.size}")
     if given.dtype == kind:
         return given if raw else given.copy()
@@ -294,7 +346,11 @@ def _sequence(field: Field, value: Any, path: str) -> Any:
         low, high = _RANGES[field.type]
         if int(given.min()) < low or int(given.max()) > high:
             raise MessageError(f"{path}: {given.min()} to {given.max()} do not fit {field.type} ({low} to {high})")
-    return given.astype(kind)
+    with np.errstate(over="ignore"):
+        made = given.astype(kind)
+    if kind.kind == "f" and (np.isinf(made) & np.isfinite(given)).any():
+        raise MessageError(f"{path}: {given.min()} to {given.max()} do not fit {field.type}")
+    return made
 
 
 def _zeros(kind: str, count: int) -> object:
@@ -304,21 +360,25 @@ def _zeros(kind: str, count: int) -> object:
 
 
 def _short(value: object) -> str:
-    text = repr(value)
+    try:
+        text = repr(value)
+    except ValueError:  # Python refuses to write out an integer of thousands of digits
+        return "a number of too many digits"
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
 
 
-def _time(value: Plain, path: str) -> tuple[int, int]:
+def _time(kind: str, value: Plain, path: str) -> tuple[int, int]:
+    secs: Any = value
+    nsecs: Any = 0
     if value is None:
         return 0, 0
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        return divmod(round(value * _NANO), _NANO)
-    if isinstance(value, Mapping):
+    if isinstance(value, Mapping) and value.keys() <= {"secs", "nsecs", "sec", "nanosec"}:
         secs, nsecs = value.get("secs", value.get("sec", 0)), value.get("nsecs", value.get("nanosec", 0))
-        known = value.keys() <= {"secs", "nsecs", "sec", "nanosec"}
-        if known and isinstance(secs, int) and isinstance(nsecs, int):
-            return secs, nsecs
-    raise MessageError(f"{path} is a time, {{secs: 0, nsecs: 0}} or seconds, not {value!r}")
+    elif isinstance(value, float) and math.isfinite(value * _NANO):
+        secs, nsecs = divmod(round(value * _NANO), _NANO)
+    if isinstance(value, bool) or not isinstance(secs, int) or not isinstance(nsecs, int):
+        raise MessageError(f"{path} is a {kind}, {{secs: 0, nsecs: 0}} or seconds, not {_short(value)}")
+    return _integer(kind, secs, f"{path}.secs"), _integer(kind, nsecs, f"{path}.nsecs")
 
 
 def _names(fields: Sequence[Field]) -> str:

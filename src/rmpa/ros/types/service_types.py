@@ -1,17 +1,16 @@
 """Service types: their definitions, MD5 sums, and requests and responses as Python objects.
 
-A definition is the request's text, a line ``---``, and the response's text (wiki.ros.org/srv). rmpa brings the
+A definition is the request's text, a line that begins with ``---``, and the response's text (wiki.ros.org/srv). Texts
+of both halves and MD5 sum are equal to genmsg's to the byte. rmpa brings the
 definitions of ROS's own packages; ``ros.types.find`` finds those of this machine's packages. Unlike publishers,
 servers do not send their definitions.
 """
 
 from __future__ import annotations
 
-import re
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rmpa.ros.types.definitions import (
-    DefinitionError,
     Specification,
     UnknownTypeError,
     complete,
@@ -25,7 +24,7 @@ from rmpa.ros.wire.services import ServiceDescription
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-_MARK = re.compile(r"^---[ \t]*$", re.MULTILINE)
+_MARK: Final = "---"
 
 
 class ServiceType:
@@ -52,14 +51,7 @@ class ServiceType:
         self.name = name
         self.source = source
         text = text if text is not None else known_service(name)
-        halves = _MARK.split(text)
-        if len(halves) != 2:
-            raise DefinitionError(
-                name,
-                f"has {len(halves) - 1} lines '---' instead of one",
-                "is it a message's type?",
-                "service type",
-            )
+        halves = _halves(text)
         parts = (f"{name}Request", f"{name}Response")
         known = {part: Specification.parse(part, half) for part, half in zip(parts, halves, strict=True)}
         complete(known, find if find is not None else known_text)
@@ -69,6 +61,21 @@ class ServiceType:
     def describe(self) -> ServiceDescription:
         """The description for a server's header."""
         return ServiceDescription(self.name, self.md5sum, self.request.name, self.response.name)
+
+
+def _halves(text: str) -> tuple[str, str]:
+    """The texts of request and response, as genmsg splits them: each line that begins with ``---`` is left out.
+
+    All is the request where there is no such line.
+    """
+    halves: tuple[list[str], list[str]] = [], []
+    half = halves[0]
+    for line in text.split("\n"):
+        if line.startswith(_MARK):
+            half = halves[1]
+        else:
+            half.append(line + "\n")
+    return "".join(halves[0]), "".join(halves[1])
 
 
 def _texts() -> Mapping[str, str]:

@@ -45,7 +45,7 @@ def _typedef(specification: Specification) -> dict[str, Any]:
         "type": specification.name,
         "fieldnames": [field.name for field in fields],
         "fieldtypes": [field.type for field in fields],
-        "fieldarraylen": [field.size if field.array else -1 for field in fields],
+        "fieldarraylen": [(field.size or 0) if field.array else -1 for field in fields],
         "examples": [_example(field) for field in fields],
         "constnames": [name for name, _ in constants],
         "constvalues": [value for _, value in constants],

@@ -78,9 +78,9 @@ class Layout:
 
     def field_size(self, field: Field) -> int:
         """Bytes of the field's default."""
-        if field.array and not field.size:
+        if field.array and field.size is None:
             return 4
-        return self.item_size(field.type) * (field.size or 1)
+        return self.item_size(field.type) * (1 if field.size is None else field.size)
 
     def item_size(self, kind: str) -> int:
         """Bytes of the default of a type, which may be a primitive."""
@@ -101,6 +101,6 @@ class Layout:
         return field.primitive or self.is_flat(field.type)
 
     def _field_values(self, field: Field) -> int:
-        if field.primitive or (field.array and not field.size):
+        if field.primitive or (field.array and field.size is None):
             return 1
-        return self.values(field.type) * (field.size or 1)
+        return self.values(field.type) * (1 if field.size is None else field.size)

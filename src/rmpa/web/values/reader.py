@@ -239,7 +239,7 @@ class _Body:
         return value
 
     def _array(self, field: Field) -> str:
-        count = str(field.size) if field.size else self._number("I")
+        count = str(field.size) if field.size is not None else self._number("I")
         self._flush()
         value = self._variable()
         if field.type == "string":

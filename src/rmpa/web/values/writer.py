@@ -198,9 +198,9 @@ def _list(field: Field, values: Any) -> Sequence[Any]:
 
 
 def _count(field: Field, count: int, writing: Writing) -> None:
-    if field.size and count != field.size:
+    if field.size is not None and count != field.size:
         raise WrongValueError(f"has {field.size} elements ({field}), not {count}")
-    if not field.size:
+    if field.size is None:
         writing.out += _LENGTH.pack(count)
 
 
@@ -264,9 +264,7 @@ def _convert(kind: str, code: str) -> Callable[[Any], bool | int | float]:
         raise WrongValueError(f"is a {kind}, not {shown(value)}")
 
     def whole(value: Any) -> int:
-        number = _integer(value, kind)
-        # A byte is signed on the wire, and many write it as 0 to 255.
-        return number - 256 if kind == "byte" and 128 <= number < 256 else number
+        return _integer(value, kind)
 
     return boolean if code == "?" else real if code in "fd" else whole
 
