@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import asyncio
 from ipaddress import IPv4Address
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
-from rmpa.agent.network import is_displaced
+from rmpa.agent import network
+from rmpa.agent.network import Network, is_displaced
+from rmpa.config.settings import Settings
+from rmpa.core.errors import StartError
 from rmpa.discovery.io.interfaces import Interface
+from rmpa.mesh import limits as mesh_limits
+from tests.bridge.io.virtual import VirtualLoop, run
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 LO = Interface("lo", 1, (IPv4Address("127.0.0.1"),), up=True, multicast=False, loopback=True)
 
@@ -40,3 +50,66 @@ def test_interfaces_that_the_user_did_not_choose_do_not_count() -> None:
     there = (LO, card("eth0", "10.0.0.1"), card("eth1", "10.1.0.1"))
     assert not is_displaced(IPv4Address("127.0.0.1"), there, ("lo",))
     assert is_displaced(IPv4Address("10.0.0.1"), there, ("eth1",))
+
+
+class Endpoint:
+    """A place in the network; those that fail cannot be started."""
+
+    failing = 0
+
+    def __init__(self, *_: object, port: int, on_displaced: Callable[[], None], **__: object) -> None:
+        self.port = port
+        self.displaced = on_displaced
+        self.started = self.closed = False
+        made.append(self)
+
+    async def start(self) -> None:
+        if Endpoint.failing:
+            Endpoint.failing -= 1
+            raise StartError("mesh port", "taken")
+        await asyncio.sleep(1.0)
+        self.started = True
+
+    async def close(self) -> None:
+        await asyncio.sleep(1.0)
+        self.closed = True
+
+
+made: list[Endpoint] = []
+
+
+@pytest.fixture
+def joined(monkeypatch: pytest.MonkeyPatch) -> Callable[[], Network]:
+    made.clear()
+    monkeypatch.setattr(network, "NetworkEndpoint", Endpoint)
+    monkeypatch.setattr(Endpoint, "failing", 0)
+    return lambda: Network(Settings(), cast("Any", None), trust=cast("Any", object()))
+
+
+def test_a_move_goes_on_until_the_agent_is_in_the_network_again(joined: Callable[[], Network]) -> None:
+    async def main() -> None:
+        sut = joined()
+        await sut.start()
+        Endpoint.failing = 2
+        made[0].displaced()
+        await asyncio.sleep(2 * mesh_limits.JOIN_RETRY + 10.0)
+        assert [one.closed for one in made] == [True, True, True, False]
+        assert sut.endpoint is not None
+        assert made[-1].started
+        await sut.close()
+
+    run(main(), VirtualLoop())
+
+
+@pytest.mark.parametrize("after", [0.5, 1.5])
+def test_an_agent_that_ends_while_it_moves_leaves_nothing_behind(joined: Callable[[], Network], after: float) -> None:
+    async def main() -> None:
+        sut = joined()
+        await sut.start()
+        made[0].displaced()
+        await asyncio.sleep(after)  # while it leaves, or while it joins
+        await sut.close()
+        assert all(one.closed for one in made)
+        assert sut.endpoint is None
+
+    run(main(), VirtualLoop())

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits
@@ -253,6 +254,7 @@ class Network:
         self._bridge = bridge
         self._trust = trust
         self._moving: asyncio.Task[None] | None = None
+        self._over = asyncio.Event()
         self.endpoint: NetworkEndpoint | None = None
         """The place now; ``None`` before the start, and while the agent moves."""
 
@@ -269,15 +271,20 @@ class Network:
 
     async def close(self) -> None:
         """Leave the network."""
+        self._over.set()
         if self._moving is not None:
-            self._moving.cancel()
+            await asyncio.wait([self._moving])  # not cancelled: the place that it leaves would stay half closed
         await self._leave()
 
     async def _join(self, port: int) -> None:
         self.endpoint = NetworkEndpoint(
             self._settings, self._bridge, port=port, on_displaced=self._displaced, trust=self._trust
         )
-        await self.endpoint.start()
+        try:
+            await self.endpoint.start()
+        except BaseException:
+            await self._leave()
+            raise
 
     async def _leave(self) -> None:
         if self.endpoint is not None:
@@ -293,12 +300,13 @@ class Network:
             port = self.endpoint.port if self.endpoint is not None else self._settings.port
             _log.info("= the machine's addresses have changed: taking a new GUID")
             await self._leave()
-            while self.endpoint is None:
+            while self.endpoint is None and not self._over.is_set():
                 try:
                     await self._join(port)
                 except RmpaError as error:
                     _log.warning("! cannot join with the new address yet: %s", error)
-                    await asyncio.sleep(mesh_limits.JOIN_RETRY)
+                    with suppress(TimeoutError):
+                        await asyncio.wait_for(self._over.wait(), mesh_limits.JOIN_RETRY)
         finally:
             self._moving = None
 

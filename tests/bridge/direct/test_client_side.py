@@ -85,6 +85,16 @@ def test_a_lasting_refusal_is_asked_again_only_when_the_peer_says_so(services: D
     assert asked(services.retry(KEY, "/adder")) == ["/add"]
 
 
+def test_a_change_at_the_peer_that_overtakes_its_refusal_is_not_overlooked(services: DirectServices) -> None:
+    """A notification is handled at once, the response that was sent before it by the task that waits for it."""
+    assert services.retry(KEY, "/adder") == []
+    assert services.replied(KEY, 1, REFUSED, 5.0) == []
+    assert services.next_timer() == 5.0 + limits.DIRECT_RETRY_PAUSE
+    assert asked(services.handle_timer(5.0 + limits.DIRECT_RETRY_PAUSE)) == ["/add"]
+    assert services.replied(KEY, 2, REFUSED, 7.0) == []
+    assert services.next_timer() is None, "once for each change"
+
+
 def test_late_outcomes_of_earlier_attempts_change_nothing(services: DirectServices) -> None:
     assert asked(services.renewed(KEY)) == ["/add"]
     assert services.replied(KEY, 1, GRANT, 0.0) == []

@@ -91,6 +91,7 @@ def test_a_server_at_another_address_is_told_again_and_its_routes_end(exports: S
     assert told(exports) == [AdvertiseServices((ServiceOffer("/add", "/adder"),))]
     assert exports.opened(1, OpenService(ROUTE, "/add")) == [Probe("/add", again)]
     assert exports.described("/add", ADD, ABOUT) == [], "the answer of the one before"
+    assert exports.refused("/add", ADD, "no answer") == [], "its late end fails no call of the next one"
 
 
 def test_what_policy_keeps_home_is_not_told_and_not_opened() -> None:
@@ -122,7 +123,7 @@ def test_one_probe_answers_all_who_wait(exports: ServiceExports) -> None:
     exports.link_up(2, "arm")
     assert exports.opened(1, OpenService(ROUTE, "/add")) == [Probe("/add", ADD)]
     assert exports.opened(2, OpenService(ROUTE, "/add")) == []
-    assert exports.refused("/add", "no answer") == [
+    assert exports.refused("/add", ADD, "no answer") == [
         Send(1, ServiceClosed(ROUTE, "no answer")),
         Send(2, ServiceClosed(ROUTE, "no answer")),
     ]

@@ -170,7 +170,7 @@ class World:
             if self.servers.get(probe.service) == probe.server:
                 self.act(self.exports.described(probe.service, probe.server, ABOUT))
             else:
-                self.act(self.exports.refused(probe.service, "no answer"))
+                self.act(self.exports.refused(probe.service, probe.server, "no answer"))
 
     def deliver(self, _service: str = "") -> bool:
         self.act(self.exports.advertise())

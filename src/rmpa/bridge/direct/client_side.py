@@ -51,6 +51,7 @@ class DirectService:
         local: Whether ``unmet`` was found here, not at the peer.
         grant: The peer's permission, from ``PROBING`` on.
         attempt: Counts the requests and probes, to tell their outcomes apart.
+        doubtful: Whether something changed there while the peer was asked, so that a refusal may be outdated.
         adrift: Whether it is ``DIRECT`` although the peer's agent has crashed.
     """
 
@@ -61,6 +62,7 @@ class DirectService:
     local: bool = True
     grant: Grant | None = None
     attempt: int = 0
+    doubtful: bool = False
     adrift: bool = False
 
 
@@ -206,7 +208,11 @@ class DirectServices:
         if service is None or service.state is not DirectState.ASKING or service.attempt != attempt:
             return []
         if isinstance(found, Unmet):
-            return self._relay(key, service, found, now)
+            doubtful = service.doubtful
+            actions = self._relay(key, service, found, now)
+            if doubtful:
+                self._timers.set(key, now + limits.DIRECT_RETRY_PAUSE)
+            return actions
         service.state, service.grant = DirectState.PROBING, found
         return [ProbeServer(key, attempt, found)]
 
@@ -253,7 +259,11 @@ class DirectServices:
     def retry(self, key: ServiceKey, node: str) -> list[ServiceAction]:
         """Ask again for a service that the peer refused: something has changed there."""
         service = self._services.get(key)
-        if service is None or service.node != node or service.local or service.state is not DirectState.RELAYED:
+        if service is None or service.node != node:
+            return []
+        if service.state is DirectState.ASKING:
+            service.doubtful = True  # this may be handled before the refusal that was sent first
+        if service.local or service.state is not DirectState.RELAYED:
             return []
         return self._ask(key, service)
 
@@ -328,7 +338,7 @@ class DirectServices:
         self._timers.set(key, None)
         actions: list[ServiceAction] = [AnswerRelay(key)] if service.state is DirectState.DIRECT else []
         service.state, service.unmet, service.local = DirectState.ASKING, None, False
-        service.grant, service.adrift = None, False
+        service.grant, service.adrift, service.doubtful = None, False, False
         service.attempt += 1
         busy = self._busy.setdefault(key.peer, set())
         if key.service not in busy and len(busy) >= limits.DIRECT_ASKS:

@@ -346,8 +346,13 @@ class ServiceExports:
         self._about[service] = about
         return self._start(service)
 
-    def refused(self, service: str, reason: str) -> list[ExportAction]:
-        """Close the routes that wait for a server that does not answer, or refuses."""
+    def refused(self, service: str, server: LocalService, reason: str) -> list[ExportAction]:
+        """Close the routes that wait for a server that does not answer, or refuses.
+
+        Ignored if the service has another server by now.
+        """
+        if self.offered.get(service) != server:
+            return []
         actions: list[ExportAction] = []
         for number, peer in self._peers.items():
             for route, session in list(peer.sessions.items()):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from typing import TYPE_CHECKING
 
 from rmpa.bridge.messages import is_crossing_name, is_crossing_type
 from rmpa.bridge.policy import Policy, is_own
 from rmpa.bridge.relay import is_outside, service_place
 from rmpa.bridge.topics.io.local_sources import LocalSources
+from rmpa.core.log import logged_failure
 from rmpa.gateway.neighbour import MeshSource, SourceKind
 from rmpa.ros.master.effects import RegistrationKind
 from rmpa.runtime.event_loop import yielding_to_data
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
     from rmpa.agent import Agent
     from rmpa.config.settings import Settings
     from rmpa.ros.master.effects import GraphChange
+
+_log = logging.getLogger(__name__)
 
 SourceKey = tuple[SourceKind, str, str]
 """Kind, name here, and node here."""
@@ -128,7 +132,8 @@ class MeshSources:
 
     def _tell(self, source: MeshSource, *, there: bool) -> None:
         for on_change in tuple(self._watchers):
-            on_change(source, there)
+            with logged_failure(_log, "a neighbour failed at %s; the others are told", source):
+                on_change(source, there)
 
     def _topic(self, topic: str) -> Iterable[MeshSource]:
         for node, local in self._local.of(topic).items():

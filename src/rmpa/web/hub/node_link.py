@@ -9,6 +9,7 @@ import logging
 from typing import TYPE_CHECKING, Generic, TypeAlias, TypeVar
 
 from rmpa.core.errors import RmpaError, UnreachableError
+from rmpa.core.log import logged_failure
 from rmpa.web import limits
 
 if TYPE_CHECKING:
@@ -54,7 +55,8 @@ class NodeLink:
     def registration_changed(self) -> None:
         """Call ``on_registration``."""
         for callback in self.on_registration:
-            callback()
+            with logged_failure(_log, "what follows a registration failed"):
+                callback()
 
     def start(self) -> None:
         """Begin, in a task."""
@@ -121,7 +123,8 @@ class NodeLink:
         self.problem = ""
         self._ready.set()
         for callback in self.on_node:
-            callback(node)
+            with logged_failure(_log, "what follows a new node failed"):
+                callback(node)
 
 
 class Registration(Generic[_T]):

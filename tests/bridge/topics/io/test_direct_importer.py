@@ -40,6 +40,8 @@ class Module:
         self.value: object = {"port": 45225, "probe": "/talker/get_loggers", "address": "10.0.0.9"}
         self.gate = asyncio.Event()
         self.gate.set()
+        self.reachable = asyncio.Event()
+        self.reachable.set()
         self.asking = self.most = 0
         self.probed: list[tuple[str, int]] = []
         self.moved: list[DirectKey] = []
@@ -47,7 +49,7 @@ class Module:
         self.warned: list[str] = []
         self.connected: list[object] = []
         self.checked = asyncio.Event()
-        link = SimpleNamespace(name="a")
+        link = SimpleNamespace(name="a", reachable=True)
         self.session: Any = SimpleNamespace(
             peer=1, link=link, linked=True, reachable=True, same_machine=False, address="10.0.0.1"
         )
@@ -107,7 +109,9 @@ class Module:
 
     async def _probe(self, address: str, port: int, *_: object, **__: object) -> str:
         self.probed.append((address, port))
-        return ""
+        link = self.session.link
+        await self.reachable.wait()
+        return "" if link.reachable else "no answer"
 
     async def _direct_links(self, *_: object) -> list[object]:
         self.checked.set()
@@ -227,6 +231,22 @@ async def test_a_source_is_kept_only_while_its_own_agent_is_dead(module: Module)
     assert not module.entry.direct
     await until(lambda: module.state == (DirectState.DIRECT, Path.DIRECT))
     assert module.moved == []
+
+
+async def test_a_probe_over_an_earlier_link_does_not_count_for_the_next_one(module: Module) -> None:
+    module.reachable.clear()
+    module.sut.shown(1, SOURCE)
+    await until(lambda: module.probed)
+    early = module.reachable
+    module.reachable = asyncio.Event()
+    module.sut.link_down(module.session, crashed=False)
+    module.session.link = SimpleNamespace(name="a", reachable=False)
+    module.sut.link_up(module.session)
+    await until(lambda: len(module.probed) == 2)
+    early.set()  # it has reached the port, before the link was lost
+    await asyncio.sleep(0)
+    module.reachable.set()
+    await until(lambda: module.state[0] is DirectState.RELAYED)
 
 
 async def test_a_subscriber_that_ends_frees_its_grant(module: Module) -> None:

@@ -146,11 +146,11 @@ class Serving:
         try:
             told = await self._pool(action.service, action.server).describe()
         except RmpaError as error:
-            self._act(self._exports.refused(action.service, str(error)))
+            self._act(self._exports.refused(action.service, action.server, str(error)))
             return
         if not is_type_name(told.type) or len(told.md5sum) != _MD5_LENGTH:
             text = f"service [{action.service}]: its server says neither type nor md5 sum (but {told})"
-            self._act(self._exports.refused(action.service, text))
+            self._act(self._exports.refused(action.service, action.server, text))
             return
         about = ServiceAbout(told.type, told.md5sum, told.request_type, told.response_type)
         self._act(self._exports.described(action.service, action.server, about))

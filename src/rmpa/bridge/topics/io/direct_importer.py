@@ -419,7 +419,7 @@ class DirectImporter:
         session = self._sessions.get(peer)
         if session is None:
             return
-        address = session.address
+        address, link = session.address, session.link
         try:
             timeout = limits.DIRECT_PROBE_TIMEOUT
             problem = await probe(address, grant.port, grant.probe, node=grant.node, timeout=timeout)
@@ -428,6 +428,8 @@ class DirectImporter:
             raise
         if problem:
             problem = f"no connection to {address}:{grant.port}: {problem}"
+        if session.link is not link:
+            return  # the next link has probes of its own
         self._act(self.routes.probed(peer, grant.port, problem, self._now()))
 
     # --- carrying out -----------------------------------------------------------------------------------------------

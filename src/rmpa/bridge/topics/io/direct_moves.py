@@ -212,6 +212,8 @@ class SubscriberMoves:
         """Repeats the list of publishers: a roscore's list is known here with a delay, and calls may be lost."""
         if not self._closed:
             later = asyncio.get_running_loop().call_later
+            if (earlier := self._repeats.pop(key, None)) is not None:
+                earlier.cancel()
             self._repeats[key] = later(limits.DIRECT_LIST_AGAIN, self._repeat, key, topic)
 
     def _repeat(self, key: DirectKey, topic: str) -> None:

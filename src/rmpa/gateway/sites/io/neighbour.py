@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.core.clock import earliest
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.log import logged_failure
 from rmpa.gateway import limits
 from rmpa.gateway.sites.catalogue import CatalogueChange, SiteCatalogue
 from rmpa.gateway.sites.exports import SiteExports
@@ -210,20 +211,22 @@ class SiteNeighbour:
         if not self._active:
             return
         for change in exports:
-            if isinstance(change.item, SiteModule):
-                self._own_module(change.item, there=change.there)
-            elif change.there:
-                self._export(change.item)
-            else:
-                self._withdraw(change.item)
+            with logged_failure(_log, "%s failed; the other changes are made", change):
+                if isinstance(change.item, SiteModule):
+                    self._own_module(change.item, there=change.there)
+                elif change.there:
+                    self._export(change.item)
+                else:
+                    self._withdraw(change.item)
         for each in imports:
             for part in self._parts:
-                if each.old is not None and each.new is not None:
-                    part.renew(each.old, each.new)
-                elif each.new is not None:
-                    part.show(each.new)
-                elif each.old is not None:
-                    part.hide(each.old)
+                with logged_failure(_log, "%s failed; the other changes are made", each):
+                    if each.old is not None and each.new is not None:
+                        part.renew(each.old, each.new)
+                    elif each.new is not None:
+                        part.show(each.new)
+                    elif each.old is not None:
+                        part.hide(each.old)
 
     # --- leading --------------------------------------------------------------------------------------------------
 
