@@ -57,9 +57,13 @@ def test_nodes_are_pinged_and_ended_across_modules(modules: ModuleFactory) -> No
     assert a.agent.rmpa("node", "ping", "b:/talker", "-c", "1")[0] == 0
     assert {"/talker", "/rosout_agg"} <= a.topics()
 
+    ping = a.ros.start("rosnode", "ping", "/rmpa/b/talker", name="ping")
+    ping.wait_for("xmlrpc reply from http://127")
     code, out = a.agent.rmpa("node", "kill", "b:/talker")
     assert (code, out.strip()) == (0, "killed b:/talker")
     b.wait_no_topic("/talker")
+    ping.wait()
+    assert "connection to [/rmpa/b/talker] failed" in ping.output, "as of any node that is gone"
 
     def killed() -> bool:
         a.ros.tool("rosnode", "kill", "/rmpa/b/other")  # refused as long as it may belong to kill -a

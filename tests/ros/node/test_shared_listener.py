@@ -11,7 +11,7 @@ import psutil
 import pytest
 
 from rmpa.core.counters import Counters
-from rmpa.core.errors import StartError
+from rmpa.core.errors import StartError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.core.identify import name_at
 from rmpa.ros.http.client import call_api
@@ -93,6 +93,9 @@ async def test_the_address_of_a_closed_node_is_refused_and_not_given_again(liste
     await first.close()
     assert second.uri != uri
     assert await request_topic(uri) == [-1, 0], "rospy tries again for ever where a call is not answered"
+    for method, *rest in (("getPid",), ("shutdown", "user request"), ("getBusInfo",)):
+        with pytest.raises(UnreachableError, match="Connection reset by peer"):
+            await call_api(uri, method, "/rosnode", *rest)
     assert await name_at(uri) is None, "an agent's leftovers at a roscore are told from a live agent's nodes"
     with pytest.raises(ConnectionResetError):
         await connect(address)

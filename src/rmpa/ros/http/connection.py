@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import struct
 from collections import deque
 from typing import TYPE_CHECKING, Final, Protocol
 
@@ -17,6 +18,8 @@ from rmpa.runtime.event_loop import yield_to_data
 if TYPE_CHECKING:
     from collections.abc import Awaitable
 
+RESET: Final = struct.pack("ii", 1, 0)
+"""SO_LINGER: closing resets the connection, like a port where nothing listens."""
 _PIECE: Final = 16 * KIB
 """Bytes parsed at once: the granularity of the bound on headers; other pending data is served in between."""
 
@@ -279,6 +282,12 @@ class HttpConnection(asyncio.Protocol):
             # Written data is still sent, but a client that does not read it cannot hold the socket for long.
             self._transport.close()
             self._expect(limits.HTTP_REQUEST_TIMEOUT)
+
+    def reset(self) -> None:
+        """Close at once, and tell the client by a reset."""
+        if self._transport is not None:
+            self._transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
+        self.abort()
 
     def abort(self) -> None:
         """Close at once."""

@@ -29,7 +29,14 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 Handler = Callable[[str, tuple[XmlRpcValue, ...], str], XmlRpcValue | Awaitable[XmlRpcValue]]
-"""``(method, params, address of the client) -> value``, at once or awaited; a ``RosFault`` raised becomes a fault."""
+"""``(method, params, address of the client) -> value``, at once or awaited.
+
+A ``RosFault`` raised becomes a fault. ``HangUp``, raised at once, resets the connection.
+"""
+
+
+class HangUp(Exception):  # noqa: N818 - the name says what the handler wants
+    """Raised by a handler: the call's connection is reset, as by a port where no process listens."""
 
 
 class XmlRpcServer:
@@ -208,6 +215,9 @@ class XmlRpcServer:
             _log.debug("< %s %s%s", connection.client, method, brief(params))
         try:
             value = self._handler(method, params, connection.client)
+        except HangUp:
+            connection.reset()
+            return b""
         except Exception as error:  # noqa: BLE001 - the top of a call: the caller gets an answer in any case
             return self._failed(method, error)
         if isinstance(value, Awaitable):

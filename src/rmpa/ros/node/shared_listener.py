@@ -10,13 +10,13 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-import struct
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.counters import Counters
 from rmpa.core.errors import StartError
 from rmpa.ros import limits
-from rmpa.ros.http.server import XmlRpcServer
+from rmpa.ros.http.connection import RESET
+from rmpa.ros.http.server import HangUp, XmlRpcServer
 from rmpa.ros.node.loopback_addresses import LoopbackAddresses
 from rmpa.runtime.acceptor import Acceptor
 from rmpa.runtime.descriptors import DESCRIPTORS, Use
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _DEVICE: Final = b"lo"
-_RESET: Final = struct.pack("ii", 1, 0)
-"""SO_LINGER: closing resets the connection, like a port where nothing listens."""
 
 
 class SharedListener:
@@ -108,17 +106,14 @@ class SharedListener:
         self._addresses.free(address, asyncio.get_running_loop().time())
 
     def _answer_stray(self, sock: socket.socket, client: tuple[str, int]) -> None:
-        """Answer a call to the address of a closed node with an error.
-
-        After a reset, rospy would repeat ``requestTopic`` twice a minute in a thread until its process ends.
-        """
+        """Take a call to the address of a closed node: see ``_former_node``."""
         self._counters.add("address.unknown.xmlrpc")
         self._strays.adopt(sock, client)
 
     def _reset_stray(self, sock: socket.socket, _client: tuple[str, int]) -> None:
         """Reset a TCPROS connection to the address of a closed node, as a closed port would: roscpp backs off."""
         self._counters.add("address.unknown.tcpros")
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
         sock.close()
 
 
@@ -192,5 +187,15 @@ async def _test_address(address: str, port: _Port) -> None:
         del port.nodes[address]
 
 
-def _former_node(_method: str, _params: tuple[XmlRpcValue, ...], _client: str) -> XmlRpcValue:
+def _former_node(method: str, _params: tuple[XmlRpcValue, ...], _client: str) -> XmlRpcValue:
+    """Reset the connection, by which ``rosnode`` and others know a dead node; an error in the answer stops them.
+
+    Answered are ``requestTopic``, which rospy repeats twice a minute after a reset until its process ends,
+    and ``getName``, by which agents tell this listener from one that is stuck.
+
+    Raises:
+        HangUp: For all other methods.
+    """
+    if method not in ("requestTopic", "getName"):
+        raise HangUp
     return [-1, "the node that had this address is gone", 0]
