@@ -83,6 +83,22 @@ async def test_any_type_comes_from_its_publisher(core: RosCore) -> None:
         assert echo.name.startswith("/echo_")
 
 
+async def test_messages_with_a_header_are_numbered_as_rospy_numbers_them(core: RosCore) -> None:
+    async with node(core, "talker") as talker, node(core, "echo") as echo:
+        publisher = await talker.advertise("/points", "geometry_msgs/PointStamped")
+        subscriber = await echo.subscribe("/points")
+        await publisher.wait_for_subscriber()
+        message = publisher.make({"header": {"seq": 99, "frame_id": "map"}, "point": {"x": 7.0}})
+        for _ in range(3):
+            publisher.publish(message)
+        publisher.publish_raw(MessageType("geometry_msgs/PointStamped").serialize(message))
+        iterator = aiter(subscriber)
+        async with asyncio.timeout(DEADLINE):
+            got = [(await anext(iterator)).message for _ in range(4)]
+        assert [each.header.seq for each in got] == [1, 2, 3, 99]  # what is relayed raw stays as it is
+        assert {(each.header.frame_id, each.point.x) for each in got} == {("map", 7.0)}
+
+
 async def test_the_iteration_ends_with_its_subscriber_and_with_its_node(core: RosCore) -> None:
     async with node(core, "n") as one:
         for end in (lambda s: s.close(), lambda _: one.close()):

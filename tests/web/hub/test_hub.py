@@ -12,6 +12,7 @@ from rmpa.core.errors import RmpaError
 from rmpa.ros.types.definitions import parse_definition
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.types.service_types import ServiceType
+from rmpa.ros.types.std_header import HEADER_PART
 from rmpa.web import limits
 from rmpa.web.hub.requests import (
     AdvertiseTopic,
@@ -274,6 +275,40 @@ async def test_what_a_client_publishes_reaches_nodes_and_other_clients(core: Ros
         one.ask(PublishMessage(1, TWO))
         await until(lambda: heard == [ONE, TWO])
         assert two.payloads(1) == [ONE, TWO]
+
+
+async def test_what_clients_publish_is_numbered_as_rospy_numbers_it(core: RosCore) -> None:
+    async with running_hub(core) as hub, node(core, "echo") as echo:
+        heard: list[int] = []
+        await echo.subscribe("/points", callback=lambda message: heard.append(message.message.header.seq))
+        await until(lambda: "/points" in hub.graph.topics)
+        clients = [FakeClient(hub), FakeClient(hub)]
+        listener = FakeClient(hub)
+        listener.ask(Subscribe(1, "/points"))
+        point = MessageType("geometry_msgs/PointStamped")
+        for client in clients:  # they share one publisher, and the first message waits for its subscribers
+            client.ask(AdvertiseTopic(1, "/points", point.name))
+            client.ask(PublishMessage(1, point.serialize(point.make({"header": {"seq": 9}}))))
+        await until(lambda: heard == [1, 2])
+        clients[0].ask(PublishMessage(1, point.serialize(point.make())))
+        await until(lambda: heard == [1, 2, 3])
+        assert [point.deserialize(payload).header.seq for payload in listener.payloads(1)] == [1, 2, 3]
+
+
+async def test_what_is_published_before_its_type_is_known_is_numbered_too(core: RosCore) -> None:
+    async with running_hub(core) as hub, node(core, "other") as other:
+        kind = MessageType.learn("my_msgs/Stamped", "Header header\n" + HEADER_PART)
+        publisher = await other.advertise("/other", kind)
+        await until(lambda: "/other" in hub.graph.topics)
+        client = FakeClient(hub)
+        client.ask(Subscribe(1, "/t"))
+        client.ask(AdvertiseTopic(2, "/t", kind.name))
+        for _ in range(2):
+            client.ask(PublishMessage(2, kind.serialize(kind.make())))
+        assert client.payloads(1) == []
+        await until(lambda: len(client.payloads(1)) == 2)
+        assert [kind.deserialize(payload).header.seq for payload in client.payloads(1)] == [1, 2]
+        await publisher.close()
 
 
 async def test_what_a_client_latches_reaches_late_nodes_and_clients(core: RosCore) -> None:

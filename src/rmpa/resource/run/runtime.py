@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
-import itertools
 import logging
 import threading
 import time
@@ -13,15 +12,14 @@ from collections import Counter, deque
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import LocalProtocolError, RmpaError
-from rmpa.core.serial_number import SERIAL_MASK
 from rmpa.resource import limits
 from rmpa.resource.declare.fence import current_fence
 from rmpa.resource.run.descriptor import TOPIC, describe, topic_of
-from rmpa.ros.types.messages import MessageError, MessageType
+from rmpa.ros.types.messages import HeaderNumbers, MessageError, MessageType
 from rmpa.ros.wire.tcpros import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
     from rmpa.resource.decide.actions import Action
     from rmpa.resource.declare.attributes import Value
@@ -130,7 +128,7 @@ class Runtime:
             for output in self.resource.outputs.values():
                 topic = topic_of(output.name, self.node.name)
                 self._publishers[output.name] = await self.node.advertise(topic, output.type, latch=output.latch)
-                output.on_publish = functools.partial(self._publish, output, itertools.count(1))
+                output.on_publish = functools.partial(self._publish, output, HeaderNumbers(output.type))
                 undo.callback(setattr, output, "on_publish", None)
             for declared in self.resource.declared_attributes.values():
                 declared.on_observation = functools.partial(self.call_in_loop, self._observed)
@@ -319,7 +317,7 @@ class Runtime:
             part.parameter_changed(parameter)
 
     def _publish(
-        self, output: Output, numbers: Iterator[int], values: Mapping[str, Any], message: object | None
+        self, output: Output, numbers: HeaderNumbers, values: Mapping[str, Any], message: object | None
     ) -> None:
         """Serialize a message in the caller's thread, so that the caller gets the errors, and send it in the loop."""
         kind = output.type
@@ -332,11 +330,7 @@ class Runtime:
             if given != kind.name:
                 shown = given or type(message).__name__
                 raise MessageError(f"{output.name} has messages of type {kind.name}, not {shown}")
-        if kind.fields and kind.fields[0].name == "header":
-            header: Any = getattr(message, "header", None)
-            if hasattr(header, "seq"):
-                header.seq = next(numbers) & SERIAL_MASK  # as rospy does, so that receivers can count losses
-        raw, fence = kind.serialize(message), current_fence()
+        raw, fence = bytes(numbers.stamp(kind.serialize(message))), current_fence()
         if fence is None:
             self.call_in_loop(self.send, output, raw)
             return

@@ -32,7 +32,6 @@ class StatusPublisher:
         self._name = runtime.resource.name
         self.publishers: dict[str, Publisher] = {}
         self._responses: list[bytes] | None = None
-        self._sequence = 0
 
     async def start(self) -> None:
         """Advertise the topics."""
@@ -72,6 +71,5 @@ class StatusPublisher:
 
     def _publish(self, topic: str, statuses: Sequence[DiagnosticStatus]) -> None:
         if (publisher := self.publishers.get(topic)) is not None:
-            self._sequence += 1
-            array = frame_array(self._sequence, time.time_ns(), [status.serialize() for status in statuses])
-            publisher.publish_raw(array[LENGTH.size :])
+            array = frame_array(0, time.time_ns(), [status.serialize() for status in statuses])[LENGTH.size :]
+            publisher.publish_raw(publisher.numbers.stamp(array) if publisher.numbers is not None else array)

@@ -15,6 +15,7 @@ from rmpa.core.errors import LocalProtocolError
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.subscription import Subscription
 from rmpa.ros.types.header_types import type_of_header
+from rmpa.ros.types.messages import HeaderNumbers
 from rmpa.ros.wire.tcpros import ANY, LENGTH, frame_message, printable
 
 if TYPE_CHECKING:
@@ -88,6 +89,8 @@ class Publisher:
         self.topic = topic
         self.description = description
         self.kind = kind
+        self.numbers = HeaderNumbers(kind) if kind is not None else None
+        """Numbers what ``publish`` sends; what ``publish_raw`` sends has its numbers already."""
         self._on_close = on_close
         self._change = asyncio.Event()
         self._log = RefusalLog(_log, Counters())
@@ -115,13 +118,16 @@ class Publisher:
     def publish(self, message: object) -> int:
         """Publish a message object; return the number of older messages dropped for slow subscribers.
 
+        ``header.seq`` counts the messages, 1, 2, 3 …, as rospy has it.
+
         Raises:
             MessageError: The message does not fit the type.
         """
-        return self.publish_raw(self._known().serialize(message))
+        payload: Buffer = self._known().serialize(message)
+        return self.publish_raw(self.numbers.stamp(payload) if self.numbers is not None else payload)
 
     def publish_raw(self, payload: Buffer) -> int:
-        """Publish a serialized message, without a length in front; returns as ``publish``.
+        """Publish a serialized message as it is, without a length in front; returns as ``publish``.
 
         Raises:
             ValueError: The message is longer than ``ros.limits.TCPROS_MESSAGE_MAX`` bytes.

@@ -7,12 +7,14 @@ without them. MD5 sums and definitions need neither.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import struct
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, Union
 
 from rmpa.core.errors import RmpaError
+from rmpa.core.sizes import UINT32_MAX
 from rmpa.ros import limits
 from rmpa.ros.types.definitions import (
     DefinitionError,
@@ -37,6 +39,7 @@ Plain: TypeAlias = Union[  # noqa: UP007 - | does not take the forward reference
 
 _TIMES: Final = {"time": "builtin_interfaces/msg/Time", "duration": "builtin_interfaces/msg/Duration"}
 _NANO: Final = 1_000_000_000
+_SEQ: Final = struct.Struct("<I")
 _FLOATS: Final = frozenset(("float32", "float64"))
 _SHOWN: Final = 80
 """Characters of a wrong value in an error."""
@@ -260,6 +263,29 @@ class MessageType:
             plain: Plain = value
             return plain
         return self._plain(field.type, value)
+
+
+class HeaderNumbers:
+    """Numbers the messages of one publisher in ``header.seq``: 1, 2, 3 …, as rospy does.
+
+    A type has such a number where its first field is ``std_msgs/Header header``, as for roscpp.
+    """
+
+    def __init__(self, kind: MessageType) -> None:
+        first = kind.fields[0] if kind.fields else None
+        self._has_header = first is not None and (first.type, first.name, first.array) == (
+            "std_msgs/Header",
+            "header",
+            False,
+        )
+        self._numbers = itertools.count(1)  # of threads that publish at one time, each gets its own
+
+    def stamp(self, payload: Buffer) -> Buffer:
+        """The next message, numbered; itself where its type has no number."""
+        number = next(self._numbers)
+        if not self._has_header:
+            return payload
+        return b"".join((_SEQ.pack(number & UINT32_MAX), memoryview(payload)[_SEQ.size :]))
 
 
 _RANGES: Final = {

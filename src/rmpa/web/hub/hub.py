@@ -81,6 +81,7 @@ class Hub:
         self.publishers = Publishers(
             self.link,
             self.types.find_message,
+            known=self.types.at_hand,
             deliver=self._published,
             ended=self.topics.forget_own,
             now_ns=now_ns,

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rmpa.core.errors import PeerRefused
+from rmpa.ros.types.messages import HeaderNumbers
 from rmpa.web import limits
 from rmpa.web.hub.node_link import EndingRegistrations, Registration
 
@@ -33,6 +34,8 @@ class _Shared:
     type: str
     latch: bool
     users: dict[Key, Callable[[RmpaError], None]] = field(default_factory=dict)
+    numbers: HeaderNumbers | None = None
+    """Numbers its messages; ``None`` while its type is not known."""
     registration: Registration[Publisher] | None = None
     linger: asyncio.TimerHandle | None = None
     early: deque[Payload] | None = field(default_factory=deque)
@@ -47,6 +50,7 @@ class Publishers:
     Args:
         link: Has the node.
         find: Finds a message type.
+        known: A message type that is found at once, or ``None``.
         deliver: ``(topic, type, payload, latch)``: hands a message to the clients of this hub.
         ended: ``(topic)``: a topic was withdrawn.
         now_ns: The wall clock, in nanoseconds.
@@ -57,12 +61,14 @@ class Publishers:
         link: NodeLink,
         find: Callable[[str], Awaitable[MessageType]],
         *,
+        known: Callable[[str], MessageType | None],
         deliver: Callable[[str, str, memoryview, bool], None],
         ended: Callable[[str], None],
         now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         self._link = link
         self._find = find
+        self._known = known
         self._deliver = deliver
         self._ended = ended
         self._now_ns = now_ns
@@ -117,25 +123,22 @@ class Publishers:
             shared.linger = asyncio.get_running_loop().call_later(delay, self._end, shared)
 
     def publish(self, topic: str, payload: Payload) -> None:
-        """Publish a message of an advertised topic. The payload must not change afterwards."""
+        """Publish a message of an advertised topic, numbered. The payload must not change afterwards."""
         shared = self._shared.get(topic)
         if shared is None:
             return
+        if shared.numbers is None:
+            self._wait(shared, payload)  # it is numbered and delivered when the type is known
+            return
+        payload = shared.numbers.stamp(payload)
         view = memoryview(payload)
         if shared.latch:
             shared.latched = (view, self._now_ns())
-        if shared.early is None and (shared.registration is None or shared.registration.value is None):
-            shared.early = deque()  # the node is made anew: the newest messages wait for it
-            shared.early_bytes = 0
-        if shared.early is not None:
-            shared.early.append(payload)
-            shared.early_bytes += len(payload)
-            while len(shared.early) > limits.EARLY_MESSAGES or (
-                len(shared.early) > 1 and shared.early_bytes > limits.EARLY_BYTES
-            ):
-                shared.early_bytes -= len(shared.early.popleft())
-        elif shared.registration is not None and shared.registration.value is not None:
-            shared.registration.value.publish_raw(payload)
+        publisher = shared.registration.value if shared.registration is not None else None
+        if shared.early is not None or publisher is None:
+            self._wait(shared, payload)  # also while the node is made anew: the newest messages wait for it
+        else:
+            publisher.publish_raw(payload)
         self._deliver(topic, shared.type, view, shared.latch)
 
     async def close(self) -> None:
@@ -146,6 +149,23 @@ class Publishers:
 
     # --- inside -----------------------------------------------------------------------------------------------
 
+    def _wait(self, shared: _Shared, payload: Payload) -> None:
+        if shared.early is None:
+            shared.early, shared.early_bytes = deque(), 0
+        shared.early.append(payload)
+        shared.early_bytes += len(payload)
+        while len(shared.early) > limits.EARLY_MESSAGES or (
+            len(shared.early) > 1 and shared.early_bytes > limits.EARLY_BYTES
+        ):
+            shared.early_bytes -= len(shared.early.popleft())
+
+    def _number(self, shared: _Shared, kind: MessageType) -> None:
+        """The type is known: number and deliver what came before."""
+        shared.numbers = HeaderNumbers(kind)
+        waiting, shared.early, shared.early_bytes = shared.early or (), deque(), 0
+        for payload in waiting:
+            self.publish(shared.topic, payload)
+
     def _begin(self, topic: str, type_: str, *, latch: bool) -> _Shared:
         if len(self._shared) >= limits.PUBLISHERS_MAX:
             waiting = next((each for each in self._shared.values() if not each.users), None)
@@ -153,7 +173,9 @@ class Publishers:
                 problem = f"its clients publish {len(self._shared)} topics, which is the limit"
                 raise PeerRefused("the web server", problem, "publish fewer topics")
             self._end(waiting)
-        shared = self._shared[topic] = _Shared(topic, type_, latch)
+        kind = self._known(type_)
+        numbers = HeaderNumbers(kind) if kind is not None else None
+        shared = self._shared[topic] = _Shared(topic, type_, latch, numbers=numbers)
         shared.registration = Registration(
             self._link,
             topic,
@@ -166,6 +188,8 @@ class Publishers:
 
     async def _register(self, shared: _Shared, node: Node) -> Publisher:
         kind = await self._find(shared.type)
+        if shared.numbers is None and self._shared.get(shared.topic) is shared:
+            self._number(shared, kind)
         publisher = await node.advertise(shared.topic, kind, latch=shared.latch)
         if shared.early is not None and not shared.latch:
             # The master has just told the subscribers, which connect now: what is published meanwhile waits for them.

@@ -69,6 +69,13 @@ class TypeLibrary:
             self._keep(name, kind)
         return kind
 
+    def at_hand(self, name: str) -> MessageType | None:
+        """A message type as ``message`` finds it, or ``None``."""
+        try:
+            return self.message(name)
+        except RmpaError:
+            return None
+
     def version(self, name: str, md5sum: str) -> MessageType:
         """The version of a message type that a publisher has; that of ``message`` where its md5 sum is not known.
 
