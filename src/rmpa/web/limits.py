@@ -21,8 +21,9 @@ PAYLOAD_BUFFERS_BYTES: Final = 16 * MIB
 """Bytes of these buffers that are kept, used and unused: what waits for one slow client."""
 PAYLOAD_BUFFERS_MAX: Final = 64
 """Such buffers; each is looked at until one is unused."""
-CLIENTS_MAX: Final = 256
-"""Clients of both gateways together."""
+CLIENTS_MAX: Final = 224
+"""WebSocket clients, pages of the monitor included. The rest of ``WEB_CONNECTIONS_MAX`` is for requests: further ones
+are told why they are refused, and the files of the pages and /metrics are still served."""
 SUBSCRIPTION_LINGER: Final = 2.0
 """Time that the hub stays subscribed to a topic without a client: pages reload, and panels move."""
 SUBSCRIBED_TOPICS_MAX: Final = 4000

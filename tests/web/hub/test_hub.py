@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
 import time
 import warnings
 from typing import TYPE_CHECKING, Any
+
+import pytest
 
 from rmpa.core.errors import RmpaError
 from rmpa.ros.types.definitions import parse_definition
@@ -27,6 +30,7 @@ from rmpa.web.hub.requests import (
     FollowParams,
     GetParams,
     GraphChanged,
+    OtherType,
     ParamsChanged,
     PublishMessage,
     ReceivedMessage,
@@ -45,8 +49,6 @@ from tests.ros.node.peers import DEADLINE, LATCHED, STRING, until
 from tests.web.hub.client import FakeClient, node, running_hub
 
 if TYPE_CHECKING:
-    import pytest
-
     from rmpa.ros.core.embedded import RosCore
 
 ONE, TWO = b"\x03\0\0\0one", b"\x03\0\0\0two"
@@ -261,6 +263,28 @@ async def test_two_types_on_one_topic_are_told_apart(core: RosCore) -> None:
         )
 
 
+async def test_a_subscription_of_another_type_is_told_and_refused_by_the_publisher(core: RosCore) -> None:
+    async with running_hub(core) as hub, node(core, "talker") as talker:
+        client = FakeClient(hub)
+        client.ask(Subscribe(1, "/t", "std_msgs/Int32"))  # before any publisher
+        publisher = await talker.advertise("/t", STRING)
+        await until(lambda: client.of(OtherType))
+        assert client.of(OtherType) == [OtherType(1, "/t", "std_msgs/String")]
+        await until(lambda: "/rmpa_web" in publisher.refusals)  # as of any node: "rmpa why" has it from there
+        assert "std_msgs/Int32" in publisher.refusals["/rmpa_web"]
+        other = FakeClient(hub)
+        other.ask(Subscribe(1, "/t"))
+        await publisher.wait_for_subscriber()
+        publisher.publish_raw(ONE)
+        await until(lambda: other.payloads(1) == [ONE])
+        await publisher.close()
+        publisher = await talker.advertise("/t", MessageType("std_msgs/Int32"))
+        await until(lambda: publisher.subscribers)
+        publisher.publish(publisher.make(7))
+        await until(lambda: client.payloads(1) == [b"\x07\0\0\0"])
+        assert len(client.of(OtherType)) == 1
+
+
 async def test_what_a_client_publishes_reaches_nodes_and_other_clients(core: RosCore) -> None:
     async with running_hub(core) as hub, node(core, "echo") as echo:
         heard: list[bytes] = []
@@ -467,6 +491,33 @@ async def test_a_client_serves_nodes_and_its_end_fails_the_open_call(core: RosCo
         error = (await asyncio.gather(second, return_exceptions=True))[0]
         assert "has ended it" in str(error)
         await until(lambda: "/served" not in hub.graph.services)
+
+
+async def test_the_newest_client_that_offers_a_service_has_it(core: RosCore) -> None:
+    """As with rosbridge_suite: the client before it may have gone without a word, and connects again."""
+    kind = ServiceType(SET_BOOL)
+    async with running_hub(core) as hub, node(core, "caller") as caller:
+        old, new = FakeClient(hub), FakeClient(hub)
+        old.ask(ServeService(1, "/set", SET_BOOL))
+        await until(lambda: core.state().services.get("/set"))
+        calling = asyncio.ensure_future(caller.call_service("/set", kind, {"data": True}))
+        await until(lambda: old.of(ServiceRequest))
+        new.ask(ServeService(1, "/set", SET_BOOL))
+        assert (await old.failure(1)).error == "another client offers /set now"
+        with pytest.raises(RmpaError, match="has ended it"):
+            await calling
+        old.close()  # it takes nothing with it
+
+        async def call() -> Any:
+            while True:
+                with contextlib.suppress(RmpaError):  # while it is registered anew
+                    return await caller.call_service("/set", kind, {"data": True})
+
+        calling = asyncio.ensure_future(call())
+        await until(lambda: new.of(ServiceRequest))
+        new.ask(Respond(1, new.of(ServiceRequest)[0].call, ok=True, response=b"\x01\0\0\0\0"))
+        assert (await calling).success
+        assert len(old.of(ServiceRequest)) == 1
 
 
 # --- parameters, graph, types ---

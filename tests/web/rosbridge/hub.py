@@ -24,6 +24,7 @@ _R = TypeVar("_R", bound=Request)
 @dataclass
 class Graph:
     topics: dict[str, GraphTopic] = field(default_factory=dict)
+    published: dict[str, str] = field(default_factory=dict)
     services: dict[str, GraphService] = field(default_factory=dict)
     nodes: tuple[str, ...] = ()
     params: dict[str, ParamValue] = field(default_factory=dict)

@@ -15,6 +15,7 @@ from rmpa.config.settings import Settings, WebSettings
 from rmpa.core.contract import ContractRule, Contracts, Priority
 from rmpa.web import limits
 from rmpa.web.gateways.gateways import Gateways
+from rmpa.web.gateways.websocket_frames import Opcode, frame_header
 from rmpa.web.server.agent_watch import AgentWatch
 from rmpa.web.server.auth import AccessPolicy, own_names
 from rmpa.web.server.hub_setup import make_hub, priority_of
@@ -103,6 +104,36 @@ async def test_pages_of_other_sites_connect_only_where_they_are_listed() -> None
         connect(session, server, Origin=origin),
     ):
         pass
+
+
+async def test_a_client_whose_frames_are_not_masked_is_disconnected() -> None:
+    """RFC 6455, section 5.1: the server closes the connection, with 1002."""
+    async with running() as (server, _), aiohttp.ClientSession() as session:
+        reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+        request = "GET / HTTP/1.1", "Host: localhost", "Upgrade: websocket", "Connection: Upgrade"
+        key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="
+        writer.write("\r\n".join([*request, "Sec-WebSocket-Version: 13", key, "", ""]).encode())
+        async with asyncio.timeout(DEADLINE):
+            assert (await reader.readuntil(b"\r\n\r\n")).startswith(b"HTTP/1.1 101")
+            writer.write(frame_header(Opcode.TEXT, 2) + b"{}")
+            received = await reader.read()
+        assert received[2:4] == (1002).to_bytes(2, "big")
+        assert b"status" not in received  # the frame itself was not answered
+        writer.close()
+        async with session.get(f"http://127.0.0.1:{server.port}/metrics") as response:
+            assert 'rmpa_web_refused_total{reason="message"} 1.0' in await response.text()
+
+
+async def test_a_client_beyond_the_bound_is_told_so_and_requests_are_served() -> None:
+    async with running() as (server, _), aiohttp.ClientSession(connector=aiohttp.TCPConnector(limit=0)) as session:
+        sockets = [await connect(session, server) for _ in range(limits.CLIENTS_MAX)]
+        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+            await connect(session, server)
+        assert refused.value.status == 503
+        async with session.get(f"http://127.0.0.1:{server.port}/metrics") as response:
+            assert 'rmpa_web_refused_total{reason="clients"} 1.0' in await response.text()
+        for socket in sockets:
+            await socket.close()
 
 
 async def test_a_failed_handshake_is_counted_and_its_connection_keeps_its_limits(

@@ -162,6 +162,10 @@ class ClientConnection(ABC):
         if refusal:
             self._refuse(refusal, reason)
 
+    def unmasked(self) -> None:
+        """Disconnect a client that sent a frame without a mask (RFC 6455, section 5.1)."""
+        self.end(WSCloseCode.PROTOCOL_ERROR, "a frame of a client is masked; this one is not", "message")
+
     def arm(self) -> None:
         """Set the timer anew, after each call of the session."""
         if self._timer is not None:

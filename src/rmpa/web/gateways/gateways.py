@@ -80,9 +80,9 @@ class Gateways:
         self.counters = Counters()
         """Clients that were refused or disconnected, by the words of ``figures.REASONS``."""
         self._refusals = RefusalLog(_log, self.counters)
-        self.upgraded: Callable[[web.Request], Callable[[], int]] = lambda _: int
-        """Called when the handshake of a WebSocket is done; returns a counter of the bytes that its client has sent,
-        which is 0 where they are not counted."""
+        self.upgraded: Callable[[web.Request, Callable[[], None]], Callable[[], int]] = lambda *_: int
+        """Called when the handshake of a WebSocket is done, with what is to be called if a frame of the client is not
+        masked; returns a counter of the bytes that its client has sent, which is 0 where they are not counted."""
         self._monitor = monitor
         self._hub = hub
         self._name = name
@@ -154,7 +154,7 @@ class Gateways:
             # A WebSocket cannot be closed before this: end_changed leaves it open.
             if self._rights_of(request) != rights:
                 connection.end(_SERVICE_RESTART, _RIGHTS_CHANGED)
-            return self.upgraded(request)
+            return self.upgraded(request, connection.unmasked)
 
         self._open[connection] = _OpenClient(response, request, rights)
         try:

@@ -32,6 +32,11 @@ class HubGraph:
         return self.hub.graph.topics
 
     @property
+    def published(self) -> Mapping[str, str]:
+        """The types of the topics that clients publish, by name: the master may not have them yet."""
+        return self.hub.publishers.topics
+
+    @property
     def services(self) -> Mapping[str, GraphService]:
         """By name, in order of names."""
         return self.hub.graph.services

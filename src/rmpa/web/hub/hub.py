@@ -77,7 +77,10 @@ class Hub:
             services_changed=self._services_changed,
             master_back=self.params.reload,
         )
-        self.topics = HubTopics(self.link, self._learn, self._own_latched, now_ns)
+        self.topics = HubTopics(
+            self.link, self._learn, self._own_latched, lambda: self.graph.topics, self.types.at_hand, now_ns
+        )
+        self.graph.follow((OWN_CLIENT, 3), self.topics.graph_changed)
         self.publishers = Publishers(
             self.link,
             self.types.find_message,
@@ -231,6 +234,7 @@ class Hub:
             request.type,
             client.receive,
             functools.partial(_fail, client, request.handle),
+            client.receive,
         )
 
     def _unsubscribe(self, client: HubClient, request: requests.Unsubscribe) -> None:

@@ -257,6 +257,18 @@ class ReceivedMessage:
 
 
 @dataclass(frozen=True, slots=True)
+class OtherType:
+    """Publishers of the subscription `handle` have only another type, `type`: nothing comes from them.
+
+    It is told once for each type; the subscription stays, for publishers of its type.
+    """
+
+    handle: int
+    topic: str
+    type: str
+
+
+@dataclass(frozen=True, slots=True)
 class ServiceResult:
     """The answer of a `CallService`: `payload` where `ok`, else `error`."""
 
@@ -366,6 +378,7 @@ class Failed:
 
 Answer: TypeAlias = (
     ReceivedMessage
+    | OtherType
     | ServiceResult
     | ServiceFound
     | ServiceRequest

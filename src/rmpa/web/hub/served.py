@@ -8,7 +8,7 @@ import itertools
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rmpa.core.errors import PeerRefused, RmpaError
+from rmpa.core.errors import RmpaError
 from rmpa.web import limits
 from rmpa.web.hub.node_link import EndingRegistrations, Registration
 
@@ -54,21 +54,17 @@ class ServedServices:
         request: Callable[[int, bytes], None],
         failed: Callable[[RmpaError], None],
     ) -> None:
-        """Offer a service.
+        """Offer a service; a client that offers it already loses it, which may have gone without a word.
 
         Args:
             key: The client and its handle.
             name: The global name.
             kind: Its type.
             request: ``(call, payload)``: hands a call to the client, which answers by ``respond``.
-            failed: Called where the service cannot be registered; it has then ended.
-
-        Raises:
-            PeerRefused: A client offers it already.
+            failed: Called where the service cannot be registered, or another client offers it; it has then ended.
         """
-        if name in self._served:
-            problem = f"a client offers {name} already"
-            raise PeerRefused("the web server", problem, "end that one first, or choose another name")
+        if (old := self._served.get(name)) is not None:
+            self._refused(old, RmpaError(f"another client offers {name} now"))
         served = self._served[name] = _Served(name, key, kind, request, failed)
         served.registration = Registration(
             self._link,

@@ -14,15 +14,17 @@ from rmpa.ros.wire.tcpros import ANY
 from rmpa.web import limits
 from rmpa.web.hub.node_link import EndingRegistrations, Registration
 from rmpa.web.hub.payload_buffers import PayloadBuffers
-from rmpa.web.hub.requests import ReceivedMessage
+from rmpa.web.hub.requests import OtherType, ReceivedMessage
 
 if TYPE_CHECKING:
     from collections.abc import Callable, KeysView, Mapping
 
     from rmpa.core.errors import RmpaError
     from rmpa.ros.node.node import Node, Subscriber
+    from rmpa.ros.types.messages import MessageType
     from rmpa.web.hub.clients import Key
     from rmpa.web.hub.node_link import NodeLink
+    from rmpa.web.hub.requests import GraphTopic
 
 _log = logging.getLogger(__name__)
 OWN: Final = ""
@@ -37,6 +39,9 @@ class _Sink:
     type: str | None
     deliver: Callable[[ReceivedMessage], None]
     failed: Callable[[RmpaError], None]
+    differs: Callable[[OtherType], None] | None = None
+    told: set[str] = field(default_factory=set)
+    """Other types that ``differs`` was called for."""
 
 
 @dataclass(slots=True, eq=False)
@@ -55,6 +60,8 @@ class _Topic:
     name: str
     sinks: dict[Key, _Sink] = field(default_factory=dict)
     registration: Registration[Subscriber] | None = None
+    kind: MessageType | None = None
+    """The type that it is registered with; ``None``: any."""
     linger: asyncio.TimerHandle | None = None
     latched: dict[str, _Latched] = field(default_factory=dict)
     headers: dict[str, Mapping[str, str]] = field(default_factory=dict)
@@ -70,6 +77,8 @@ class HubTopics:
         link: Has the node.
         learn: ``(topic, header)``: a publisher's header, at each new connection, before its first message.
         own_latched: The type, payload and time of the latched message that a client of this hub publishes on a topic.
+        graph: All topics of the graph by name; ``graph_changed`` is called at its changes.
+        find: A message type, if it is known at once.
         now_ns: The wall clock, in nanoseconds.
     """
 
@@ -78,11 +87,15 @@ class HubTopics:
         link: NodeLink,
         learn: Callable[[str, Mapping[str, str]], None],
         own_latched: Callable[[str], tuple[str, memoryview, int] | None],
+        graph: Callable[[], Mapping[str, GraphTopic]] = dict,
+        find: Callable[[str], MessageType | None] = lambda _: None,
         now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         self._link = link
         self._learn = learn
         self._own_latched = own_latched
+        self._graph = graph
+        self._find = find
         self._now_ns = now_ns
         self._topics: dict[str, _Topic] = {}
         self._ending: EndingRegistrations[Subscriber] = EndingRegistrations()
@@ -102,6 +115,7 @@ class HubTopics:
         type_: str | None,
         deliver: Callable[[ReceivedMessage], None],
         failed: Callable[[RmpaError], None],
+        differs: Callable[[OtherType], None] | None = None,
     ) -> None:
         """Begin a subscription; latched messages that are there are delivered before this returns.
 
@@ -111,19 +125,13 @@ class HubTopics:
             type_: The only type that is wanted; ``None`` for any.
             deliver: Takes each message.
             failed: Called where the master refuses the subscription, which has then ended.
+            differs: Called once for each other type that all its publishers have.
         """
-        sink = _Sink(key[1], None if type_ == ANY else type_, deliver, failed)
+        sink = _Sink(key[1], None if type_ == ANY else type_, deliver, failed, differs)
         there = self._topics.get(topic)
         if there is None:
             there = self._topics[topic] = _Topic(topic)
-            there.registration = Registration(
-                self._link,
-                topic,
-                functools.partial(self._register, there),
-                _withdraw,
-                functools.partial(self._refused, there),
-                after=self._ending.take(topic),
-            )
+            there.registration = self._registration(there)
             own = self._own_latched(topic)
             if own is not None:
                 self._keep(there, OWN, _Latched({}, *own))
@@ -131,6 +139,7 @@ class HubTopics:
             there.linger.cancel()
             there.linger = None
         there.sinks[key] = sink
+        self._judge(there)
         self._replay(there, sink)
 
     def unsubscribe(self, key: Key, topic: str) -> None:
@@ -155,6 +164,11 @@ class HubTopics:
         """Forget the latched message of the hub's own publisher, which has ended."""
         self._forget_latched(topic, OWN)
 
+    def graph_changed(self) -> None:
+        """Publishers have come or gone: tell the subscriptions whose type is another."""
+        for there in [*self._topics.values()]:
+            self._judge(there)
+
     async def close(self) -> None:
         """End all, after the node was closed."""
         for there in [*self._topics.values()]:
@@ -163,8 +177,40 @@ class HubTopics:
 
     # --- inside -----------------------------------------------------------------------------------------------
 
+    def _registration(self, there: _Topic) -> Registration[Subscriber]:
+        return Registration(
+            self._link,
+            there.name,
+            functools.partial(self._register, there),
+            _withdraw,
+            functools.partial(self._refused, there),
+            after=self._ending.take(there.name),
+        )
+
     async def _register(self, there: _Topic, node: Node) -> Subscriber:
-        return await node.subscribe(there.name, None, on_bytes=functools.partial(self._take, there))
+        return await node.subscribe(there.name, there.kind, on_bytes=functools.partial(self._take, there))
+
+    def _judge(self, there: _Topic) -> None:
+        """Compare the types that are wanted with those that are published.
+
+        Where nothing of a topic can be delivered, it is subscribed to with the type that is wanted: its publishers
+        then refuse the connection as they refuse any node's, so that no message is sent in vain, and ``rmpa why`` and
+        the diagnostics name the mismatch.
+        """
+        topic = self._graph().get(there.name)
+        types = topic.types if topic is not None and topic.publishers else ()
+        wanted = {sink.type for sink in there.sinks.values()}
+        for sink in [*there.sinks.values()] if types else ():
+            if sink.type is not None and sink.type not in types and types[0] not in sink.told:
+                sink.told.add(types[0])
+                if sink.differs is not None:
+                    sink.differs(OtherType(sink.handle, there.name, types[0]))
+        unfit = types and len(wanted) == 1 and not wanted & {None, *types}
+        kind = self._find(next(iter(wanted)) or "") if unfit else None
+        if there.registration is not None and kind is not there.kind:
+            there.kind = kind
+            self._ending.end(there.name, there.registration)
+            there.registration = self._registration(there)
 
     def _refused(self, there: _Topic, error: RmpaError) -> None:
         if self._topics.get(there.name) is there:

@@ -149,7 +149,6 @@ class Actions:
                 for goal_id, goal in list(action.goals.items()):
                     self._end_goal(action, goal_id)
                     op = {"op": "action_result", "action": action.spelling, "values": problem}
-                    self._context.status("error", f"send_action_goal {action.name}: {problem}", goal.mid)
                     self._send(goal, op | {"status": _ABORTED, "result": False})
                 return True
         return False

@@ -58,17 +58,17 @@ class Calls:
         self._open: dict[int, _Call] = {}
 
     def call(self, op: protocol.RosbridgeCallService) -> None:
-        """Begin a call; each ends with one ``service_response``, also if it fails.
+        """Begin a call; each ends with one ``service_response``, also if it fails, and with nothing beside it.
 
-        Raises:
-            OpError: The op has no usable service or style: there is nothing to answer to.
+        A ``status`` beside it would be an error of its own to roslib and roslibpy, which have no handler for it.
         """
         # An old way to give an id: /service#id.
         spelling, mark, suffix = op.service.partition("#")
         mid = op.id if op.id is not None or not mark else suffix
-        style = Style.parse(op.compression, op.fragment_size)
-        call = _Call(op.service[: limits.NAME_MAX], graph_name(spelling), mid, style, op.args, _timeout(op.timeout))
+        call = _Call(op.service[: limits.NAME_MAX], spelling, mid, Style(), op.args)
         try:
+            call.style = Style.parse(op.compression, op.fragment_size)
+            call.name, call.timeout = graph_name(spelling), _timeout(op.timeout)
             check_count(len(self._open), limits.CALLS_MAX, "open calls")
             if self._rosapi.offers(call.name):
                 self._ask_rosapi(call)
@@ -164,9 +164,7 @@ class Calls:
         self._context.send_op(op if call.mid is None else op | {"id": call.mid}, call.style, call.mid)
 
     def _fail(self, call: _Call, text: str) -> None:
-        text = text[: limits.TEXT_MAX]
-        self._context.status("error", f"call_service {call.name}: {text}", call.mid)
-        self._answer(call, text, ok=False)
+        self._answer(call, text[: limits.TEXT_MAX], ok=False)
 
 
 def _values(codec: MessageCodec, payload: Payload, style: Style) -> dict[str, Any]:

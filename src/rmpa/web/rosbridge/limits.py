@@ -22,6 +22,8 @@ FRAGMENTED_MAX: Final = 16 * MIB
 """Bytes of all incomplete messages of a client; the oldest incomplete message is dropped."""
 FRAGMENTED_MESSAGES_MAX: Final = 16
 """Incomplete messages of a client; the oldest is dropped."""
+TYPE_WAIT: Final = 2.0
+"""Time for a topic to appear that is subscribed to without a type, as it may begin at the same moment."""
 FRAGMENT_TIMEOUT: Final = 60.0
 """Time within which the next fragment of a message must arrive."""
 PNG_MAX: Final = 4 * MIB

@@ -27,6 +27,9 @@ Values: TypeAlias = dict[str, Any]
 NAMESPACE: Final = "/rosapi/"
 _NANO: Final = 1_000_000_000
 _ACTION_TOPICS: Final = ("cancel", "feedback", "goal", "result", "status")
+_SERVER_TOPICS: Final = ("feedback", "result", "status")
+"""Those that an action's server publishes."""
+_STATUS_TYPE: Final = "actionlib_msgs/GoalStatusArray"
 
 
 class GraphView(Protocol):
@@ -35,6 +38,10 @@ class GraphView(Protocol):
     @property
     def topics(self) -> Mapping[str, GraphTopic]:
         """By name, in order of names."""
+
+    @property
+    def published(self) -> Mapping[str, str]:
+        """The types of the topics that clients publish, by name: the master may not have them yet."""
 
     @property
     def services(self) -> Mapping[str, GraphService]:
@@ -218,10 +225,23 @@ class Rosapi:
         return self._graph.topics.get(graph_name(request["topic"]))
 
     def _action_servers(self, _: Any) -> Values:
+        """As rosapi, the names of which all topics of an action are there; and those that publish a server's topics.
+
+        Of a peer's server the topics that it subscribes to are not in this module's graph until a client publishes.
+        """
         topics = self._graph.topics
-        found = (name.removesuffix("/goal") for name in topics if name.endswith("/goal") and name != "/goal")
+
+        def serves(name: str) -> bool:
+            status = topics.get(f"{name}/status")
+            published = all((there := topics.get(f"{name}/{part}")) and there.publishers for part in _SERVER_TOPICS)
+            return published and status is not None and _STATUS_TYPE in status.types
+
+        names = (name.rpartition("/")[0] for name in topics if name.endswith(("/goal", "/status")))
+        found = dict.fromkeys(name for name in names if name)
         return {
-            "action_servers": [each for each in found if all(f"{each}/{part}" in topics for part in _ACTION_TOPICS)]
+            "action_servers": [
+                each for each in found if all(f"{each}/{part}" in topics for part in _ACTION_TOPICS) or serves(each)
+            ]
         }
 
     # --- services -------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from rmpa.core.errors import RmpaError
 from rmpa.web.hub.requests import (
     Answer,
     Failed,
+    OtherType,
     ParamsChanged,
     ReceivedMessage,
     Request,
@@ -71,7 +72,6 @@ class RosbridgeSession:
         self._served = RosbridgeServedServices(self._context)
         self._actions = Actions(self._context, client)
         self._handlers: Mapping[type[protocol.Op], Callable[[Any], None]] = {
-            protocol.RosbridgeSubscribe: self._subscriptions.subscribe,
             protocol.RosbridgeUnsubscribe: self._subscriptions.unsubscribe,
             protocol.RosbridgeAdvertise: self._publications.advertise,
             protocol.RosbridgePublish: self._publications.publish,
@@ -109,6 +109,8 @@ class RosbridgeSession:
                 self._unwrap(op, now, depth)
             elif isinstance(op, protocol.RosbridgeUnadvertise):
                 self._publications.unadvertise(op, now)
+            elif isinstance(op, protocol.RosbridgeSubscribe):
+                self._subscriptions.subscribe(op, now)
             else:
                 self._handlers[type(op)](op)
         except RmpaError as error:
@@ -158,6 +160,8 @@ class RosbridgeSession:
             self._served.request(answer)
         elif isinstance(answer, ServiceResult | ServiceFound | ParamsChanged):
             self._calls.receive(answer)
+        elif isinstance(answer, OtherType):
+            self._subscriptions.differs(answer)
         elif isinstance(answer, Failed):
             parts = (self._subscriptions, self._publications, self._calls, self._served, self._actions)
             any(part.fail(answer) for part in parts)

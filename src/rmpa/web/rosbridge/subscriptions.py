@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rmpa.core.errors import RmpaError
-from rmpa.web.hub.requests import ReceivedMessage, Subscribe, Unsubscribe
+from rmpa.web.hub.requests import Failed, ReceivedMessage, Subscribe, Unsubscribe
 from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.context import check_count, fragment_of
 from rmpa.web.rosbridge.encodings import Compression, PublishFrames, encode_cbor_raw
@@ -21,7 +21,7 @@ from rmpa.web.values.codec import MessageCodec, codec_for
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.web.hub.requests import Failed
+    from rmpa.web.hub.requests import OtherType
     from rmpa.web.rosbridge import protocol
     from rmpa.web.rosbridge.context import SessionContext
 
@@ -49,6 +49,8 @@ class _Topic:
     fragment_size: int | None = None
     codecs: dict[tuple[str, str], MessageCodec] = field(default_factory=dict)
     problem: str = ""
+    judged_at: float | None = None
+    """When it fails, if the topic is not there by then."""
 
     def choose(self) -> None:
         """Choose from all wishes."""
@@ -78,8 +80,10 @@ class Subscriptions:
         """Messages that throttles dropped, of the present subscriptions."""
         return sum(each.throttle.dropped for each in self._topics.values())
 
-    def subscribe(self, op: protocol.RosbridgeSubscribe) -> None:
+    def subscribe(self, op: protocol.RosbridgeSubscribe, now: float) -> None:
         """Begin a subscription, or change that of the same id.
+
+        Without a type it fails where the topic does not appear within `limits.TYPE_WAIT`.
 
         Raises:
             OpError: A value is wrong, or the type is another than that of the client's other subscriptions.
@@ -98,6 +102,8 @@ class Subscriptions:
         topic = self._topics.get(op.topic)
         if topic is None:
             topic = self._begin(op.topic, name, kind)
+            if op.type is None and compression is not Compression.CBOR_RAW and not self._is_there(name):
+                topic.judged_at = now + limits.TYPE_WAIT
         elif kind is not None and topic.type is not None and kind != topic.type:
             raise OpError(f"{op.topic} is subscribed as {topic.type}, not {kind}", "unsubscribe it first")
         if op.id not in topic.wishes:
@@ -105,6 +111,10 @@ class Subscriptions:
         topic.wishes[op.id] = wish
         topic.choose()
         self._context.status("info", f"subscribed to {op.topic}", op.id)
+
+    def _is_there(self, name: str) -> bool:
+        known = self._context.graph.topics.get(name)
+        return bool(known is not None and known.types) or name in self._context.graph.published
 
     def _begin(self, spelling: str, name: str, kind: str | None) -> _Topic:
         check_count(len(self._topics), limits.SUBSCRIPTIONS_MAX, "subscribed topics")
@@ -140,6 +150,14 @@ class Subscriptions:
             self._send(topic, topic.throttle.offer(message, now))
         return topic is not None
 
+    def differs(self, other: OtherType) -> None:
+        """A publisher has another type: its messages do not come, and the subscription waits for others."""
+        topic = self._by_handle.get(other.handle)
+        if topic is not None:
+            error = OpError(f"{topic.name} has the type {other.type}, not {topic.type}", "subscribe with that type")
+            for mid in topic.wishes:
+                self._context.status("error", f"subscribe: {error}", mid)
+
     def fail(self, failed: Failed) -> bool:
         """The hub cannot serve a subscription; False if it is none of these."""
         topic = self._by_handle.get(failed.handle)
@@ -157,14 +175,20 @@ class Subscriptions:
 
     def _timers(self) -> Iterator[float]:
         for topic in self._topics.values():
-            at = topic.throttle.next_timer()
-            if at is not None:
-                yield at
+            for at in (topic.throttle.next_timer(), topic.judged_at):
+                if at is not None:
+                    yield at
 
     def handle_timer(self, now: float) -> None:
-        """Send what was held back until now."""
-        for topic in self._topics.values():
+        """Send what was held back until now, and end what waits in vain."""
+        for topic in [*self._topics.values()]:
             self._send(topic, topic.throttle.due(now))
+            if topic.judged_at is not None and topic.judged_at <= now:
+                topic.judged_at = None
+                if not self._is_there(graph_name(topic.name)):
+                    self._context.ask(Unsubscribe(topic.handle))
+                    text = "the topic is not there, and its type is not known"
+                    self.fail(Failed(topic.handle, text, "give its 'type'"))
 
     def close(self) -> None:
         """End all."""

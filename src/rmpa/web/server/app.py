@@ -303,12 +303,12 @@ def _connection(request: web.Request) -> GuardedConnection | None:
     return protocol if isinstance(protocol, GuardedConnection) else None
 
 
-def _upgraded(request: web.Request) -> Callable[[], int]:
+def _upgraded(request: web.Request, on_unmasked: Callable[[], None]) -> Callable[[], int]:
     """The limits of requests do not hold for the connection any more; returns what counts its bytes."""
     connection = _connection(request)
     if connection is None:
         return int
-    connection.upgrade()
+    connection.upgrade(on_unmasked)
     return lambda: connection.received
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final, cast
 
 from rmpa.core.counters import RefusalLog
 from rmpa.web import limits
+from rmpa.web.gateways.websocket_frames import MaskCheck
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -95,6 +96,8 @@ class GuardedConnection(asyncio.Protocol):
         self._arriving = False
         self._unread = False
         self._upgraded = False
+        self._mask: MaskCheck | None = None
+        self._on_unmasked: Callable[[], None] | None = None
         self.received = 0
         """Bytes of the client so far."""
         self.is_answering = False
@@ -114,9 +117,14 @@ class GuardedConnection(asyncio.Protocol):
         if not self._upgraded:
             self._limit(limits.WEB_IDLE_TIMEOUT, None, "")
 
-    def upgrade(self) -> None:
-        """The connection is a WebSocket from now on, whose handler has limits of its own."""
+    def upgrade(self, on_unmasked: Callable[[], None]) -> None:
+        """The connection is a WebSocket from now on, whose handler has limits of its own.
+
+        Args:
+            on_unmasked: Called when a frame of the client is not masked; it and all after it is dropped.
+        """
         self._upgraded = True
+        self._mask, self._on_unmasked = MaskCheck(), on_unmasked
         self._stop_timer()
 
     # --- the transport ---
@@ -131,6 +139,11 @@ class GuardedConnection(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         """Pass bytes on, as many as one request may have."""
         self.received += len(data)
+        if self._on_unmasked is not None and (self._mask is None or not self._mask.passes(data)):
+            if self._mask is not None:
+                self._mask = None
+                self._on_unmasked()
+            return
         if not self._upgraded:
             self._received += len(data)
             if self._received > limits.WEB_REQUEST_MAX:
