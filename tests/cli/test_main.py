@@ -5,8 +5,10 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import socket
 import subprocess
 import sys
+import threading
 from typing import TYPE_CHECKING
 
 import click
@@ -14,10 +16,15 @@ import pytest
 from click.testing import CliRunner
 
 from rmpa import __version__
+from rmpa.cli import completion
 from rmpa.cli.lazy_group import LazyGroup
-from rmpa.cli.main import cli, main
+from rmpa.cli.main import MEANT, cli, main
+from tests.cli.conftest import DEADLINE, with_core
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.ros.core.embedded import RosCore
     from tests.cli.conftest import Place
 
 
@@ -116,7 +123,7 @@ def test_a_command_that_moved_says_where_it_is(capsys: pytest.CaptureFixture[str
 
 def test_a_misspelt_command_is_told_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["topci", "list"]) == 2
-    assert "Did you mean topic?" in capsys.readouterr().err
+    assert "Did you mean `rmpa topic`?" in capsys.readouterr().err
 
 
 def test_a_setting_that_cannot_be_exits_2(place: Place) -> None:
@@ -150,3 +157,89 @@ def test_help_imports_no_command() -> None:
         "sys.exit(' '.join({'asyncio', 'msgspec', 'rmpa.cli.up', 'rmpa.cli.peer'} & set(sys.modules)) or 0)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False, capture_output=True).stderr == b""
+
+
+@pytest.mark.parametrize(
+    ("line", "hint"),
+    [
+        ("list", "Did you mean `rmpa peer list` or `rmpa topic list`?"),
+        ("help", "Did you mean `rmpa --help`?"),
+        ("version", "Did you mean `rmpa --version`?"),
+        ("start", "Did you mean `rmpa up`?"),
+        ("--json peer list", "--json stands behind the command: rmpa peer list --json"),
+        ("topic --agent base list", "--agent stands behind the command: rmpa topic list --agent"),
+    ],
+)
+def test_a_word_at_the_wrong_place_leads_to_the_right_verb(
+    line: str, hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(line.split()) == 2
+    assert hint in capsys.readouterr().err
+
+
+def test_every_word_that_leads_to_a_verb_leads_to_one_that_is_there(capsys: pytest.CaptureFixture[str]) -> None:
+    for line in {line for lines in MEANT.values() for line in lines if not line.startswith("--")}:
+        assert main([*line.split(), "--help"]) == 0
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize("word", ["nan", "inf", "-inf"])
+def test_no_number_of_the_command_line_is_endless(word: str) -> None:
+    numbers = [(path, each) for path, _, command in ALL for each in command.params if "float" in each.type.name]
+    assert numbers
+    for path, option in numbers:
+        with pytest.raises(click.BadParameter):
+            pytest.fail(f"{path} takes {option.type.convert(word, option, None)}")
+
+
+BASH = """\
+eval "$(rmpa completion bash)"
+compopt() { :; }
+COMP_LINE=$1 COMP_POINT=${#1}
+_rmpa_completion rmpa
+printf '%s\\n' "${COMPREPLY[@]}"
+"""
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("rmpa peer in", ["info"]),
+        ("rmpa peer info j", ["joystick"]),
+        ("rmpa topic echo /cm", ["/cmd"]),
+        ("rmpa topic echo joystick:/c", ["/cmd"]),
+        ("rmpa topic hz --agent b", ["base"]),
+        ("rmpa param get /ro", ["/rosdistro", "/rosversion"]),
+        ("rmpa service call /rosout/get", ["/rosout/get_loggers"]),
+        ("rmpa node info joy", ["joystick:/joy"]),
+        ("rmpa node info joystick:/", ["/joy"]),
+    ],
+)
+def test_bash_completes_what_the_agent_knows(
+    place: Place, agent: Callable[..., None], core: RosCore, line: str, words: list[str]
+) -> None:
+    agent(snapshot=with_core(core.uri))
+    with socket.create_server(("127.0.0.1", 0)) as stands:
+        api = f"http://127.0.0.1:{stands.getsockname()[1]}/"
+        assert core.call("registerPublisher", "/rmpa/joystick/joy", "/cmd", "sensor_msgs/Joy", api).code == 1
+        (place.path / "rmpa").write_text(f'#!/bin/sh\nexec {sys.executable} -m rmpa.cli.main "$@"\n')
+        (place.path / "rmpa").chmod(0o755)
+        environ = place.environ | {"PATH": f"{place.path}:{os.environ['PATH']}"}
+        shell = ["bash", "-c", BASH, "bash", line]
+        said = subprocess.run(
+            shell, env=environ, cwd=place.path, capture_output=True, text=True, timeout=60, check=True
+        )
+        core.call("unregisterPublisher", "/rmpa/joystick/joy", "/cmd", api)
+    assert said.stdout.split() == words
+
+
+def test_an_agent_that_hangs_does_not_hold_up_the_shell(monkeypatch: pytest.MonkeyPatch) -> None:
+    end = threading.Event()
+
+    def hang(_: click.Context, __: str) -> list[str]:
+        end.wait(DEADLINE)
+        return ["late"]
+
+    monkeypatch.setitem(completion._FIND, "peer", hang)
+    assert completion.completes("peer")(click.Context(cli), cli.params[0], "") == []
+    end.set()

@@ -65,7 +65,7 @@ def test_the_verbs(place: Place, core: RosCore) -> None:
         (("delete", "/"), 2, "the root holds every parameter"),
         (("load", "list.yaml"), 1, "not a dictionary of parameters"),
         (("get", "/a", "--peer", "b", "--master", "http://x:1/"), 2, "--peer"),
-        (("gte", "/a"), 2, "Did you mean get?"),
+        (("gte", "/a"), 2, "Did you mean `rmpa param get`?"),
     ],
 )
 def test_mistakes_change_nothing(place: Place, core: RosCore, words: tuple[str, ...], code: int, error: str) -> None:
@@ -118,8 +118,10 @@ def peer(place: Place, background: Background) -> Iterator[dict[str, Any]]:
 
 def test_a_peers(place: Place, peer: dict[str, Any]) -> None:
     assert place.run("param", "get", "--peer", "base", "/speed") == (0, "1.5\n", "")
-    assert place.json("param", "get", "--peer", "base", "/big", "--json") == [peer["/big"]]
+    assert place.json("param", "get", "base:/big", "--json") == [peer["/big"]]
     assert place.run("param", "list", "--peer", "base") == (0, "/big\n/speed\n", "")
+    assert place.run("param", "list", "base:/") == (0, "/big\n/speed\n", "")
+    assert "names a peer too" in place.run("param", "get", "--peer", "arm", "base:/big")[2]
     (place.path / "text").write_text("é" * 40_000)
     assert place.json("param", "set", "--peer", "base", "/new", "-t", "text", "--json") == [{"key": "/new", "set": 1}]
     assert peer["/new"] == "é" * 40_000

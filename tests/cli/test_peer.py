@@ -23,12 +23,12 @@ Agent = Callable[..., None]
 
 def test_list_in_a_pipe_is_plain_and_aligned(place: Place, agent: Agent) -> None:
     agent()
-    code, out, err = place.run("peer", "list")
+    code, out, err = place.run("peer", "list", "-v")
     assert code == 0
     head, joystick, pc = out.splitlines()
     assert head.split()[:4] == ["PEER", "STATE", "SINCE", "ADDRESS"]
     assert " ".join(joystick.split()) == (
-        "joystick linked 1 min 2 s 10.0.0.2:40002 by us 432 µs -1.25 ms ±216 µs 12.3 MB 1.23 kB 10 B 2"
+        "joystick linked 1 min 2 s 10.0.0.2:40002 432 µs by us -1.25 ms ±216 µs 12.3 MB 1.23 kB 10 B 2"
     )
     assert pc.startswith("pc        linking")
     assert head.index("STATE") == joystick.index("linked") == pc.index("linking")

@@ -177,13 +177,24 @@ def test_ctrl_c_is_quiet_and_leaves_nothing(place: Place, talking: subprocess.Po
         assert core.state().subscribers.get("/cmd") is None
 
 
-def test_another_peers_messages_are_left_out(place: Place, talking: subprocess.Popen[str]) -> None:
+def test_another_peers_messages_are_left_out(place: Place, talking: subprocess.Popen[str], core: RosCore) -> None:
+    # What a bridge would register for another topic of peer joystick.
+    with socket.create_server(("127.0.0.1", 0)) as stands:
+        api = f"http://127.0.0.1:{stands.getsockname()[1]}/"
+        assert core.call("registerPublisher", "/rmpa/joystick/joy", "/joy", "sensor_msgs/Joy", api).code == 1
+        _hear_nothing_of_joystick(place)
+        core.call("unregisterPublisher", "/rmpa/joystick/joy", "/joy", api)
+
+
+def _hear_nothing_of_joystick(place: Place) -> None:
     with place.start("topic", "hz", "joystick:/cmd") as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "subscribed to [joystick:/cmd]\n"
         assert process.stdout.readline() == "no new messages\n"
         process.send_signal(signal.SIGINT)
         process.wait(30)
+        assert process.stderr is not None
+        assert process.stderr.read() == "! joystick:/cmd is not published yet; waiting\n"
 
 
 def test_delay_needs_a_header(place: Place, core: RosCore) -> None:

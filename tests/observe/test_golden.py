@@ -179,6 +179,7 @@ def diagnoses() -> Iterator[Diagnosis]:
         yield from topic.walk()
     for topic, *_ in test_topics.WARNINGS.values():
         yield from topic.walk()
+    yield from test_topics.Case(subscribers=(), readers=(), **test_topics.route(state="idle")).walk()
     yield from test_topics.Case(there=None, refusal="it is older").walk()
     yield from test_direct_stages.direct().walk()
     yield from test_direct_stages.direct(relayed=True).walk()

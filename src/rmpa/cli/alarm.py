@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from rmpa.bridge.proxy_names import proxied_peer
+from rmpa.cli.completion import completes
 from rmpa.cli.graph import GraphName, read_graph
 from rmpa.cli.options import GraphOptions, graph_options
 from rmpa.cli.output import Column, print_json, print_line, print_table, printable, warn
@@ -78,7 +79,7 @@ Examples:
   rmpa alarm echo --json | jq -r .message
 """
 )
-@click.argument("resource", required=False)
+@click.argument("resource", required=False, shell_complete=completes("resource"))
 @click.option("-n", "--count", type=click.IntRange(1), help="Stop after so many alarms.")
 @graph_options
 def echo(resource: str | None, count: int | None, options: GraphOptions) -> None:

@@ -1,27 +1,207 @@
-"""``rmpa completion``: prints click's own scripts for shell completion."""
+"""``rmpa completion``: completion in a shell, of commands, options, and the names that the agent knows."""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import os
+import threading
+from typing import TYPE_CHECKING, Final
+
 import click
-from click.shell_completion import get_completion_class
+from click.shell_completion import BashComplete, get_completion_class
+
+from rmpa.core.errors import RmpaError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from rmpa.cli.graph import Graph
+    from rmpa.cli.master import Master
 
 EPILOG = """\
 \b
 Examples:
-  rmpa completion bash > ~/.local/share/bash-completion/completions/rmpa
+  eval "$(rmpa completion bash)"             in this shell; in ~/.bashrc for all
   rmpa completion zsh > "${fpath[1]}/_rmpa"
+  mkdir -p ~/.config/fish/completions
   rmpa completion fish > ~/.config/fish/completions/rmpa.fish
+"""
+ANSWER: Final = 0.3
+"""Seconds that the agent or master has for its answer: a person waits with the key pressed."""
+_BASH: Final = """\
+%(complete_func)s() {
+    local IFS=$'\\n' line=${COMP_LINE:0:COMP_POINT} words current number reply
+    # bash takes PEER:/name for three words. These are those of the line, up to the cursor.
+    IFS=' ' read -ra words <<< "$line"
+    [[ $line == *' ' ]] && words+=('')
+    current=${words[-1]}
+    COMPREPLY=()
+    number=$((${#words[@]} - 1))
+    for reply in $(env COMP_WORDS="${words[*]}" COMP_CWORD=$number %(complete_var)s=bash_complete $1); do
+        case ${reply%%%%,*} in
+            dir) compopt -o dirnames ;;
+            file) compopt -o default ;;
+            *) reply=${reply#*,}
+               [[ $current == *:* ]] && reply=${reply#"${current%%:*}:"}
+               COMPREPLY+=("$reply") ;;
+        esac
+    done
+}
+complete -o nosort -F %(complete_func)s %(prog_name)s
 """
 
 
 @click.command(epilog=EPILOG)
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
 def completion(shell: str) -> None:
-    """Print the script that completes rmpa's commands in a shell."""
+    """Print the script that completes commands, options, and the names that the agent knows, in a shell."""
     from rmpa.cli.main import cli
 
     kind = get_completion_class(shell)
     assert kind is not None  # noqa: S101 - each of the choices has one
     # ``source()`` of bash's class would run bash to check its version; the template needs no shell.
     complete = kind(cli, {}, "rmpa", "_RMPA_COMPLETE")
-    click.echo(complete.source_template % complete.source_vars())
+    template = _BASH if isinstance(complete, BashComplete) else complete.source_template
+    click.echo(template % complete.source_vars())
+
+
+def completes(kind: str) -> Callable[[click.Context, click.Parameter, str], list[str]]:
+    """A function that completes names, for ``shell_complete`` of an argument or option.
+
+    Nothing is completed where no agent or master answers in time.
+
+    Args:
+        kind: ``peer``, ``agent``, ``topic``, ``service``, ``node``, ``param``, ``resource``, ``profile`` or
+            ``context``. Of a peer's own names, ``PEER:/name``, those of that peer are offered.
+    """
+
+    def complete(ctx: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
+        found: list[str] = []
+
+        def ask() -> None:
+            with contextlib.suppress(RmpaError, OSError, ValueError):
+                found.extend(name for name in _FIND[kind](ctx, incomplete) if name.startswith(incomplete))
+
+        # Imported here, not in the thread: the time that this takes is not the agent's.
+        from rmpa.cli import graph, master, param_store, resource_graph  # noqa: F401
+
+        if kind in _BY_NODE:
+            from rmpa.ros.node import node  # noqa: F401
+
+        # In a thread, which the end of the program ends: an agent that hangs must not hold up the shell.
+        asked = threading.Thread(target=ask, daemon=True)
+        asked.start()
+        asked.join(ANSWER)
+        return sorted({*found})
+
+    return complete
+
+
+def _master(ctx: click.Context) -> Master:
+    from rmpa.cli.master import choose_master
+
+    return choose_master(ctx.params.get("master"), ctx.params.get("agent"), os.environ)
+
+
+def _graph(ctx: click.Context) -> Graph:
+    from rmpa.cli.graph import read_graph
+
+    return asyncio.run(read_graph(_master(ctx)))
+
+
+def _of_peer(name: str, node: str) -> str:
+    """A name as a user writes it: ``PEER:/name`` if the node that offers it is a peer's proxy."""
+    from rmpa.bridge.proxy_names import proxied_peer
+
+    peer = proxied_peer(node)
+    return name if peer is None else f"{peer}:{name}"
+
+
+def _with_peers(found: dict[str, list[str]], incomplete: str) -> Iterable[str]:
+    """Names, of this module and of its peers; ``PEER:/name`` too, unless a name without peer has been begun."""
+    for name, nodes in found.items():
+        yield name
+        if not incomplete.startswith("/"):
+            yield from (_of_peer(name, node) for node in nodes)
+
+
+def _agents(ctx: click.Context, _: str) -> Iterable[str]:  # noqa: ARG001 - as the others
+    from rmpa.observe.io.control_client import find_agents
+
+    return [agent.name for agent in find_agents(os.environ)]
+
+
+def _peers(ctx: click.Context, _: str) -> Iterable[str]:
+    from rmpa.observe.io.control_client import ControlClient, choose_agent
+
+    with ControlClient(choose_agent(os.environ, ctx.params.get("agent")).path, timeout=ANSWER) as client:
+        return [peer.name for peer in client.snapshot(topics=()).peers]
+
+
+def _topics(ctx: click.Context, incomplete: str) -> Iterable[str]:
+    graph = _graph(ctx)
+    return _with_peers({**graph.subscribers, **graph.publishers}, incomplete)
+
+
+def _services(ctx: click.Context, incomplete: str) -> Iterable[str]:
+    return _with_peers(_graph(ctx).services, incomplete)
+
+
+def _nodes(ctx: click.Context, _: str) -> Iterable[str]:
+    from rmpa.bridge.proxy_names import proxied_node
+
+    for node in _graph(ctx).nodes:
+        proxy = proxied_node(node)
+        yield node if proxy is None else _of_peer(proxy[1], node)
+
+
+def _params(ctx: click.Context, incomplete: str) -> Iterable[str]:
+    from rmpa.cli.options import GraphOptions
+    from rmpa.cli.param_store import open_store, split_peer
+
+    before = incomplete.partition(":")[0] + ":" if ":" in incomplete else ""
+    peer, _ = split_peer(ctx.params.get("peer"), incomplete)
+    store = open_store(peer, GraphOptions(False, ctx.params.get("agent"), ctx.params.get("master")))
+    for name in store.names():
+        parts = name.split("/")
+        # Namespaces too: rosparam's verbs take them.
+        yield from (before + "/".join(parts[:end]) for end in range(2, len(parts) + 1))
+
+
+def _resources(ctx: click.Context, _: str) -> Iterable[str]:
+    from rmpa.resource.run.descriptor import TOPIC
+
+    ending = f"/{TOPIC}"
+    for topic, nodes in _graph(ctx).publishers.items():
+        if topic.endswith(ending):
+            yield from (_of_peer(topic.removesuffix(ending), node) for node in nodes)
+
+
+def _choices(ctx: click.Context, what: str) -> Iterable[str]:
+    """The profiles or contexts of the resource that stands before them in the line."""
+    from rmpa.cli.resource_graph import ResourceGraph, with_resources
+
+    found: list[str] = []
+
+    async def body(graph: ResourceGraph) -> None:
+        one = graph.pick(ctx.params.get("resource")).descriptor
+        found.extend(each.name for each in (one.profiles if what == "profile" else one.contexts))
+
+    asyncio.run(with_resources(_master(ctx), body))
+    return found
+
+
+_FIND: Final[dict[str, Callable[[click.Context, str], Iterable[str]]]] = {
+    "agent": _agents,
+    "peer": _peers,
+    "topic": _topics,
+    "service": _services,
+    "node": _nodes,
+    "param": _params,
+    "resource": _resources,
+    "profile": lambda ctx, _: _choices(ctx, "profile"),
+    "context": lambda ctx, _: _choices(ctx, "context"),
+}
+_BY_NODE: Final = frozenset({"profile", "context"})
+"""Kinds of names for which a node subscribes to a resource's description."""

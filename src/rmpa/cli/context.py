@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from rmpa.cli.completion import completes
 from rmpa.cli.manual_choice import ManualChoice, resource_json
 from rmpa.cli.options import GraphOptions, graph_options
 from rmpa.cli.output import Column, print_json, print_table
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @click.command("list", epilog="\b\nExamples:\n  rmpa context list\n  rmpa context list base:/sonar --json\n")
-@click.argument("resource", required=False)
+@click.argument("resource", required=False, shell_complete=completes("resource"))
 @graph_options
 def list_(resource: str | None, options: GraphOptions) -> None:
     """List a RESOURCE's contexts, their rules and what they require."""

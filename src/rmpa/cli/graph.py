@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from rmpa.bridge.proxy_names import proxied_node, proxied_peer
-from rmpa.cli.output import printable
+from rmpa.cli.output import printable, warn
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.names import is_legal_name
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from rmpa.cli.master import Master
+    from rmpa.observe.peer_info import PeerInfo
+    from rmpa.observe.snapshot import Snapshot
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +70,44 @@ def read_name(text: str, what: str = "topic") -> GraphName:
     if not name or not is_legal_name(name) or name.startswith("~") or (colon and not peer):
         raise ConfigError(what.upper(), f"{text!r} is not a {what}", "write /name, or PEER:/name for one peer's")
     return GraphName("/" + name.strip("/"), peer or None)
+
+
+def find_peer(snapshot: Snapshot, wanted: str) -> PeerInfo:
+    """The peer of that name or GUID.
+
+    Raises:
+        RmpaError: There is none; the text offers the nearest name.
+    """
+    for info in snapshot.peers:
+        if wanted in (info.name, info.guid, info.guid.partition("#")[0]):
+            return info
+    names = [info.name for info in snapshot.peers]
+    near = did_you_mean(wanted, names)
+    known = f"known are {', '.join(names)}" if names else "no peer is known yet"
+    raise RmpaError(
+        f"{snapshot.agent.name} knows no peer {wanted!r}; " + (f"did you mean {near}?" if near else known)
+    )
+
+
+def require_peer(master: Master, graph: Graph, wanted: GraphName) -> None:
+    """Check that the peer of a name is known here: a node of it stands in the graph, or the agent knows the peer.
+
+    Raises:
+        UnreachableError: The master is not an agent's core, and so knows no peers.
+        RmpaError: There is no such peer; the text offers the nearest name.
+    """
+    if wanted.peer is None or any(wanted.matches(node) for node in graph.nodes):
+        return
+    snapshot = master.snapshot(topics=())
+    if snapshot is None:
+        raise master.no_agent()
+    known = {peer.name for peer in snapshot.peers}
+    if wanted.peer == snapshot.agent.name and wanted.peer not in known:
+        raise RmpaError(f"{wanted.peer} is this module itself: leave it out and write {wanted.name}")
+    # Of a module of another site, SITE/MODULE, the agent knows the site.
+    peer = find_peer(snapshot, wanted.peer.partition("/")[0])
+    if peer.name not in wanted.peer:
+        raise RmpaError(f"{wanted.peer} is the GUID of {peer.name}: write {peer.name}:{wanted.name}")
 
 
 def read_namespace(text: str, what: str) -> GraphName:
@@ -123,6 +163,21 @@ def unknown_name(what: str, name: str, known: Iterable[str]) -> RmpaError:
     """
     near = did_you_mean(name, known)
     return RmpaError(f"no {what} {name}; " + (f"did you mean {near}?" if near else f"`rmpa {what} list` shows all"))
+
+
+def warn_unpublished(master: Master, graph: Graph, wanted: GraphName) -> None:
+    """Say on stderr that no node publishes a topic yet, if that is so: a command waits for its messages.
+
+    Args:
+        master: The master of the graph.
+        graph: The graph.
+        wanted: The topic; with a peer only that peer's publishers count.
+    """
+    if any(map(wanted.matches, graph.publishers.get(wanted.name, ()))):
+        return
+    near = did_you_mean(wanted.name, graph.publishers) if wanted.name not in graph.publishers else None
+    hint = f"did you mean {near}?" if near else f"`rmpa why {wanted}` says why" if master.agent is not None else ""
+    warn(f"{wanted} is not published yet; waiting" + (f" ({hint})" if hint else ""))
 
 
 @dataclass(frozen=True, slots=True)

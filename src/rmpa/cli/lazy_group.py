@@ -11,7 +11,7 @@ from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
 
 class PipeClosed(Exception):  # noqa: N818 - not an error: the program that reads our output has closed the pipe
@@ -28,6 +28,7 @@ class LazyGroup(click.Group):
         commands_at: By name: the module, which has the command under that name (or with ``_`` behind it, where the
             name is a builtin's), and the line that the group's help shows.
         moved: By name: where a command of an earlier release is now, for the error.
+        meant: By a word that is no command: what a user who writes it wants, a command line without the program.
         arguments: For ``click.Group``.
     """
 
@@ -36,11 +37,13 @@ class LazyGroup(click.Group):
         *,
         commands_at: Mapping[str, tuple[str, str]],
         moved: Mapping[str, str] | None = None,
+        meant: Mapping[str, Sequence[str]] | None = None,
         **arguments: object,
     ) -> None:
         super().__init__(**arguments)  # type: ignore[arg-type] # handed through as they came
         self.commands_at = commands_at
         self.moved = moved or {}
+        self.meant = meant or {}
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
         """The names, in the order of the table."""
@@ -56,6 +59,26 @@ class LazyGroup(click.Group):
             command = getattr(module, f"{cmd_name}_")
         assert isinstance(command, click.Command)  # noqa: S101 - a mistake in our own table
         return command
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Read the group's own options; for one of a command the error says where it stands.
+
+        Raises:
+            click.NoSuchOption: The group has no such option.
+        """
+        words = [*args]
+        try:
+            return super().parse_args(ctx, args)
+        except click.NoSuchOption as error:
+            path = [ctx.command_path]
+            found: click.Command = self
+            for word in words:
+                if isinstance(found, LazyGroup) and word in found.commands_at:
+                    path.append(word)
+                    found = found.get_command(ctx, word) or found
+            if any(error.option_name in each.opts for each in found.params):
+                ctx.fail(f"{error.option_name} stands behind the command: {' '.join(path)} {error.option_name}")
+            raise
 
     def invoke(self, ctx: click.Context) -> object:
         """Run the command.
@@ -76,7 +99,9 @@ class LazyGroup(click.Group):
             raise ConfigError(args[0], self.moved[args[0]])
         if args and args[0] not in self.commands_at and not args[0].startswith("-"):
             near = did_you_mean(args[0], self.commands_at)
-            hint = f"Did you mean {near}?" if near else f"There are {', '.join(self.commands_at)}."
+            others = self.meant.get(args[0]) or ([near] if near else [])
+            named = " or ".join(f"`{ctx.command_path} {other}`" for other in others)
+            hint = f"Did you mean {named}?" if others else f"There are {', '.join(self.commands_at)}."
             ctx.fail(f"No such command {args[0]!r}. {hint}")
         return super().resolve_command(ctx, args)
 

@@ -53,6 +53,28 @@ MOVED = {
     "or python -m lab experiment (docs/experiments.md)",
 }
 """Commands of releases before this one, and where they are now; to be dropped after one release."""
+MEANT = {
+    "help": ("--help",),
+    "version": ("--version",),
+    "start": ("up",),
+    "roscore": ("core",),
+    "status": ("peer list", "doctor"),
+    "check": ("doctor",),
+    "list": ("peer list", "topic list"),
+    "info": ("peer info", "topic info"),
+    "ping": ("peer ping", "node ping"),
+    "echo": ("topic echo",),
+    "pub": ("topic pub",),
+    "hz": ("topic hz",),
+    "bw": ("topic bw",),
+    "delay": ("topic delay",),
+    "call": ("service call",),
+    "get": ("param get",),
+    "set": ("param set",),
+    "join": ("trust join",),
+    "invite": ("trust invite",),
+}
+"""Words that are no commands of ``rmpa``, and what a user who writes them wants."""
 EPILOG = """\
 \b
 Examples:
@@ -68,6 +90,7 @@ Examples:
     cls=LazyGroup,
     commands_at=COMMANDS,
     moved=MOVED,
+    meant=MEANT,
     epilog=EPILOG,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )

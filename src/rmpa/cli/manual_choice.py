@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from rmpa.cli.completion import completes
 from rmpa.cli.options import GraphOptions, graph_options
 from rmpa.cli.output import print_json, print_line
 from rmpa.cli.resource_graph import known_name, run_with_resources
@@ -37,7 +38,7 @@ class ManualChoice:
         """The command ``get`` with its help text."""
 
         @click.command("get", help=text, epilog=f"\b\nExamples:\n  rmpa {self.what} get /sonar\n")
-        @click.argument("resource", required=False)
+        @click.argument("resource", shell_complete=completes("resource"), required=False)
         @graph_options
         def get(resource: str | None, options: GraphOptions) -> None:
             async def body(graph: ResourceGraph) -> None:
@@ -57,8 +58,8 @@ class ManualChoice:
         examples = f"  rmpa {self.what} set /sonar {example}\n  rmpa {self.what} set base:/sonar --auto\n"
 
         @click.command("set", help=text, epilog=f"\b\nExamples:\n{examples}")
-        @click.argument("resource")
-        @click.argument("name", required=False, metavar=f"[{self.what.upper()}]")
+        @click.argument("resource", shell_complete=completes("resource"))
+        @click.argument("name", required=False, metavar=f"[{self.what.upper()}]", shell_complete=completes(self.what))
         @click.option("--auto", is_flag=True, help=auto_text)
         @graph_options
         def set_(resource: str, name: str | None, auto: bool, options: GraphOptions) -> None:

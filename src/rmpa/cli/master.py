@@ -41,6 +41,11 @@ class Master:
         """The error for a master that does not answer."""
         return UnreachableError("ROS master", f"{self.uri} ({self.source})", _REMEDY)
 
+    def no_agent(self) -> UnreachableError:
+        """The error for a question about peers at a master that is not an agent's core."""
+        remedy = "name the agent with --agent, or run `rmpa up`: only an agent knows peers"
+        return UnreachableError("agent", f"{self.uri} ({self.source})", remedy)
+
     def snapshot(
         self,
         *,

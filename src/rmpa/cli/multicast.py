@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.cli.options import json_option
+from rmpa.cli.options import FiniteRange, json_option
 from rmpa.cli.output import print_json, print_line, warn
 from rmpa.config import limits as config_limits
 from rmpa.core.errors import ConfigError, RmpaError
@@ -64,9 +64,7 @@ def choose_interfaces(names: tuple[str, ...]) -> tuple[Interface, ...]:
 @click.option(
     "-c", "--count", type=click.IntRange(1), default=1, show_default=True, help="Packets on each interface."
 )
-@click.option(
-    "-i", "--interval", type=click.FloatRange(0.01), default=0.5, show_default=True, help="Seconds between."
-)
+@click.option("-i", "--interval", type=FiniteRange(0.01), default=0.5, show_default=True, help="Seconds between.")
 @json_option
 def send(interfaces: tuple[str, ...], group: str, port: int, count: int, interval: float, as_json: bool) -> int:
     """Send packets to the group, on every interface or on those that are named.
@@ -102,7 +100,7 @@ def send(interfaces: tuple[str, ...], group: str, port: int, count: int, interva
 @_group
 @_port
 @click.option("-c", "--count", type=click.IntRange(1), default=1, show_default=True, help="Packets to wait for.")
-@click.option("-t", "--timeout", type=click.FloatRange(0.01), help="Seconds to wait altogether. [default: for ever]")
+@click.option("-t", "--timeout", type=FiniteRange(0.01), help="Seconds to wait altogether. [default: for ever]")
 @json_option
 def receive(
     interfaces: tuple[str, ...], group: str, port: int, count: int, timeout: float | None, as_json: bool

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from rmpa.bridge.policy import is_own
-from rmpa.cli.graph import read_graph
+from rmpa.cli.completion import completes
+from rmpa.cli.graph import Graph, read_graph, require_peer
 from rmpa.cli.node_names import ask_peer, find_uri, read_node
-from rmpa.cli.options import GraphOptions, graph_options
+from rmpa.cli.options import FiniteRange, GraphOptions, graph_options
 from rmpa.cli.output import print_json, print_line, printable
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.ros import limits
@@ -55,11 +56,9 @@ Examples:
   rmpa node ping --all                    each node of this module once
 """
 )
-@click.argument("node", default="")
+@click.argument("node", default="", shell_complete=completes("node"))
 @click.option("-c", "--count", type=click.IntRange(1), help="Stop after so many. [default: at Ctrl-C]")
-@click.option(
-    "-i", "--interval", type=click.FloatRange(0.01), default=1.0, show_default=True, help="Seconds between."
-)
+@click.option("-i", "--interval", type=FiniteRange(0.01), default=1.0, show_default=True, help="Seconds between.")
 @click.option("-a", "--all", "everything", is_flag=True, help="Each node of this module, once.")
 @graph_options
 def ping(node: str, count: int | None, interval: float, everything: bool, options: GraphOptions) -> int:
@@ -70,6 +69,8 @@ def ping(node: str, count: int | None, interval: float, everything: bool, option
     """
     master = options.master()
     found = _named(master, (node,) if node else (), everything=everything)
+    if node:
+        require_peer(master, Graph(), found[0])
     if everything:
         answers = [_ping(master, one, 1, as_json=options.as_json) for one in found]
         return 0 if all(answers) else 1
@@ -129,7 +130,7 @@ Examples:
   rmpa node kill --all                    every node of this module
 """
 )
-@click.argument("nodes", nargs=-1, metavar="NODE...")
+@click.argument("nodes", nargs=-1, metavar="NODE...", shell_complete=completes("node"))
 @click.option("-a", "--all", "everything", is_flag=True, help="All of this module but /rosout and the agent's own.")
 @graph_options
 def kill(nodes: tuple[str, ...], everything: bool, options: GraphOptions) -> int:

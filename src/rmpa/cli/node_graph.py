@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from rmpa.bridge.proxy_names import proxied_peer
+from rmpa.cli.completion import completes
 from rmpa.cli.graph import GraphName, read_graph, read_namespace
 from rmpa.cli.node_names import ask_peer, find_uri, module_of, peers_nodes, read_node, unreachable_nodes, uris_of
 from rmpa.cli.options import GraphOptions, graph_options
@@ -27,9 +28,9 @@ CALLER_ID = "/rmpa_node"
 _COLUMNS = (
     Column("NODE"),
     Column("MODULE"),
-    Column("PUBLISHES", right=True),
-    Column("SUBSCRIBES", right=True),
-    Column("SERVICES", right=True),
+    Column("PUB", right=True),
+    Column("SUB", right=True),
+    Column("SRV", right=True),
     Column("URI"),
 )
 
@@ -37,8 +38,8 @@ _COLUMNS = (
 @click.command(
     "list", epilog="\b\nExamples:\n  rmpa node list\n  rmpa node list -v /camera\n  rmpa node list joystick:/\n"
 )
-@click.argument("namespace", default="")
-@click.option("-v", "--verbose", is_flag=True, help="With module, counts of topics and services, and address.")
+@click.argument("namespace", default="", shell_complete=completes("node"))
+@click.option("-v", "--verbose", is_flag=True, help="With module, address, and counts of topics and services.")
 @selection_options
 @graph_options
 def list_(namespace: str, verbose: bool, selection: Selection, options: GraphOptions) -> None:
@@ -107,7 +108,7 @@ def _row(peer: str | None, line: NodeLine, here: str | None) -> Sequence[str]:
 
 
 @click.command(epilog="\b\nExamples:\n  rmpa node info /talker\n  rmpa node info joystick:/joy_node --json\n")
-@click.argument("node")
+@click.argument("node", shell_complete=completes("node"))
 @graph_options
 def info(node: str, options: GraphOptions) -> None:
     """Show a node's module, address, process, topics and services, and whether it answers."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 from rmpa.bridge.proxy_names import proxied_node, proxied_peer
 from rmpa.cli.graph import GraphName, read_name, unknown_name
 from rmpa.cli.output import warn
-from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
+from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.observe import limits
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.ros.http.client import call, call_api
@@ -82,8 +82,7 @@ def ask_peer(master: Master, wanted: GraphName, what: str, kind: type[_T]) -> _T
         RmpaError: There is no such peer, it does not answer, or it refuses.
     """
     if master.agent is None:
-        remedy = "name the agent with --agent, or run `rmpa up`: only an agent knows peers"
-        raise UnreachableError("agent", f"{master.uri} ({master.source})", remedy)
+        raise master.no_agent()
     with ControlClient(master.agent, timeout=limits.CONTROL_HANDLER_TIMEOUT) as client:
         try:
             return client.call("node", kind, what=what, peer=wanted.peer, node=wanted.name)

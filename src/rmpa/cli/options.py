@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import functools
+import math
 import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 import click
+
+from rmpa.cli.completion import completes
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -18,11 +21,29 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON; a stream prints one object a line.")
 agent_option = click.option(
-    "--agent", metavar="NAME", help="Which agent of this machine to ask, if several run. [env: RMPA_AGENT]"
+    "--agent",
+    metavar="NAME",
+    shell_complete=completes("agent"),
+    help="Which agent of this machine to ask, if several run. [env: RMPA_AGENT]",
 )
 _master_option = click.option(
     "--master", metavar="URI", help="The ROS master to ask. [default: see rmpa topic --help]"
 )
+
+
+class FiniteRange(click.FloatRange):
+    """A number in a range. Unlike click's own type it refuses ``nan``, which lies in every range, and ``inf``."""
+
+    def convert(self, value: float, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Read the number.
+
+        Raises:
+            click.BadParameter: It is none, is not finite, or out of range.
+        """
+        found = super().convert(value, param, ctx)
+        if not math.isfinite(found):
+            self.fail(f"{value!r} is not a finite number.", param, ctx)
+        return found
 
 
 @dataclass(frozen=True, slots=True)

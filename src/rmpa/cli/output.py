@@ -19,6 +19,9 @@ from rmpa.observe.check import CheckLevel
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+_ANY_WIDTH: Final = 10_000
+"""Columns of a terminal that no table needs."""
+_INDENT: Final = "    "
 _UNITS: Final = ("B", "kB", "MB", "GB", "TB")
 LEVEL_COLOURS: Final = {
     CheckLevel.OK: "green",
@@ -52,6 +55,9 @@ def print_json(value: object) -> None:
 def print_table(columns: Sequence[Column], rows: Sequence[Sequence[str]], *, colours: Sequence[str] = ()) -> None:
     """Print a table under its headings: by rich on a terminal, as aligned plain text elsewhere.
 
+    No cell is cut. Where a table is wider than the terminal, each row is a paragraph: the first cell, then the others
+    behind their headings.
+
     Args:
         columns: From left to right.
         rows: One text a column; control characters are escaped here.
@@ -74,12 +80,27 @@ def _print_rich(columns: Sequence[Column], rows: Sequence[Sequence[str]], colour
     from rich.table import Table
     from rich.text import Text
 
+    console = Console()
     table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
     for column in columns:
         table.add_column(column.title, justify="right" if column.right else "left", no_wrap=True)
     for row, style in zip_longest(rows, colours, fillvalue=""):
         table.add_row(*(Text(cell, style=style if index == 1 else "") for index, cell in enumerate(row)))
-    Console().print(table)
+    if console.measure(table, options=console.options.update(width=_ANY_WIDTH)).maximum <= console.width:
+        console.print(table)
+        return
+    for row, style in zip_longest(rows, colours, fillvalue=""):
+        console.print(Text(row[0], style="bold"), overflow="fold")
+        line = Text()
+        for index, (column, cell) in enumerate(zip(columns[1:], row[1:], strict=True)):
+            if cell in ("", "-"):
+                continue
+            fact = Text(f"{column.title.strip().lower()} {cell}", style="" if index else style)
+            if line and len(_INDENT) + line.cell_len + 2 + fact.cell_len > console.width:
+                console.print(_INDENT, line, sep="", overflow="fold")
+                line = Text()
+            line = Text(", ").join((line, fact)) if line else fact
+        console.print(_INDENT, line, sep="", overflow="fold")
 
 
 def warn(text: str) -> None:
@@ -89,7 +110,8 @@ def warn(text: str) -> None:
 
 def print_line(text: str = "", colour: str | None = None) -> None:
     """One line on standard output at once; control characters are escaped, and terminals show the colour."""
-    click.secho(printable(text), fg=colour)
+    text = printable(text)
+    click.echo(text if colour is None else click.style(text, fg=colour))
 
 
 def printable(text: str) -> str:

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from rmpa.cli.completion import completes
 from rmpa.cli.options import GraphOptions, agent_option, graph_options, json_option
 from rmpa.cli.output import Column, json_text, print_json, print_line, print_table, printable, size, warn
-from rmpa.cli.param_store import open_store, read_key
+from rmpa.cli.param_store import open_store, read_key, split_peer
 from rmpa.cli.param_yaml import read_documents, read_yaml, show_yaml, write_yaml
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.observe.io.control_client import ControlClient, choose_agent
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 peer_option = click.option(
     "--peer",
     metavar="PEER",
+    shell_complete=completes("peer"),
     help="The parameters of this peer's module (or its GUID); SITE/MODULE: of another site's.",
 )
 
@@ -46,15 +48,16 @@ def _json(value: Any) -> Any:
 Examples:
   rmpa param get /robot_description
   rmpa param get /base --json
-  rmpa param get --peer base /run_id
+  rmpa param get base:/run_id          as --peer base /run_id
 """
 )
-@click.argument("key")
+@click.argument("key", shell_complete=completes("param"))
 @click.option("-p", "--pretty", is_flag=True, help="A string as it is, without YAML's quotes and folding.")
 @peer_option
 @graph_options
 def get(key: str, pretty: bool, peer: str | None, options: GraphOptions) -> None:
     """Print the parameter KEY, or all of the namespace KEY, as YAML."""
+    peer, key = split_peer(peer, key)
     value = open_store(peer, options).get(read_key(key, os.environ))
     if options.as_json:
         print_json(_json(value))
@@ -77,7 +80,7 @@ Examples:
   rmpa param set /robot_description -t robot.urdf
 """,
 )
-@click.argument("key")
+@click.argument("key", shell_complete=completes("param"))
 @click.argument("value", required=False)
 @click.option("-t", "--textfile", metavar="FILE", help="Set it to this file's text.")
 @click.option("-b", "--binfile", metavar="FILE", help="Set it to this file's bytes.")
@@ -90,6 +93,7 @@ def set_(
 
     A dictionary sets each of its members; others of the namespace stay as they are.
     """
+    peer, key = split_peer(peer, key)
     given = [word for word in (value, textfile, binfile) if word is not None]
     if len(given) != 1:
         raise ConfigError("VALUE", "none is given" if not given else "two are given", "one of VALUE, -t and -b")
@@ -109,11 +113,12 @@ def set_(
 @click.command(
     "list", epilog="\b\nExamples:\n  rmpa param list\n  rmpa param list /base\n  rmpa param list --peer base --json\n"
 )
-@click.argument("namespace", default="")
+@click.argument("namespace", default="", shell_complete=completes("param"))
 @peer_option
 @graph_options
 def list_(namespace: str, peer: str | None, options: GraphOptions) -> None:
     """List the names of all parameters, or of those in NAMESPACE."""
+    peer, namespace = split_peer(peer, namespace)
     key = read_key(namespace, os.environ) if namespace else "/"
     begin = "/" if key == "/" else f"{key}/"
     names = [name for name in open_store(peer, options).names() if name.startswith(begin)]
@@ -125,11 +130,12 @@ def list_(namespace: str, peer: str | None, options: GraphOptions) -> None:
 
 
 @click.command(epilog="\b\nExamples:\n  rmpa param delete /speed\n  rmpa param delete --peer base /base/trial\n")
-@click.argument("key")
+@click.argument("key", shell_complete=completes("param"))
 @peer_option
 @graph_options
 def delete(key: str, peer: str | None, options: GraphOptions) -> None:
     """Delete the parameter KEY, or all of the namespace KEY."""
+    peer, key = split_peer(peer, key)
     name = read_key(key, os.environ)
     if name == "/":
         raise ConfigError("KEY", "the root holds every parameter", "name the one that you mean")
@@ -148,11 +154,12 @@ Examples:
 """
 )
 @click.argument("file", default="-")
-@click.argument("namespace", default="")
+@click.argument("namespace", default="", shell_complete=completes("param"))
 @peer_option
 @graph_options
 def dump(file: str, namespace: str, peer: str | None, options: GraphOptions) -> None:
     """Write all parameters, or those in NAMESPACE, as YAML to FILE, or to standard output (-)."""
+    peer, namespace = split_peer(peer, namespace)
     value = open_store(peer, options).get(read_key(namespace, os.environ, root=True))
     if file == "-":
         if options.as_json:
@@ -177,7 +184,7 @@ Examples:
 """
 )
 @click.argument("file")
-@click.argument("namespace", default="")
+@click.argument("namespace", default="", shell_complete=completes("param"))
 @peer_option
 @graph_options
 def load(file: str, namespace: str, peer: str | None, options: GraphOptions) -> None:
@@ -185,6 +192,7 @@ def load(file: str, namespace: str, peer: str | None, options: GraphOptions) -> 
 
     As in rosparam, a key _ns of a document is a namespace for all of it.
     """
+    peer, namespace = split_peer(peer, namespace)
     documents = [_placed(document, namespace, file) for document in read_documents(_text(file), file)]
     store = open_store(peer, options)
     count = sum(store.set(key, value) for key, value in documents)

@@ -79,6 +79,24 @@ def open_store(peer: str | None, options: GraphOptions) -> ParamStore:
     return PeerParams(ControlClient(agent.path, limits.CONTROL_HANDLER_TIMEOUT), peer)
 
 
+def split_peer(peer: str | None, text: str) -> tuple[str | None, str]:
+    """The peer and the name that are meant, by ``--peer`` or as ``PEER:/name``.
+
+    Args:
+        peer: The option's value.
+        text: What the user wrote as the name; a parameter's own name has no colon.
+
+    Raises:
+        ConfigError: Both name a peer.
+    """
+    before, colon, name = text.partition(":")
+    if not colon or not before:
+        return peer, text
+    if peer is not None:
+        raise ConfigError("--peer", f"{text!r} names a peer too", "leave one out")
+    return before, name or "/"
+
+
 def read_key(text: str, environ: Mapping[str, str], *, root: bool = False) -> str:
     """The global name of a parameter; a relative one is resolved in ROS_NAMESPACE.
 

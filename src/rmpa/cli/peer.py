@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.options import agent_option, json_option
+from rmpa.cli.completion import completes
+from rmpa.cli.graph import find_peer
+from rmpa.cli.options import FiniteRange, agent_option, json_option
 from rmpa.cli.output import Column, duration, print_json, print_line, print_table, size, warn
 from rmpa.cli.selection import LINES, Selection, summary
 from rmpa.cli.topic_crossing import shown_state
-from rmpa.config.values import did_you_mean
-from rmpa.core.errors import PeerRefused, RmpaError
+from rmpa.core.errors import PeerRefused
 from rmpa.core.stats import SampleSummary
 from rmpa.observe.io.control_client import ControlClient, choose_agent
 from rmpa.observe.snapshot import PingReply
@@ -37,8 +38,10 @@ _USUAL: Final = frozenset({"linked", "relayed", "parked"})
 """States that are no problem."""
 _COLUMNS: Final = tuple(
     Column(title, right=title not in ("PEER", "STATE", "ADDRESS", "DIALLED"))
-    for title in ("PEER", "STATE", "SINCE", "ADDRESS", "DIALLED", "RTT", "CLOCK", "IN", "OUT", "QUEUE", "DROPS")
+    for title in ("PEER", "STATE", "SINCE", "ADDRESS", "RTT", "DIALLED", "CLOCK", "IN", "OUT", "QUEUE", "DROPS")
 )
+_BRIEF: Final = 5
+"""Columns that are shown without ``-v``: they fit 80 characters."""
 _ROUTES: Final = (
     *map(Column, ("  TOPIC", "TYPE", "NODE", "ROUTE")),
     *(Column(title, right=True) for title in ("MESSAGES", "RATE", "LATENCY", "P99", "LOST")),
@@ -58,18 +61,26 @@ def connect(agent: str | None) -> ControlClient:
 \b
 Examples:
   rmpa peer list
+  rmpa peer list -v
   rmpa peer list 'arm*' --state linked --state refused
   rmpa peer list --json | jq '.[].name'
 """,
 )
-@click.argument("pattern", default="")
+@click.argument("pattern", default="", shell_complete=completes("peer"))
+@click.option("-v", "--verbose", is_flag=True, help="With the side that dialled, clock, traffic, queue and drops.")
 @click.option("--state", "states", multiple=True, help="Only peers in this state; may be given again.")
 @click.option("--limit", type=click.IntRange(1), help=f"At most so many. [default: {LINES} on a terminal]")
 @click.option("--all", "everything", is_flag=True, help="Leave nothing out on a terminal.")
 @json_option
 @agent_option
 def list_(
-    pattern: str, states: tuple[str, ...], limit: int | None, everything: bool, as_json: bool, agent: str | None
+    pattern: str,
+    verbose: bool,
+    states: tuple[str, ...],
+    limit: int | None,
+    everything: bool,
+    as_json: bool,
+    agent: str | None,
 ) -> None:
     """List the peers, all or those with names like PATTERN, and how their links are.
 
@@ -97,7 +108,9 @@ def list_(
             peers.sort(key=_urgency)
             click.echo(summary(len(peers), "peers", (p.state for p in peers)) + "\n")
         shown = selection.shown(peers)
-        print_table(_COLUMNS, [_row(p) for p in shown], colours=[_COLOURS.get(p.state, "") for p in shown])
+        width = len(_COLUMNS) if verbose else _BRIEF
+        colours = [_COLOURS.get(p.state, "") for p in shown]
+        print_table(_COLUMNS[:width], [_row(p)[:width] for p in shown], colours=colours)
         selection.print_rest(peers, "peers", "rmpa peer list 'arm*', --state linked")
     if snapshot.agent.links.startswith("links on demand"):
         click.echo(f"{snapshot.agent.name} keeps {snapshot.agent.links}")
@@ -129,8 +142,8 @@ def _row(info: PeerInfo) -> list[str]:
         f"{info.state}, at rest" if link.rests else info.state,
         duration(info.since_ago),
         link.remote,
-        "by us" if link.dialled else "by it",
         duration(link.rtt),
+        "by us" if link.dialled else "by it",
         clock,
         size(link.bytes_in),
         size(link.bytes_out),
@@ -152,25 +165,8 @@ def _troubles(snapshot: Snapshot, peers: Sequence[PeerInfo]) -> list[str]:
     return found
 
 
-def find_peer(snapshot: Snapshot, wanted: str) -> PeerInfo:
-    """The peer of that name or GUID.
-
-    Raises:
-        RmpaError: There is none; the text offers the nearest name.
-    """
-    for info in snapshot.peers:
-        if wanted in (info.name, info.guid, info.guid.partition("#")[0]):
-            return info
-    names = [info.name for info in snapshot.peers]
-    near = did_you_mean(wanted, names)
-    known = f"known are {', '.join(names)}" if names else "no peer is known yet"
-    raise RmpaError(
-        f"{snapshot.agent.name} knows no peer {wanted!r}; " + (f"did you mean {near}?" if near else known)
-    )
-
-
 @click.command(epilog="\b\nExamples:\n  rmpa peer info base\n")
-@click.argument("name")
+@click.argument("name", shell_complete=completes("peer"))
 @json_option
 @agent_option
 def info(name: str, as_json: bool, agent: str | None) -> None:
@@ -289,11 +285,9 @@ def _probes_text(probes: ProbesInfo) -> str:
 
 
 @click.command(epilog="\b\nExamples:\n  rmpa peer ping base\n  rmpa peer ping base -c 10 -i 0.1\n")
-@click.argument("name")
+@click.argument("name", shell_complete=completes("peer"))
 @click.option("-c", "--count", type=click.IntRange(1), help="Stop after so many. [default: at Ctrl-C]")
-@click.option(
-    "-i", "--interval", type=click.FloatRange(0.01), default=1.0, show_default=True, help="Seconds between."
-)
+@click.option("-i", "--interval", type=FiniteRange(0.01), default=1.0, show_default=True, help="Seconds between.")
 @json_option
 @agent_option
 def ping(name: str, count: int | None, interval: float, as_json: bool, agent: str | None) -> int:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from rmpa.cli.completion import completes
 from rmpa.cli.manual_choice import ManualChoice, resource_json
 from rmpa.cli.options import GraphOptions, graph_options
 from rmpa.cli.output import Column, print_json, print_line, print_table
@@ -38,7 +39,7 @@ async def _decision(graph: ResourceGraph, one: SeenResource) -> dict[str, Any]:
 
 
 @click.command("list", epilog="\b\nExamples:\n  rmpa profile list\n  rmpa profile list base:/sonar --json\n")
-@click.argument("resource", required=False)
+@click.argument("resource", required=False, shell_complete=completes("resource"))
 @graph_options
 def list_(resource: str | None, options: GraphOptions) -> None:
     """List a RESOURCE's profiles and what they offer."""
@@ -109,7 +110,7 @@ Examples:
   rmpa profile explain base:/sonar --json
 """
 )
-@click.argument("resource", required=False)
+@click.argument("resource", required=False, shell_complete=completes("resource"))
 @graph_options
 def explain(resource: str | None, options: GraphOptions) -> None:
     """Show each term of a RESOURCE's last decision."""

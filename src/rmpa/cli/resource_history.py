@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 import click
 from click.core import ParameterSource
 
+from rmpa.cli.completion import completes
 from rmpa.cli.options import json_option
 from rmpa.cli.output import Column, duration, print_json, print_table
 from rmpa.core.errors import ConfigError, RmpaError
@@ -38,7 +39,7 @@ Examples:
 
 
 @click.command(epilog=_EXAMPLES)
-@click.argument("resource", required=False)
+@click.argument("resource", required=False, shell_complete=completes("resource"))
 @click.option("--profiles", "shown", flag_value="profiles", help="Which profile ran when, and why.")
 @click.option("--violations", "shown", flag_value="violations", help="Only alarms, and when they were over.")
 @click.option("--windows", "shown", flag_value="windows", help="The measured quality, window by window.")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from rmpa.cli.completion import completes
 from rmpa.cli.options import GraphOptions, graph_options
 from rmpa.cli.output import Column, print_json, print_line, print_table, warn
 from rmpa.cli.profile import offers, shown
@@ -24,7 +25,7 @@ _TIMES: Final = frozenset({"deadline", "lifespan", "liveliness_lease"})
 
 
 @click.command(epilog="\b\nExamples:\n  rmpa resource info /sonar\n  rmpa resource info base:/arm --json\n")
-@click.argument("resource", required=False)
+@click.argument("resource", required=False, shell_complete=completes("resource"))
 @graph_options
 def info(resource: str | None, options: GraphOptions) -> None:
     """Show all of a RESOURCE: topics, parameters, qualities, profiles, contexts, tasks, what it asks, and clients."""

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.graph import read_graph, read_name
+from rmpa.cli.completion import completes
+from rmpa.cli.graph import read_graph, read_name, require_peer
 from rmpa.cli.message_text import to_text
-from rmpa.cli.options import GraphOptions, graph_options
+from rmpa.cli.options import FiniteRange, GraphOptions, graph_options
 from rmpa.cli.output import print_json, printable
 from rmpa.cli.service_probe import CALLER_ID, known_type, lookup
 from rmpa.cli.topic_pub import fill_stamps, read_values
@@ -41,11 +42,11 @@ Examples:
   rmpa service call /map_server/static_map --wait --json | jq .response.map.info
 """,
 )
-@click.argument("service")
+@click.argument("service", shell_complete=completes("service"))
 @click.argument("values", nargs=-1)
 @click.option("-w", "--wait", is_flag=True, help="Wait until the service is there, for as long as --timeout says.")
 @click.option(
-    "-t", "--timeout", type=click.FloatRange(0.001), default=60.0, show_default=True, help="Seconds for the answer."
+    "-t", "--timeout", type=FiniteRange(0.001), default=60.0, show_default=True, help="Seconds for the answer."
 )
 @graph_options
 def call(service: str, values: tuple[str, ...], wait: bool, timeout: float, options: GraphOptions) -> None:
@@ -76,7 +77,9 @@ async def _call(
 
     if wait:
         await _wait(master, wanted, timeout)
-    (await read_graph(master)).require_service(wanted)
+    graph = await read_graph(master)
+    require_peer(master, graph, wanted)
+    graph.require_service(wanted)
     uri = await lookup(master, wanted.name)
     connection = await ServiceConnection.open(uri, wanted.name, CALLER_ID, timeout=timeout)
     try:

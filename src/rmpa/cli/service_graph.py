@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.cli.graph import origin_json, origin_text, peers_of, print_names, read_name, read_namespace
+from rmpa.cli.completion import completes
+from rmpa.cli.graph import origin_json, origin_text, peers_of, print_names, read_name, read_namespace, require_peer
 from rmpa.cli.options import GraphOptions, graph_options
 from rmpa.cli.output import Column, print_json, print_line, print_table, warn
 from rmpa.cli.selection import Selection, selection_options, summary
@@ -16,7 +17,8 @@ from rmpa.cli.service_probe import known_type, probe, probe_all
 from rmpa.core.errors import RmpaError
 
 if TYPE_CHECKING:
-    from rmpa.cli.graph import Graph
+    from rmpa.cli.graph import Graph, GraphName
+    from rmpa.cli.master import Master
     from rmpa.cli.service_probe import Probed
     from rmpa.observe.snapshot import ServiceInfo
     from rmpa.ros.types.messages import MessageType
@@ -40,7 +42,7 @@ def _service_json(graph: Graph, name: str, found: Probed | None = None) -> dict[
 @click.command(
     "list", epilog="\b\nExamples:\n  rmpa service list\n  rmpa service list -v /arm\n  rmpa service list base:/\n"
 )
-@click.argument("namespace", default="")
+@click.argument("namespace", default="", shell_complete=completes("service"))
 @click.option("-v", "--verbose", is_flag=True, help="Types and nodes too; each server is asked.")
 @selection_options
 @graph_options
@@ -51,6 +53,7 @@ def list_(namespace: str, verbose: bool, selection: Selection, options: GraphOpt
     """
     master, graph = options.graph()
     wanted = read_namespace(namespace, "service")
+    require_peer(master, graph, wanted)
     names = [name for name in sorted(graph.services) if wanted.contains(name, peers_of(graph.services[name]))]
     names = every = selection.with_peers(names, lambda name: peers_of(graph.services[name]))
     if not options.as_json and selection.is_long(names):
@@ -84,12 +87,13 @@ def _type_of(found: Probed) -> str:
 @click.command(
     epilog="\b\nExamples:\n  rmpa service info /add_two_ints\n  rmpa service info base:/arm/enable --json\n"
 )
-@click.argument("service")
+@click.argument("service", shell_complete=completes("service"))
 @graph_options
 def info(service: str, options: GraphOptions) -> None:
     """Show a service's node, address, type and arguments, and what of it crosses."""
     wanted = read_name(service, "service")
     master, graph = options.graph()
+    _require_peer(master, graph, wanted)
     mesh = crossing(master, wanted)
     if any(each.hidden for each in mesh) and all(each.hidden for each in mesh):
         # It is not in the graph because it is hidden: the lines say why.
@@ -124,6 +128,12 @@ def info(service: str, options: GraphOptions) -> None:
     _print_mesh(mesh)
 
 
+def _require_peer(master: Master, graph: Graph, wanted: GraphName) -> None:
+    """Check that the peer is known; where another module serves the name, that is told instead."""
+    if wanted.name not in graph.services:
+        require_peer(master, graph, wanted)
+
+
 def _print_mesh(mesh: tuple[ServiceInfo, ...]) -> None:
     if mesh:
         click.echo("\nMesh:")
@@ -146,12 +156,13 @@ def _fields(half: MessageType) -> list[str]:
 
 
 @click.command("type", epilog="\b\nExamples:\n  rmpa service type /add_two_ints\n")
-@click.argument("service")
+@click.argument("service", shell_complete=completes("service"))
 @graph_options
 def type_(service: str, options: GraphOptions) -> None:
     """Print a service's type."""
     wanted = read_name(service, "service")
     master, graph = options.graph()
+    _require_peer(master, graph, wanted)
     graph.require_service(wanted)
     found = asyncio.run(probe(master, wanted.name))
     if found.description is None:

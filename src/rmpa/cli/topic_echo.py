@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 import click
 
 from rmpa.bridge.proxy_names import proxied_node
-from rmpa.cli.graph import Graph, GraphName, read_graph, read_name
+from rmpa.cli.completion import completes
+from rmpa.cli.graph import Graph, GraphName, read_graph, read_name, require_peer, warn_unpublished
 from rmpa.cli.message_text import flatten, pick, shorten, to_text
 from rmpa.cli.options import GraphOptions, graph_options
-from rmpa.cli.output import print_json, warn
+from rmpa.cli.output import print_json
 from rmpa.cli.stream import Enough, StreamWatch, run_stream, watch_topic
-from rmpa.config.values import did_you_mean
 
 if TYPE_CHECKING:
     from rmpa.cli.master import Master
@@ -93,7 +93,7 @@ Examples:
   rmpa topic echo /cmd --json | jq .message.axes
 """
 )
-@click.argument("topic")
+@click.argument("topic", shell_complete=completes("topic"))
 @click.option("-n", "--count", type=click.IntRange(1), help="Stop after so many messages.")
 @click.option("-p", "--plot", is_flag=True, help="Comma-separated values, for plotting.")
 @click.option("--noarr", is_flag=True, help="Leave arrays out.")
@@ -116,9 +116,8 @@ def echo(
 async def _echo(master: Master, topic: str, count: int | None, printer: _MessagePrinter) -> None:
     graph = await read_graph(master)
     wanted, path = split_field(topic, graph)
-    if wanted.name not in graph.publishers:
-        near = did_you_mean(wanted.name, graph.publishers)
-        warn(f"{wanted.name} is not published yet; waiting" + (f" (did you mean {near}?)" if near else ""))
+    require_peer(master, graph, wanted)
+    warn_unpublished(master, graph, wanted)
 
     def on_message(received: Received) -> None:
         if count is None or printer.count < count:

@@ -7,7 +7,17 @@ from typing import TYPE_CHECKING
 import click
 
 from rmpa.bridge.proxy_names import proxied_peer
-from rmpa.cli.graph import origin_json, origin_text, peers_mark, peers_of, print_names, read_name, read_namespace
+from rmpa.cli.completion import completes
+from rmpa.cli.graph import (
+    origin_json,
+    origin_text,
+    peers_mark,
+    peers_of,
+    print_names,
+    read_name,
+    read_namespace,
+    require_peer,
+)
 from rmpa.cli.options import GraphOptions, graph_options
 from rmpa.cli.output import duration, print_json, print_line, printable, warn
 from rmpa.cli.selection import Selection, selection_options, summary
@@ -32,7 +42,7 @@ def _topic_json(graph: Graph, name: str) -> dict[str, object]:
 @click.command(
     "list", epilog="\b\nExamples:\n  rmpa topic list\n  rmpa topic list -v /camera\n  rmpa topic list joystick:/\n"
 )
-@click.argument("namespace", default="")
+@click.argument("namespace", default="", shell_complete=completes("topic"))
 @click.option("-v", "--verbose", is_flag=True, help="Types and counts, publishers and subscribers apart.")
 @click.option("-p", "--publishers", is_flag=True, help="Only topics that have a publisher.")
 @click.option("-s", "--subscribers", is_flag=True, help="Only topics that have a subscriber.")
@@ -51,8 +61,9 @@ def list_(
     A topic that peers publish has their names behind it: /cmd  [joystick]. A terminal shows the first of very many,
     this module's own before the others.
     """
-    _, graph = options.graph()
+    master, graph = options.graph()
     wanted = read_namespace(namespace, "topic")
+    require_peer(master, graph, wanted)
     names = [
         name
         for name in graph.topics
@@ -106,7 +117,7 @@ Examples:
   rmpa topic info /cmd --json | jq '.mesh.routes[0].latency.p99'
 """
 )
-@click.argument("topic")
+@click.argument("topic", shell_complete=completes("topic"))
 @graph_options
 def info(topic: str, options: GraphOptions) -> None:
     """Show a topic's type, publishers and subscribers, and what of it crosses.
@@ -117,6 +128,7 @@ def info(topic: str, options: GraphOptions) -> None:
     """
     wanted = read_name(topic)
     master, graph = options.graph()
+    require_peer(master, graph, wanted)
     graph.require_topic(wanted.name)
     crossing = ask_agent(master, wanted.name, figures=True)
     if options.as_json:
@@ -154,12 +166,13 @@ def _print_crossing(crossing: TopicInfo, wanted: GraphName) -> None:
 
 
 @click.command("type", epilog="\b\nExamples:\n  rmpa topic type /cmd\n")
-@click.argument("topic")
+@click.argument("topic", shell_complete=completes("topic"))
 @graph_options
 def type_(topic: str, options: GraphOptions) -> None:
     """Print a topic's type."""
     wanted = read_name(topic)
-    _, graph = options.graph()
+    master, graph = options.graph()
+    require_peer(master, graph, wanted)
     graph.require_topic(wanted.name)
     kind = graph.types.get(wanted.name)
     if kind is None:

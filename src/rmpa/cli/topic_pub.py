@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
+from rmpa.cli.completion import completes
 from rmpa.cli.graph import read_name
-from rmpa.cli.options import GraphOptions, graph_options
+from rmpa.cli.options import FiniteRange, GraphOptions, graph_options
 from rmpa.cli.output import print_json, print_line, warn
 from rmpa.cli.stream import run_stream, with_node
 from rmpa.core.errors import ConfigError, UnreachableError
@@ -81,10 +82,10 @@ Examples:
   rmpa topic pub /cmd sensor_msgs/Joy '{header: auto, axes: [0.5, 0.0]}'
 """,
 )
-@click.argument("topic")
+@click.argument("topic", shell_complete=completes("topic"))
 @click.argument("kind", metavar="TYPE")
 @click.argument("values", nargs=-1)
-@click.option("-r", "--rate", type=click.FloatRange(0.001, 10_000), help="Messages a second, until Ctrl-C.")
+@click.option("-r", "--rate", type=FiniteRange(0.001, 10_000), help="Messages a second, until Ctrl-C.")
 @click.option("-1", "--once", is_flag=True, help="Publish one message and end.")
 @click.option("-l", "--latch", is_flag=True, help="Latch, with -r too: a new subscriber gets the last message.")
 @graph_options

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from rmpa.bridge.proxy_names import proxied_peer
-from rmpa.cli.graph import read_name
+from rmpa.cli.completion import completes
+from rmpa.cli.graph import read_name, require_peer, warn_unpublished
 from rmpa.cli.options import GraphOptions, graph_options
 from rmpa.cli.output import print_json, size
 from rmpa.cli.stream import Enough, StreamWatch, run_stream, watch_topic
@@ -192,7 +193,9 @@ async def _show(figures: _Figures, master: Master, wanted: GraphName, *, as_json
 
 def _watch(topic: str, make: Callable[[Master], _Figures], count: int | None, options: GraphOptions) -> None:
     wanted = read_name(topic)
-    master, as_json = options.master(), options.as_json
+    (master, graph), as_json = options.graph(), options.as_json
+    require_peer(master, graph, wanted)
+    warn_unpublished(master, graph, wanted)
     figures = make(master)
 
     async def body(watch: StreamWatch) -> None:
@@ -233,7 +236,9 @@ def _shared(window: int) -> Callable[[Callable[..., None]], Callable[..., None]]
         help="Over how many messages.",
     )
     count = click.option("-n", "--count", type=click.IntRange(1), help="Stop after so many messages.")
-    return lambda command: click.argument("topic")(messages(count(graph_options(command))))
+    return lambda command: click.argument("topic", shell_complete=completes("topic"))(
+        messages(count(graph_options(command)))
+    )
 
 
 @click.command(epilog="\b\nExamples:\n  rmpa topic hz /cmd\n  rmpa topic hz joystick:/cmd -w 100 --json\n")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
+from rmpa.cli.completion import completes
 from rmpa.cli.options import json_option
 from rmpa.cli.output import print_json, printable, warn
 from rmpa.config.permission_rules import ACTION_CLIENT, ACTION_SERVER, Access
@@ -29,7 +30,7 @@ _WORDS: Final = (*(access.value for access in Access), ACTION_CLIENT, ACTION_SER
     epilog="\b\nExamples:\n  rmpa trust check joystick publish /cmd_vel\n"
     "  rmpa trust check joystick action /arm/move --config new.toml\n"
 )
-@click.argument("peer")
+@click.argument("peer", shell_complete=completes("peer"))
 @click.argument("what", type=click.Choice(_WORDS), metavar="|".join(_WORDS))
 @click.argument("name")
 @click.option("--config", "file", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]")

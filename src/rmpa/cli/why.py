@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
+from rmpa.cli.completion import completes
 from rmpa.cli.graph import read_name
 from rmpa.cli.options import agent_option, json_option
 from rmpa.cli.output import LEVEL_COLOURS, print_json, printable
+from rmpa.core.errors import ConfigError
 from rmpa.observe import limits
 from rmpa.observe.check import FAIL, OK, WARN
 from rmpa.observe.io.control_client import ControlClient, choose_agent
@@ -22,7 +24,8 @@ if TYPE_CHECKING:
 
 EPILOG = """\
 \b
-Exit codes: 0 it flows, on every way if there are several; 1 it does not, and the first stage that fails says why.
+Exit codes: 0 it flows, on every way if there are several, or no node subscribes and nothing is in its way;
+1 it does not flow, and the first stage that fails says why.
 
 \b
 Examples:
@@ -38,7 +41,7 @@ _WELL: Final = {"service": "it can be called", "module": "it is linked"}
 
 
 @click.command(epilog=EPILOG)
-@click.argument("name", metavar="[PEER:]NAME")
+@click.argument("name", metavar="[PEER:]NAME", shell_complete=completes("topic"))
 @click.option("-s", "--service", is_flag=True, help="A service is meant, though a topic has that name.")
 @click.option("-m", "--module", is_flag=True, help="NAME is a module: its link is checked.")
 @json_option
@@ -57,6 +60,8 @@ def why(name: str, service: bool, module: bool, as_json: bool, agent: str | None
         wanted = read_name(name)
         args = {"name": wanted.name, "peer": wanted.peer, "service": service}
     with ControlClient(choose_agent(os.environ, agent).path, timeout=limits.CONTROL_HANDLER_TIMEOUT) as client:
+        if not module and any(peer.name == name for peer in client.snapshot(topics=()).peers):
+            raise ConfigError("NAME", f"{name} is a module", f"`rmpa why --module {name}` says how it is linked")
         found = client.call("why", tuple[Diagnosis, ...], **args)
     if as_json:
         print_json(found)
@@ -82,7 +87,9 @@ def _lines(diagnosis: Diagnosis) -> list[str]:
     width = max((len(stage.name) for stage in diagnosis.stages), default=0)
     lines += [_line(stage, width) for stage in diagnosis.stages]
     failed = diagnosis.failed
-    if failed is None:
+    if diagnosis.unasked:
+        lines.append(_paint("nothing is in its way: it flows as soon as a node subscribes", WARN))
+    elif failed is None:
         lines.append(_paint(_WELL.get(diagnosis.kind, "it flows"), OK))
     else:
         lines.append(_paint(printable(f"it stops at: {failed.name}"), FAIL))

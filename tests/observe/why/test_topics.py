@@ -289,12 +289,6 @@ FAILURES: dict[str, tuple[Case, str, str, str]] = {
         "the agent has no file descriptor to accept it with: node /x has to wait: none left",
         "raise it",
     ),
-    "nobody here": (
-        Case(subscribers=(), readers=(), **route(state="idle")),
-        "subscriber",
-        "no node here subscribes to /cmd",
-        "rmpa topic echo /cmd",
-    ),
     "not connected": (
         Case(readers=(), **route(state="idle")),
         "subscriber",
@@ -389,6 +383,18 @@ def test_the_first_stage_that_fails(case: Case, stage: str, text: str, remedy: s
     assert names == [name for name in ORDER if name in names]
     missing = set(ORDER[: ORDER.index(stage)]) - set(names)
     assert missing <= {"md5", *ONLY_FAILS}
+
+
+def test_a_topic_that_no_node_subscribes_to_has_no_fault() -> None:
+    found = one(Case(subscribers=(), readers=(), **route(state="idle")))
+    assert found.flows
+    assert found.unasked
+    assert found.failed is None
+    last = found.stages[-1]
+    assert (last.text, last.remedy) == (
+        "no node here subscribes to /cmd, so nothing is sent",
+        "to try it: rmpa topic echo /cmd",
+    )
 
 
 def test_every_stage_can_fail_but_transport_and_contract() -> None:

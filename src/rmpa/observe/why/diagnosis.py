@@ -23,6 +23,9 @@ PERMISSION_THERE: Final = "permission there"
 PERMISSION_HERE: Final = "permission here"
 """The stage of what this module lets that of the publisher (server) do."""
 
+UNASKED: Final = "demand"
+"""The last stage of a path that nothing uses: no node subscribes, so nothing is sent."""
+
 
 class Diagnosis(msgspec.Struct, frozen=True, kw_only=True):
     """The path of a topic (service) from its publisher (server) in one module to its users in another.
@@ -33,7 +36,7 @@ class Diagnosis(msgspec.Struct, frozen=True, kw_only=True):
         peer: The module of the publisher (server).
         to: The module of the users.
         node: The publisher (server), by its name in its own module; empty where there is none.
-        flows: Whether messages (calls) get through.
+        flows: Whether messages (calls) get through, or would if a node subscribed (``unasked``).
         stages: From the peer to the reader, up to the first that fails.
     """
 
@@ -52,6 +55,11 @@ class Diagnosis(msgspec.Struct, frozen=True, kw_only=True):
         """The diagnosis that follows from the stages: it flows if none of them fails."""
         flows = all(stage.level is not FAIL for stage in stages)
         return cls(kind=kind, name=name, peer=peer, to=to, node=node, flows=flows, stages=stages)
+
+    @property
+    def unasked(self) -> bool:
+        """Whether nothing is sent because no node subscribes."""
+        return bool(self.stages) and self.stages[-1].name == UNASKED
 
     @property
     def failed(self) -> Check | None:

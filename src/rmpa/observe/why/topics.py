@@ -23,6 +23,7 @@ from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check
 from rmpa.observe.why.diagnosis import (
     PERMISSION_HERE,
     PERMISSION_THERE,
+    UNASKED,
     Diagnosis,
     permission_here,
     permission_there,
@@ -230,7 +231,10 @@ def _source_stages(ends: BothEnds, later: BothEnds | None, peer: str, node: str,
         yield Check(PERMISSION_HERE, OK, permission)
     yield _type(ends.here, route)
     yield _in_graph(ends.here, route)
-    yield from _subscriber(ends.here, route)
+    for stage in _subscriber(ends.here, route):
+        yield stage
+        if stage.name == UNASKED:
+            return
     now, report_now = _route(later, peer, node) or route, _report(later, node) or report
     relayed = bool(ends.here.proxy(node).connections)
     yield transport(now)
@@ -364,7 +368,7 @@ def _subscriber(here: TopicAtSubscriber, route: RouteInfo) -> Iterator[Check]:
             yield Check("subscriber", FAIL, text, remedy)
         else:
             text = f"no node here subscribes to {here.topic}, so nothing is sent"
-            yield Check("subscriber", FAIL, text, f"that is no fault; to try it: rmpa topic echo {here.topic}")
+            yield Check(UNASKED, WARN, text, f"to try it: rmpa topic echo {here.topic}")
         return
     there = ["connected to its proxy"] if connections else []
     names = [", ".join(dict.fromkeys(c.node for c in connections))] if connections else []

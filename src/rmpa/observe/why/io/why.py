@@ -139,8 +139,9 @@ class WhyService:
             calls = await self._service(name, wanted)
             if any(diagnosis.node for diagnosis in calls):
                 return calls
-            # Whether there is a topic or a service of this name is not told to those who may not have it.
-            return (*found, *(diagnosis for diagnosis in calls if _is_denied(diagnosis)))
+            # A peer that denies both does not tell whether there is a topic or a service of this name: one is shown.
+            if not _is_denied(found[0]):
+                return (*found, *filter(_is_denied, calls))
         return found
 
     async def _module(self, name: str) -> Diagnosis:
