@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from rmpa.bridge.proxy_names import proxied_peer
-from rmpa.cli.completion import completes
 from rmpa.cli.graph import GraphName, read_graph
-from rmpa.cli.options import GraphOptions, graph_options
+from rmpa.cli.options import GraphOptions, completes, graph_options
 from rmpa.cli.output import Column, print_json, print_line, print_table, printable, warn
 from rmpa.cli.resource_graph import run_with_resources, with_resources
 from rmpa.cli.stream import run_stream, with_node

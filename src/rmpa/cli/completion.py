@@ -66,36 +66,31 @@ def completion(shell: str) -> None:
     click.echo(template % complete.source_vars())
 
 
-def completes(kind: str) -> Callable[[click.Context, click.Parameter, str], list[str]]:
-    """A function that completes names, for ``shell_complete`` of an argument or option.
-
-    Nothing is completed where no agent or master answers in time.
+def names(kind: str, ctx: click.Context, incomplete: str) -> list[str]:
+    """The names that begin as a user began to write; none where no agent or master answers in time.
 
     Args:
-        kind: ``peer``, ``agent``, ``topic``, ``service``, ``node``, ``param``, ``resource``, ``profile`` or
-            ``context``. Of a peer's own names, ``PEER:/name``, those of that peer are offered.
+        kind: As for ``options.completes``.
+        ctx: The command line so far.
+        incomplete: The begun word.
     """
+    found: list[str] = []
 
-    def complete(ctx: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
-        found: list[str] = []
+    def ask() -> None:
+        with contextlib.suppress(RmpaError, OSError, ValueError):
+            found.extend(name for name in _FIND[kind](ctx, incomplete) if name.startswith(incomplete))
 
-        def ask() -> None:
-            with contextlib.suppress(RmpaError, OSError, ValueError):
-                found.extend(name for name in _FIND[kind](ctx, incomplete) if name.startswith(incomplete))
+    # Imported here, not in the thread: the time that this takes is not the agent's.
+    from rmpa.cli import graph, master, param_store, resource_graph  # noqa: F401
 
-        # Imported here, not in the thread: the time that this takes is not the agent's.
-        from rmpa.cli import graph, master, param_store, resource_graph  # noqa: F401
+    if kind in _BY_NODE:
+        from rmpa.ros.node import node  # noqa: F401
 
-        if kind in _BY_NODE:
-            from rmpa.ros.node import node  # noqa: F401
-
-        # In a thread, which the end of the program ends: an agent that hangs must not hold up the shell.
-        asked = threading.Thread(target=ask, daemon=True)
-        asked.start()
-        asked.join(ANSWER)
-        return sorted({*found})
-
-    return complete
+    # In a thread, which the end of the program ends: an agent that hangs must not hold up the shell.
+    asked = threading.Thread(target=ask, daemon=True)
+    asked.start()
+    asked.join(ANSWER)
+    return sorted({*found})
 
 
 def _master(ctx: click.Context) -> Master:

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rmpa.cli.completion import completes
-from rmpa.cli.options import GraphOptions, graph_options
+from rmpa.cli.options import GraphOptions, completes, graph_options
 from rmpa.cli.output import print_json, print_line
 from rmpa.cli.resource_graph import known_name, run_with_resources
 from rmpa.core.errors import ConfigError

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from rmpa.bridge.policy import is_own
-from rmpa.cli.completion import completes
 from rmpa.cli.graph import Graph, read_graph, require_peer
 from rmpa.cli.node_names import ask_peer, find_uri, read_node
-from rmpa.cli.options import FiniteRange, GraphOptions, graph_options
+from rmpa.cli.options import FiniteRange, GraphOptions, completes, graph_options
 from rmpa.cli.output import print_json, print_line, printable
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.ros import limits

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 import click
 
 from rmpa.bridge.proxy_names import proxied_peer
-from rmpa.cli.completion import completes
 from rmpa.cli.graph import GraphName, read_graph, read_namespace
 from rmpa.cli.node_names import ask_peer, find_uri, module_of, peers_nodes, read_node, unreachable_nodes, uris_of
-from rmpa.cli.options import GraphOptions, graph_options
+from rmpa.cli.options import GraphOptions, completes, graph_options
 from rmpa.cli.output import Column, print_json, print_line, print_table, warn
 from rmpa.cli.selection import Selection, selection_options, summary
 from rmpa.core.errors import RmpaError

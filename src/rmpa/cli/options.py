@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import math
 import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 import click
-
-from rmpa.cli.completion import completes
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -19,6 +18,24 @@ if TYPE_CHECKING:
     from rmpa.cli.master import Master
 
 _T = TypeVar("_T")
+
+
+def completes(kind: str) -> Callable[[click.Context, click.Parameter, str], list[str]]:
+    """A function that completes names in a shell, for ``shell_complete`` of an argument or option.
+
+    Args:
+        kind: ``peer``, ``agent``, ``topic``, ``service``, ``node``, ``param``, ``resource``, ``profile`` or
+            ``context``. Of a peer's own names, ``PEER:/name``, those of that peer are offered.
+    """
+
+    def complete(ctx: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
+        # By its name, as commands are: it asks the agent by the modules of the commands, which import this one.
+        found: list[str] = importlib.import_module("rmpa.cli.completion").names(kind, ctx, incomplete)
+        return found
+
+    return complete
+
+
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON; a stream prints one object a line.")
 agent_option = click.option(
     "--agent",

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rmpa.cli.completion import completes
-from rmpa.cli.options import GraphOptions, agent_option, graph_options, json_option
+from rmpa.cli.options import GraphOptions, agent_option, completes, graph_options, json_option
 from rmpa.cli.output import Column, json_text, print_json, print_line, print_table, printable, size, warn
 from rmpa.cli.param_store import open_store, read_key, split_peer
 from rmpa.cli.param_yaml import read_documents, read_yaml, show_yaml, write_yaml

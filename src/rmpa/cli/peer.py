@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.completion import completes
 from rmpa.cli.graph import find_peer
-from rmpa.cli.options import FiniteRange, agent_option, json_option
+from rmpa.cli.options import FiniteRange, agent_option, completes, json_option
 from rmpa.cli.output import Column, duration, print_json, print_line, print_table, size, warn
 from rmpa.cli.selection import LINES, Selection, summary
 from rmpa.cli.topic_crossing import shown_state

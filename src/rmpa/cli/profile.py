@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rmpa.cli.completion import completes
 from rmpa.cli.manual_choice import ManualChoice, resource_json
-from rmpa.cli.options import GraphOptions, graph_options
+from rmpa.cli.options import GraphOptions, completes, graph_options
 from rmpa.cli.output import Column, print_json, print_line, print_table
 from rmpa.cli.resource_graph import decision_of, run_with_resources
 from rmpa.core.errors import RmpaError

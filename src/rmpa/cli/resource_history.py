@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Final
 import click
 from click.core import ParameterSource
 
-from rmpa.cli.completion import completes
-from rmpa.cli.options import json_option
+from rmpa.cli.options import completes, json_option
 from rmpa.cli.output import Column, duration, print_json, print_table
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.resource.declare.units import quantity

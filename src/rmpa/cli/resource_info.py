@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from rmpa.cli.completion import completes
-from rmpa.cli.options import GraphOptions, graph_options
+from rmpa.cli.options import GraphOptions, completes, graph_options
 from rmpa.cli.output import Column, print_json, print_line, print_table, warn
 from rmpa.cli.profile import offers, shown
 from rmpa.cli.resource_graph import run_with_resources

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.completion import completes
 from rmpa.cli.graph import read_graph, read_name, require_peer
 from rmpa.cli.message_text import to_text
-from rmpa.cli.options import FiniteRange, GraphOptions, graph_options
+from rmpa.cli.options import FiniteRange, GraphOptions, completes, graph_options
 from rmpa.cli.output import print_json, printable
 from rmpa.cli.service_probe import CALLER_ID, known_type, lookup
 from rmpa.cli.topic_pub import fill_stamps, read_values

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.cli.completion import completes
 from rmpa.cli.graph import origin_json, origin_text, peers_of, print_names, read_name, read_namespace, require_peer
-from rmpa.cli.options import GraphOptions, graph_options
+from rmpa.cli.options import GraphOptions, completes, graph_options
 from rmpa.cli.output import Column, print_json, print_line, print_table, warn
 from rmpa.cli.selection import Selection, selection_options, summary
 from rmpa.cli.service_crossing import crossing, print_crossing, transport_json, transport_text, transports

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING
 import click
 
 from rmpa.bridge.proxy_names import proxied_node
-from rmpa.cli.completion import completes
 from rmpa.cli.graph import Graph, GraphName, read_graph, read_name, require_peer, warn_unpublished
 from rmpa.cli.message_text import flatten, pick, shorten, to_text
-from rmpa.cli.options import GraphOptions, graph_options
+from rmpa.cli.options import GraphOptions, completes, graph_options
 from rmpa.cli.output import print_json
 from rmpa.cli.stream import Enough, StreamWatch, run_stream, watch_topic
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import click
 
 from rmpa.bridge.proxy_names import proxied_peer
-from rmpa.cli.completion import completes
 from rmpa.cli.graph import (
     origin_json,
     origin_text,
@@ -18,7 +17,7 @@ from rmpa.cli.graph import (
     read_namespace,
     require_peer,
 )
-from rmpa.cli.options import GraphOptions, graph_options
+from rmpa.cli.options import GraphOptions, completes, graph_options
 from rmpa.cli.output import duration, print_json, print_line, printable, warn
 from rmpa.cli.selection import Selection, selection_options, summary
 from rmpa.cli.topic_crossing import ask_agent, facts, shown_state

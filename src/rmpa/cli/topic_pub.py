@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.completion import completes
 from rmpa.cli.graph import read_name
-from rmpa.cli.options import FiniteRange, GraphOptions, graph_options
+from rmpa.cli.options import FiniteRange, GraphOptions, completes, graph_options
 from rmpa.cli.output import print_json, print_line, warn
 from rmpa.cli.stream import run_stream, with_node
 from rmpa.core.errors import ConfigError, UnreachableError

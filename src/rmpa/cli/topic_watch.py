@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from rmpa.bridge.proxy_names import proxied_peer
-from rmpa.cli.completion import completes
 from rmpa.cli.graph import read_name, require_peer, warn_unpublished
-from rmpa.cli.options import GraphOptions, graph_options
+from rmpa.cli.options import GraphOptions, completes, graph_options
 from rmpa.cli.output import print_json, size
 from rmpa.cli.stream import Enough, StreamWatch, run_stream, watch_topic
 from rmpa.cli.topic_crossing import arriving, bandwidth_text, latency_text, origin, rate_text

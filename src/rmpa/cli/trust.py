@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.completion import completes
-from rmpa.cli.options import json_option
+from rmpa.cli.options import completes, json_option
 from rmpa.cli.output import print_json, printable, warn
 from rmpa.config.permission_rules import ACTION_CLIENT, ACTION_SERVER, Access
 from rmpa.config.sources import load_settings

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.completion import completes
 from rmpa.cli.graph import read_name
-from rmpa.cli.options import agent_option, json_option
+from rmpa.cli.options import agent_option, completes, json_option
 from rmpa.cli.output import LEVEL_COLOURS, print_json, printable
 from rmpa.core.errors import ConfigError
 from rmpa.observe import limits
