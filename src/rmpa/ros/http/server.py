@@ -31,11 +31,11 @@ _log = logging.getLogger(__name__)
 Handler = Callable[[str, tuple[XmlRpcValue, ...], str], XmlRpcValue | Awaitable[XmlRpcValue]]
 """``(method, params, address of the client) -> value``, at once or awaited.
 
-A ``RosFault`` raised becomes a fault. ``HangUp``, raised at once, resets the connection.
+A ``RosFault`` raised becomes a fault. ``ResetConnection``, raised at once, resets the connection.
 """
 
 
-class HangUp(Exception):  # noqa: N818 - the name says what the handler wants
+class ResetConnection(Exception):  # noqa: N818 - the name says what the handler wants
     """Raised by a handler: the call's connection is reset, as by a port where no process listens."""
 
 
@@ -215,7 +215,7 @@ class XmlRpcServer:
             _log.debug("< %s %s%s", connection.client, method, brief(params))
         try:
             value = self._handler(method, params, connection.client)
-        except HangUp:
+        except ResetConnection:
             connection.reset()
             return b""
         except Exception as error:  # noqa: BLE001 - the top of a call: the caller gets an answer in any case

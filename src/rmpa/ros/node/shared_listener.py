@@ -16,7 +16,7 @@ from rmpa.core.counters import Counters
 from rmpa.core.errors import StartError
 from rmpa.ros import limits
 from rmpa.ros.http.connection import RESET
-from rmpa.ros.http.server import HangUp, XmlRpcServer
+from rmpa.ros.http.server import ResetConnection, XmlRpcServer
 from rmpa.ros.node.loopback_addresses import LoopbackAddresses
 from rmpa.runtime.acceptor import Acceptor
 from rmpa.runtime.descriptors import DESCRIPTORS, Use
@@ -194,8 +194,8 @@ def _former_node(method: str, _params: tuple[XmlRpcValue, ...], _client: str) ->
     and ``getName``, by which agents tell this listener from one that is stuck.
 
     Raises:
-        HangUp: For all other methods.
+        ResetConnection: For all other methods.
     """
     if method not in ("requestTopic", "getName"):
-        raise HangUp
+        raise ResetConnection
     return [-1, "the node that had this address is gone", 0]
