@@ -57,6 +57,12 @@ def test_each_command_but_those_without_an_answer_has_json(path: str, command: c
         assert any("--json" in parameter.opts for parameter in command.params), path
 
 
+@pytest.mark.parametrize("command", ["up", "core"])
+def test_an_option_that_is_gone_says_what_to_use(command: str, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main([command, "--fresh"]) == 2
+    assert "No such option: --fresh; write --keep never" in capfd.readouterr().err
+
+
 WORDS = {"values": "{}", "value": "1"}
 QUIET = {
     "rmpa doctor",

@@ -21,7 +21,7 @@ from tests.core.example import EXAMPLE, uncommented
 if TYPE_CHECKING:
     import click
 
-NOT_OF_A_GATEWAY = {"--core", "--master", "--fresh", "--web", "--no-web"}
+NOT_OF_A_GATEWAY = {"--core", "--master", "--keep", "--web", "--no-web"}
 """Options of ``rmpa up`` about what a gateway has not: a core of its nodes, a page."""
 DOCS = Path(__file__).parents[2] / "docs"
 

@@ -180,7 +180,7 @@ def test_every_flag(load: Load) -> None:
         "core_port": "1",
         "core": "external",
         "master": "http://h:1",
-        "fresh": True,
+        "keep": "never",
         "port": "2",
         "domain": "3",
         "interface": ("lo", "eth0"),
@@ -211,7 +211,7 @@ def test_every_flag(load: Load) -> None:
         core_port=1,
         core_mode="external",
         core_master="http://h:1",
-        core_fresh=True,
+        core_keep="never",
         port=2,
         domain=3,
         interfaces=("lo", "eth0"),
@@ -253,11 +253,18 @@ def test_settings_of_the_other_kind_of_core_are_reported(load: Load) -> None:
         load(environ={"RMPA_CORE": "external", "RMPA_MASTER": "robot:11311"})
     with pytest.raises(ConfigError, match=r"rmpa\.toml:2: core\.mode: 'extern' is not a kind.* \"external\""):
         load('[core]\nmode = "extern"\n')
-    notes = load("", options={"core": "external", "core_port": "1", "fresh": True}).notes
+    notes = load("", options={"core": "external", "core_port": "1", "keep": "never"}).notes
     assert notes == (
         "--core-port: is of no use with an external core",
-        "--fresh: is of no use with an external core",
+        "--keep: is of no use with an external core",
     )
+
+
+def test_what_is_gone_says_what_to_use(load: Load) -> None:
+    with pytest.raises(ConfigError, match=r'rmpa\.toml:2: core\.fresh: an unknown key; write keep = "never"'):
+        load("[core]\nfresh = true\n")
+    with pytest.raises(ConfigError, match=r"RMPA_FRESH: is not a variable any more; set RMPA_KEEP=never"):
+        load("", environ={"RMPA_FRESH": "1"})
 
 
 def test_every_variable(load: Load) -> None:
@@ -287,7 +294,7 @@ def test_every_variable(load: Load) -> None:
         "RMPA_LOG_JSON": "yes",
         "RMPA_RUNTIME_DIR": "/run/x",
         "RMPA_STATE_DIR": "/var/x",
-        "RMPA_FRESH": "yes",
+        "RMPA_KEEP": "always",
         "RMPA_AGENT": "other",
     }
     loaded = load(environ=environ)
@@ -297,7 +304,7 @@ def test_every_variable(load: Load) -> None:
         domain=3,
         core_host="localhost",
         core_port=1,
-        core_fresh=True,
+        core_keep="always",
         port=2,
         interfaces=("lo", "eth0"),
         seeds=(HostPort("h", 1), HostPort("10.0.0.1")),

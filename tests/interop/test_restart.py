@@ -84,7 +84,7 @@ def test_a_killed_agent_has_its_nodes_back_and_they_each_other(modules: ModuleFa
     _echoes(echo)
 
     a.agent.kill()
-    a.agent.flags = ["--fresh"]
+    a.agent.flags = ["--keep", "never"]
     a.agent.restart()
     assert "/robot" not in a.ros.tool("rosparam", "list")
     assert _run_id(a) != run_id

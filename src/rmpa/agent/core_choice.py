@@ -35,7 +35,7 @@ def make_core(settings: Settings) -> Core:
             settings.core_host,
             settings.core_port,
             state=state,
-            fresh=settings.core_fresh,
+            keep=settings.core_keep,
             temporary=is_own,
         )
     uri = settings.core_master or DEFAULT_MASTER_URI

@@ -38,23 +38,25 @@ def _default_port() -> int:
 )
 @click.option("--advertise", default="", metavar="NAME", help="Host name or address that nodes get, if not --host.")
 @click.option(
-    "--fresh",
-    is_flag=True,
-    help="Begin empty, as roscore does, without nodes and parameters of the run before.",
+    "--keep",
+    type=click.Choice(["auto", "always", "never"]),
+    default="auto",
+    show_default=True,
+    help="Take up nodes and parameters of the run before: auto, if a node of it still runs or the core died.",
 )
 @click.option("-v", "--verbose", is_flag=True, help="Log every registration.")
 @click.option("--debug", is_flag=True, help="Log every call.")
-def core(port: int | None, host: str, advertise: str, fresh: bool, verbose: bool, debug: bool) -> None:
+def core(port: int | None, host: str, advertise: str, keep: str, verbose: bool, debug: bool) -> None:
     """Run a ROS core: master, parameter server and /rosout, as roscore does."""
     from rmpa.runtime.descriptors import raise_file_limit
 
     level = logging.DEBUG if debug else logging.INFO if verbose else logging.WARNING
     logging.basicConfig(level=level, format="%(asctime)s %(levelname)-7s %(name)s %(message)s")
     raise_file_limit()
-    asyncio.run(_run(host, _default_port() if port is None else port, advertise, fresh=fresh))
+    asyncio.run(_run(host, _default_port() if port is None else port, advertise, keep=keep))
 
 
-async def _run(host: str, port: int, advertise: str, *, fresh: bool) -> None:
+async def _run(host: str, port: int, advertise: str, *, keep: str) -> None:
     from rmpa import __version__
     from rmpa.ros.core.embedded import ROS_VERSION, RosCore
     from rmpa.runtime.state_dir import core_file
@@ -69,7 +71,7 @@ async def _run(host: str, port: int, advertise: str, *, fresh: bool) -> None:
         advertised_host=advertise,
         on_shutdown=lambda _: ended.set(),
         state=core_file(os.environ, port),
-        fresh=fresh,
+        keep=keep,
     )
     await core.start()
     click.echo(f"rmpa core {__version__}, in place of ros_comm {ROS_VERSION.strip()}")

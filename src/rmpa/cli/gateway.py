@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger("rmpa.gateway")
 _LIBRARIES: Final = {"zenoh": "eclipse-zenoh", "xxhash": "xxhash"}
 """What the extra installs: the name in Python, and that of the package."""
-_OF_THE_AGENT: Final = ("core_mode", "core_master", "core_fresh", "web.enabled")
+_OF_THE_AGENT: Final = ("core_mode", "core_master", "core_keep", "web.enabled")
 """Settings whose options a gateway has not: its core is its own, and only for its proxies."""
 _SUFFIX: Final = "_gateway"
 COMMANDS: Final = {
@@ -117,7 +117,7 @@ def load_gateway(options: Mapping[str, object], environ: Mapping[str, str], host
         name=settings.name if _is_option(given, "name") else peer_name_from(settings.name + _SUFFIX),
         core_mode=defaults.core_mode,
         core_master=defaults.core_master,
-        core_fresh=True,
+        core_keep="never",
         core_host=settings.core_host if _is_option(given, "core_host") else defaults.core_host,
         core_port=settings.core_port if _is_option(given, "core_port") else 0,
         port=settings.port if _is_option(given, "port") else 0,

@@ -121,6 +121,11 @@ def _run(arguments: Sequence[str] | None) -> int:
     try:
         code = cli.main(args=arguments, prog_name="rmpa", standalone_mode=False)
     except click.ClickException as error:
+        if isinstance(error, click.NoSuchOption):
+            from rmpa.config.settings import REMOVED
+
+            if remedy := REMOVED.get(error.option_name):
+                error = click.UsageError(f"No such option: {error.option_name}; {remedy}", error.ctx)
         error.show()
         return _failed(arguments, error.format_message(), error.exit_code)
     except (click.Abort, KeyboardInterrupt):

@@ -65,7 +65,7 @@ Examples:
     metavar="DIR",
     help="Where resources keep their state. [env: RMPA_STATE_DIR; default: ~/.local/state/rmpa]",
 )
-@click.option("--no-state", is_flag=True, help="The resources store nothing; for an empty core add -- --fresh.")
+@click.option("--no-state", is_flag=True, help="The resources store nothing; for an empty core add -- --keep never.")
 @click.option("--log-level", default="info", type=click.Choice(["debug", "info", "warning", "error"]))
 @click.argument("options", nargs=-1, type=click.UNPROCESSED, metavar="[-- OPTIONS OF rmpa up]")
 def run(

@@ -7,7 +7,7 @@ import tomllib
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.config import limits
-from rmpa.config.settings import SETTINGS
+from rmpa.config.settings import REMOVED, SETTINGS
 from rmpa.config.toml_lines import line_of, value_at
 from rmpa.config.values import JsonSchema, Place, did_you_mean, shown
 from rmpa.core.errors import ConfigError
@@ -67,7 +67,7 @@ def parse_config(data: bytes, path: Path | None) -> dict[Key, object]:
     table = _parse_toml(text, path)
     for place, suggestion in _unknown(table):
         what = "an unknown table" if isinstance(value_at(table, place), dict) else "an unknown key"
-        raise ConfigError(dotted(place), what, suggestion, path, line_of(text, place))
+        raise ConfigError(dotted(place), what, REMOVED.get(dotted(place), suggestion), path, line_of(text, place))
     for place, value, types in _mistyped(table):
         problem, remedy = _type_mistake(place, value, types)
         raise ConfigError(dotted(place), problem, remedy, path, line_of(text, place))

@@ -28,6 +28,7 @@ from rmpa.config.service_rules import SERVICE_RULES, ServiceRule
 from rmpa.config.values import (
     BOOL,
     BOUND,
+    CORE_KEEP,
     CORE_MODE,
     CPU,
     DOMAIN,
@@ -384,13 +385,13 @@ class Settings:
         option="--master",
         shown_default="ROS_MASTER_URI",
     )
-    core_fresh: bool = setting(
-        False,
-        BOOL,
-        "Begin with an empty core, as roscore does; else nodes and parameters of the run before are taken up.",
-        key="core.fresh",
-        env="RMPA_FRESH",
-        option="--fresh",
+    core_keep: str = setting(
+        "auto",
+        CORE_KEEP,
+        "Take up nodes and parameters of the run before; auto: if a node of it still runs, or the core died.",
+        key="core.keep",
+        env="RMPA_KEEP",
+        option="--keep",
     )
     core_host: str = setting(
         "127.0.0.1",
@@ -548,6 +549,12 @@ class Settings:
         return any(word in (Transport.DIRECT, Transport.AUTO) for word in words)
 
 
+REMOVED: Final = {
+    "core.fresh": 'write keep = "never" in place of true',
+    "RMPA_FRESH": "set RMPA_KEEP=never in its place",
+    "--fresh": "write --keep never",
+}
+"""What to use in place of a key, variable or option that is gone."""
 SETTINGS: Final = tuple(settings_of(Settings))
 """Every setting, in the order of the documentation."""
 TABLES: Final = {

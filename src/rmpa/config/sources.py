@@ -21,7 +21,7 @@ from rmpa.config.file import dotted, parse_config
 from rmpa.config.param_rules import follow_problems
 from rmpa.config.peer_rules import peer_warnings
 from rmpa.config.permission_rules import permission_problems
-from rmpa.config.settings import SETTINGS, Settings
+from rmpa.config.settings import REMOVED, SETTINGS, Settings
 from rmpa.config.toml_lines import line_of
 from rmpa.config.values import BadValue, did_you_mean
 from rmpa.config.web_tokens import web_token_problems
@@ -252,6 +252,8 @@ def _file_layer(path: Path) -> _Layer:
 
 def _variable_layer(environ: Mapping[str, str], notes: list[str]) -> _Layer:
     for variable in sorted(environ):
+        if variable in REMOVED:
+            raise ConfigError(variable, "is not a variable any more", REMOVED[variable])
         if variable.startswith("RMPA_") and variable not in VARIABLES:
             near = did_you_mean(variable, VARIABLES)
             notes.append(f"{variable} is not a variable of ours" + (f"; did you mean {near}?" if near else ""))
@@ -278,7 +280,7 @@ def _check_core(strongest: _Layer, notes: list[str], *, external: bool) -> None:
         raise strongest["core_master"].error(
             "is of no use with the embedded core", "say also that the core is external (--core external)", ()
         )
-    embedded_only = ("core_host", "core_port", "core_fresh")
+    embedded_only = ("core_host", "core_port", "core_keep")
     given_here = [strongest[name] for name in embedded_only if external and name in strongest]
     useless = [given for given in given_here if given.path is None]  # a file may be written for both
     notes += [str(given.error("is of no use with an external core", "", ())) for given in useless]

@@ -32,6 +32,7 @@ JsonSchema = dict[str, Any]
 
 _LOG_LEVELS: Final = ("debug", "info", "warning", "error")
 _CORE_MODES: Final = ("embedded", "external")
+_CORE_KEEPS: Final = ("auto", "always", "never")
 _MASTER: Final = re.compile(r"http://(?P<host>[^\s/:\[\]]+):(?P<port>[0-9]{1,5})/?")
 _HOST: Final = re.compile(r"(?=.{1,253}\Z)[A-Za-z0-9_](?:[A-Za-z0-9_.-]*[A-Za-z0-9_])?")
 _NUMERIC: Final = re.compile(r"[0-9.]+")
@@ -161,6 +162,12 @@ def word_of(known: Iterable[str], what: str, remedy: str, metavar: str) -> Value
 
 
 LOG_LEVEL: Final = word_of(_LOG_LEVELS, "a log level", f"the levels are {', '.join(_LOG_LEVELS)}", "LEVEL")
+CORE_KEEP: Final = word_of(
+    _CORE_KEEPS,
+    "a choice",
+    "auto: if a node of the run before still runs, or the core died; always; never: begin empty, as roscore does",
+    "WHEN",
+)
 CORE_MODE: Final = word_of(
     _CORE_MODES, "a kind of core", "embedded: the agent's own; external: a roscore that runs already", "MODE"
 )

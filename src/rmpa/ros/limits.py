@@ -232,6 +232,9 @@ for these."""
 VERIFY_PROMPT: Final = 0.25
 """A node that has not answered after this time no longer counts in ``VERIFY_AT_ONCE``, so that a node that hangs
 delays no other."""
+VERIFY_START: Final = 1.0
+"""A core that starts waits this long for an answer of one node of the run before; one that does not answer counts as
+running."""
 VERIFY_RETRY_FIRST: Final = 0.5
 """Pause before a node that did not answer is verified again."""
 VERIFY_RETRY_MAX: Final = 10.0

@@ -6,11 +6,12 @@ import asyncio
 import sqlite3
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Final, Self
+from unittest.mock import AsyncMock
 
 import pytest
 
 from rmpa.ros import limits
-from rmpa.ros.core import store
+from rmpa.ros.core import persistence, store
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.store import CoreStore
 from rmpa.ros.http.client import call, call_api
@@ -94,6 +95,7 @@ def path(tmp_path: Path) -> Path:
 
 @asynccontextmanager
 async def running(path: Path, **options: object) -> AsyncIterator[RosCore]:
+    options.setdefault("keep", "always")
     core = RosCore(port=0, rosout=False, state=path, **options)  # type: ignore[arg-type] # the core's own
     await core.start()
     try:
@@ -266,7 +268,7 @@ async def test_our_own_nodes_are_not_stored(path: Path) -> None:
         assert [name for kind, name in rows(path) if kind == "node"] == ["/user"]
 
 
-async def test_parameters_survive_with_their_types_and_fresh_forgets_all(path: Path) -> None:
+async def test_parameters_survive_with_their_types_and_never_forgets_all(path: Path) -> None:
     value: XmlRpcValue = {"gains": [1, 2.5], "map": b"\0\1", "name": "ärm", "on": True, "none": {}}
     async with Slave("/node") as node:
         async with running(path) as core:
@@ -279,17 +281,61 @@ async def test_parameters_survive_with_their_types_and_fresh_forgets_all(path: P
             assert (await call_api(core.uri, "getParam", "/x", "/robot")).value == value
             assert (await call_api(core.uri, "hasParam", "/x", "/gone")).value is False
             run_id = core.call("getParam", "/x", "/run_id").value
-        async with running(path, fresh=True) as core:
+        async with running(path, keep="never") as core:
             assert (await call_api(core.uri, "hasParam", "/x", "/robot")).value is False
             assert core.call("getParam", "/x", "/run_id").value != run_id
             await asyncio.sleep(0)
             assert names(core) == set()
-            assert "begun empty" in core.restored()
+            assert "the core begins empty: core.keep is never" in core.restored()
             await call(core.uri, "setParam", "/x", "/after", 1)
         async with running(path) as core:
             assert (await call_api(core.uri, "hasParam", "/x", "/robot")).value is False
             assert (await call_api(core.uri, "getParam", "/x", "/after")).value == 1
             assert names(core) == set()
+
+
+@pytest.mark.parametrize(
+    ("left", "died", "boot", "kept"),
+    [
+        ("node", False, "the same", True),  # an update, Ctrl-C, systemctl restart
+        ("node", False, "another", True),  # on another machine, which kept running
+        ("", False, "the same", False),  # the end of a session
+        ("", True, "the same", True),  # kill -9, and nodes that come again by themselves
+        ("", True, "another", False),  # power off
+        ("another node", False, "the same", False),  # which has that port now
+    ],
+)
+async def test_what_was_lost_under_running_nodes_is_restored_else_the_core_begins_empty(
+    path: Path, left: str, died: bool, boot: str, kept: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    boot_id = path.parent.parent / "boot_id"
+    boot_id.write_text("the same\n")
+    monkeypatch.setattr(persistence, "_BOOT_ID", boot_id)
+    async with Slave("/node") as node:
+        async with running(path, keep="auto") as core:
+            await node.publish(core, "/a")
+            core.call("setParam", "/x", "/robot/speed", 1)
+            run_id = core.call("getParam", "/x", "/run_id").value
+            assert core.persistence is not None
+            writer = core.persistence._writer
+            await until(lambda: writer._tree is core._api.parameters.tree and "/node" in writer._revisions)
+            if died:
+                monkeypatch.setattr(writer, "_write", AsyncMock(return_value=True))
+        boot_id.write_text(f"{boot}\n")
+        node.name = {"node": "/node", "another node": "/other"}.get(left, "/node")
+        if not left:
+            await node.server.close()
+        for again in (1, 2):  # what the core decided at its start holds for the next one too
+            async with running(path, keep="auto") as core:
+                assert core.call("hasParam", "/x", "/robot").value is kept
+                assert (core.call("getParam", "/x", "/run_id").value == run_id) is kept
+                assert ("the core begins empty: no node of the run before is left" in core.restored()) is (
+                    not kept and again == 1
+                )
+                if left == "node":
+                    await until(lambda: "/node" in names(core))
+            if not left:
+                break
 
 
 @pytest.mark.parametrize("left", [True, False])

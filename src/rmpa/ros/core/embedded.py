@@ -56,7 +56,7 @@ class RosCore(Core):
         counters: Where refusals, calls and notifications are counted.
         on_shutdown: ``(reason)``: a client called ``shutdown``; the owner closes the core then.
         state: The file that stores registrations and parameters for the next run; ``None`` stores nothing.
-        fresh: Begin empty, and ignore the content of the file.
+        keep: When the content of the file is restored; see ``CorePersistence``.
         temporary: Whether a node of this name is not stored, because its owner registers it anew.
     """
 
@@ -70,7 +70,7 @@ class RosCore(Core):
         counters: Counters | None = None,
         on_shutdown: Callable[[str], None] | None = None,
         state: Path | None = None,
-        fresh: bool = False,
+        keep: str = "auto",
         temporary: Callable[[str], bool] = lambda _: False,
     ) -> None:
         self.counters = counters if counters is not None else Counters()
@@ -93,7 +93,7 @@ class RosCore(Core):
             self.persistence = CorePersistence(
                 state,
                 self._api,
-                fresh=fresh,
+                keep=keep,
                 temporary=lambda node: node in own or temporary(node),
                 carry_out=self._carry_out,
                 counters=self.counters,

@@ -61,6 +61,8 @@ class StateWriter:
         self._size = 0
         self._unfit: dict[Key, str] = {}
         self._rewrite = False
+        self._run = self._run_written = b""
+        """The row that says that this core runs, and whether it is in the file."""
         self._unread = False
         """Whether the file could not be read at the start: it is copied before it is written."""
         self._timer: asyncio.TimerHandle | None = None
@@ -75,12 +77,13 @@ class StateWriter:
 
     # --- the start --------------------------------------------------------------------------------------------
 
-    async def open(self, *, fresh: bool) -> StoredRegistrations:
+    async def open(self, boot: str) -> StoredRegistrations:
         """Open the file and read it; the result is empty if it cannot be read (``problem`` says why).
 
         Args:
-            fresh: Return nothing, and empty the file with the first write.
+            boot: Identifies the present boot of the machine; written until ``close()``.
         """
+        self._run = boot.encode()
         try:
             rows = await self._opened()
         except OSError as error:
@@ -88,15 +91,18 @@ class StateWriter:
             self._set_problem(str(error))
             self._after(limits.CORE_STATE_RETRY)
             return stored_rows.StoredRegistrations()
-        if fresh:
-            self._rewrite = bool(rows)
-            return stored_rows.StoredRegistrations()
         found = stored_rows.read(rows)
         for lost in found.lost[: core_limits.LOG_LINES_MAX]:
             _log.warning("! %s: left out: %s", self.path, lost)
         self._known = {(kind, name): _known(name, value) for kind, name, value in rows}
         self._size = sum(size for size, _ in self._known.values())
+        self._run_written = found.boot.encode()
         return found
+
+    def begin_empty(self) -> None:
+        """Write everything with the next write, in place of what the file has."""
+        self._revisions, self._tree, self._known, self._size, self._run_written = {}, {}, {}, 0, b""
+        self._rewrite = True
 
     async def _opened(self) -> list[Row]:
         """Open the file and return its rows; tries again while the previous process holds the file's lock."""
@@ -136,6 +142,7 @@ class StateWriter:
             async with asyncio.timeout(limits.CORE_STATE_CLOSE):
                 if self._writing is not None:
                     await self._writing
+                self._run = b""
                 await self._write()
         if self._writing is not None and not self._writing.done():
             self._writing.cancel()
@@ -179,7 +186,8 @@ class StateWriter:
         """Write what has changed; return whether that succeeded."""
         registrations, tree = self._api.registrations, self._api.parameters.tree
         revisions, revision = dict(registrations.revisions), registrations.revision
-        if revisions == self._revisions and tree is self._tree and not self._rewrite and not self.problem:
+        same = revisions == self._revisions and tree is self._tree and self._run == self._run_written
+        if same and not self._rewrite and not self.problem:
             self._revision = revision
             return True
         try:
@@ -188,10 +196,13 @@ class StateWriter:
                     _log.warning("! %s was not read at the start; what it holds is kept as %s", self.path, aside)
                 self._unread = False
             if await self._store.taken_away() and not self._rewrite:
-                self._forget()
+                self.begin_empty()
             rows = dict(self._changed_nodes(revisions))
             rows |= self._changed_params(tree)
             known = self._fitting(rows)
+            run = self._run
+            if run != self._run_written:
+                rows[stored_rows.RUN] = run
             if rows or self._rewrite:
                 await self._store.write(rows, anew=self._rewrite)
                 self._counters.add("kept.written")
@@ -200,18 +211,13 @@ class StateWriter:
             self._set_problem(str(error))
             return False
         self._rewrite = False
-        self._revisions, self._tree, self._revision = revisions, tree, revision
+        self._revisions, self._tree, self._revision, self._run_written = revisions, tree, revision, run
         for key, (size, digest) in known.items():
             self._size += size - self._known.pop(key, _NONE)[0]
             if size:
                 self._known[key] = size, digest
         self._set_problem("")
         return True
-
-    def _forget(self) -> None:
-        """Write everything with the next write, because the file was removed or replaced."""
-        self._revisions, self._tree, self._known, self._size = {}, {}, {}, 0
-        self._rewrite = True
 
     def _changed_nodes(self, revisions: dict[str, int]) -> dict[Key, bytes | None]:
         rows: dict[Key, bytes | None] = {

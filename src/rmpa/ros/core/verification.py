@@ -20,13 +20,15 @@ from rmpa.core.backoff import Backoff
 from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.core.identify import name_at
+from rmpa.ros.core.liveness import is_gone, listening_ports
 from rmpa.ros.http.client import call_api
 from rmpa.ros.master.effects import RegistrationKind
+from rmpa.ros.node.local_addresses import local_addresses
 from rmpa.ros.wire.xmlrpc import RosFault
 from rmpa.runtime.event_loop import yield_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from rmpa.ros.master.registrations import Registrations
     from rmpa.ros.master.unverified import NodeRecord
@@ -279,6 +281,38 @@ class NodeVerification:
                 registrations.register_subscriber(topic, listed[topic], node, api)
                 registrations.notify_subscriber(topic, node)
         self._carry_out()
+
+
+async def any_left(nodes: Mapping[str, NodeRecord]) -> bool:
+    """Whether one of these nodes still runs; a node that does not answer counts as running."""
+    if not nodes:
+        return False
+    try:
+        ports, addresses = await asyncio.to_thread(lambda: (listening_ports(), set(local_addresses())))
+    except OSError:  # such as no file descriptor left to ask the kernel
+        ports, addresses = None, set()
+    found: defaultdict[str, dict[str, NodeRecord]] = defaultdict(dict)
+    for name, record in nodes.items():
+        if not is_gone(record.api, ports, addresses):
+            found[record.api][name] = record
+    slots = asyncio.Semaphore(limits.VERIFY_AT_ONCE)
+
+    async def is_left(api: str) -> bool:
+        async with slots:
+            return await _probe(api, found[api]) in (_ProbeResult.UP, _ProbeResult.SILENT)
+
+    asking = [asyncio.create_task(is_left(api), name=f"verify {api}") for api in found]
+    try:
+        for answer in asyncio.as_completed(asking, timeout=limits.VERIFY_START):
+            if await answer:
+                return True
+    except TimeoutError:
+        return True
+    finally:
+        for task in asking:
+            task.cancel()
+        await asyncio.gather(*asking, return_exceptions=True)
+    return False
 
 
 async def _probe(api: str, nodes: dict[str, NodeRecord]) -> _ProbeResult:

@@ -4,6 +4,7 @@ A row is ``(kind, name, value)``::
 
     ("node", "/talker", JSON of a NodeRecord)
     ("param", JSON list of its namespaces and its name, MessagePack)
+    ("run", "", the boot of the machine in which a core runs; empty once it has ended in order)
 
 A parameter's row is one value, or one empty namespace. Rows that are read are checked: bad ones are reported and left
 out, the rest is used.
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 
 NODE: Final = "node"
 PARAM: Final = "param"
+RUN: Final = ("run", "")
+"""The key of the row that tells a core that died from one that was ended."""
 Key: TypeAlias = tuple[str, str]
 """Kind and name of a row."""
 Row: TypeAlias = tuple[str, str, bytes]
@@ -60,11 +63,13 @@ class StoredRegistrations:
         nodes: Records by the node's name.
         tree: The parameters.
         lost: Rows that could not be read, as texts for the log.
+        boot: In which boot of the machine the run died; empty if it ended in order.
     """
 
     nodes: dict[str, NodeRecord] = field(default_factory=dict)
     tree: Tree = field(default_factory=dict)
     lost: list[str] = field(default_factory=list)
+    boot: str = ""
 
 
 # --- parameters as rows ---------------------------------------------------------------------------------------
@@ -180,6 +185,8 @@ def read(rows: Iterable[Row]) -> StoredRegistrations:
             match kind:
                 case "node":
                     kept.nodes[name] = _node(name, value)
+                case "run":
+                    kept.boot = value.decode()
                 case "param":
                     _put(kept.tree, _path(name), _value(value))
                 case _:
