@@ -15,7 +15,7 @@ import pytest
 
 from rmpa.agent import Agent
 from rmpa.agent.permission_notes import permission_notes
-from rmpa.bridge.io.node_requests import INFO
+from rmpa.bridge.io.node_requests import INFO, LIST, PING
 from rmpa.bridge.io.proxy_kills import KILL
 from rmpa.bridge.params import transfer
 from rmpa.bridge.session.peer_session import PeerSession
@@ -217,6 +217,72 @@ async def test_parameters_are_read_and_set_only_with_permission(
         assert await sets("/arm/secret/deeper", 7) == no("/arm/secret/deeper"), "here too"
         assert a.core.call("getParam", "/n", "/arm")[2] == {"speed": 5, "secret": 2, "deep": {"x": 3}}
         assert await asks(transfer.DELETE, "/arm/deep") == "{}"
+
+
+async def test_a_gateway_has_for_another_site_what_both_may_have(settings: Callable[..., Settings]) -> None:
+    params = ParamSettings(remote_get=("/**",), remote_set=("/**",))
+    rules = (
+        allow("b", param="/arm/**"),
+        allow("yard", param="/arm/deep/** /other"),
+        deny("thief", param="/arm/deep/y"),
+    )
+    a_settings = replace(with_rules(settings("a"), *rules), params=params)
+    async with secured(a_settings, with_rules(settings("b"))) as (a, b):
+        link = next(iter(b.bridge.sessions.linked()))
+        for key, value in (("/arm/speed", 1), ("/arm/deep/x", 2), ("/arm/deep/y", 3), ("/other", 4)):
+            a.core.call("setParam", "/n", key, value)
+
+        async def asks(what: str, key: str, *askers: str, **more: object) -> str:
+            args = {"key": key, "site": "yard", "askers": list(askers), **more}
+            try:
+                return str((await b.bridge.rpc.request(link, what, args)).get("text", "done"))
+            except PeerRefused as error:
+                return error.reason
+
+        def no(key: str) -> str:
+            return f"the permissions there do not let yard read or set {key}"
+
+        five = serialize_response(5).decode()
+        assert "3" in await asks(transfer.GET, "/arm/deep/y", "base")
+        assert await asks(transfer.GET, "/arm/deep/y/", "thief") == no("/arm/deep/y")
+        assert await asks(transfer.GET, "/arm/deep", "base", "thief") == no("/arm/deep"), "one of them may not"
+        assert await asks(transfer.GET, "/arm", "base") == no("/arm")
+        assert await asks(transfer.GET, "/other", "base") == no("/other"), "the gateway may not"
+        names = await asks(transfer.NAMES, "", "thief")
+        assert ("/arm/deep/x" in names, "/arm/deep/y" in names, "/arm/speed" in names) == (True, False, False)
+        assert await asks(transfer.SET, "/arm/deep/y", "thief", text=five) == no("/arm/deep/y")
+        assert await asks(transfer.SET, "/arm/deep", "thief", text=five) == no("/arm/deep"), "y would be lost"
+        assert await asks(transfer.DELETE, "/arm/deep/", "thief") == no("/arm/deep")
+        assert a.core.call("getParam", "/n", "/arm/deep")[2] == {"x": 2, "y": 3}
+        assert await asks(transfer.DELETE, "/arm/deep", "base") == "done"
+        for bad in ({"site": 5}, {"site": "**"}, {"askers": "base"}, {"askers": ["{peer}"]}, {"askers": ["b"] * 300}):
+            assert "/arm/speed" not in await asks(transfer.NAMES, "", **bad)
+
+
+async def test_nodes_of_which_a_module_may_have_nothing_are_not_there_for_it(
+    settings: Callable[..., Settings],
+) -> None:
+    a_settings = with_rules(settings("a"), allow("b", subscribe="/odom", publish="/cmd_vel"))
+    async with (
+        secured(a_settings, with_rules(settings("b"))) as (a, b),
+        node("base", a) as base,
+        node("secret_driver", a) as secret,
+    ):
+        for topic in ("/odom", "/secret"):
+            await base.advertise(topic, "std_msgs/String")
+        await base.subscribe("/cmd_vel", "std_msgs/String", lambda _: None)
+        await secret.advertise("/secret", "std_msgs/String")
+        link = next(iter(b.bridge.sessions.linked()))
+        (line,) = await b.bridge.rpc.request(link, LIST, {})
+        assert (line["name"], line["publications"], line["subscriptions"]) == ("/base", 1, 1)
+        assert (await b.bridge.rpc.request(link, PING, {"node": "/base"}))["pid"]
+        for what in (PING, INFO):
+            said = []
+            for name in ("/secret_driver", "/secret_drivex"):
+                with pytest.raises(PeerRefused) as refused:
+                    await b.bridge.rpc.request(link, what, {"node": name})
+                said.append(refused.value.reason.replace(name, "NAME"))
+            assert said == ["a has no node NAME"] * 2
 
 
 async def test_facts_about_a_node_leave_out_what_the_asker_may_not_have(

@@ -10,6 +10,7 @@ import pytest
 from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import Condition
 from rmpa.bridge.direct.service_requests import SERVICE, SERVICE_CLOSED, SERVICE_RETRY
+from rmpa.bridge.permission_gate import Needs
 from rmpa.config.settings import ServiceRule, ServiceSettings
 from rmpa.core.contract import Transport
 from rmpa.core.errors import PeerRefused
@@ -152,7 +153,7 @@ async def test_false_answers_lead_nowhere(pair: tuple[Settings, Settings], lie: 
         description = ServiceDescription("a/Add", MD5)
         trap.node.add_service(ServiceEndpoint("/add", "/trap", trap.calls.append, description=description))
         answer = HOSTILE[lie](int(trap.node.service_uri.rpartition(":")[2]))
-        a.bridge.rpc.on_request(SERVICE, lambda _session, _args: answer)
+        a.bridge.rpc.on_request(SERVICE, lambda _session, _args: answer, Needs((), "a test"))
         async with serving(a):
             await until(lambda: transport(b)[1])
             info = about(b)
@@ -175,7 +176,7 @@ async def test_a_flood_of_notifications_does_no_harm(pair: tuple[Settings, Setti
 
     async with running(*pair) as (a, b), serving(a), serving(a, "/sub", "/other"):
         await until(lambda: transport(b)[0] == transport(b, "/sub")[0] == "direct")
-        a.bridge.rpc.on_request(SERVICE, refuse)
+        a.bridge.rpc.on_request(SERVICE, refuse, Needs((), "a test"))
         (session,) = a.bridge.sessions.linked()
         for number in range(500):
             args = {"service": f"/no{number}", "node": "/adder", "why": "node", "text": "x"}

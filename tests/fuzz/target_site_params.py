@@ -12,9 +12,11 @@ from rmpa.gateway.sites.params import (
     ParamQuestion,
     followed_of,
     from_json,
+    lost_with,
     param_key,
+    parameters_in,
     parse_param_key,
-    refused_leaf,
+    refused_one,
     to_json,
 )
 from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
@@ -23,7 +25,7 @@ _TEXT: Final = serialize_response({"p": 1.5, "names": ["a", True], "blob": b"\0\
 SEEDS: list[bytes] = [
     b"",
     ParamQuestion(op="get", key="/gains").serialize(),
-    ParamQuestion(op="names").serialize(),
+    ParamQuestion(op="names", askers=("arm", "base")).serialize(),
     ParamQuestion(op="set", key="/gains/p", text=_TEXT).serialize(),
     ParamQuestion(op="delete", key="/gains").serialize(),
     ParamQuestion(op="values", last={"/gains": "-", "/rate": "0" * 32}).serialize(),
@@ -69,7 +71,10 @@ def _fuzz_value(data: bytes) -> None:
     except RmpaError as error:
         _check_text(error)
         return
-    refused_leaf("/a", value, lambda name: "" if name.startswith("/a") else f"{name} is not below /a")
+    names = parameters_in("/a", value)
+    refused_one(names, lambda name: "" if name.startswith("/a") else f"{name} is not below /a")
+    if lost_with(["/a"], names) != [name for name in names if name != "/a"]:
+        raise AssertionError(f"{names} are all lost with /a")
     to_json(value)
 
 

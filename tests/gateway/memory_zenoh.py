@@ -196,7 +196,9 @@ class MemorySession:
                 self.network.soon(self.network.watches, entry, token.key, True)
         return declared
 
-    def queryable(self, key: str, on_query: Callable[[ZenohQuery], None], *, complete: bool = True) -> MemoryDeclared:
+    def queryable(
+        self, key: str, on_query: Callable[[ZenohQuery], None], _needs: object = None, *, complete: bool = True
+    ) -> MemoryDeclared:
         del complete
         return MemoryDeclared(self.network.queryables, Entry(self, key, on_query))
 

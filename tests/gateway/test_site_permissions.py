@@ -19,7 +19,7 @@ def test_a_site_may_do_what_the_rules_let_a_module_of_its_name_do_and_a_refusal_
     permissions = site_permissions(counters, PermissionRule(("warehouse",), names={"publish": ("/scan",)}))
     assert permissions.admits(Access.PUBLISH, "warehouse", "arm", "/scan")
     assert not permissions.admits(Access.PUBLISH, "elsewhere", "arm", "/scan")
-    assert "elsewhere" in permissions.why_not(Access.CALL, "elsewhere", "", "/stop")
+    assert "elsewhere" in permissions.why_not(Access.CALL, "elsewhere", "/stop")
     assert (counters["permission.publish"], counters["permission.call"]) == (1, 1)
 
 

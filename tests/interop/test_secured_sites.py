@@ -40,6 +40,10 @@ publish = ["/**"]
 subscribe = ["/**"]
 call = ["/**"]
 serve = ["/**"]
+param = ["/**"]
+
+[params]
+remote_set = ["/**"]
 """
 WAREHOUSE: Final = (
     _AT_HOME.format(module="arm", gateway="warehouse_gateway")
@@ -48,11 +52,13 @@ WAREHOUSE: Final = (
 modules = ["yard"]
 subscribe = ["/**"]
 call = ["/work"]
+param = ["/shown/**"]
 
 [[permission]]
 modules = ["yard"]
 effect = "deny"
 subscribe = ["/secret"]
+param = ["/shown/secret"]
 """
 )
 YARD: Final = (
@@ -71,6 +77,7 @@ publish = ["/**"]
 subscribe = ["/**"]
 call = ["/**"]
 serve = ["/**"]
+param = ["/**"]
 
 [[permission]]
 modules = ["yard_gateway"]
@@ -157,6 +164,38 @@ def test_what_a_permission_of_the_site_denies_stays_there_and_why_says_so(joined
         assert (code, "it flows" in output) == (0, True), output
         counters = joined.warehouse.gateway.snapshot().counters
         assert counters.get("permission.subscribe", 0) > 0, counters
+
+
+def test_a_parameter_is_had_by_way_of_gateways_only_as_its_owner_permits(joined: JoinedModules) -> None:
+    arm, base = joined.arm.agent, joined.base.agent
+    for key, value in (("/shown/speed", "1"), ("/shown/secret", "42"), ("/other", "42")):
+        assert arm.rmpa("param", "set", key, value)[0] == 0
+    at_arm = ("--peer", "warehouse/arm")
+    code, output = base.rmpa("param", "get", "/shown/speed", *at_arm)
+    assert (code, output.strip()) == (0, "1"), output
+    for words in (
+        ("get", "/"),
+        ("get", "/shown"),
+        ("get", "/shown/"),
+        ("get", "/shown/secret"),
+        ("get", "/shown/secret/"),
+        ("get", "/other"),
+        ("set", "/shown/secret", "5"),
+        ("set", "/shown/secret/", "5"),
+        ("set", "/shown", "5"),
+        ("delete", "/shown/secret"),
+        ("delete", "/shown/"),
+    ):
+        code, output = base.rmpa("param", *words, *at_arm)
+        assert (code, "42" in output, "do not let" in output) == (1, False, True), (words, output)
+    code, output = base.rmpa("param", "list", *at_arm)
+    assert "/shown/speed" in output
+    assert "secret" not in output
+    assert "/other" not in output
+    assert base.rmpa("param", "set", "/shown/speed", "7", *at_arm)[0] == 0
+    assert arm.rmpa("param", "get", "/shown")[1].split() == ["secret:", "42", "speed:", "7"]
+    code, output = arm.rmpa("param", "get", "/", "--peer", "warehouse/arm")
+    assert (code, "of this very site" in output) == (1, True), output
 
 
 def test_what_the_router_denies_a_gateway_does_not_pass_it_and_why_says_where_to_look(joined: JoinedModules) -> None:

@@ -10,6 +10,7 @@ import random
 import time
 from typing import TYPE_CHECKING, Any, Final
 
+from rmpa.bridge.permission_gate import Needs
 from rmpa.bridge.session.part import Part
 from rmpa.core.backoff import Backoff
 from rmpa.core.errors import RemoteProtocolError, RmpaError, StartError, UnreachableError
@@ -137,10 +138,12 @@ class AgentTrust(Part):
         self._renewing: asyncio.Task[None] | None = None
         self._problem = ""
         rpc = bridge.rpc
-        rpc.on_notification(Notice.HAVE, self._have)
-        rpc.on_notification(Notice.DENY, lambda session, args: self._document(session, Notice.DENY, args))
-        rpc.on_notification(Notice.KEYS, lambda session, args: self._document(session, Notice.KEYS, args))
-        rpc.on_request(RENEW, self._renew_other)
+        signed = Needs((), "a document holds by the signature of the mesh's authority")
+        rpc.on_notification(Notice.HAVE, self._have, Needs((), "numbers of the documents that each member has"))
+        rpc.on_notification(Notice.DENY, lambda session, args: self._document(session, Notice.DENY, args), signed)
+        rpc.on_notification(Notice.KEYS, lambda session, args: self._document(session, Notice.KEYS, args), signed)
+        own = Needs((), "the certificate for the peer's own certified name, unless that is revoked")
+        rpc.on_request(RENEW, self._renew_other, own)
 
     # --- life -------------------------------------------------------------------------------------------------
 

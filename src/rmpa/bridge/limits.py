@@ -90,6 +90,8 @@ PARAM_TRANSFERS: Final = 4
 oldest be given up."""
 PARAM_TRANSFER_IDLE: Final = 30.0
 """Seconds without a further portion after which a parameter's transfer may be dropped."""
+PARAM_ASKERS_MAX: Final = 256
+"""Modules of another site for which a gateway asks at once: as many as one mesh has."""
 PARAM_ASK_TIMEOUT: Final = 25.0
 """Seconds that a peer has to answer a request about a parameter: as data goes first, its core may need seconds for
 megabytes of numbers. Less than CONTROL_HANDLER_TIMEOUT, so that the error names the agent that did not answer."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
@@ -10,6 +11,8 @@ from rmpa.core.counters import Counters
 from rmpa.trust.permissions import PermissionDecision, prohibition, refusal
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from rmpa.config.permission_rules import Access
     from rmpa.config.settings import TrustSettings
     from rmpa.trust.permissions import Permissions
@@ -18,6 +21,23 @@ _log = logging.getLogger(__name__)
 
 _WITHOUT_TRUST: Final = PermissionDecision(True, "trust is off")
 _RELAY: Final = "relay"
+
+
+@dataclass(frozen=True, slots=True)
+class Needs:
+    """What a handler of messages from outside asks the permissions; declared where it is registered.
+
+    ``docs/security.md`` lists all of them; a test compares it with the registrations.
+
+    Args:
+        access: The kinds of access that are judged; none: nothing is.
+        of: The names that are judged for them, and what is told of others; or why nothing has to be asked.
+        key: The keys of a Zenoh query, which has no other name.
+    """
+
+    access: tuple[Access, ...]
+    of: str
+    key: str = ""
 
 
 class PermissionGate:
@@ -64,6 +84,25 @@ class PermissionGate:
         if relay and not (decision := self.permissions.may_relay(relay)).allowed:
             return decision
         return self.permissions.judge(access, module, name)
+
+    def judge_site(self, access: Access, site: str, modules: Iterable[str], name: str) -> PermissionDecision:
+        """Decide whether another site may do something here; nothing proves the names of the site and its modules.
+
+        So a site has the permissions of a module with the site's name, and denials of the modules that it names hold
+        on top: what a rule allows to the module ``arm`` of this mesh it does not allow to an ``arm`` elsewhere.
+
+        Args:
+            access: What it would do.
+            site: The site's name; empty for a program that names none.
+            modules: Those of the site that the message, query or token names.
+            name: The topic, service or parameter, by its name here.
+        """
+        decision = self.judge(access, site, name)
+        for module in modules if decision.allowed else ():
+            own = self.judge(access, module, name)
+            if not own.allowed and own.number is not None:
+                return own
+        return decision
 
     def may_relay(self, relay: str) -> bool:
         """Whether a peer may pass on what others offer."""

@@ -80,7 +80,7 @@ here may follow."""
 SITE_PARAM_BYTES_MAX: Final = 64 * MIB
 """Bytes of one question or answer about parameters between gateways: some of the largest values."""
 SITE_PARAM_TRANSFERS_MAX: Final = 64
-"""Modules of other sites whose parameters are read or written in portions at once."""
+"""Modules here that read or write parameters of other sites in portions at once; of each ``PARAM_TRANSFERS`` hold."""
 SITE_FOLLOW_INTERVAL: Final = 1.0
 """Seconds between questions for followed parameters of other sites: one question for each module."""
 SITE_PARAM_TIMEOUT: Final = 20.0

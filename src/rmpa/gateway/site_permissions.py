@@ -1,8 +1,7 @@
 """What other sites may do here, by ``[[permission]]``: the rules of the module that the gateway is.
 
-Zenoh proves which gateway is connected, but not which site or module a message is of. So a site has the permissions
-of a module with the site's name, and a denial of the module that it names holds on top: a rule that allows something
-to the module ``arm`` of this site allows nothing to one that is named so elsewhere.
+Zenoh proves which gateway is connected, but not which site or module a message is of: so they are judged as
+``PermissionGate.judge_site`` says.
 """
 
 from __future__ import annotations
@@ -13,6 +12,8 @@ from rmpa.bridge.permission_gate import OPEN_GATE
 from rmpa.trust.permissions import refusal
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from rmpa.bridge.permission_gate import PermissionGate
     from rmpa.config.permission_rules import Access
     from rmpa.trust.permissions import PermissionDecision
@@ -37,12 +38,7 @@ class SitePermissions:
             module: The module that the message, query or token names; empty where it names none.
             name: The topic, service or parameter, by its name here.
         """
-        decision = self._gate.judge(access, site, name)
-        if decision.allowed and module:
-            own = self._gate.judge(access, module, name)
-            if not own.allowed and own.number is not None:
-                return own
-        return decision
+        return self._gate.judge_site(access, site, (module,) if module else (), name)
 
     def admits(self, access: Access, site: str, module: str, name: str) -> bool:
         """Decide as ``judge`` does; a refusal is counted (``permission.publish`` and so on), and logged once."""
@@ -51,6 +47,20 @@ class SitePermissions:
             self._gate.refused(access, site, name, decision)
         return decision.allowed
 
-    def why_not(self, access: Access, site: str, module: str, name: str) -> str:
-        """What another site is told if it may not do something, which is counted here; empty if it may."""
-        return "" if self.admits(access, site, module, name) else refusal(access, site, name)
+    def why_not(
+        self, access: Access, site: str, name: str, modules: Iterable[str] = (), told: str | None = None
+    ) -> str:
+        """What another site is told if it may not do something, which is counted here; empty if it may.
+
+        Args:
+            access: What it would do.
+            site: The site's name.
+            name: The topic, service or parameter, by its name here.
+            modules: Those of its modules that ask.
+            told: The name that it asked for, if ``name`` was found in it and may be a secret.
+        """
+        decision = self._gate.judge_site(access, site, modules, name)
+        if decision.allowed:
+            return ""
+        self._gate.refused(access, site, name, decision)
+        return refusal(access, site, name if told is None else told)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from rmpa.bridge.permission_gate import Needs
     from rmpa.ros.wire.tcpros import Buffer
 
 
@@ -195,8 +196,10 @@ class ZenohSession(Protocol):
     def watch_tokens(self, key: str, on_token: Callable[[str, bool], None]) -> Declared:
         """Call ``on_token(key, alive)`` for each token that is there, and at each change."""
 
-    def queryable(self, key: str, on_query: Callable[[ZenohQuery], None], *, complete: bool = True) -> Declared:
-        """Answer queries."""
+    def queryable(
+        self, key: str, on_query: Callable[[ZenohQuery], None], _needs: Needs, *, complete: bool = True
+    ) -> Declared:
+        """Answer queries; ``on_query`` asks for the permissions that ``_needs`` declares."""
 
     async def get(
         self,

@@ -18,6 +18,7 @@ from rmpa.core.errors import RemoteProtocolError
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from rmpa.bridge.permission_gate import Needs
     from rmpa.bridge.session.peer_session import PeerSession
 
 INSTANCE = bytes(range(16))
@@ -216,7 +217,9 @@ class Rpc:
         self.sent: list[tuple[str, dict[str, object]]] = []
         self.listeners: dict[str, Callable[[PeerSession, dict[str, object]], None]] = {}
 
-    def on_notification(self, what: str, listener: Callable[[PeerSession, dict[str, object]], None]) -> None:
+    def on_notification(
+        self, what: str, listener: Callable[[PeerSession, dict[str, object]], None], _needs: Needs
+    ) -> None:
         self.listeners[what] = listener
 
     def notify(self, _session: PeerSession, what: str, args: dict[str, object]) -> None:

@@ -71,7 +71,7 @@ class LoopbackSession:
         self.asked: list[LoopbackQuery] = []
 
     def queryable(
-        self, key: str, on_query: Callable[[LoopbackQuery], None], *, complete: bool = True
+        self, key: str, on_query: Callable[[LoopbackQuery], None], _needs: object = None, *, complete: bool = True
     ) -> LoopbackDeclared:
         assert complete
         declared = LoopbackDeclared(lambda: self.queryables.pop(declared, None) and None)

@@ -19,6 +19,7 @@ from rmpa.gateway.sites.io.param_part import SiteParams
 from rmpa.gateway.sites.params import (
     ParamAnswer,
     ParamQuestion,
+    SiteAsker,
     digest,
     followed_of,
     from_json,
@@ -71,7 +72,7 @@ class OwnParams:
     """The gateway's own parameters."""
 
     def __init__(self) -> None:
-        self.followed_by_peers: list[str] = []
+        self.followed_by_peers: dict[str, frozenset[str]] = {}
         self.values: dict[str, Any] = {}
         self.provided = 0
 
@@ -95,14 +96,14 @@ class ParamSites:
         self.part = SiteParams(self.exports, self.imports)
         self.part.lead(leads=True)
 
-    def _why_not(self, site: str, module: str, name: str) -> str:
-        return f"a rule keeps {name} of {module} from {site}" if name in self.denied else ""
+    def _why_not(self, asker: SiteAsker, module: str, name: str, told: str) -> str:
+        return f"a rule keeps {told} of {module} from {asker.site}" if name in self.denied else ""
 
     async def drive(self, steps: Any) -> Any:
         try:
             question = next(steps)
             while True:
-                question = steps.send(await self.imports.ask("warehouse", "arm", *question))
+                question = steps.send(await self.imports.ask("desk", "warehouse", "arm", *question))
         except StopIteration as done:
             return done.value
 
@@ -131,7 +132,7 @@ async def test_parameters_of_another_site_are_read_and_written_also_large_ones(s
     assert sites.arm.values["/big"] == large
     names = await sites.drive(transfer.reading(transfer.NAMES, {}))
     assert parse_response(names.encode()) == ["/speed", "/gains/p", "/gains/i", "/big"]
-    assert await sites.imports.ask("warehouse", "arm", transfer.DELETE, {"key": "/speed"}) == {}
+    assert await sites.imports.ask("desk", "warehouse", "arm", transfer.DELETE, {"key": "/speed"}) == {}
     assert "/speed" not in sites.arm.values
 
 
@@ -150,7 +151,7 @@ async def test_a_rule_of_the_gateway_keeps_parameters_home_also_within_a_namespa
         with pytest.raises(PeerRefused, match="a rule keeps"):
             await sites.get(key)
         with pytest.raises(PeerRefused, match="a rule keeps"):
-            await sites.imports.ask("warehouse", "arm", transfer.DELETE, {"key": key})
+            await sites.imports.ask("desk", "warehouse", "arm", transfer.DELETE, {"key": key})
     with pytest.raises(PeerRefused, match="a rule keeps"):
         await sites.set("/gains", {"p": 5})
     assert sites.arm.values["/gains"] == {"p": 1, "i": 2}
@@ -179,7 +180,8 @@ async def test_a_gateway_that_stands_by_does_not_answer(sites: ParamSites) -> No
 
 
 async def test_followed_parameters_are_kept_equal_in_the_gateways_core(sites: ParamSites) -> None:
-    sites.own.followed_by_peers = ["/warehouse/arm/speed", "/warehouse/arm/gains", "/own", "/elsewhere/arm/speed"]
+    keys = ("/warehouse/arm/speed", "/warehouse/arm/gains", "/own", "/elsewhere/arm/speed")
+    sites.own.followed_by_peers = dict.fromkeys(keys, frozenset({"desk"}))
     await sites.imports.look()
     assert sites.own.values == {"/warehouse/arm/speed": 1.5, "/warehouse/arm/gains": {"p": 1, "i": 2}}
     await sites.imports.look()
@@ -196,7 +198,7 @@ async def test_followed_parameters_are_kept_equal_in_the_gateways_core(sites: Pa
     sites.denied = {"/speed"}
     await sites.imports.look()
     assert "a rule keeps" in sites.imports.problems["/warehouse/arm/speed"]
-    sites.own.followed_by_peers = []
+    sites.own.followed_by_peers = {}
     await sites.imports.look()
     assert sites.imports.problems == {}
     assert sites.imports.followed == 0
@@ -262,3 +264,70 @@ def test_keys() -> None:
             parse_param_key(key)
     assert followed_of("/warehouse/arm/gains/p") == ("warehouse", "arm", "/gains/p")
     assert followed_of("/warehouse/arm") is None
+
+
+async def test_a_module_here_gets_what_it_may_have_by_this_gateways_permissions_too(sites: ParamSites) -> None:
+    """As ``ParamOwner`` judges: leaves, what would be lost, and the slash at the end."""
+    hidden = {"/gains/i"}
+    sites.imports._why_not = lambda asker, name, told: (
+        f"{asker} may not have {told}" if asker == "desk" and name in hidden else ""
+    )
+    for key in ("/gains", "/gains/", "/gains/i/"):
+        with pytest.raises(PeerRefused, match=rf"desk may not have {key.rstrip('/')}$"):
+            await sites.get(key)
+        with pytest.raises(PeerRefused, match="desk may not have"):
+            await sites.imports.ask("desk", "warehouse", "arm", transfer.DELETE, {"key": key})
+        with pytest.raises(PeerRefused, match="desk may not have"):
+            await sites.set(key, 5)
+    assert sites.arm.values["/gains"] == {"p": 1, "i": 2}
+    names = await sites.drive(transfer.reading(transfer.NAMES, {}))
+    assert parse_response(names.encode()) == ["/speed", "/gains/p", "/big"]
+    answer = await sites.imports.ask("", "warehouse", "arm", transfer.GET, {"key": "/gains"})
+    assert "p" in cast("Any", answer)["text"], "this machine's user"
+
+
+async def test_questions_carry_the_modules_that_ask_to_the_owner(sites: ParamSites) -> None:
+    asked: list[tuple[str, Any, Any]] = []
+    arm_asks = sites.arm.ask
+
+    async def ask(module: str, what: str, args: dict[str, Any]) -> object:
+        asked.append((what, args["site"], args["askers"]))
+        return await arm_asks(module, what, args)
+
+    sites.exports._ask = ask
+    await sites.get("/speed")
+    await sites.set("/speed", 2)
+    await sites.drive(transfer.reading(transfer.NAMES, {}))
+    await sites.imports.ask("desk", "warehouse", "arm", transfer.DELETE, {"key": "/speed"})
+    sites.own.followed_by_peers = {"/warehouse/arm/gains": frozenset({"base", "desk"})}
+    await sites.imports.look()
+    assert {(site, tuple(askers)) for _, site, askers in asked[:-1]} == {("office", ("desk",))}
+    assert asked[-1] == (transfer.GET, "office", ["base", "desk"])
+    await sites.session.get("rmpa/1/warehouse/arm/p/gains")
+    assert asked[-1] == (transfer.GET, "", [])
+
+
+async def test_no_module_reads_or_replaces_what_another_one_transfers(sites: ParamSites) -> None:
+    def ask(asker: str, what: str, args: dict[str, Any]) -> Any:
+        return sites.imports.ask(asker, "warehouse", "arm", what, args)
+
+    reading = (await ask("desk", transfer.GET, {"key": "/big"}))["reading"]
+    await ask("desk", transfer.PUT, {"writing": 7, "offset": 0, "text": "x"})
+    for what, args in (
+        (transfer.MORE, {"reading": reading, "offset": 0}),
+        (transfer.PUT, {"writing": 7, "offset": 1, "text": "y"}),
+        (transfer.SET, {"key": "/speed", "writing": 7, "size": 1}),
+    ):
+        with pytest.raises(RemoteProtocolError, match="given up"):
+            await ask("thief", what, args)
+    assert await ask("desk", transfer.PUT, {"writing": 7, "offset": 1, "text": "z"}) == {"size": 2}
+
+
+async def test_the_own_sites_modules_are_asked_by_themselves(sites: ParamSites) -> None:
+    for asker in ("desk", ""):
+        with pytest.raises(PeerRefused, match="of this very site: ask it itself, by --peer base"):
+            await sites.imports.ask(asker, "office", "base", transfer.GET, {"key": "/"})
+    sites.own.followed_by_peers = {"/office/base/x": frozenset({"desk"})}
+    sites.sites.append("office")
+    await sites.imports.look()
+    assert sites.session.asked == []

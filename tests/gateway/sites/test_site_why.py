@@ -8,9 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from rmpa.bridge.permission_gate import PermissionGate
 from rmpa.config.gateway_rules import Crossing, CrossingRule
-from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.config.permission_rules import Access, PermissionRule
+from rmpa.config.settings import TrustSettings
+from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.gateway.neighbour import SourceKind
+from rmpa.gateway.site_permissions import SitePermissions
 from rmpa.gateway.sites.history import SiteHistory
 from rmpa.gateway.sites.io.site_answers import SiteAnswers
 from rmpa.gateway.sites.io.site_why import SiteWhy
@@ -28,6 +32,7 @@ from rmpa.gateway.sites.why import (
 from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN
 from rmpa.observe.io.site_requests import BODY, INFO, LAST, PARAM, REPORT, WHY
 from rmpa.ros.wire.tcpros import TopicDescription
+from rmpa.trust.permissions import Permissions
 from tests.gateway.memory_zenoh import eventually as until
 from tests.gateway.sites.site_bed import site_bed
 
@@ -53,25 +58,36 @@ class Asked:
     params: list[tuple[str, str, str]]
 
     async def why(self, name: str, site: str = "", module: str = "", asker: str = "") -> list[Diagnosis]:
-        found: list[Diagnosis] = await self.answers.answer(
-            WHY, {"name": name, "site": site, "module": module, "asker": asker}
-        )
+        args = {"name": name, "site": site, "module": module}
+        found: list[Diagnosis] = await self.answers.answer(WHY, args, asker)
         return found
 
-    async def report(self, what: str = REPORT, **args: str) -> SitesReport:
-        found: SitesReport = await self.answers.answer(what, args)
+    async def report(self, what: str = REPORT, asker: str = "", **args: str) -> SitesReport:
+        found: SitesReport = await self.answers.answer(what, args, asker)
         return found
 
 
-async def asked(bed: SiteBed, name: str, rules: tuple[CrossingRule, ...] = (), seen: Path | None = None) -> Asked:
+async def asked(
+    bed: SiteBed,
+    name: str,
+    rules: tuple[CrossingRule, ...] = (),
+    seen: Path | None = None,
+    permissions: tuple[PermissionRule, ...] | None = None,
+) -> Asked:
+    gate = PermissionGate(None if permissions is None else Permissions(TrustSettings(rules=permissions)))
+
+    def may(asker: str, access: Access, name: str) -> bool:
+        return not asker or gate.judge(access, asker, name).allowed
+
     site = await bed.site(name, rules=rules, seen=seen)
     history = SiteHistory(time.monotonic)
     site.neighbour.on_sites = history.seen
     site.neighbour.on_site_source = lambda source, there: history.source(source, there=there)
-    why = SiteWhy(name, f"{name}_gateway", site.session, site.neighbour, history, CrossingRules(rules))
+    crossing = CrossingRules(rules, permissions=SitePermissions(gate))
+    why = SiteWhy(name, f"{name}_gateway", site.session, site.neighbour, history, crossing, may)
     params: list[tuple[str, str, str]] = []
 
-    async def ask_param(at: str, module: str, what: str, args: dict[str, Any]) -> object:
+    async def ask_param(_asker: str, at: str, module: str, what: str, args: dict[str, Any]) -> object:
         params.append((at, module, what))
         return args
 
@@ -86,6 +102,7 @@ async def asked(bed: SiteBed, name: str, rules: tuple[CrossingRule, ...] = (), s
         ask_param,
         why,
         lambda: 1,
+        may if gate.on else None,
     )
     site.neighbour.add(answers)
     await until(lambda: site.neighbour.leads)
@@ -144,6 +161,41 @@ async def test_rules_of_both_sites_are_named() -> None:
         assert problems["/told"] == ""
         assert "lets it not come in" in problems["/noise"]
         assert site.not_shown == 1
+
+
+async def test_a_module_and_a_site_are_told_only_of_what_they_may_have() -> None:
+    """The answers about what is denied are equal to those about what is not there."""
+    to_desk = PermissionRule(("desk",), names={"subscribe": ("/open",), "call": ("/open",)})
+    to_hall = PermissionRule(("hall",), names={"subscribe": ("/open", "/hidden")})
+    async with site_bed() as bed:
+        yard = await asked(bed, "yard", permissions=(to_hall,))
+        hall = await asked(bed, "hall", permissions=(to_desk,))
+        for name in ("/open", "/hidden", "/secret"):
+            yard.site.graph.add(name, TEXT)
+            hall.site.graph.add(f"/home{name}", TEXT, module="press")
+        hall.site.graph.add("/home/mine", TEXT, module="desk")
+        await until(lambda: hall.site.shows("/hidden") and hall.site.shows("/open"))
+        for site, names in (("yard", {"/open"}), ("hall", {"/home/mine"})):
+            (told,) = (await hall.report(INFO, "desk", site=site)).sites
+            assert {source.name for source in told.sources} == names
+            assert sum(module.topics for module in told.modules) == 1
+            assert len((await hall.report(INFO, site=site)).sites[0].sources) > 1, "this machine's user"
+        for name, real in (("/hidden", True), ("/none", False)):
+            assert await hall.why(name, asker="desk") == []
+            (denied,) = await hall.why(name, "yard", asker="desk")
+            assert str(denied.failed).replace(name, "NAME").count("do not let desk subscribe to NAME") == 1, real
+        (way,) = await hall.why("/open", asker="desk")
+        assert way.node == "/talker"
+        said = []
+        for name in ("/secret", "/none"):
+            (refused,) = await hall.why(name, "yard", "arm")
+            said.append(str(refused.failed).replace(name, "NAME"))
+        assert said[0] == said[1]
+        assert "the permissions there do not let hall subscribe to NAME" in said[0]
+        args = {"site": "hall", "module": "press", "topic": "/home/open", "offset": 0}
+        for what in (LAST, BODY):
+            with pytest.raises(PeerRefused, match="of this very site: subscribe to it"):
+                await hall.answers.answer(what, args, "desk")
 
 
 async def test_a_site_that_left_is_unreachable_since_then_and_one_that_never_was_is_no_site() -> None:

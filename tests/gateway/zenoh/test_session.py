@@ -16,7 +16,7 @@ from rmpa.gateway.zenoh_api import ZenohPriority, ZenohQos
 from tests.gateway.zenoh_bed import bed, free_port, until
 
 if TYPE_CHECKING:
-    from rmpa.gateway.zenoh_api import ZenohQuery, ZenohSample, ZenohSession
+    from rmpa.gateway.zenoh_api import ZenohQuery, ZenohSample
 
 pytest.importorskip("zenoh")
 
@@ -125,7 +125,7 @@ async def test_a_query_that_is_never_answered_ends_with_its_time_out_and_no_answ
 
 async def test_all_complete_asks_each_server() -> None:
     async with bed() as net:
-        servers: list[ZenohSession] = [await net.session(), await net.session()]
+        servers = [await net.session(), await net.session()]
         client = await net.session()
 
         def server_of(number: int) -> None:

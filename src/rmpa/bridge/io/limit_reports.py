@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge.catalogue.peer_limits import Beyond, from_json, to_json
+from rmpa.bridge.permission_gate import Needs
 from rmpa.bridge.session.part import Part
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ class LimitReports(Part):
         self._limit_settings = limit_settings
         self._told: dict[int, tuple[Beyond, ...]] = {}
         self._there: dict[int, tuple[Beyond, ...]] = {}
-        rpc.on_notification(HIDDEN, self._told_by_peer)
+        rpc.on_notification(HIDDEN, self._told_by_peer, Needs((), "numbers that `rmpa peer info` shows"))
 
     def here(self, peer: int) -> tuple[Beyond, ...]:
         """How much of a peer is hidden here, by each limit."""

@@ -13,6 +13,9 @@ of it, and the next is sent when the last was answered, so megabytes delay no co
     param.follow {keys}                   → {refused}                 from now on their changes, as below
     notification param.value {key, exists, size, text}                without text: larger than a portion; read it
 
+A gateway that asks for another site adds ``site`` (empty for a program that names none) and ``askers``, modules of
+that site. Then the owner asks the permissions of the gateway, of the site, and denials of those modules.
+
 The asking side is two generators, used by the agent's event loop and by the command line: they yield requests, and
 the answers are sent to them.
 """

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.catalogue.digest import HeldOffers, digest_text, parse_digest
+from rmpa.bridge.permission_gate import Needs
 from rmpa.bridge.session.offer_copies import OfferCopies
 from rmpa.bridge.session.peer_session import PeerState
 from rmpa.core.errors import RemoteProtocolError
@@ -76,8 +77,8 @@ class OfferVersions:
     def listen(self, rpc: PeerRpc, refusals: RefusalLog) -> None:
         """Exchange versions with the peers over their links; copies that differ are logged and counted."""
         self._rpc, self._refusals = rpc, refusals
-        rpc.on_notification(OFFERS, self._told)
-        rpc.on_notification(OFFERS_AGAIN, self._asked_again)
+        rpc.on_notification(OFFERS, self._told, Needs((), "the version of the peer's own catalogue"))
+        rpc.on_notification(OFFERS_AGAIN, self._asked_again, Needs((), "what is offered to the peer anyway"))
 
     @property
     def version(self) -> int:

@@ -25,6 +25,7 @@ from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
     from rmpa.bridge.messages import Message
+    from rmpa.bridge.permission_gate import Needs
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.core.counters import Counters
 
@@ -59,12 +60,12 @@ class PeerRpc(Part):
         self.want: Callable[[PeerSession], None] = lambda _: None
         """Has a parked peer linked again; see ``PeerSessions.want``."""
 
-    def on_request(self, what: str, handler: Handler) -> None:
-        """Set the handler of the requests named ``what``."""
+    def on_request(self, what: str, handler: Handler, _needs: Needs) -> None:
+        """Set the handler of the requests named ``what``, which asks for the permissions that ``_needs`` declares."""
         self._handlers[what] = handler
 
-    def on_notification(self, what: str, listener: Listener) -> None:
-        """Set the listener for the notifications named ``what``."""
+    def on_notification(self, what: str, listener: Listener, _needs: Needs) -> None:
+        """Set the listener for the notifications named ``what``; ``_needs`` as of ``on_request``."""
         self._listeners[what] = listener
 
     def notify(self, session: PeerSession, what: str, args: dict[str, Any]) -> None:

@@ -10,13 +10,15 @@ payload it sets it to that JSON. JSON has neither binary data nor dates, so gate
     {"op": "delete", "key": "/gains/p"}                     {}
     {"op": "values", "last": {"/gains": "<digest>"}}        {"values": {"/gains": {"text": …} or {"problem": …}}}
 
-``values`` brings those whose digest is another one; its ``text`` is missing where there is no such parameter.
+Each question has ``"askers": ["arm"]``, the modules of the other site that ask. ``values`` brings those whose digest
+is another one; its ``text`` is missing where there is no such parameter.
 """
 
 from __future__ import annotations
 
 import base64
 import hashlib
+from dataclasses import dataclass
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, Final
 
@@ -25,13 +27,14 @@ import msgspec
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.params.rules import key_problem
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.identity import peer_name_problem
 from rmpa.gateway import limits
 from rmpa.gateway.sites.keys import ROOT
 from rmpa.ros.limits import PARAM_DEPTH_MAX
 from rmpa.ros.master.parameters import leaves
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Collection, Iterable
 
     from rmpa.ros.wire.tcpros import Buffer
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
@@ -49,12 +52,14 @@ class ParamQuestion(msgspec.Struct, omit_defaults=True, kw_only=True):
         key: The parameter's global name in its module.
         text: The value as XML-RPC text.
         last: The digest of what is known, by key; empty for nothing.
+        askers: The modules for which the gateway asks.
     """
 
     op: str
     key: str = ""
     text: str = ""
     last: dict[str, str] = {}
+    askers: tuple[str, ...] = ()
 
     def serialize(self) -> bytes:
         """As JSON."""
@@ -73,10 +78,30 @@ class ParamQuestion(msgspec.Struct, omit_defaults=True, kw_only=True):
         keys = {"names": (), "values": tuple(found.last)}.get(found.op, (found.key,))
         if len(keys) > limits.SITE_PARAMS_AT_ONCE:
             raise RemoteProtocolError(f"{len(keys)} parameters at once; at most {limits.SITE_PARAMS_AT_ONCE}")
+        if len(found.askers) > bridge_limits.PARAM_ASKERS_MAX or any(map(peer_name_problem, found.askers)):
+            raise RemoteProtocolError("askers are not the names of modules, or too many")
         for key in keys:
             if problem := key_problem(key):
                 raise RemoteProtocolError(problem)
+        found.key = plain_key(found.key)
         return found
+
+
+@dataclass(frozen=True, slots=True)
+class SiteAsker:
+    """What asks for parameters of this site.
+
+    Args:
+        site: The other site; empty for a program that names none.
+        modules: Its modules that ask, as its gateway says.
+    """
+
+    site: str
+    modules: tuple[str, ...] = ()
+
+    def args(self, args: dict[str, Any]) -> dict[str, Any]:
+        """A request's arguments (``bridge.params.transfer``), for the module that has the parameters."""
+        return {**args, "site": self.site, "askers": list(self.modules)}
 
 
 class ParamNews(msgspec.Struct, omit_defaults=True, kw_only=True):
@@ -145,13 +170,40 @@ def parse_param_key(key: str) -> tuple[str, str]:
     if any("*" in chunk for chunk in chunks):
         raise RemoteProtocolError(f"{key[:120]!r} names several; ask for one, or for a namespace")
     name = "/".join(chunks[5:])
-    return chunks[3], GATEWAYS if name == GATEWAYS else "/" + name
+    return chunks[3], GATEWAYS if name == GATEWAYS else plain_key("/" + name)
 
 
-def refused_leaf(key: str, value: XmlRpcValue, why_not: Callable[[str], str]) -> str:
-    """Why a value may not cross: the first reason for one of the parameters in it; empty if all may."""
-    names = [name for name, _ in leaves(key, value)] if isinstance(value, dict) and value else [key]
-    return next((why for name in names if (why := why_not(name.rstrip("/") or "/"))), "")
+def plain_key(key: str) -> str:
+    """A key as masters take it and rules are written: without the slashes at its end."""
+    return key.rstrip("/") or key[:1]
+
+
+def parameters_in(key: str, value: XmlRpcValue) -> list[str]:
+    """The parameters of a value: itself, or those of a namespace."""
+    if not isinstance(value, dict) or not value:
+        return [key]
+    return [plain_key(name) for name, _ in leaves(key, value)]
+
+
+def lost_with(written: Iterable[str], present: Iterable[str]) -> list[str]:
+    """The parameters that are lost if others are written or deleted: those within them, and those around them.
+
+    Args:
+        written: The parameters.
+        present: All that are there.
+    """
+    wanted = {plain_key(name) for name in written}
+    around = {name[:at] for name in wanted for at, letter in enumerate(name) if letter == "/" and at}
+    return [name for name in present if name in around or (name not in wanted and _is_within(name, wanted))]
+
+
+def _is_within(name: str, namespaces: Collection[str]) -> bool:
+    return "/" in namespaces or any(name[:at] in namespaces for at, letter in enumerate(name) if letter == "/" and at)
+
+
+def refused_one(names: Iterable[str], why_not: Callable[[str], str]) -> str:
+    """Why parameters may not cross: the first reason for one of them; empty if all may."""
+    return next((why for name in names if (why := why_not(name))), "")
 
 
 def to_json(value: XmlRpcValue) -> bytes:

@@ -108,7 +108,15 @@ class CrossingRules:
                 return _outgoing(number, rule, site)
         return CrossingDecision(True, _NO_RULE)
 
-    def refusal(self, site: str, module: str, name: str, access: Access = Access.SUBSCRIBE) -> str:
+    def refusal(
+        self,
+        site: str,
+        module: str,
+        name: str,
+        access: Access = Access.SUBSCRIBE,
+        askers: tuple[str, ...] = (),
+        told: str | None = None,
+    ) -> str:
         """Why another site may not have a source or parameter of this one; empty if it may.
 
         Args:
@@ -116,11 +124,24 @@ class CrossingRules:
             module: The module that has it.
             name: Its name in its module.
             access: What the other site would do with it.
+            askers: The modules of the other site that ask, as it says.
+            told: The name for the text, if ``name`` was found in what was asked for and may be a secret.
         """
         decision = self.outgoing_to(site, module, name)
         if not decision.allowed:
             return decision.why
-        return "" if self._permissions is None else self._permissions.why_not(access, site, "", name)
+        return self.denial(site, name, access, askers, told)
+
+    def denial(
+        self,
+        site: str,
+        name: str,
+        access: Access,
+        askers: tuple[str, ...] = (),
+        told: str | None = None,
+    ) -> str:
+        """Why the permissions, without the rules, do not let another site have a name; empty if they do."""
+        return "" if self._permissions is None else self._permissions.why_not(access, site, name, askers, told)
 
     def kept(self, module: str, name: str) -> bool:
         """Whether the first rule that fits a topic of this site has its last value kept."""

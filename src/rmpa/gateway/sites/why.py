@@ -39,11 +39,13 @@ class WhyQuestion(msgspec.Struct, kw_only=True, frozen=True):
         site: The site that asks.
         name: A topic or service, by its name in its module.
         module: Of this module alone; empty for all.
+        service: Whether a service is meant.
     """
 
     site: str
     name: str
     module: str = ""
+    service: bool = False
 
     @classmethod
     def parse(cls, data: Buffer) -> WhyQuestion:
@@ -69,7 +71,7 @@ class SourceThere(msgspec.Struct, kw_only=True, frozen=True):
     Attributes:
         kind: ``t`` or ``s``.
         module: The module.
-        node: Its node there.
+        node: Its node there; empty where permissions deny the name, whether or not it is there.
         type: ``package/Name``.
         rule: The rule that lets it cross to the site that asks.
         refused: Why it may not cross to the site that asks; empty if it may.
@@ -194,7 +196,9 @@ def there_stages(
         text = f"no node of {whose} has {name}, as the gateway there sees it"
         remedy = f"start it there; or the [bridge] or [services] of {whose} keeps it at home: `rmpa why {name}` there"
         return [Check("source there", FAIL, text, remedy)]
-    stages = [Check("source there", OK, f"{found.node} of {found.module} at {site} has it: {found.type}")]
+    # Of what its permissions deny a gateway does not tell whether it is there.
+    told = [Check("source there", OK, f"{found.node} of {found.module} at {site} has it: {found.type}")]
+    stages = told if found.node else []
     if found.refused:
         return [*stages, refused_stage("there", found.refused, site)]
     stages.append(Check("rule there", OK, found.rule or "it may go out"))

@@ -27,6 +27,7 @@ from rmpa.runtime.threads import in_thread
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from rmpa.bridge.permission_gate import Needs
     from rmpa.gateway.zenoh.config import ZenohConfig
     from rmpa.gateway.zenoh_api import Declared, ZenohQos, ZenohQuery, ZenohReply
     from rmpa.ros.wire.tcpros import Buffer
@@ -294,7 +295,9 @@ class OpenSession:
 
         return Declaration(self._declarations, self._kept, declare, queue)
 
-    def queryable(self, key: str, on_query: Callable[[ZenohQuery], None], *, complete: bool = True) -> Declaration:
+    def queryable(
+        self, key: str, on_query: Callable[[ZenohQuery], None], _needs: Needs | None = None, *, complete: bool = True
+    ) -> Declaration:
         """Answer queries."""
         self._check(key)
         queue: ArrivalQueue[ArrivedQuery] = ArrivalQueue(

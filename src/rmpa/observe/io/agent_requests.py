@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
+from rmpa.bridge.permission_gate import Needs
+
 if TYPE_CHECKING:
     from rmpa.bridge.session.peer_rpc import PeerRpc
     from rmpa.bridge.session.peer_session import PeerSession
@@ -24,7 +26,7 @@ class AgentRequests:
 
     def __init__(self, asks: PeerRpc, snapshots: SnapshotBuilder) -> None:
         self._snapshots = snapshots
-        asks.on_request(INFO, self._info)
+        asks.on_request(INFO, self._info, Needs((), "figures of the agent, none of the module's graph"))
 
     def _info(self, _asker: PeerSession, _args: dict[str, Any]) -> PeerAgent:
         return self._snapshots.peer_agent()

@@ -7,12 +7,10 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from rmpa.bridge import limits
-from rmpa.bridge.params import transfer
-from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
+from rmpa.bridge.permission_gate import OPEN_GATE, Needs, PermissionGate
 from rmpa.bridge.session.peer_rpc import UNKNOWN_QUESTION
 from rmpa.config.permission_rules import Access
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
-from rmpa.trust.permissions import refusal
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
@@ -31,17 +29,31 @@ BODY: Final = "site.last.body"
 PARAM: Final = "site.param"
 """A request about parameters (``bridge.params.transfer``) to a module: ``{site, module, what, args}``."""
 WHY: Final = "site.why"
-"""The request for the ways of a topic or a service through gateways: ``{name, site, module, asker, service}``."""
+"""The request for the ways of a topic or a service through gateways: ``{name, site, module, service}``."""
 _ALL: Final = (REPORT, WHY)
 """Those that every gateway answers for itself."""
 QUESTIONS: Final = (REPORT, INFO, LAST, BODY, PARAM, WHY)
+_SOURCES: Final = Needs(
+    (Access.SUBSCRIBE, Access.CALL),
+    "each topic and service; of this site the asking module's own alone. Sites and modules are named to all",
+)
+_VALUE: Final = Needs((Access.SUBSCRIBE,), "the topic; of this site the asking module's own alone")
+_PARAM: Final = Needs(
+    (Access.PARAM,),
+    "as `param.get` and its like, by this gateway, the other site's and the owner. None of this site",
+)
+_WAYS: Final = Needs(
+    (Access.SUBSCRIBE, Access.CALL), "the topic or service, by its name here; what leaves is the asking module's own"
+)
 
 
 class SiteAnswerer(Protocol):
     """Answers questions about other sites: ``gateway.sites`` has it."""
 
-    def answer(self, what: str, args: dict[str, Any], /) -> Awaitable[Any]:
-        """The reply to one of ``QUESTIONS``.
+    def answer(self, what: str, args: dict[str, Any], asker: str = "", /) -> Awaitable[Any]:
+        """The reply to one of ``QUESTIONS``, which tells ``asker``, a linked module, only what it may have.
+
+        Without ``asker`` this machine's user asks, who may have everything.
 
         Raises:
             RmpaError: It cannot be answered; the text says why.
@@ -76,8 +88,13 @@ class SiteRequests:
     def serve(self, gateway: SiteAnswerer) -> None:
         """Answer as a gateway from now on."""
         self._gateway = gateway
-        for what in QUESTIONS:
-            self._rpc.on_request(what, partial(self._answer_peer, gateway, what))
+        rpc = self._rpc
+        rpc.on_request(REPORT, partial(self._answer_peer, gateway, REPORT), _SOURCES)
+        rpc.on_request(INFO, partial(self._answer_peer, gateway, INFO), _SOURCES)
+        rpc.on_request(LAST, partial(self._answer_peer, gateway, LAST), _VALUE)
+        rpc.on_request(BODY, partial(self._answer_peer, gateway, BODY), _VALUE)
+        rpc.on_request(PARAM, partial(self._answer_peer, gateway, PARAM), _PARAM)
+        rpc.on_request(WHY, partial(self._answer_peer, gateway, WHY), _WAYS)
 
     async def answer(self, args: dict[str, Any]) -> Any:
         """The operation ``site``: ``what`` (one of ``QUESTIONS``) and its ``args``.
@@ -131,12 +148,10 @@ class SiteRequests:
         self, gateway: SiteAnswerer, what: str, asker: PeerSession, args: dict[str, Any]
     ) -> Awaitable[object]:
         """Answer a linked module, which another site takes for this one's gateway: so it is judged here."""
-        if self._gate.on:
-            access, name = _needs(what, args)
-            peer = asker.link.name
-            if name and not self._gate.admits(access, peer, name):
-                raise PeerRefused(str(args.get("site", "")), refusal(access, peer, name))
-        return gateway.answer(what, args)
+        peer = asker.link.name
+        if what in (LAST, BODY) and (why := self._gate.why_not(Access.SUBSCRIBE, peer, str(args.get("topic", "")))):
+            raise PeerRefused(str(args.get("site", "")), why)
+        return gateway.answer(what, args, peer)
 
     async def _ask(
         self, session: PeerSession, what: str, args: dict[str, Any], wait: float
@@ -145,16 +160,6 @@ class SiteRequests:
             return await self._rpc.request(session, what, args, wait), None
         except RmpaError as error:
             return None, error
-
-
-def _needs(what: str, args: dict[str, Any]) -> tuple[Access, str]:
-    """What a module must be allowed for a question, and for which name; empty: nothing."""
-    if what in (LAST, BODY):
-        return Access.SUBSCRIBE, str(args.get("topic", ""))
-    inner = args.get("args")
-    if what != PARAM or not isinstance(inner, dict) or args.get("what") in (transfer.MORE, transfer.PUT):
-        return Access.PARAM, ""  # portions: the question that begins or ends with them names the parameter
-    return Access.PARAM, str(inner.get("key", "")) or "/"
 
 
 def _is_no_gateway(error: RmpaError) -> bool:

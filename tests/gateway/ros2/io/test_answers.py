@@ -17,7 +17,7 @@ from tests.gateway.ros2.io.ros2_bed import STRING, topic_bed
 class OtherSites:
     """Answers for another site."""
 
-    async def answer(self, what: str, args: dict[str, Any], /) -> Any:
+    async def answer(self, what: str, args: dict[str, Any], _asker: str = "", /) -> Any:
         del args
         sites = (SiteInfo(name="hall", state="this site"),)
         return SitesReport(gateway="gate", site="hall", sites=sites) if what == REPORT else ["of a site"]

@@ -10,6 +10,7 @@ from rmpa.bridge import limits
 from rmpa.bridge.params import transfer
 from rmpa.bridge.params.io.core import ParamCore, read_text
 from rmpa.bridge.params.rules import Following, learn
+from rmpa.bridge.permission_gate import Needs
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 
@@ -53,7 +54,7 @@ class ParamFollower:
         self._asking: dict[int, asyncio.Task[None]] = {}
         self._subscribed: set[str] = set()
         self._left: set[str] = set()
-        rpc.on_notification(transfer.VALUE, self._told)
+        rpc.on_notification(transfer.VALUE, self._told, Needs((), "what `[[param]]` follows from this very peer"))
 
     # --- events from the part ------------------------------------------------------------------------------------
 

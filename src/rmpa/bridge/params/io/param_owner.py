@@ -6,17 +6,19 @@ import asyncio
 import contextlib
 import logging
 from collections import defaultdict
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.params import transfer
 from rmpa.bridge.params.io.core import PEERS, ParamCore, read_text, write_text
 from rmpa.bridge.params.rules import key_problem, replaced
-from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
+from rmpa.bridge.permission_gate import OPEN_GATE, Needs, PermissionGate
 from rmpa.config import limits as config_limits
 from rmpa.config.param_rules import overlap
 from rmpa.config.permission_rules import Access
 from rmpa.core.errors import LocalProtocolError, RmpaError
+from rmpa.core.identity import peer_name_problem
 from rmpa.ros.master.parameters import leaves
 from rmpa.runtime.event_loop import yield_to_data, yielding_to_data
 from rmpa.trust.permissions import refusal
@@ -28,8 +30,48 @@ if TYPE_CHECKING:
     from rmpa.bridge.session.peer_rpc import PeerRpc
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
+    from rmpa.trust.permissions import PermissionDecision
 
 _log = logging.getLogger(__name__)
+
+_EACH: Final = Needs((Access.PARAM,), "each parameter, all within a namespace and all that would be lost")
+_LISTED: Final = Needs((Access.PARAM,), "each parameter; others are left out")
+_PORTION: Final = Needs((), "portions of the peer's own requests")
+_FOLLOWED: Final = Needs((Access.PARAM,), "each parameter, and again at each change")
+
+
+@dataclass(frozen=True, slots=True)
+class _Asker:
+    """What asks: a peer, or by way of a peer that is a gateway another site.
+
+    Args:
+        peer: The peer's name, as its certificate proves it.
+        site: The other site; ``None``: the peer asks for itself.
+        modules: Its modules that ask, as the gateways say.
+    """
+
+    peer: str
+    site: str | None
+    modules: tuple[str, ...]
+
+    @classmethod
+    def read(cls, session: PeerSession, args: dict[str, Any]) -> _Asker:
+        """Read ``site`` and ``askers`` of a request.
+
+        Raises:
+            RmpaError: They are none.
+        """
+        site, modules = args.get("site"), args.get("askers", [])
+        if not isinstance(modules, list) or len(modules) > limits.PARAM_ASKERS_MAX:
+            raise RmpaError(f"askers is not a list of at most {limits.PARAM_ASKERS_MAX} modules")
+        for name in [*([site] if site else []), *modules]:
+            # Globs of permissions have the name put in for {peer}: it must be a name, and no glob.
+            if not isinstance(name, str) or peer_name_problem(name) is not None:
+                raise RmpaError(f"{str(name)[:80]!r} is not the name of a site or a module")
+        return cls(session.link.name, site, tuple(modules))
+
+    def __str__(self) -> str:
+        return self.peer if self.site is None else self.site or "a program without a site"
 
 
 class ParamOwner:
@@ -64,13 +106,13 @@ class ParamOwner:
         self._left: set[str] = set()
         self._changed: dict[str, None] = {}
         self._telling: asyncio.Task[None] | None = None
-        rpc.on_request(transfer.GET, self._get)
-        rpc.on_request(transfer.NAMES, self._names)
-        rpc.on_request(transfer.MORE, lambda session, args: self._of(session).more(args, self._now()))
-        rpc.on_request(transfer.PUT, lambda session, args: self._of(session).put(args, self._now()))
-        rpc.on_request(transfer.SET, self._set)
-        rpc.on_request(transfer.DELETE, self._delete)
-        rpc.on_request(transfer.FOLLOW, self._follow)
+        rpc.on_request(transfer.GET, self._get, _EACH)
+        rpc.on_request(transfer.NAMES, self._names, _LISTED)
+        rpc.on_request(transfer.MORE, lambda session, args: self._of(session).more(args, self._now()), _PORTION)
+        rpc.on_request(transfer.PUT, lambda session, args: self._of(session).put(args, self._now()), _PORTION)
+        rpc.on_request(transfer.SET, self._set, _EACH)
+        rpc.on_request(transfer.DELETE, self._delete, _EACH)
+        rpc.on_request(transfer.FOLLOW, self._follow, _FOLLOWED)
 
     # --- events from the part ------------------------------------------------------------------------------------
 
@@ -117,7 +159,7 @@ class ParamOwner:
         """Notify the peers of parameters that the new rules no longer let them follow."""
         for session, keys in self._followers.values():
             for key in list(keys):
-                if why := self.policy.why_not_follow(key) or self._why_denied(session, key):
+                if why := self.policy.why_not_follow(key) or self._why_denied(_Asker.read(session, {}), key):
                     keys.discard(key)
                     self._rpc.notify(session, transfer.VALUE, _refusal(key, why))
         self._forget_unfollowed()
@@ -133,54 +175,62 @@ class ParamOwner:
         """The keys that at least one peer follows."""
         return iter(self._last)
 
+    def followers(self) -> dict[str, frozenset[str]]:
+        """The names of the peers that follow each key."""
+        names: dict[str, set[str]] = {}
+        for session, keys in self._followers.values():
+            for key in keys:
+                names.setdefault(key, set()).add(session.link.name)
+        return {key: frozenset(found) for key, found in names.items()}
+
     # --- requests -----------------------------------------------------------------------------------------------
 
     async def _get(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
-        key = self._key(args.get("key"))
+        key, asker = self._key(args.get("key")), _Asker.read(session, args)
         found, value = await self._core.get(key)
         # The permissions come first: the error of ``[params]`` may name a parameter that they hide.
-        self._refuse(self._why_denied(session, key, value) or self._why_not_get(key, value))
+        self._refuse(self._why_denied(asker, key, value) or self._why_not_get(key, value))
         if not found:
             raise RmpaError(f"there is no parameter {key}")
         return self._of(session).answer(await write_text(key, value), self._now())
 
-    async def _names(self, session: PeerSession, _args: dict[str, Any]) -> dict[str, object]:
-        peer = session.link.name
+    async def _names(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
+        asker = _Asker.read(session, args)
         names = [
             name
             for name in yielding_to_data(await self._core.names())
-            if not self.policy.why_not_get(name) and self._gate.judge(Access.PARAM, peer, name).allowed
+            if not self.policy.why_not_get(name) and self._judge(asker, name).allowed
         ]
         return self._of(session).answer(await write_text("the list of parameters", names), self._now())
 
     async def _set(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
-        key = self._key(args.get("key"))
+        key, asker = self._key(args.get("key")), _Asker.read(session, args)
         value = await read_text(self._of(session).written(args, self._now()))
         parameters: list[tuple[str, XmlRpcValue]] = []
         for given, one in yielding_to_data(leaves(key, value)):
             # A member may be named "" or "a/": the core drops the slash at the end, so the name is judged without it.
             name = given.rstrip("/") or "/"
-            self._refuse(key_problem(given) or self.policy.why_not_set(name) or self._why_denied(session, name))
+            self._refuse(key_problem(given) or self.policy.why_not_set(name) or self._why_denied(asker, name))
             parameters.append((name, one))
-        await self._keep_others(session, key, [name for name, _ in parameters])
+        await self._keep_others(asker, key, [name for name, _ in parameters])
         for number, (name, one) in enumerate(parameters):
             await self._core.set(name, one, PEERS)
             yield_to_data()
             if number % limits.APPLIED_AT_ONCE == 0:
                 await asyncio.sleep(0)
-        _log.info("< %s sets %d parameters at %s", session.link.name, len(parameters), key)
+        _log.info("< %s sets %d parameters at %s", asker, len(parameters), key)
         return {"count": len(parameters)}
 
     async def _delete(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
-        key = self._key(args.get("key"))
+        key, asker = self._key(args.get("key")), _Asker.read(session, args)
         self._refuse(self.policy.why_not_set(key))
         if self._gate.on:
             # All of a namespace, and the namespace itself: a rule may name either.
             _, value = await self._core.get(key)
-            self._refuse(self._why_denied(session, key) or self._why_denied(session, key, value))
+            self._refuse(self._why_denied(asker, key) or self._why_denied(asker, key, value))
         if not await self._core.delete(key, PEERS):
             raise RmpaError(f"there is no parameter {key}")
-        _log.info("< %s deletes parameter %s", session.link.name, key)
+        _log.info("< %s deletes parameter %s", asker, key)
         return {}
 
     async def _follow(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
@@ -188,12 +238,13 @@ class ParamOwner:
         keys = args.get("keys")
         if not isinstance(keys, list) or len(keys) > config_limits.FOLLOW_RULES_MAX:
             raise RmpaError(f"keys is not a list of at most {config_limits.FOLLOW_RULES_MAX} parameters")
+        asker = _Asker.read(session, args)
         refused: dict[str, str] = {}
         wanted: set[str] = set()
         for given in keys:
             problem = key_problem(given)
             key = str(given).rstrip("/") or "/"
-            why = problem or self.policy.why_not_follow(key) or self._why_denied(session, key)
+            why = problem or self.policy.why_not_follow(key) or self._why_denied(asker, key)
             if not why and key not in wanted and len(wanted) >= self.followed_max:
                 text = f"more parameters than limits.params = {self.followed_max} over there"
                 why = f"{text}; raise it, or follow a namespace"
@@ -218,19 +269,26 @@ class ParamOwner:
             (why for name, _ in yielding_to_data(leaves(key, value)) if (why := self.policy.why_not_get(name))), ""
         )
 
-    def _why_denied(self, session: PeerSession, key: str, value: XmlRpcValue = None) -> str:
+    def _judge(self, asker: _Asker, name: str) -> PermissionDecision:
+        """Decide whether a parameter may be had: by the peer, and by the site for which it asks."""
+        decision = self._gate.judge(Access.PARAM, asker.peer, name)
+        if asker.site is None or not decision.allowed:
+            return decision
+        return self._gate.judge_site(Access.PARAM, asker.site, asker.modules, name)
+
+    def _why_denied(self, asker: _Asker, key: str, value: XmlRpcValue = None) -> str:
         """Why the permissions do not let a peer have a parameter, or all of a namespace; empty if they do."""
         if not self._gate.on:
             return ""
         names = [name for name, _ in leaves(key, value)] if isinstance(value, dict) and value else [key]
         for name in yielding_to_data(names):
-            decision = self._gate.judge(Access.PARAM, session.link.name, name)
+            decision = self._judge(asker, name)
             if not decision.allowed:
-                self._gate.refused(Access.PARAM, session.link.name, name, decision)
-                return refusal(Access.PARAM, session.link.name, key)  # not the name: it may be a secret
+                self._gate.refused(Access.PARAM, str(asker), name, decision)
+                return refusal(Access.PARAM, str(asker), key)  # not the name: it may be a secret
         return ""
 
-    async def _keep_others(self, session: PeerSession, key: str, names: list[str]) -> None:
+    async def _keep_others(self, asker: _Asker, key: str, names: list[str]) -> None:
         """Refuse to set parameters where others would be lost by it that the peer may not set.
 
         Raises:
@@ -241,8 +299,8 @@ class ParamOwner:
         around = "/".join(key.split("/")[:2])
         _, present = await self._core.get(around)
         for name in yielding_to_data(list(replaced(names, around, present))):
-            if self._why_denied(session, name):
-                raise RmpaError(refusal(Access.PARAM, session.link.name, key))
+            if self._why_denied(asker, name):
+                raise RmpaError(refusal(Access.PARAM, str(asker), key))
 
     def _key(self, given: object) -> str:
         self._refuse(key_problem(given))
@@ -295,7 +353,7 @@ class ParamOwner:
             self._last[key] = text if text is None or len(text) <= limits.PARAM_SMALL else ""
         for session, keys in list(self._followers.values()):
             if key in keys:
-                why = self._why_denied(session, key, value)
+                why = self._why_denied(_Asker.read(session, {}), key, value)
                 self._rpc.notify(session, transfer.VALUE, _refusal(key, why) if why else args)
 
     async def _small_text(self, key: str) -> str | None:

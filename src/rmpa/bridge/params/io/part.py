@@ -71,9 +71,9 @@ class Params(Part):
         return self._follower.following
 
     @property
-    def followed_by_peers(self) -> Iterable[str]:
-        """The keys of this module that a linked peer follows."""
-        return self._server.followed
+    def followed_by_peers(self) -> dict[str, frozenset[str]]:
+        """The keys of this module that linked peers follow, each with their names."""
+        return self._server.followers()
 
     async def read(self, key: str) -> XmlRpcValue:
         """The value of a parameter or namespace of this module's core; ``None`` if there is none.

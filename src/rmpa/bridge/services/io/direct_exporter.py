@@ -11,7 +11,8 @@ from rmpa.bridge.direct.io.endpoints import LocalEndpoints
 from rmpa.bridge.direct.io.nodes import end_from
 from rmpa.bridge.direct.server_side import ReofferService, ServiceGrants, WithdrawService
 from rmpa.bridge.direct.service_requests import RetryService, ServiceDirectClosed
-from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
+from rmpa.bridge.permission_gate import OPEN_GATE, Needs, PermissionGate
+from rmpa.config.permission_rules import Access
 from rmpa.core.contract import Transport
 
 if TYPE_CHECKING:
@@ -66,8 +67,9 @@ class DirectServiceExporter:
         self._counters = counters
         self.grants = ServiceGrants()
         """What the peers were answered."""
-        rpc.on_request(requests.SERVICE, self._answer)
-        rpc.on_notification(requests.SERVICE_CLOSE, self._released)
+        offered = Needs((Access.CALL,), "the service: only what is offered to the peer")
+        rpc.on_request(requests.SERVICE, self._answer, offered)
+        rpc.on_notification(requests.SERVICE_CLOSE, self._released, Needs((), "what was granted to the peer itself"))
 
     def reload(self, rules: ServiceRules) -> None:
         """Take new rules, and withdraw the grants that they do not allow."""

@@ -23,7 +23,7 @@ from rmpa.bridge.direct.client_side import (
 from rmpa.bridge.direct.conditions import NO_LINK, Condition, Grant, Unmet, read_reply, read_unmet, unmet_by_trust
 from rmpa.bridge.direct.io.nodes import connecting, end_these, end_to
 from rmpa.bridge.direct.service_requests import AskService, ReleaseService
-from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
+from rmpa.bridge.permission_gate import OPEN_GATE, Needs, PermissionGate
 from rmpa.bridge.policy import OWN_NODE, is_own
 from rmpa.bridge.session.peer_rpc import UNKNOWN_QUESTION
 from rmpa.core.contract import Transport
@@ -125,8 +125,9 @@ class DirectServiceImporter:
         self._looking: asyncio.TimerHandle | None = None
         self._closed = False
         self._able = core.on_lookup(self._lookup)
-        rpc.on_notification(requests.SERVICE_CLOSED, self._closed_there)
-        rpc.on_notification(requests.SERVICE_RETRY, self._retry)
+        own = Needs((), "the peer's own services that are called directly")
+        rpc.on_notification(requests.SERVICE_CLOSED, self._closed_there, own)
+        rpc.on_notification(requests.SERVICE_RETRY, self._retry, own)
 
     @staticmethod
     def _now() -> float:

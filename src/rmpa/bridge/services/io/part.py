@@ -25,7 +25,7 @@ from rmpa.bridge.messages import (
     Source,
 )
 from rmpa.bridge.naming import Names
-from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
+from rmpa.bridge.permission_gate import OPEN_GATE, Needs, PermissionGate
 from rmpa.bridge.policy import Policy, is_own
 from rmpa.bridge.relay import service_place
 from rmpa.bridge.services.actions import (
@@ -183,7 +183,7 @@ class Services(Part):
         )
         """Direct calls of local nodes to peers' servers."""
         sessions.offers.add(PartCatalogue(self.exports, self.imports, self._driver))
-        rpc.on_notification(_MISMATCH, self._told_of_mismatch)
+        rpc.on_notification(_MISMATCH, self._told_of_mismatch, Needs((), "a text for the log"))
 
     def __iter__(self) -> Iterator[ShownService]:
         """The peers' services in the local graph."""

@@ -13,9 +13,10 @@ from rmpa.bridge.direct.io.nodes import end_from
 from rmpa.bridge.direct.publisher_side import DirectGrants, EndConnections, Granted, Retry, WithdrawGrant
 from rmpa.bridge.direct.requests import DirectClosed, RetryDirect
 from rmpa.bridge.messages import Source
-from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
+from rmpa.bridge.permission_gate import OPEN_GATE, Needs, PermissionGate
 from rmpa.bridge.policy import is_own
 from rmpa.bridge.topics.audience import compares_names
+from rmpa.config.permission_rules import Access
 from rmpa.core.contract import combine
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
 
@@ -71,8 +72,8 @@ class DirectExporter:
         self.grants = DirectGrants()
         """The grants in force."""
         self._expiries: dict[int, asyncio.TimerHandle] = {}
-        rpc.on_request(requests.OPEN, self._open)
-        rpc.on_notification(requests.CLOSE, self._close)
+        rpc.on_request(requests.OPEN, self._open, Needs((Access.SUBSCRIBE,), "the topic: only what is offered"))
+        rpc.on_notification(requests.CLOSE, self._close, Needs((), "what was granted to the peer itself"))
 
     def reload(self, contracts: Contracts) -> None:
         """Take new contracts, and withdraw the grants that they do not allow."""

@@ -23,7 +23,7 @@ from rmpa.bridge.direct.direct_route import Ask, Decided, DirectKey, Fallback, H
 from rmpa.bridge.direct.io.nodes import direct_links, end_links, kernel_tells, report_failure, standing, standing_at
 from rmpa.bridge.direct.requests import CloseDirect, OpenDirect
 from rmpa.bridge.direct.subscriber_side import DirectSubscriptions
-from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
+from rmpa.bridge.permission_gate import OPEN_GATE, Needs, PermissionGate
 from rmpa.bridge.policy import is_own
 from rmpa.bridge.session.peer_rpc import UNKNOWN_QUESTION
 from rmpa.bridge.topics.audience import compares_names
@@ -124,8 +124,9 @@ class DirectImporter:
         self._kernel_tells = kernel_tells()
         self._started = self._now()
         """Subscribers may have direct connections from before this moment, of an earlier run of this agent."""
-        rpc.on_notification(requests.CLOSED, self._closed_there)
-        rpc.on_notification(requests.RETRY, self._retry)
+        own = Needs((), "the peer's own topics that come directly")
+        rpc.on_notification(requests.CLOSED, self._closed_there, own)
+        rpc.on_notification(requests.RETRY, self._retry, own)
 
     @staticmethod
     def _now() -> float:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge.data.qos_events import shown_seconds
 from rmpa.bridge.messages import Source
+from rmpa.bridge.permission_gate import Needs
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros import limits as ros_limits
@@ -62,7 +63,7 @@ class LossReports:
         self._rpc = rpc
         self._counters = counters
         self._refusals = refusals
-        rpc.on_notification(OVERSIZED, self._oversized_there)
+        rpc.on_notification(OVERSIZED, self._oversized_there, Needs((), "the peer's own topics; a text for the log"))
 
     def away(self, peer: int) -> tuple[str, float]:
         """The name of an absent peer, and for how many seconds it has been away."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Final
 
+from rmpa.bridge.permission_gate import Needs
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.gateway.ros1_bridge import limits
 from rmpa.gateway.ros1_bridge.keys import BridgedKind, BridgedTopic
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from rmpa.gateway.ros1_bridge.io.announcer import BridgeAnnouncer
     from rmpa.gateway.zenoh_api import Declared, ZenohQuery, ZenohSession
 
+_NEEDS = Needs(
+    (), "the service crosses by `[[gateway.rule]]` for `ros1_bridge`", key="services for zenoh-bridge-ros1"
+)
 _REMEDY: Final = "is zenoh-bridge-ros1 there connected, and its server alive?"
 
 
@@ -100,7 +104,7 @@ class BridgedServiceExport:
                 continue
             self._problem = ""
             self._topic = BridgedTopic(self.source.here, found.type, found.md5sum, self._namespace)
-            self._queryable = self._session.queryable(self._topic.key(), self._asked)
+            self._queryable = self._session.queryable(self._topic.key(), self._asked, _NEEDS)
             self._announcer.add(BridgedKind.SERVICE, self._topic)
 
     def _asked(self, query: ZenohQuery) -> None:

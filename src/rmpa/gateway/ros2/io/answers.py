@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from rmpa.config.permission_rules import Access
 from rmpa.core.errors import UnreachableError
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.crossing import SITE
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
     from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour
     from rmpa.observe.io.site_requests import SiteAnswerer
+    from rmpa.observe.why.diagnosis import Diagnosis
 
 
 class Ros2Answers:
@@ -27,6 +29,7 @@ class Ros2Answers:
         neighbour: ROS 2.
         endpoints: Returns the Zenoh endpoints that the session is connected to.
         sites: Answers for the other sites; ``None``: the gateway joins none.
+        may: ``(asker, access, name)``: whether a linked module may have a topic or service, by its name here.
     """
 
     def __init__(
@@ -35,39 +38,48 @@ class Ros2Answers:
         neighbour: Ros2Neighbour,
         endpoints: Callable[[], tuple[str, ...]],
         sites: SiteAnswerer | None = None,
+        may: Callable[[str, Access, str], bool] = lambda _asker, _access, _name: True,
     ) -> None:
         self._name = name
         self._neighbour = neighbour
         self._endpoints = endpoints
         self._sites = sites
+        self._may = may
 
-    async def answer(self, what: str, args: dict[str, Any], /) -> Any:
+    async def answer(self, what: str, args: dict[str, Any], asker: str = "", /) -> Any:
         """The reply to one question of ``observe.io.site_requests``; raises as that says."""
         site = str(args.get("site") or "")
         if what == WHY:
-            name, module, asker = (str(args.get(key) or "") for key in ("name", "module", "asker"))
-            ways = await self._neighbour.ways(name, site, module, asker, service=args.get("service") is True)
-            return [*ways, *(await self._sites.answer(what, args) if self._sites is not None else ())]
+            name, module = (str(args.get(key) or "") for key in ("name", "module"))
+            ways: list[Diagnosis] = []
+            if self._tells(asker, "topic", name) or self._tells(asker, "service", name):
+                ways = await self._neighbour.ways(name, site, module, asker, service=args.get("service") is True)
+            return [*ways, *(await self._sites.answer(what, args, asker) if self._sites is not None else ())]
         if what == REPORT or (what == INFO and site == SITE):
-            report = await self._report_of_sites()
+            report = await self._report_of_sites(asker)
             if what == INFO:
-                return msgspec.structs.replace(report, sites=(self._site(sources=True),))
-            return msgspec.structs.replace(report, sites=(*report.sites, self._site(sources=False)))
+                return msgspec.structs.replace(report, sites=(self._site(asker, sources=True),))
+            return msgspec.structs.replace(report, sites=(*report.sites, self._site(asker, sources=False)))
         if self._sites is None:
             raise UnreachableError(f"site {site!r}", "this gateway", f"it joins {SITE} alone")
-        return await self._sites.answer(what, args)
+        return await self._sites.answer(what, args, asker)
 
-    async def _report_of_sites(self) -> SitesReport:
+    def _tells(self, asker: str, kind: str, name: str) -> bool:
+        """Whether a module is told of a topic or service that has this name here."""
+        return self._may(asker, Access.CALL if kind == "service" else Access.SUBSCRIBE, name)
+
+    async def _report_of_sites(self, asker: str) -> SitesReport:
         if self._sites is not None:
-            found: SitesReport = await self._sites.answer(REPORT, {})
+            found: SitesReport = await self._sites.answer(REPORT, {}, asker)
             return found
         endpoints = self._endpoints()
         problem = "" if endpoints else "it is connected to no other Zenoh session"
         return SitesReport(gateway=self._name, site="", leads=True, problem=problem, endpoints=endpoints)
 
-    def _site(self, *, sources: bool) -> SiteInfo:
+    def _site(self, asker: str, *, sources: bool) -> SiteInfo:
         report = self._neighbour.report()
-        listed = list(_sources(report)) if sources else []
+        every = list(_sources(report)) if sources else []
+        listed = [source for source in every if self._tells(asker, source.kind, source.here or source.name)]
         refused = report.get("topics_refused")
         return SiteInfo(
             name=SITE,

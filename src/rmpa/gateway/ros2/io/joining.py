@@ -6,14 +6,17 @@ from typing import TYPE_CHECKING, Any
 
 from rmpa.core.errors import UnreachableError
 from rmpa.gateway import limits
+from rmpa.gateway.ros2.crossing import SITE
 from rmpa.gateway.ros2.io.actions import Ros2Actions
 from rmpa.gateway.ros2.io.answers import Ros2Answers
 from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour
 from rmpa.gateway.ros2.io.params import Ros2Params
 from rmpa.gateway.ros2.io.services import Ros2Services
 from rmpa.gateway.ros2.io.topics import Ros2Topics
+from rmpa.gateway.sites.params import SiteAsker
 
 if TYPE_CHECKING:
+    from rmpa.config.permission_rules import Access
     from rmpa.config.settings import Settings
     from rmpa.gateway.graph.own_graph import AgentGraph
     from rmpa.gateway.zenoh_api import OwnedSession
@@ -30,11 +33,17 @@ def make_ros2_neighbour(graph: AgentGraph, session: OwnedSession, settings: Sett
     async def ask_module(module: str, what: str, args: dict[str, Any]) -> object:
         for peer in agent.bridge.sessions.linked():
             if peer.link.name == module:
-                return await agent.bridge.rpc.request(peer, what, args, limits.ROS2_PARAM_TIMEOUT)
+                asked = SiteAsker(SITE).args(args)
+                return await agent.bridge.rpc.request(peer, what, asked, limits.ROS2_PARAM_TIMEOUT)
         raise UnreachableError("module", repr(module), "it is not linked to this gateway")
 
     parts = (Ros2Params(ask_module, agent.params), Ros2Actions(), Ros2Services(), Ros2Topics())
     neighbour = Ros2Neighbour(graph, session, settings.gateway, parts, settings.make_contracts())
     sites = agent.sites.answerer if settings.gateway.site else None
-    agent.sites.serve(Ros2Answers(settings.name, neighbour, lambda: session.endpoints, sites))
+    gate = agent.bridge.gate
+
+    def may(asker: str, access: Access, name: str) -> bool:
+        return not asker or gate.judge(access, asker, name).allowed
+
+    agent.sites.serve(Ros2Answers(settings.name, neighbour, lambda: session.endpoints, sites, may))
     return neighbour

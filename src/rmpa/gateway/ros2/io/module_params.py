@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge.params import transfer
 from rmpa.bridge.params.io.core import read_text, write_text
+from rmpa.bridge.permission_gate import Needs
+from rmpa.config.permission_rules import Access
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.ros2.attachment import Ros2Attachment
@@ -15,6 +17,7 @@ from rmpa.gateway.ros2.graph import OWN_NAMESPACE
 from rmpa.gateway.ros2.params import SERVICES, ParamTypes, key_of, listed, name_in_ros2
 from rmpa.gateway.ros2.qos import Ros2Qos
 from rmpa.gateway.ros2.tokens import EntityKind, data_key
+from rmpa.gateway.sites.params import parameters_in
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Generator, Sequence
@@ -26,6 +29,13 @@ if TYPE_CHECKING:
 
     AskModule = Callable[[str, str, dict[str, Any]], Awaitable[object]]
     """Asks a linked module: its name, one of ``bridge.params.transfer``'s requests, the arguments."""
+
+
+_NEEDS = Needs(
+    (Access.PARAM,),
+    "each parameter, by the module that has it, of the gateway and of `ros2`",
+    key="the services of `ros2 param`",
+)
 
 
 class ModuleParams:
@@ -51,7 +61,7 @@ class ModuleParams:
             kind, type_hash = types.service(service)
             name = f"{node}/{service}"
             key = data_key(context.settings.ros2.domain, name, kind, type_hash)
-            queryable = context.session.queryable(key, self._taker(service, kind))
+            queryable = context.session.queryable(key, self._taker(service, kind), _NEEDS)
             endpoint = context.nodes.declare(node, EntityKind.SERVICE, name, kind, type_hash, Ros2Qos())
             self._declared += (queryable, endpoint)
 
@@ -125,9 +135,10 @@ class ModuleParams:
         if not self._crosses(key):
             return None
         try:
-            return await read_text(await self._drive(transfer.reading(transfer.GET, {"key": key})))
+            value = await read_text(await self._drive(transfer.reading(transfer.GET, {"key": key})))
         except PeerRefused:
             return None
+        return value if all(map(self._crosses, parameters_in(key, value))) else None
 
     async def _set(self, parameter: Any) -> Any:
         make, key = self._types.make, key_of(parameter.name)

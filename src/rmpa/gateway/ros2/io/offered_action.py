@@ -15,6 +15,7 @@ from rmpa.gateway.ros2.crossing import SITE
 from rmpa.gateway.ros2.goals_to_ros1 import Answer, GoalsToRos1, TellServer
 from rmpa.gateway.ros2.graph import valid_name
 from rmpa.gateway.ros2.io.action_types import find_action, find_topics
+from rmpa.gateway.ros2.io.part import SERVICE_NEEDS
 from rmpa.gateway.ros2.qos import Ros2Durability, Ros2Qos
 from rmpa.gateway.ros2.tokens import EntityKind, data_key
 from rmpa.gateway.zenoh_api import ZenohQos
@@ -119,7 +120,8 @@ class OfferedAction:
             ("cancel_goal", CANCEL_TYPE, self._cancel_goal),
         ):
             key = data_key(context.settings.ros2.domain, f"{self.name}{PART}{part}", kind, types.hashes[kind])
-            self._declared.append(context.session.queryable(key, take))  # before its token, which clients wait for
+            # Before its token, which clients wait for.
+            self._declared.append(context.session.queryable(key, take, SERVICE_NEEDS))
             self._declare(machine, part, EntityKind.SERVICE, kind, Ros2Qos())
         latched = Ros2Qos(durability=Ros2Durability.TRANSIENT_LOCAL, depth=1)
         for part, kind, qos, cache in (

@@ -11,6 +11,7 @@ from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.attachment import Ros2Attachment
 from rmpa.gateway.ros2.graph import valid_name
+from rmpa.gateway.ros2.io.part import SERVICE_NEEDS
 from rmpa.gateway.ros2.qos import Ros2Qos
 from rmpa.gateway.ros2.service_pair import ServicePair, ros1_without_use, type_by_name
 from rmpa.gateway.ros2.tokens import EntityKind, data_key
@@ -112,7 +113,7 @@ class OfferedService:
         context, name = self._context, self.source.here
         key = data_key(context.settings.ros2.domain, name, pair.ros2, pair.type_hash)
         # Before its token: a client may call as soon as it sees that.
-        self._queryable = context.session.queryable(key, self._query)
+        self._queryable = context.session.queryable(key, self._query, SERVICE_NEEDS)
         self._endpoint = context.nodes.declare(
             self.source.proxy, EntityKind.SERVICE, name, pair.ros2, pair.type_hash, Ros2Qos()
         )

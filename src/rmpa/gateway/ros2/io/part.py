@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
+from rmpa.bridge.permission_gate import Needs
 from rmpa.ros.types.definitions import known_types
 
 if TYPE_CHECKING:
@@ -21,6 +22,13 @@ if TYPE_CHECKING:
     from rmpa.gateway.ros2.tokens import Ros2Endpoint
     from rmpa.gateway.ros2.types import Ros2Types
     from rmpa.gateway.zenoh_api import ZenohSession
+
+
+SERVICE_NEEDS: Final = Needs(
+    (),
+    "`[[gateway.rule]]` for `ros2` alone: ROS 2 has no permissions",
+    key="services and actions of ROS 2",
+)
 
 
 @dataclass(frozen=True, slots=True)

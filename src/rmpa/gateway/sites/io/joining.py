@@ -30,11 +30,13 @@ from rmpa.gateway.sites.keys import SiteGateway
 from rmpa.gateway.sites.rules import CrossingRules
 from rmpa.runtime.state_dir import module_dir, state_dir
 from rmpa.runtime.system_clock import SystemClock
+from rmpa.trust.permissions import refusal
 
 if TYPE_CHECKING:
     from rmpa.agent import Agent
     from rmpa.config.settings import Settings
     from rmpa.gateway.neighbour import MeshSource, OwnGraph
+    from rmpa.gateway.sites.params import SiteAsker
     from rmpa.gateway.sites.part import SitePart
     from rmpa.gateway.zenoh_api import OwnedSession
 
@@ -102,17 +104,39 @@ def _add_questions(
         where = f"site {own.site} as {module!r}"
         raise UnreachableError("module", where, "`rmpa peer list` there shows which are linked to its gateway")
 
-    def may_not(site: str, module: str, parameter: str) -> str:
-        return rules.refusal(site, module, parameter, Access.PARAM)
+    def may_not(asker: SiteAsker, module: str, parameter: str, told: str) -> str:
+        return rules.refusal(asker.site, module, parameter, Access.PARAM, asker.modules, told)
+
+    gate = agent.bridge.gate
+
+    def may_not_here(asker: str, parameter: str, told: str) -> str:
+        if not asker or gate.admits(Access.PARAM, asker, parameter):
+            return ""
+        return refusal(Access.PARAM, asker, told)
+
+    def may(asker: str, access: Access, source: str) -> bool:
+        return not asker or gate.judge(access, asker, source).allowed
 
     exports = SiteParamExports(own.site, session, ask_module, may_not)
-    imports = SiteParamImports(own.site, session, clock.wall_ns, agent.params, lambda: neighbour.catalogue.sites)
+    imports = SiteParamImports(
+        own.site, session, clock.wall_ns, agent.params, lambda: neighbour.catalogue.sites, may_not_here
+    )
     params = SiteParams(exports, imports)
     neighbour.add(params)
     neighbour.on_leads = params.lead
-    why = SiteWhy(own.site, name, session, neighbour, history, rules)
+    why = SiteWhy(own.site, name, session, neighbour, history, rules, may)
     answers = SiteAnswers(
-        name, own, session, neighbour, history, seen, lambda: session.endpoints, imports.ask, why, clock.wall_ns
+        name,
+        own,
+        session,
+        neighbour,
+        history,
+        seen,
+        lambda: session.endpoints,
+        imports.ask,
+        why,
+        clock.wall_ns,
+        may if gate.on else None,
     )
     neighbour.add(answers)
     agent.sites.serve(answers)

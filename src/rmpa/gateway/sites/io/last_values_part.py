@@ -8,6 +8,8 @@ import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from rmpa.bridge.permission_gate import Needs
+from rmpa.config.permission_rules import Access
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.zenoh_api import Declared, ZenohQuery, ZenohSession
     from rmpa.ros.wire.tcpros import TopicDescription
 
+_NEEDS = Needs((Access.SUBSCRIBE,), "each topic, of the site", key="rmpa/1/<site>/<module>/v/**")
 _log = logging.getLogger(__name__)
 
 
@@ -90,7 +93,7 @@ class SiteLastValues(PassivePart):
         self._answering = self._refused = 0
         self._looking: dict[ValueKey, asyncio.Task[None]] = {}
         self._opening = asyncio.get_running_loop().create_task(store.open(), name="open last values")
-        self._queryable: Declared = session.queryable(value_key(site, "*", "**"), self._take)
+        self._queryable: Declared = session.queryable(value_key(site, "*", "**"), self._take, _NEEDS)
 
     def export(self, entry: SiteExport) -> None:
         """Keep the last value of a topic, if it is of those that are kept."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import secrets
 from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge.params import transfer
+from rmpa.bridge.permission_gate import Needs
+from rmpa.config.permission_rules import Access
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.gateway import limits
 from rmpa.gateway.sites.attachment import SiteAttachment
@@ -18,10 +19,14 @@ from rmpa.gateway.sites.params import (
     ParamAnswer,
     ParamNews,
     ParamQuestion,
+    SiteAsker,
     digest,
     from_json,
+    lost_with,
+    parameters_in,
     parse_param_key,
-    refused_leaf,
+    plain_key,
+    refused_one,
     to_json,
 )
 from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
@@ -33,6 +38,11 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _MISSING = "there is no parameter"
+_NEEDS = Needs(
+    (Access.PARAM,),
+    "each parameter, of the site and of the modules that ask; also by the module that has it",
+    key="rmpa/1/<site>/<module>/p/**",
+)
 
 
 class SiteParamExports:
@@ -42,8 +52,8 @@ class SiteParamExports:
         site: This site's name.
         session: The Zenoh session.
         ask: Asks a module of this site over the mesh: module, question, arguments; raises ``RmpaError``.
-        why_not: ``(site, module, parameter)``: why a site may not have a parameter; empty if it may. The site is
-            empty for programs that do not tell theirs.
+        why_not: ``(asker, module, parameter, told)``: why a site may not have a parameter; empty if it may. ``told``
+            is what it asked for: a parameter that was found in that may be a secret.
     """
 
     def __init__(
@@ -51,7 +61,7 @@ class SiteParamExports:
         site: str,
         session: ZenohSession,
         ask: Callable[[str, str, dict[str, Any]], Awaitable[object]],
-        why_not: Callable[[str, str, str], str],
+        why_not: Callable[[SiteAsker, str, str, str], str],
     ) -> None:
         self._site = site
         self._session = session
@@ -67,7 +77,7 @@ class SiteParamExports:
     def lead(self, leads: bool) -> None:
         """Answer while this gateway leads its site."""
         if leads and self._queryable is None:
-            self._queryable = self._session.queryable(f"{ROOT}/{self._site}/*/p/**", self._take)
+            self._queryable = self._session.queryable(f"{ROOT}/{self._site}/*/p/**", self._take, _NEEDS)
         elif not leads and self._queryable is not None:
             self._queryable.close()
             self._queryable = None
@@ -93,15 +103,17 @@ class SiteParamExports:
 
     async def _answer(self, query: ZenohQuery) -> None:
         try:
-            site = SiteAttachment.parse(query.attachment).path[-1] if query.attachment else ""
+            asker = SiteAsker(SiteAttachment.parse(query.attachment).path[-1] if query.attachment else "")
             module, name = parse_param_key(query.key)
             if name == GATEWAYS:
-                reply = (await self._for_gateway(site, module, ParamQuestion.parse(query.payload))).serialize()
+                question = ParamQuestion.parse(query.payload)
+                asker = SiteAsker(asker.site, question.askers)
+                reply = (await self._for_gateway(asker, module, question)).serialize()
             elif query.payload:
                 text = serialize_response(from_json(query.payload)).decode()
-                reply = to_json(await self._set(site, module, name, text))
+                reply = to_json(await self._set(asker, module, name, text))
             else:
-                reply = to_json(parse_response((await self._get(site, module, name)).encode()))
+                reply = to_json(parse_response((await self._get(asker, module, name)).encode()))
             query.reply(query.key, reply)
             query.finish()
         except PeerRefused as error:
@@ -119,54 +131,52 @@ class SiteParamExports:
         self.refused += 1
         query.reply_error(text)
 
-    async def _for_gateway(self, site: str, module: str, question: ParamQuestion) -> ParamAnswer:
+    async def _for_gateway(self, asker: SiteAsker, module: str, question: ParamQuestion) -> ParamAnswer:
         match question.op:
             case "get":
-                return ParamAnswer(text=await self._get(site, module, question.key))
+                return ParamAnswer(text=await self._get(asker, module, question.key))
             case "names":
-                return ParamAnswer(names=await self._names(site, module))
+                return ParamAnswer(names=await self._names(asker, module))
             case "set":
-                return ParamAnswer(count=await self._set(site, module, question.key, question.text))
+                return ParamAnswer(count=await self._set(asker, module, question.key, question.text))
             case "delete":
-                await self._delete(site, module, question.key)
+                await self._delete(asker, module, question.key)
                 return ParamAnswer()
             case _:
-                return ParamAnswer(values=await self._values(site, module, question.last))
+                return ParamAnswer(values=await self._values(asker, module, question.last))
 
-    async def _get(self, site: str, module: str, key: str) -> str:
-        text = await self._read(module, key)
-        self._judge(site, module, key, text)
+    async def _get(self, asker: SiteAsker, module: str, key: str) -> str:
+        text: str = await self._drive(asker, module, transfer.reading(transfer.GET, {"key": key}))
+        self._judge(asker, module, key, parameters_in(key, parse_response(text.encode())))
         return text
 
-    async def _read(self, module: str, key: str) -> str:
-        text: str = await self._drive(module, transfer.reading(transfer.GET, {"key": key}))
-        return text
-
-    async def _names(self, site: str, module: str) -> list[str]:
-        text = await self._drive(module, transfer.reading(transfer.NAMES, {}))
+    async def _present(self, asker: SiteAsker, module: str) -> list[str]:
+        text = await self._drive(asker, module, transfer.reading(transfer.NAMES, {}))
         names = parse_response(text.encode())
-        found = [str(name) for name in names] if isinstance(names, list) else []
-        return [name for name in found if not self._why_not(site, module, name)]
+        return [str(name) for name in names] if isinstance(names, list) else []
 
-    async def _set(self, site: str, module: str, key: str, text: str) -> int:
-        self._judge(site, module, key, text)
-        return int(await self._drive(module, transfer.writing(key, text, secrets.randbits(31))))
+    async def _names(self, asker: SiteAsker, module: str) -> list[str]:
+        found = await self._present(asker, module)
+        return [name for name in found if not self._why_not(asker, module, name, name)]
 
-    async def _delete(self, site: str, module: str, key: str) -> None:
-        self._refuse(self._why_not(site, module, key))
-        text = ""
-        with contextlib.suppress(PeerRefused):  # what is missing, or may not be read, is judged by its module
-            text = await self._read(module, key)
-        if text:
-            self._judge(site, module, key, text)
-        await self._ask(module, transfer.DELETE, {"key": key})
+    async def _set(self, asker: SiteAsker, module: str, key: str, text: str) -> int:
+        names = parameters_in(key, parse_response(text.encode()))
+        self._judge(asker, module, key, names)
+        # What the owner does not name it judges itself.
+        self._judge(asker, module, key, lost_with(names, await self._present(asker, module)))
+        return int(await self._drive(asker, module, transfer.writing(key, text, secrets.randbits(31))))
 
-    async def _values(self, site: str, module: str, last: dict[str, str]) -> dict[str, ParamNews]:
+    async def _delete(self, asker: SiteAsker, module: str, key: str) -> None:
+        self._judge(asker, module, key, [key])
+        self._judge(asker, module, key, lost_with([key], await self._present(asker, module)))
+        await self._ask(module, transfer.DELETE, asker.args({"key": key}))
+
+    async def _values(self, asker: SiteAsker, module: str, last: dict[str, str]) -> dict[str, ParamNews]:
         found = {}
         for key, known in last.items():
             text: str | None = None
             try:
-                text = await self._get(site, module, key)
+                text = await self._get(asker, module, plain_key(key))
             except RmpaError as error:
                 reason = error.reason if isinstance(error, PeerRefused) else str(error)
                 if not reason.startswith(_MISSING):
@@ -176,18 +186,14 @@ class SiteParamExports:
                 found[key] = ParamNews(text=text)
         return found
 
-    def _judge(self, site: str, module: str, key: str, text: str) -> None:
-        value = parse_response(text.encode())
-        self._refuse(refused_leaf(key, value, lambda name: self._why_not(site, module, name)))
-
-    def _refuse(self, why: str) -> None:
-        if why:
+    def _judge(self, asker: SiteAsker, module: str, key: str, names: list[str]) -> None:
+        if why := refused_one(names, lambda name: self._why_not(asker, module, name, key)):
             raise PeerRefused(f"site {self._site}", why)
 
-    async def _drive(self, module: str, steps: Generator[transfer.Question, object, Any]) -> Any:
+    async def _drive(self, asker: SiteAsker, module: str, steps: Generator[transfer.Question, object, Any]) -> Any:
         try:
-            question = next(steps)
+            what, args = next(steps)
             while True:
-                question = steps.send(await self._ask(module, *question))
+                what, args = steps.send(await self._ask(module, what, asker.args(args)))
         except StopIteration as done:
             return done.value

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import defaultdict
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rmpa.bridge.params import transfer
@@ -13,11 +12,23 @@ from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.gateway import limits
 from rmpa.gateway.sites.attachment import SiteAttachment
-from rmpa.gateway.sites.params import GATEWAYS, ParamAnswer, ParamNews, ParamQuestion, digest, followed_of, param_key
+from rmpa.gateway.sites.params import (
+    GATEWAYS,
+    ParamAnswer,
+    ParamNews,
+    ParamQuestion,
+    digest,
+    followed_of,
+    lost_with,
+    param_key,
+    parameters_in,
+    plain_key,
+    refused_one,
+)
 from rmpa.gateway.sites.services import NO_MD5
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Mapping
 
     from rmpa.gateway.zenoh_api import ZenohSession
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
@@ -29,8 +40,8 @@ class FollowedCore(Protocol):
     """The gateway's own parameters: ``bridge.params.io.part.Params``."""
 
     @property
-    def followed_by_peers(self) -> Iterable[str]:
-        """The keys that a linked module follows."""
+    def followed_by_peers(self) -> Mapping[str, frozenset[str]]:
+        """The keys that linked modules follow, each with the names of these modules."""
 
     async def provide(self, key: str, value: XmlRpcValue) -> None:
         """Set a parameter, of which the linked modules are notified; ``None`` deletes it."""
@@ -45,6 +56,8 @@ class SiteParamImports:
         stamp: The wall clock, nanoseconds since 1970.
         core: The gateway's own parameters, which hold followed ones as ``/<site>/<module>/<name>``.
         sites: Returns the names of the sites that are there.
+        why_not: ``(asker, parameter, told)``: why a module of this site, which asks, may not have a parameter, by its
+            name at the other site; empty if it may. ``told`` is the name that it asked for.
     """
 
     def __init__(
@@ -54,13 +67,16 @@ class SiteParamImports:
         stamp: Callable[[], int],
         core: FollowedCore,
         sites: Callable[[], Iterable[str]],
+        why_not: Callable[[str, str, str], str] = lambda _asker, _name, _told: "",
     ) -> None:
         self._site = site
         self._session = session
         self._stamp = stamp
         self._core = core
         self._sites = sites
-        self._transfers: dict[tuple[str, str], transfer.Transfers] = defaultdict(transfer.Transfers)
+        self._why_not = why_not
+        self._transfers: dict[str, transfer.Transfers] = {}
+        """What each module here reads or writes in portions, by its name; empty: this machine's user."""
         self._known: dict[str, str] = {}
         """The digest of each followed parameter, by its key here."""
         self.problems: dict[str, str] = {}
@@ -86,43 +102,83 @@ class SiteParamImports:
         """The number of parameters that are followed from other sites."""
         return len(self._known)
 
-    async def ask(self, site: str, module: str, what: str, args: dict[str, Any]) -> object:
+    async def ask(self, asker: str, site: str, module: str, what: str, args: dict[str, Any]) -> object:
         """Answer a request of ``bridge.params.transfer`` for a module of another site.
 
+        Args:
+            asker: The linked module that asks; empty for this machine's user.
+            site: The other site.
+            module: The module there.
+            what: The request.
+            args: Its arguments.
+
         Raises:
-            PeerRefused: Module or site refused.
+            PeerRefused: This gateway, module or site refused.
             UnreachableError: No gateway of that site answers for the module.
         """
-        transfers, now = self._transfers[site, module], asyncio.get_running_loop().time()
-        while len(self._transfers) > limits.SITE_PARAM_TRANSFERS_MAX:
-            del self._transfers[next(iter(self._transfers))]
-        key = str(args.get("key", ""))
+        if site == self._site:
+            raise PeerRefused(site, f"{module} is a module of this very site: ask it itself, by --peer {module}")
+        transfers, now = self._transfers_of(asker), asyncio.get_running_loop().time()
+        key, askers = plain_key(str(args.get("key", ""))), (asker,) if asker else ()
         match what:
             case transfer.GET:
-                found = await self._question(site, module, ParamQuestion(op="get", key=key))
-                return transfers.answer(found.text, now)
+                question = ParamQuestion(op="get", key=key, askers=askers)
+                return transfers.answer(await self._get(asker, site, module, question), now)
             case transfer.NAMES:
-                found = await self._question(site, module, ParamQuestion(op="names"))
-                return transfers.answer(await write_text("the list of parameters", list(found.names)), now)
+                found = await self._names(asker, site, module)
+                names = [name for name in found if not self._why_not(asker, name, name)]
+                return transfers.answer(await write_text("the list of parameters", list(names)), now)
             case transfer.MORE:
                 return transfers.more(args, now)
             case transfer.PUT:
                 return transfers.put(args, now)
             case transfer.SET:
                 text = transfers.written(args, now)
-                found = await self._question(site, module, ParamQuestion(op="set", key=key, text=text))
-                return {"count": found.count}
+                written = parameters_in(key, await read_text(text))
+                await self._judge_change(asker, site, module, key, written)
+                question = ParamQuestion(op="set", key=key, text=text, askers=askers)
+                return {"count": (await self._question(site, module, question)).count}
             case transfer.DELETE:
-                await self._question(site, module, ParamQuestion(op="delete", key=key))
+                await self._judge_change(asker, site, module, key, [key])
+                await self._question(site, module, ParamQuestion(op="delete", key=key, askers=askers))
                 return {}
         raise RemoteProtocolError(f"{what[:40]!r} is no question about parameters")
 
+    def _transfers_of(self, asker: str) -> transfer.Transfers:
+        found = self._transfers[asker] = self._transfers.pop(asker, transfer.Transfers())
+        while len(self._transfers) > limits.SITE_PARAM_TRANSFERS_MAX:
+            del self._transfers[next(iter(self._transfers))]
+        return found
+
+    async def _get(self, asker: str, site: str, module: str, question: ParamQuestion) -> str:
+        key = question.key
+        try:
+            text = (await self._question(site, module, question)).text
+        except PeerRefused:
+            self._judge(asker, key, [key])  # it is not told whether it is there
+            raise
+        self._judge(asker, key, parameters_in(key, await read_text(text)))
+        return text
+
+    async def _names(self, asker: str, site: str, module: str) -> list[str]:
+        askers = (asker,) if asker else ()
+        return (await self._question(site, module, ParamQuestion(op="names", askers=askers))).names
+
+    async def _judge_change(self, asker: str, site: str, module: str, key: str, written: list[str]) -> None:
+        self._judge(asker, key, written)
+        if asker:
+            self._judge(asker, key, lost_with(written, await self._names(asker, site, module)))
+
+    def _judge(self, asker: str, key: str, names: list[str]) -> None:
+        if why := refused_one(names, lambda name: self._why_not(asker, name, key)):
+            raise PeerRefused(f"site {self._site}", why)
+
     async def _question(self, site: str, module: str, question: ParamQuestion) -> ParamAnswer:
-        asker = SiteAttachment(1, self._stamp(), NO_MD5, "/rmpa", (self._site,))
+        origin = SiteAttachment(1, self._stamp(), NO_MD5, "/rmpa", (self._site,))
         replies = await self._session.get(
             param_key(site, module, GATEWAYS),
             question.serialize(),
-            asker.serialize(),
+            origin.serialize(),
             timeout=limits.SITE_PARAM_TIMEOUT,
         )
         for reply in sorted(replies, key=lambda each: not each.ok):
@@ -147,26 +203,28 @@ class SiteParamImports:
 
     async def look(self) -> None:
         """Ask once for all that modules here follow, and set what has changed; values of absent sites stay."""
-        wanted: dict[tuple[str, str], dict[str, str]] = {}
-        there = {*self._sites(), self._site}
-        for key in list(self._core.followed_by_peers):
+        wanted: dict[tuple[str, str, frozenset[str]], dict[str, str]] = {}
+        there = {*self._sites()} - {self._site}
+        for key, askers in self._core.followed_by_peers.items():
             found = followed_of(key)
             if (
                 found is not None
                 and found[0] in there
                 and sum(map(len, wanted.values())) < limits.SITE_PARAMS_AT_ONCE
             ):
-                wanted.setdefault(found[:2], {})[key] = found[2]
+                wanted.setdefault((*found[:2], askers), {})[key] = found[2]
         keys = {key for names in wanted.values() for key in names}
         for table in (self._known, self.problems):
             for key in [key for key in table if key not in keys]:
                 del table[key]
-        await asyncio.gather(*(self._look_at(site, module, names) for (site, module), names in wanted.items()))
+        await asyncio.gather(*(self._look_at(*whom, names) for whom, names in wanted.items()))
 
-    async def _look_at(self, site: str, module: str, names: dict[str, str]) -> None:
+    async def _look_at(self, site: str, module: str, askers: frozenset[str], names: dict[str, str]) -> None:
+        """Ask for what modules here follow at one module; all of them must be allowed to have it."""
         last = {name: self._known.get(key, "") for key, name in names.items()}
         try:
-            found = (await self._question(site, module, ParamQuestion(op="values", last=last))).values
+            question = ParamQuestion(op="values", last=last, askers=tuple(sorted(askers)))
+            found = (await self._question(site, module, question)).values
         except RmpaError as error:
             found = {name: ParamNews(problem=str(error)) for name in last}
         for key, name in names.items():

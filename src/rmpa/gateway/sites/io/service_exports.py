@@ -8,6 +8,8 @@ import logging
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from rmpa.bridge.permission_gate import Needs
+from rmpa.config.permission_rules import Access
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.zenoh_api import Declared, ZenohQuery, ZenohSession
     from rmpa.ros.wire.services import ServiceDescription
 
+_NEEDS = Needs((Access.CALL,), "the service, of the site", key="rmpa/1/<site>/<module>/s/**")
 _log = logging.getLogger(__name__)
 _ANYBODY: Final = ""
 """The site of a program that sends no attachment."""
@@ -89,7 +92,7 @@ class SiteServiceExports:
         """
         self.withdraw(source, to)
         key = data_key(self._site, source.module, SourceKind.SERVICE, UNKNOWN_TYPE, source.name, to)
-        queryable = self._session.queryable(key, lambda query: self._take(source, to, query))
+        queryable = self._session.queryable(key, lambda query: self._take(source, to, query), _NEEDS)
         slots = asyncio.Semaphore(limits.SITE_CALLS_AT_ONCE)
         self._exported[source.module, source.name, to] = _Exported(source, to, queryable, slots)
 

@@ -13,6 +13,7 @@ from rmpa.core.names import is_global_name
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.sites.attachment import SiteAttachment
+from rmpa.gateway.sites.io.site_why import ACCESS
 from rmpa.gateway.sites.last_values import HEADER, ValueHeader, ValueKey, value_key
 from rmpa.gateway.sites.part import PassivePart
 from rmpa.gateway.sites.services import NO_MD5
@@ -22,6 +23,7 @@ from rmpa.observe.sites import LastValueInfo, SiteInfo, SiteModuleInfo, SiteSour
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
 
+    from rmpa.config.permission_rules import Access
     from rmpa.gateway.sites.history import SiteHistory
     from rmpa.gateway.sites.io.seen_values import SiteSeenValues
     from rmpa.gateway.sites.io.site_why import SiteWhy
@@ -43,9 +45,11 @@ class SiteAnswers(PassivePart):
         history: Since when sites are there or away.
         seen: What came of other sites' latched topics, which answers for a site that is off as a whole.
         endpoints: The Zenoh endpoints that the session is connected to.
-        ask_param: Asks a module of another site about a parameter: site, module, question, arguments.
+        ask_param: Asks a module of another site about a parameter: asker, site, module, question, arguments.
         why: Tells the ways of a topic or a service through this gateway; closed here.
         stamp: The wall clock, nanoseconds since 1970.
+        may: ``(asker, access, name)``: whether a module of this site may have a topic or service, by its name here.
+            ``None``: trust is off, and each may have all.
     """
 
     name = "answers"
@@ -59,9 +63,10 @@ class SiteAnswers(PassivePart):
         history: SiteHistory,
         seen: SiteSeenValues,
         endpoints: Callable[[], tuple[str, ...]],
-        ask_param: Callable[[str, str, str, dict[str, Any]], Awaitable[object]],
+        ask_param: Callable[[str, str, str, str, dict[str, Any]], Awaitable[object]],
         why: SiteWhy,
         stamp: Callable[[], int],
+        may: Callable[[str, Access, str], bool] | None = None,
     ) -> None:
         self._gateway = gateway
         self._own = own
@@ -73,6 +78,7 @@ class SiteAnswers(PassivePart):
         self._ask_param = ask_param
         self._why = why
         self._stamp = stamp
+        self._may = may
         self._readings: dict[tuple[str, str, str, str], bytes] = {}
         self._forgetting: asyncio.TimerHandle | None = None
 
@@ -83,20 +89,23 @@ class SiteAnswers(PassivePart):
         if self._forgetting is not None:
             self._forgetting.cancel()
 
-    async def answer(self, what: str, args: dict[str, Any], /) -> Any:
+    async def answer(self, what: str, args: dict[str, Any], asker: str = "", /) -> Any:
         """The reply to one question of ``observe.io.site_requests``; raises as that says."""
         if what == REPORT:
-            return self._report(self._site_names(), sources=False)
+            return self._report(self._site_names(), asker, sources=False)
         if what == WHY:
-            name, site, module, asker = (str(args.get(key) or "") for key in ("name", "site", "module", "asker"))
+            name, site, module = (str(args.get(key) or "") for key in ("name", "site", "module"))
             return await self._why.ways(name, site, module, asker, service=args.get("service") is True)
         site = str(args.get("site", ""))
         if what == INFO:
-            return await self._info(site)
+            return await self._info(site, asker)
         module = str(args.get("module", ""))
         for name in (site, module):
             if peer_name_problem(name) is not None:
                 raise RemoteProtocolError(f"{name[:80]!r} is not the name of a site or a module")
+        if what in (LAST, BODY) and site == self._own.site and not self._owns(asker, module):
+            # This gateway's permissions say nothing about what that module lets the asking one have.
+            raise PeerRefused(site, f"{module} is a module of this very site: subscribe to it")
         if what == LAST:
             return await self._last(site, module, _topic(args))
         if what == BODY:
@@ -106,19 +115,28 @@ class SiteAnswers(PassivePart):
             inner = args.get("args")
             if not isinstance(inner, dict):
                 raise RemoteProtocolError("a question about a parameter has no arguments")
-            return await self._ask_param(site, module, str(args.get("what", "")), inner)
+            return await self._ask_param(asker, site, module, str(args.get("what", "")), inner)
         raise RemoteProtocolError(f"{what[:80]!r} is no question about sites")
 
-    async def _info(self, site: str) -> SitesReport:
+    async def _info(self, site: str, asker: str) -> SitesReport:
         known = self._site_names()
         seen = await self._seen.of_site(site)
         if site not in known and not seen:
-            return self._report(known, sources=False)  # the names of all are the answer
-        report = self._report([site], sources=True)
+            return self._report(known, asker, sources=False)  # the names of all are the answer
+        report = self._report([site], asker, sources=True)
         away = self._is_away(site)
-        values = [_info(key, header, self._own.site, text=False) for key, header in seen.items()] if away else []
+        told = {key: header for key, header in seen.items() if self._tells(asker, SourceKind.TOPIC, key.topic)}
+        values = [_info(key, header, self._own.site, text=False) for key, header in told.items()] if away else []
         found = msgspec.structs.replace(report.sites[0], values=(*report.sites[0].values, *_sorted(values)))
         return msgspec.structs.replace(report, sites=(found,))
+
+    def _tells(self, asker: str, kind: SourceKind, name: str) -> bool:
+        """Whether a module of this site is told of a topic or service that has this name here."""
+        return self._may is None or self._may(asker, ACCESS[kind], name)
+
+    def _owns(self, asker: str, module: str) -> bool:
+        """Whether what a module of this site has is told by this gateway: the others it asks itself."""
+        return self._may is None or asker in ("", module)
 
     def _is_away(self, site: str) -> bool:
         """Whether a site is another one that is not there now."""
@@ -139,7 +157,7 @@ class SiteAnswers(PassivePart):
         known = ", ".join(self._sites.catalogue.sites) or "none"
         raise UnreachableError(f"site {site!r}", "any Zenoh router that this gateway reaches", f"known are: {known}")
 
-    def _report(self, names: list[str], *, sources: bool) -> SitesReport:
+    def _report(self, names: list[str], asker: str, *, sources: bool) -> SitesReport:
         found = self._sites.report()
         return SitesReport(
             gateway=self._gateway,
@@ -149,23 +167,23 @@ class SiteAnswers(PassivePart):
             problem="" if self._endpoints() else "it is connected to no other Zenoh session",
             endpoints=self._endpoints(),
             sites=tuple(
-                self._this_site(sources=sources, parts=found.get("parts"))
+                self._this_site(asker, sources=sources, parts=found.get("parts"))
                 if name == self._own.site
-                else self._other(name, sources=sources)
+                else self._other(name, asker, sources=sources)
                 for name in names
             ),
         )
 
-    def _this_site(self, *, sources: bool, parts: object) -> SiteInfo:
+    def _this_site(self, asker: str, *, sources: bool, parts: object) -> SiteInfo:
         exports = self._sites.exports
         modules: dict[tuple[str, str], list[int]] = {}
         for source in exports.sources:
             counts = modules.setdefault((source.module, source.instance), [0, 0])
-            counts[source.kind is SourceKind.SERVICE] += 1
-        refused = list(exports.refusals())
+            counts[source.kind is SourceKind.SERVICE] += self._owns(asker, source.module)
+        refused = [(source, why) for source, why in exports.refusals() if self._owns(asker, source.module)]
         listed: list[SiteSourceInfo] = []
         if sources:
-            offered = [(source, "") for source in exports.sources]
+            offered = [(source, "") for source in exports.sources if self._owns(asker, source.module)]
             listed = [
                 SiteSourceInfo(
                     kind=_KINDS[source.kind],
@@ -188,21 +206,21 @@ class SiteAnswers(PassivePart):
             ),
             sources=tuple(listed[: limits.SITE_REPORT_SOURCES_MAX]),
             not_shown=len(refused),
-            values=_values(parts) if sources else (),
+            values=tuple(value for value in _values(parts) if sources and self._owns(asker, value.module)),
         )
 
-    def _other(self, site: str, *, sources: bool) -> SiteInfo:
+    def _other(self, site: str, asker: str, *, sources: bool) -> SiteInfo:
         catalogue = self._sites.catalogue
         if site not in catalogue.sites:
             return SiteInfo(name=site, state="unreachable", since_ago=self._history.since_ago(site))
         refused = {
             (source.kind, source.module, source.node, source.name): why
             for source, why in self._sites.imports.refusals()
-            if source.module.site == site
+            if source.module.site == site and self._tells(asker, source.kind, source.name)
         }
         modules, listed = [], []
         for module in catalogue.modules(site):
-            each = self._module(module, refused)
+            each = self._module(module, asker, refused)
             modules.append(_counted(module, each))
             listed += each
         gateways = catalogue.gateways(site)
@@ -218,11 +236,13 @@ class SiteAnswers(PassivePart):
         )
 
     def _module(
-        self, module: SiteModule, refused: dict[tuple[SourceKind, SiteModule, str, str], str]
+        self, module: SiteModule, asker: str, refused: dict[tuple[SourceKind, SiteModule, str, str], str]
     ) -> list[SiteSourceInfo]:
         found = []
         for source in self._sites.catalogue.sources(module):
             entry = self._sites.imports.entry(source)
+            if not self._tells(asker, source.kind, entry.source.name if entry is not None else source.name):
+                continue
             found.append(
                 SiteSourceInfo(
                     kind=_KINDS[source.kind],

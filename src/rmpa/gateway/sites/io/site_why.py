@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
+from rmpa.bridge.permission_gate import Needs
+from rmpa.config.permission_rules import Access
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
@@ -23,10 +25,10 @@ from rmpa.gateway.sites.why import (
     why_key,
 )
 from rmpa.observe.check import FAIL, OK, Check
-from rmpa.observe.why.diagnosis import Diagnosis, until_failure
+from rmpa.observe.why.diagnosis import Diagnosis, permission_there, until_failure
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.sites.history import SiteHistory
@@ -35,6 +37,13 @@ if TYPE_CHECKING:
     from rmpa.gateway.sites.rules import CrossingRules
     from rmpa.gateway.zenoh_api import Declared, ZenohQuery, ZenohSession
 
+_NEEDS = Needs(
+    (Access.SUBSCRIBE, Access.CALL),
+    "the topic or service, of the site",
+    key="rmpa/1/<site>/-gateway/why",
+)
+ACCESS: Final = {SourceKind.TOPIC: Access.SUBSCRIBE, SourceKind.SERVICE: Access.CALL}
+"""What a module or a site must be allowed to be told of a source."""
 _KINDS = {SourceKind.TOPIC: "topic", SourceKind.SERVICE: "service"}
 _PARTS = {SourceKind.TOPIC: "topics", SourceKind.SERVICE: "services"}
 _ReportKey = tuple[SourceKind, str, str, str, str, str]
@@ -51,6 +60,7 @@ class SiteWhy:
         sites: What is known of sites.
         history: Since when sites are there or away.
         rules: Decide what may cross.
+        may: ``(asker, access, name)``: whether a module of this site may have a topic or service, by its name here.
     """
 
     def __init__(
@@ -61,6 +71,7 @@ class SiteWhy:
         sites: Sites,
         history: SiteHistory,
         rules: CrossingRules,
+        may: Callable[[str, Access, str], bool] = lambda _asker, _access, _name: True,
     ) -> None:
         self._site = site
         self._gateway = gateway
@@ -68,7 +79,8 @@ class SiteWhy:
         self._sites = sites
         self._history = history
         self._rules = rules
-        self._queryable: Declared = session.queryable(why_key(site), self._take)
+        self._may = may
+        self._queryable: Declared = session.queryable(why_key(site), self._take, _NEEDS)
 
     def close(self) -> None:
         """Answer no more."""
@@ -83,21 +95,30 @@ class SiteWhy:
             name: A topic or service, by its name at the module that asks.
             site: From this site alone; empty for all.
             module: From this module of it alone; empty for all.
-            asker: The module that asks, whose own sources are told of too; empty for this gateway.
+            asker: The module that asks, whose own sources are told of too; empty for this machine's user.
             service: Whether a service is meant.
         """
         known = site in self._sites.catalogue.sites or site in self._history.away
         if not self._sites.leads or (site and not known and not module):
             return []  # a name that is no site's is a peer's
-        found = [each for each in self._here(name, site, module) if not service or each.kind is SourceKind.SERVICE]
+        kinds = (SourceKind.SERVICE,) if service else tuple(ACCESS)
+        found = [
+            each
+            for each in self._here(name, site, module)
+            if each.kind in kinds and self._may(asker, ACCESS[each.kind], each.here or each.name)
+        ]
         ways = list(await asyncio.gather(*(self._way(each) for each in found)))
+        permitted = [kind for kind in kinds if self._may(asker, ACCESS[kind], name)]
+        if site and not ways and not permitted:
+            denied = permission_there(self._gateway, asker, ACCESS[kinds[0]], name)
+            return [self._diagnosis(name, f"{site}/{module}" if module else site, "", kinds[0], [denied])]
         if site and not ways:
-            ways.append(await self._no_way(name, site, module, service=service))
-        if not site:
+            ways.append(await self._no_way(name, site, module, permitted))
+        if not site and permitted:
             for away, had in self._history.had(name):
-                ways.append(await self._no_way(name, away, had, service=service))
+                ways.append(await self._no_way(name, away, had, permitted))
         if not site:
-            ways += self._leaving(name, asker if asker != self._gateway else "", service=service)
+            ways += self._leaving(name, asker, service=service)
         return ways
 
     # --- what comes in ----------------------------------------------------------------------------------------------
@@ -133,12 +154,9 @@ class SiteWhy:
 
     async def _way(self, here: SourceHere) -> Diagnosis:
         answer, refusal = await self._ask(here.site, here.name, here.module)
+        mine = (here.kind.value, here.module)
         there = next(
-            (
-                s
-                for s in answer.sources
-                if s.kind == here.kind.value and s.module == here.module and s.node == here.node
-            ),
+            (s for s in answer.sources if (s.kind, s.module) == mine and s.node in (here.node, "")),
             None,
         )
         stages = [
@@ -155,10 +173,11 @@ class SiteWhy:
         ]
         return self._diagnosis(here.here or here.name, f"{here.site}/{here.module}", here.node, here.kind, stages)
 
-    async def _no_way(self, name: str, site: str, module: str, *, service: bool) -> Diagnosis:
-        """A site is named that has nothing of that name, as it is seen here."""
-        answer, refusal = await self._ask(site, name, module)
-        wanted = [each for each in answer.sources if not service or each.kind == SourceKind.SERVICE.value]
+    async def _no_way(self, name: str, site: str, module: str, kinds: list[SourceKind]) -> Diagnosis:
+        """A site is named that has nothing of that name, as it is seen here; of kinds that the asker may have."""
+        service = SourceKind.TOPIC not in kinds
+        answer, refusal = await self._ask(site, name, module, service=service)
+        wanted = [each for each in answer.sources if SourceKind(each.kind) in kinds]
         there = wanted[0] if wanted else None
         stages = [self._site_stage(site), *there_stages(site, module, name, there, refusal)]
         if there is not None and not there.refused:
@@ -214,7 +233,8 @@ class SiteWhy:
         exports, hidden = self._sites.exports, set()
         for entry in exports.entries:
             source, to = entry.source, entry.announced.to
-            refused = self._rules.refusal(asking, source.module, source.name) if asking else ""
+            access = ACCESS[source.kind]
+            refused = self._rules.refusal(asking, source.module, source.name, access) if asking else ""
             if asking and to not in ("", asking):
                 if not refused or source in hidden:
                     continue  # another entry is the one for the site that asks
@@ -240,10 +260,10 @@ class SiteWhy:
 
     # --- the other gateway --------------------------------------------------------------------------------------
 
-    async def _ask(self, site: str, name: str, module: str) -> tuple[WhyAnswer, str]:
+    async def _ask(self, site: str, name: str, module: str, *, service: bool = False) -> tuple[WhyAnswer, str]:
         if site not in self._sites.catalogue.sites:
             return WhyAnswer(), "it is not there"
-        question = msgspec.json.encode(WhyQuestion(site=self._site, name=name, module=module))
+        question = msgspec.json.encode(WhyQuestion(site=self._site, name=name, module=module, service=service))
         replies = await self._session.get(why_key(site), question, timeout=limits.SITE_ASK_TIMEOUT, all_complete=True)
         problem = "it does not answer; is it of an earlier release?"
         for reply in replies:
@@ -264,13 +284,20 @@ class SiteWhy:
         except RemoteProtocolError as error:
             query.reply_error(str(error))
             return
-        sources = tuple(
+        kinds = (SourceKind.SERVICE,) if question.service else tuple(ACCESS)
+        denials = {kind: self._rules.denial(question.site, question.name, ACCESS[kind]) for kind in kinds}
+        sources = [
             there
             for source, there, _ in self._out(question.site)
-            if source.name == question.name and question.module in ("", source.module)
-        )
+            if source.name == question.name
+            and question.module in ("", source.module)
+            and not denials.get(source.kind, "")
+        ]
+        if denial := denials[kinds[0]]:
+            # Whether or not it is there: that is not told.
+            sources.append(SourceThere(kind=kinds[0].value, module=question.module, node="", refused=denial))
         modules = tuple(sorted({module.name for module in self._sites.exports.modules}))
-        query.reply(query.key, msgspec.json.encode(WhyAnswer(sources=sources, modules=modules)))
+        query.reply(query.key, msgspec.json.encode(WhyAnswer(sources=tuple(sources), modules=modules)))
         query.finish()
 
 

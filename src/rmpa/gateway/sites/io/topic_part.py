@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
+from rmpa.bridge.permission_gate import Needs
+from rmpa.config.permission_rules import Access
 from rmpa.core.counters import Counters
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
@@ -146,8 +148,16 @@ class SiteTopics:
         if there and module not in self._questions:
             prefix = f"{ROOT}/{module.site}/{module.name}/d"
             self._questions[module] = (
-                self._session.queryable(f"{prefix}/t/**", lambda query: self._on_header_query(module, query)),
-                self._session.queryable(f"{prefix}/m/*", lambda query: self._on_definition_query(module, query)),
+                self._session.queryable(
+                    f"{prefix}/t/**",
+                    lambda query: self._on_header_query(module, query),
+                    Needs((Access.SUBSCRIBE,), "the topic, of the site", key="rmpa/1/<site>/<module>/d/t/**"),
+                ),
+                self._session.queryable(
+                    f"{prefix}/m/*",
+                    lambda query: self._on_definition_query(module, query),
+                    Needs((), "the definition of a type whose md5 sum is known", key="rmpa/1/<site>/<module>/d/m/*"),
+                ),
             )
         elif not there:
             for declared in self._questions.pop(module, ()):

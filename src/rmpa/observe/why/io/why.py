@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import msgspec
 
 from rmpa.bridge import limits
+from rmpa.bridge.permission_gate import Needs
+from rmpa.config.permission_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
 from rmpa.core.names import is_global_name
@@ -77,9 +79,10 @@ class WhyService:
         self._snapshots = snapshots
         self._topics = TopicEvidence(settings, core, bridge, snapshots)
         self._services = ServiceEvidence(settings, core, bridge, services)
-        bridge.rpc.on_request(TOPIC, self._topics.answer)
-        bridge.rpc.on_request(SERVICE, self._services.answer)
-        bridge.rpc.on_request(HERE, self._answer_here)
+        rpc = bridge.rpc
+        rpc.on_request(TOPIC, self._topics.answer, Needs((Access.SUBSCRIBE,), "the topic, and those like it"))
+        rpc.on_request(SERVICE, self._services.answer, Needs((Access.CALL,), "the service, and those like it"))
+        rpc.on_request(HERE, self._answer_here, Needs((Access.PUBLISH,), "the topic, which the peer publishes"))
 
     def reload(self, settings: Settings) -> None:
         """Use other settings from now on."""
@@ -122,7 +125,7 @@ class WhyService:
     async def _through_gateways(self, name: str, peer: str | None, *, service: bool) -> tuple[Diagnosis, ...]:
         """The ways from other sites and to them: ``peer`` is a site, or a site and a module of it."""
         site, _, module = (peer or "").partition("/")
-        asked = {"name": name, "site": site, "module": module, "asker": self._name, "service": service}
+        asked = {"name": name, "site": site, "module": module, "service": service}
         found: list[Diagnosis] = []
         for answer in await self._sites.all(WHY_SITES, asked):
             with contextlib.suppress(msgspec.ValidationError):  # of another release
