@@ -183,12 +183,17 @@ class TrustOperations:
         return TrustReply(module=name, done=True, number=deny.number)
 
     def sign(self, args: Args) -> dict[str, str]:
-        """Answer a join by files: ``request`` in base64; the reply has the module's name and the file's content."""
+        """Answer a join by files: ``request`` in base64, ``module``: a member that may join again.
+
+        The reply has the module's name and the file's content.
+        """
         try:
             request = base64.b64decode(str(args.get("request", "")), validate=True)
         except ValueError:
             raise ConfigError("request", "is not in base64") from None
-        asked, answer = self._authority().join_file(request)
+        joins, again = self._trust.joins, str(args.get("module") or "")
+        is_in_use = (lambda _: False) if joins is None else joins.is_in_use
+        asked, answer = self._authority().join_file(request, again, is_in_use)
         return {
             "module": asked.name,
             "key": asked.key_hash[: limits.FINGERPRINT_BYTES].hex(),

@@ -54,7 +54,11 @@ _FINGERPRINT: Final = 2 * limits.FINGERPRINT_BYTES
 @click.option(
     "--for", "lifetime", metavar="TIME", default="15min", help="Validity: 90s, 15min, 2h, 3d. [default: 15min]"
 )
-@click.option("--module", metavar="MODULE", help="The only module that may use it. [default: any]")
+@click.option(
+    "--module",
+    metavar="MODULE",
+    help="The only module that may use it, which may be one that joins again. [default: any]",
+)
 @click.option(
     "--address", metavar="HOST[:PORT]", help="Where the module reaches this one. [default: as other agents do]"
 )
@@ -87,7 +91,8 @@ def invite(
     host, port = _address(address)
     place = find_place(name, file)
     if sign is not None:
-        _sign(place, Path(sign), Path(out) if out else Path(f"{sign}.answer"), yes=yes, as_json=as_json)
+        answer = Path(out) if out else Path(f"{sign}.answer")
+        _sign(place, Path(sign), answer, module or "", yes=yes, as_json=as_json)
         return
     if place.agent != "secured":
         membership = place.membership()
@@ -158,7 +163,7 @@ def _await_join(place: TrustPlace, invited: InviteReply, *, yes: bool, as_json: 
         click.echo(f"{step.module} has joined", err=True)
 
 
-def _sign(place: TrustPlace, request: Path, out: Path, *, yes: bool, as_json: bool) -> None:
+def _sign(place: TrustPlace, request: Path, out: Path, module: str, *, yes: bool, as_json: bool) -> None:
     """Answer a join by files."""
     check_library()
     from rmpa.trust import certificates
@@ -173,16 +178,21 @@ def _sign(place: TrustPlace, request: Path, out: Path, *, yes: bool, as_json: bo
     except (ValueError, certificates.CertificateError) as error:
         remedy = "make it by rmpa trust join --request FILE"
         raise ConfigError(str(request), f"is no request: {error}", remedy) from None
+    if module and module != wanted.name:
+        raise ConfigError("--module", f"is {module}, and the request is of {wanted.name}")
+    if out.exists():  # before a certificate takes the name
+        raise ConfigError(str(out), "exists already", "choose another --out, or remove it")
     key = wanted.key_hash[: limits.FINGERPRINT_BYTES].hex()
     click.echo(f"{wanted.name} asks with the key {grouped(key)}", err=True)
     if not yes and not confirm(f"Does {wanted.name} show this key?"):
         raise ConfigError("rmpa trust invite --sign", "nothing was signed")
     if place.agent == "secured":
-        answer = place.call("sign", dict[str, str], request=b64encode(data).decode())["answer"].encode()
+        reply = place.call("sign", dict[str, str], request=b64encode(data).decode(), module=module)
+        answer = reply["answer"].encode()
     else:
         import msgspec
 
-        _, made = place.authority(place.membership()).join_file(data)
+        _, made = place.authority(place.membership()).join_file(data, module)
         answer = msgspec.json.encode(made)
     _write_secret(out, answer)
     if as_json:
@@ -284,6 +294,8 @@ def join(
     files = _accepted(place, Path(accept), ca) if accept is not None else _join_by_token(place, token or "", yes=yes)
     place.store.save(files)
     place.store.forget("request.key")
+    import time
+
     from rmpa.trust import certificates
 
     found = certificates.verify(files.certificate, files.ca, None)
@@ -291,10 +303,23 @@ def join(
         print_json(TrustReply(module=found.name, done=True, expires=int(found.expires)))
         return
     print_line(f"{found.name} has joined; its certificate ends {date_of(found.expires)}, and renews itself before")
+    if text := _clock_problem(time.time(), found.issued, by_files=accept is not None):
+        warn(text)
     if place.socket is not None:
         warn(f"the agent {place.name} runs without trust until it is started again")
     else:
         print_line("Next: rmpa up; rmpa trust check says what other modules may do here.")
+
+
+def _clock_problem(wall: float, issued: float, *, by_files: bool) -> str:
+    """What is wrong with this machine's clock, by a certificate that was issued just now; empty: nothing."""
+    off = wall - issued
+    if abs(off) <= limits.CLOCK_TOLERANCE or (by_files and off > 0):
+        return ""
+    here = f"the clock of this machine shows {date_of(wall)}, the authority's {date_of(issued)}"
+    if off < -limits.CERTIFICATE_BACKDATE:
+        return f"{here}: it counts as not set, and no times are checked until it is (timedatectl, chrony)"
+    return f"{here}: links are refused while they differ by more than {limits.CLOCK_TOLERANCE:.0f} s; set it"
 
 
 def _join_by_token(place: TrustPlace, text: str, *, yes: bool) -> MemberFiles:

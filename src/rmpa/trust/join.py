@@ -353,7 +353,8 @@ class InvitingSide(_Side):
         serial: A random number for the certificate.
         nonce: ``limits.NONCE_BYTES`` random bytes.
         now: Monotonic seconds.
-        is_taken: Whether a member that is linked has a name.
+        is_taken: Whether a member, or another module that joins, has a name; asked when one asks for it, and again
+            before the certificate is issued.
     """
 
     def __init__(
@@ -396,7 +397,10 @@ class InvitingSide(_Side):
         if self._over:
             raise LocalProtocolError("the join is over")
         self._code.agree()
-        self._grant(wall)
+        try:
+            self._grant(wall)
+        except _Refused as error:
+            self._refuse(error.reason, error.text)
 
     def _handle(self, message: _Message, wall: float | None) -> None:
         if wall is None:
@@ -423,8 +427,7 @@ class InvitingSide(_Side):
         proof = proof_of(self._book.key_of(self._token_id) or b"", hello.request, hello.commitment, self._server)
         if not hmac.compare_digest(proof, hello.proof):
             raise _Refused("token", "the hello is not signed with the token's key")
-        if self._is_taken(request.name):
-            raise _Refused("taken", f"a module named {request.name} is a member: choose another --name, or revoke it")
+        self._check_free(request.name)
         context = CodeContext(request.name, request.key_hash, _hash(self._secrets.ca), self._token_id)
         self._send(_Challenge(self._code.receive_commitment(hello.commitment, context)))
         self._request = request
@@ -434,10 +437,16 @@ class InvitingSide(_Side):
         if not self._agreed_there or self._code.state is not CodeState.AGREED:
             return
         assert self._request is not None  # noqa: S101 - there is no code without it
+        self._check_free(self._request.name)  # minutes have passed
         secrets = self._secrets
         certificate = certificates.issue(self._request, secrets.ca, secrets.ca_key, self._serial, wall)
         self._send(_Grant(certificate, secrets.keys, secrets.deny))
         self._end(Joined(self._request.name, certificate, secrets.ca, secrets.keys, secrets.deny))
+
+    def _check_free(self, name: str) -> None:
+        if self._is_taken(name):
+            text = f"a module named {name} is a member, or joins just now: choose another --name, or revoke it"
+            raise _Refused("taken", text)
 
 
 def proof_of(key: bytes, request: bytes, commitment: bytes, server: bytes) -> bytes:

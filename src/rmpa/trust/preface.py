@@ -7,7 +7,7 @@
      5 purpose   1 byte    1 link, 2 join, 3 renewal
      6 key       2 bytes   the low 16 bits of the group key's number; 0 for a join
      8 id        8 bytes   join: the token's; else 0
-    16 time      8 bytes   the dialler's wall clock in ms since 1970; 0 if it is not set
+    16 time      8 bytes   the dialler's wall clock in ms since 1970; 0 if it is not set, and for a join
     24 nonce    16 bytes   random
     40 tag      16 bytes   HMAC-SHA256 over all before it, the first half
 

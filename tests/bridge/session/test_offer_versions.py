@@ -28,7 +28,8 @@ class Scene:
         self.session = PeerSession(1, cast("Any", link), cast("Any", None))
         self.versions = OfferVersions(lambda: [self.session], self._want, lambda: 1.0)
         handlers: dict[str, Callable[[PeerSession, dict[str, Any]], None]] = {}
-        self.versions.listen(cast("Any", SimpleNamespace(on_notification=handlers.__setitem__)), cast("Any", None))
+        rpc = SimpleNamespace(on_notification=lambda what, told, _needs: handlers.__setitem__(what, told))
+        self.versions.listen(cast("Any", rpc), cast("Any", None))
         self._told = handlers[OFFERS]
 
     def hear(self, version: int) -> None:

@@ -13,7 +13,14 @@ import pytest
 
 pytest.importorskip("cryptography")
 
-from rmpa.core.errors import LocalProtocolError, PeerRefused, RemoteProtocolError, StartError, UnreachableError
+from rmpa.core.errors import (
+    ConfigError,
+    LocalProtocolError,
+    PeerRefused,
+    RemoteProtocolError,
+    StartError,
+    UnreachableError,
+)
 from rmpa.trust import certificates, limits
 from rmpa.trust.certificates import CertificateError, make_request
 from rmpa.trust.documents import DocumentKind
@@ -364,6 +371,49 @@ async def test_the_name_of_an_absent_member_is_not_given_to_another(lab: Lab) ->
         await lab.join(lab.invite(unattended=True))  # its certificate has ended
 
 
+async def test_of_two_modules_that_join_under_one_name_at_a_time_one_becomes_a_member(lab: Lab) -> None:
+    async with running(lab):
+        first, second = lab.invite(), lab.invite("arm")
+        joining = asyncio.ensure_future(lab.join(first))
+        await code_shown(lab, first)
+        with pytest.raises(PeerRefused, match=r"joins just now.*\(taken\)"):
+            await lab.join(second, "arm")
+        key = private_key(lab.base.files.key, "module.key")
+        for name in ("arm", "ARM"):
+            with pytest.raises(ConfigError, match="joins just now"):
+                lab.authority.join_file(make_request(key, name), "arm", lab.server.is_in_use)
+        lab.server.answer(first.token_id, agree=True)
+        await joining
+        await lab.join(lab.invite("arm", unattended=True))  # away, and invited by its name
+
+
+async def test_a_name_that_was_taken_while_the_code_was_compared_is_not_granted(lab: Lab) -> None:
+    async with running(lab):
+        token = lab.invite("arm")
+        joining = asyncio.ensure_future(lab.join(token))
+        await code_shown(lab, token)
+        lab.taken.add("arm")  # the member of that name is back
+        lab.server.answer(token.token_id, agree=True)
+        with pytest.raises(PeerRefused, match=r"a module named arm is a member.*\(taken\)"):
+            await joining
+        assert [each.name for each in lab.authority.issued] == ["base"]
+
+
+@pytest.mark.parametrize("wall", [0.0, WALL - 3 * DAY, WALL + 3 * DAY])
+async def test_a_module_joins_whatever_its_clock_shows(lab: Lab, wall: float) -> None:
+    """A robot without a battery for its clock has the time of its last shutdown, or 1970."""
+    async with running(lab):
+        clock = HandClock(wall_seconds=wall)
+        files = await join_mesh(lab.invite(unattended=True), "arm", clock, lambda _code: asyncio.sleep(0, True))
+    store = TrustStore(lab.folder, "arm")
+    store.save(files)
+    arm = Membership.load(store, clock, clock.wall)
+    assert (arm.wall() is None) == (wall < WALL)
+    if arm.wall() is None:
+        arm.judge_member(lab.base.files.certificate, "base")
+        assert Preface.parse(arm.preface(Purpose.LINK)).time_ms == 0
+
+
 async def test_two_connections_with_one_token_at_once_are_one_join(
     lab: Lab, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -430,6 +480,9 @@ def test_a_join_by_files(lab: Lab) -> None:
     assert asked.name == "arm"
     assert certificates.verify(answer.certificate, answer.ca, WALL).name == "arm"
     assert "kkkk" not in repr(answer)
+    with pytest.raises(ConfigError, match=r"a module named arm is a member.*: --module arm; else rmpa trust revoke"):
+        lab.authority.join_file(request)
+    assert lab.authority.join_file(request, "arm")[0].name == "arm"
     with pytest.raises(ValueError, match="BEGIN CERTIFICATE REQUEST"):
         request_der(b"hello")
 

@@ -221,8 +221,38 @@ class MeshAuthority:
         _, certificate = self.issue(self._membership.request())
         self._membership.renewed(certificate)
 
-    def join_file(self, request: bytes) -> tuple[CertificateRequest, JoinFile]:
-        """The answer to a request (DER) in a join by files; raises as ``issue``."""
+    def has_issued(self, name: str, again: str = "") -> bool:
+        """Whether a module of a name has a certificate that has not ended, be it present or not.
+
+        Names that differ in case alone would have the same names for browsers.
+
+        Args:
+            name: The name.
+            again: A module that may join again: its certificate does not count.
+        """
+        now, folded = self.wall(), name.casefold()
+        issued = (each.name for each in self._issued.values() if each.expires > now)
+        return any(each.casefold() == folded and each != again for each in issued)
+
+    def join_file(
+        self, request: bytes, again: str = "", is_in_use: Callable[[str], bool] = lambda _: False
+    ) -> tuple[CertificateRequest, JoinFile]:
+        """The answer to a request (DER) in a join by files.
+
+        Args:
+            request: PKCS #10.
+            again: The name of a member that may join again, as of an invitation for it.
+            is_in_use: Whether a module that is linked, or joins just now, has a name.
+
+        Raises:
+            ConfigError: Another member has the name, or a join under way.
+            RmpaError: As ``issue``.
+        """
+        name = certificates.read_request(request).name
+        if is_in_use(name) or self.has_issued(name, again):
+            text = f"a module named {name} is a member, or joins just now"
+            remedy = f"if it is that one, and away: --module {name}; else rmpa trust revoke {name}, or another name"
+            raise ConfigError("the request", text, remedy)
         asked, certificate = self.issue(request)
         secrets = self.secrets
         return asked, JoinFile(certificate, secrets.ca, secrets.keys, secrets.deny)

@@ -209,19 +209,19 @@ class JoinServer:
             del self._joining[token_id]
 
     def _taken(self, token_id: bytes, name: str) -> bool:
-        """Whether a member has a name, present or not; an invitation for the name itself lets it join again.
+        """Whether a member, or another module that joins just now, has a name.
 
-        Names that differ in case alone would have the same names for browsers.
+        An invitation for the name itself lets it join again while it is away.
         """
-        if self._is_taken(name):
-            return True
         invitation = self._authority.book.find(token_id)
-        again = name if invitation is not None and invitation.name == name else ""
-        now, folded = self._authority.wall(), name.casefold()
-        return any(
-            each.name.casefold() == folded and each.expires > now and each.name != again
-            for each in self._authority.issued
-        )
+        again = invitation.name if invitation is not None else ""
+        return self.is_in_use(name, token_id) or self._authority.has_issued(name, again)
+
+    def is_in_use(self, name: str, token_id: bytes = b"") -> bool:
+        """Whether a linked member has a name, or a module that joins just now with another token."""
+        others = (each.side for token, each in self._joining.items() if token != token_id)
+        joining = {side.module.casefold() for side in others if not side.over}
+        return self._is_taken(name) or name.casefold() in joining
 
     async def _converse(self, connection: JoinConnection, joining: _Joining, token_id: bytes, where: str) -> None:
         """Drive one side of a join to its end."""

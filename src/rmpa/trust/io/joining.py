@@ -131,9 +131,8 @@ async def join_mesh(
     """
     key_pem = new_key()
     request = certificates.make_request(private_key(key_pem, files_of.KEY), name)
-    preface = Preface(
-        Purpose.JOIN, 0, clock.wall_ns() // 1_000_000, os.urandom(limits.PREFACE_NONCE_BYTES), token.token_id
-    )
+    # Without the time: this clock may not be set. A token is used once, and by its holder (``join.proof_of``).
+    preface = Preface(Purpose.JOIN, 0, 0, os.urandom(limits.PREFACE_NONCE_BYTES), token.token_id)
     sock = await _open(str(token.address), token.port, preface.serialize(token.key))
     connection = JoinConnection(sock, join_client_context(), server_side=False)
     try:
