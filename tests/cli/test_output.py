@@ -14,6 +14,7 @@ from rmpa.cli.topic_crossing import facts
 from rmpa.cli.topic_pub import fill_stamps, read_values
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.observe.snapshot import RouteInfo
+from tests.observe.samples import DIRECT
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -117,6 +118,22 @@ def test_a_contract_is_shown_with_the_units_of_its_keys() -> None:
     for one in (route, crossed):
         shown = dict(facts(one))["contract"]
         assert shown == "reliability reliable, depth 90, deadline 200 ms, lifespan 1 min 30 s, max_rate 12.5 Hz"
+
+
+def test_an_unknown_loss_is_not_shown_as_none() -> None:
+    route = RouteInfo(peer="a", node="/t", direction="in", state="open", messages=9, events={"loss_unknown": 5})
+    assert dict(facts(route))["missing"] == "loss unknown (5 times), 0 late, 0 expired, 0 dropped here"
+    known = msgspec.structs.replace(route, lost=3, events={"loss_unknown": 1})
+    assert dict(facts(known))["missing"].startswith("loss unknown (once), 3 more lost, ")
+
+
+def test_a_direct_topic_tells_that_it_was_interrupted() -> None:
+    texts = [text for _, text in facts(DIRECT)]
+    told = "interrupted 2 times, the last for 39.0 s, until 12.0 s ago; what is lost of that time is not counted"
+    assert told in texts
+    one = msgspec.structs.replace(DIRECT.subscribers[0], interruptions=1, interrupted_ago=None)
+    texts = [text for _, text in facts(msgspec.structs.replace(DIRECT, subscribers=(one,)))]
+    assert "interrupted once, the last for 39.0 s now; what is lost of that time is not counted" in texts
 
 
 def test_a_table_measures_its_columns_once(capsys: pytest.CaptureFixture[str]) -> None:

@@ -173,7 +173,9 @@ VIEWER = SubscriberTransport(
     since_ago=180.0,
     wanted="auto",
     endpoint="10.0.0.2:41234",
-    missed=2,
+    interruptions=2,
+    interrupted=39.0,
+    interrupted_ago=12.0,
     connected=True,
     figures=DirectFigures(messages=1801, bytes=180_100, dropped=0, rate=10.0, bandwidth=1000.0, window=3.0),
 )

@@ -327,7 +327,7 @@ def test_a_direct_topic_tells_what_its_nodes_count() -> None:
     assert shown == {
         "direct /viewer to": "10.0.0.2:41234",
         "direct /viewer since (s)": "180",
-        "direct /viewer missed": "2",
+        "direct /viewer interruptions": "2",
         "direct /viewer rate (Hz)": "10",
         "direct /viewer bandwidth (B/s)": "1000",
         "direct /viewer messages": "1801",

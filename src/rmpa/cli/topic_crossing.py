@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from rmpa.cli.graph import GraphName
     from rmpa.cli.master import Master
-    from rmpa.observe.snapshot import DirectFigures, LatencyInfo, RouteInfo, TopicInfo
+    from rmpa.observe.snapshot import DirectFigures, LatencyInfo, RouteInfo, SubscriberTransport, TopicInfo
 
 
 def ask_agent(master: Master, topic: str, *, figures: bool = False) -> TopicInfo | None:
@@ -74,7 +74,10 @@ def losses_text(route: RouteInfo) -> str:
     """Messages that did not arrive, by reason."""
     ours = f"{route.dropped} dropped here"
     if route.direction == "in":
-        return f"{route.lost} lost, {route.late} late, {route.expired} expired, {ours}"
+        lost = f"{route.lost} lost"
+        if unknown := route.events.get("loss_unknown", 0):
+            lost = f"loss unknown ({_times(unknown)})" + (f", {route.lost} more lost" if route.lost else "")
+        return f"{lost}, {route.late} late, {route.expired} expired, {ours}"
     return f"{route.lost} lost to {route.peer}" if route.contract.get("reliability") == "reliable" else ours
 
 
@@ -98,12 +101,26 @@ def transport_lines(route: RouteInfo) -> Iterator[tuple[str, str]]:
         yield from (("transport", text) for text in route_texts(route))
     for one in route.subscribers:
         since = duration(one.since_ago) if one.since_ago is not None else ""
-        missed = f"; {one.missed} messages missed while it was moved" if one.missed else ""
-        yield "transport", subscriber_text(one, since) + missed
+        yield "transport", subscriber_text(one, since)
+        if one.interruptions:
+            yield "", interruption_text(one)
         if one.figures is not None:
             yield "", figures_text(one.figures, route.node if one.state == "granted" else one.node)
         if one.unmeasured:
             yield "", one.unmeasured
+
+
+def interruption_text(one: SubscriberTransport) -> str:
+    """How often a subscriber was without its path, and for how long the last time."""
+    lasted = duration(one.interrupted)
+    over = (
+        f"{lasted}, until {duration(one.interrupted_ago)} ago" if one.interrupted_ago is not None else f"{lasted} now"
+    )
+    return f"interrupted {_times(one.interruptions)}, the last for {over}; what is lost of that time is not counted"
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
 
 
 def figures_text(figures: DirectFigures, node: str) -> str:
@@ -131,7 +148,7 @@ def facts(route: RouteInfo) -> Iterator[tuple[str, str]]:
         yield "rate", rate_text(route)
         yield "latency", latency_text(route.latency)
         yield "bandwidth", bandwidth_text(route)
-    if route.messages or route.lost:
+    if route.messages or route.lost or route.events.get("loss_unknown"):
         yield "missing", losses_text(route)
     if route.kept:
         yield "waiting", f"{route.kept} messages for {route.peer}"

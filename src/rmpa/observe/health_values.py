@@ -120,7 +120,7 @@ def _direct_values(one: SubscriberTransport) -> dict[str, str]:
     """The figures of a subscriber that is connected directly."""
     if one.transport != "direct":
         return {}
-    known = {"to": one.endpoint, "since (s)": number(one.since_ago), "missed": str(one.missed or "")}
+    known = {"to": one.endpoint, "since (s)": number(one.since_ago), "interruptions": str(one.interruptions or "")}
     if (figures := one.figures) is not None:
         known |= {
             "rate (Hz)": number(figures.rate),

@@ -213,7 +213,10 @@ class SubscriberTransport(msgspec.Struct, kw_only=True, frozen=True):
         endpoint: ``address:port`` of the publisher's node while the transport is direct; ``out``: the port alone.
         condition: The condition of direct transport that does not hold (docs/contracts.md), if it is relayed.
         text: That as text, ready to read.
-        missed: Messages that were seen to pass while it was moved between transports.
+        interruptions: How often it was without a path: moved between transports, its connection broken, or its link
+            lost. What was published meanwhile is lost, and not counted.
+        interrupted: How long the last of these lasted, or lasts, in seconds.
+        interrupted_ago: Seconds since it was over; ``None`` while it lasts.
         stuck: Why its direct connection cannot be ended although it has to be relayed; empty: nothing is wrong.
         connected: Whether its direct connection stands, by the node and the kernel; ``None``: not looked at.
         figures: Of its direct connection, while somebody looks; see ``unmeasured``.
@@ -229,7 +232,9 @@ class SubscriberTransport(msgspec.Struct, kw_only=True, frozen=True):
     endpoint: str = ""
     condition: str = ""
     text: str = ""
-    missed: int = 0
+    interruptions: int = 0
+    interrupted: float | None = None
+    interrupted_ago: float | None = None
     stuck: str = ""
     connected: bool | None = None
     figures: DirectFigures | None = None

@@ -74,7 +74,6 @@ class DirectRoute:
         since: When the state began, monotonic seconds.
         breaks: When its direct connections broke, monotonic seconds.
         answered_at: When it was last answered, monotonic seconds.
-        missed: Messages that passed while it was moved, as far as they were seen.
         held: Whether the peer may hold a grant for it.
         asked_at: When the peer was last asked, monotonic seconds.
         doubtful: Whether a notification of the peer came while it was asked, so that its response may be outdated.
@@ -93,7 +92,6 @@ class DirectRoute:
     since: float = 0.0
     breaks: deque[float] = field(default_factory=lambda: deque(maxlen=limits.DIRECT_BREAKS))
     answered_at: float = 0.0
-    missed: int = 0
     held: bool = False
     asked_at: float = -math.inf
     doubtful: bool = False
@@ -104,6 +102,49 @@ class DirectRoute:
         if self.state is not DirectState.DIRECT or self.grant is None or endpoint is None:
             return False
         return endpoint[1] == self.grant.port
+
+
+@dataclass(slots=True)
+class Interruption:
+    """That a subscriber was without its direct path: what was published meanwhile is lost to it, and not counted.
+
+    Args:
+        count: How often.
+        began: When the last one began, monotonic seconds.
+        ended: When it ended; ``None`` while it lasts.
+    """
+
+    count: int
+    began: float
+    ended: float | None = None
+
+
+class Interruptions:
+    """The interruptions of direct paths, by the peer's name, the source and the subscriber. They outlast links."""
+
+    def __init__(self) -> None:
+        self._all: dict[tuple[str, Source, str], Interruption] = {}
+
+    def get(self, peer: str, source: Source, subscriber: str) -> Interruption | None:
+        """The interruptions of one subscriber; ``None``: there was none."""
+        return self._all.get((peer, source, subscriber))
+
+    def begin(self, peer: str, source: Source, subscriber: str, now: float) -> None:
+        """Note that a path is gone; does nothing while it was gone already."""
+        key = (peer, source, subscriber)
+        before = self._all.pop(key, None)
+        if before is not None and before.ended is None:
+            self._all[key] = before
+            return
+        self._all[key] = Interruption(before.count + 1 if before is not None else 1, now)
+        if len(self._all) > limits.DIRECT_MAX:
+            del self._all[next(iter(self._all))]
+
+    def end(self, peer: str, source: Source, subscriber: str, now: float) -> None:
+        """Note that a subscriber has a path again, direct or relayed."""
+        found = self._all.get((peer, source, subscriber))
+        if found is not None and found.ended is None:
+            found.ended = now
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -15,7 +16,7 @@ from rmpa.observe.snapshot import RouteInfo, SubscriberTransport
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from rmpa.bridge.direct.direct_route import DirectRoute
+    from rmpa.bridge.direct.direct_route import DirectRoute, Interruption
     from rmpa.bridge.direct.publisher_side import Granted
     from rmpa.bridge.io.bridge import Bridge
     from rmpa.bridge.messages import Source
@@ -73,7 +74,15 @@ class DirectSection:
         publication = topics.of(session).publication(source) if session is not None else None
         relayed = publication is not None and publication.subscribers > 0
         routes = topics.direct_imports.routes.of(peer, source)
-        subscribers = tuple(self._measured(_subscriber(name, route, now), topic, route) for name, route in routes)
+        known = topics.direct_imports.interruptions
+        subscribers = tuple(
+            _interrupted(
+                self._measured(_subscriber(name, route, now), topic, route),
+                known.get(session.link.name, source, name) if session is not None else None,
+                now,
+            )
+            for name, route in routes
+        )
         direct = any(one.transport == "direct" for one in subscribers)
         condition, text = _condition(subscribers)
         if relayed and not condition and contract.transport is Transport.RELAY:
@@ -103,11 +112,16 @@ class DirectSection:
 
     def granted_to(self, peer: int, source: Source) -> tuple[SubscriberTransport, ...]:
         """A peer's subscribers that may connect to a local source directly, by name."""
-        grants = self._bridge.topics.direct_exports.grants
+        exports, session = self._bridge.topics.direct_exports, self._bridge.sessions.get(peer)
+        grants, known = exports.grants, exports.interruptions
         return tuple(
-            _with(
-                SubscriberTransport(node=name, transport="direct", state="granted", endpoint=str(granted.port)),
-                self.sampler[_flow_out(source, name, granted)],
+            _interrupted(
+                _with(
+                    SubscriberTransport(node=name, transport="direct", state="granted", endpoint=str(granted.port)),
+                    self.sampler[_flow_out(source, name, granted)],
+                ),
+                known.get(session.link.name, source, name) if session is not None else None,
+                asyncio.get_running_loop().time(),
             )
             for owner, name, granted in sorted(grants.of(source), key=lambda grant: grant[:2])
             if owner == peer
@@ -128,6 +142,19 @@ def _with(one: SubscriberTransport, sample: DirectSample) -> SubscriberTransport
     """A subscriber with what its node, or its publisher, said last."""
     return msgspec.structs.replace(
         one, connected=sample.connected, figures=sample.figures, unmeasured=sample.problem, silent=sample.silent
+    )
+
+
+def _interrupted(one: SubscriberTransport, found: Interruption | None, now: float) -> SubscriberTransport:
+    """A subscriber with when it was without its path."""
+    if found is None:
+        return one
+    ended = now if found.ended is None else found.ended
+    return msgspec.structs.replace(
+        one,
+        interruptions=found.count,
+        interrupted=ended - found.began,
+        interrupted_ago=None if found.ended is None else now - ended,
     )
 
 
@@ -156,6 +183,5 @@ def _subscriber(name: str, route: DirectRoute, now: float) -> SubscriberTranspor
         endpoint=f"{route.endpoint[0]}:{route.endpoint[1]}" if direct and route.endpoint is not None else "",
         condition=unmet.condition.value if unmet is not None else "",
         text=unmet.text if unmet is not None else "",
-        missed=route.missed,
         stuck=route.stuck,
     )

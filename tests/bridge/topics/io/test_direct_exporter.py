@@ -317,3 +317,16 @@ async def test_without_trust_a_peer_tries_again_when_a_topic_is_published(module
     module.offered.update(offered)
     module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=True)
     assert [(peer, what) for peer, what, _ in module.told] == [(1, requests.RETRY)]
+
+
+async def test_an_interruption_by_a_lost_link_is_told_after_it(module: Module) -> None:
+    await module.open()
+    module.sut.link_down(module.sessions[1], crashed=True)
+    assert module.sut.interruptions.get("peer1", SOURCE, "/viewer") is None, "the nodes go on"
+    module.sut.link_down(module.sessions[1], crashed=False)
+    lasting = module.sut.interruptions.get("peer1", SOURCE, "/viewer")
+    assert lasting is not None
+    assert lasting.ended is None
+    module.sut.gone(module.sessions[1])
+    await module.open()
+    assert lasting.ended is not None

@@ -233,6 +233,21 @@ async def test_a_source_is_kept_only_while_its_own_agent_is_dead(module: Module)
     assert module.moved == []
 
 
+async def test_an_interruption_by_a_lost_link_is_told_after_it(module: Module) -> None:
+    module.sut.shown(1, SOURCE)
+    assert await module.ask() == DIRECT
+    assert module.sut.interruptions.get("a", *KEY[1:]) is None
+    module.sut.link_down(module.session, crashed=False)
+    module.sut.hidden(1, SOURCE)
+    lasting = module.sut.interruptions.get("a", *KEY[1:])
+    assert lasting is not None
+    assert (lasting.count, lasting.ended) == (1, None)
+    module.sut.shown(1, SOURCE)
+    module.sut.link_up(module.session)
+    assert await module.ask() == DIRECT
+    assert lasting.ended is not None
+
+
 async def test_a_probe_over_an_earlier_link_does_not_count_for_the_next_one(module: Module) -> None:
     module.reachable.clear()
     module.sut.shown(1, SOURCE)

@@ -74,6 +74,25 @@ async def direct_links(uri: str, topic: str, endpoint: tuple[str, int]) -> list[
     return [one for one in links if one.inbound and one.topic == topic and one.connected and one.remote == endpoint]
 
 
+async def forgotten(uri: str, topic: str, publisher: str) -> None:
+    """Wait until a subscriber has no connection to a publisher any more, by its own word.
+
+    rospy ignores a publisher in a list while the connection that has just ended is not removed yet, which takes a
+    moment, and longer on a busy machine. At most ``limits.DIRECT_MOVE_WAIT``.
+
+    Args:
+        uri: The subscriber's slave API.
+        topic: The topic.
+        publisher: The publisher's slave API.
+    """
+    deadline = asyncio.get_running_loop().time() + limits.DIRECT_MOVE_WAIT
+    while links := await bus_links(uri):
+        connected = any(one.inbound and one.topic == topic and one.other == publisher for one in links)
+        if not connected or asyncio.get_running_loop().time() >= deadline:
+            return
+        await asyncio.sleep(limits.DIRECT_LOOK)
+
+
 def standing_at(address: str) -> dict[int, set[int]]:
     """The connections from this machine to one address: their local ports, by the remote port.
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from rmpa.bridge import limits
 from rmpa.bridge.direct import requests
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, reply_of, unmet_by_contract, unmet_by_trust
+from rmpa.bridge.direct.direct_route import Interruptions
 from rmpa.bridge.direct.io.nodes import end_from
 from rmpa.bridge.direct.publisher_side import DirectGrants, EndConnections, Granted, Retry, WithdrawGrant
 from rmpa.bridge.direct.requests import DirectClosed, RetryDirect
@@ -71,6 +72,8 @@ class DirectExporter:
         self._counters = counters
         self.grants = DirectGrants()
         """The grants in force."""
+        self.interruptions = Interruptions()
+        """When peers' subscribers were without a grant because their link was lost."""
         self._expiries: dict[int, asyncio.TimerHandle] = {}
         rpc.on_request(requests.OPEN, self._open, Needs((Access.SUBSCRIBE,), "the topic: only what is offered"))
         rpc.on_notification(requests.CLOSE, self._close, Needs((), "what was granted to the peer itself"))
@@ -116,6 +119,10 @@ class DirectExporter:
         """
         if (expiry := self._expiries.pop(session.peer, None)) is not None:
             expiry.cancel()
+        now = asyncio.get_running_loop().time()
+        for source, peer, subscriber, _ in self.grants if not crashed else ():
+            if peer == session.peer:
+                self.interruptions.begin(session.link.name, source, subscriber, now)
         shared = any(other.address == session.address for other in self._sessions.reachable() if other is not session)
         if session.link.silent and not crashed and not session.same_machine and not shared:
             self._act(self.grants.unreachable(session.peer))
@@ -159,6 +166,8 @@ class DirectExporter:
             return self._refused(session, asked, unmet)
         granted = Granted(asked.contract, found.port, uri)
         self.grants.grant(session.peer, source, asked.subscriber, granted)
+        now = asyncio.get_running_loop().time()
+        self.interruptions.end(session.link.name, source, asked.subscriber, now)
         self._counters.add("direct.granted")
         _log.debug("< %s: %s connects to %s directly", session.link.name, asked.subscriber, source)
         return found

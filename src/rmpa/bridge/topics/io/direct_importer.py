@@ -19,7 +19,18 @@ from rmpa.bridge.direct.conditions import (
     unmet_by_contract,
     unmet_by_trust,
 )
-from rmpa.bridge.direct.direct_route import Ask, Decided, DirectKey, Fallback, HangUp, Move, Path, ProbeNode, Release
+from rmpa.bridge.direct.direct_route import (
+    Ask,
+    Decided,
+    DirectKey,
+    Fallback,
+    HangUp,
+    Interruptions,
+    Move,
+    Path,
+    ProbeNode,
+    Release,
+)
 from rmpa.bridge.direct.io.nodes import direct_links, end_links, kernel_tells, report_failure, standing, standing_at
 from rmpa.bridge.direct.requests import CloseDirect, OpenDirect
 from rmpa.bridge.direct.subscriber_side import DirectSubscriptions
@@ -101,6 +112,8 @@ class DirectImporter:
         self._counters = counters
         self.routes = DirectSubscriptions(self._is_latched, self._is_relayed)
         """The state of each subscriber."""
+        self.interruptions = Interruptions()
+        """When subscribers were without their path."""
         self._timer = MachineTimer(self.routes.next_timer, lambda now: self._act(self.routes.handle_timer(now)))
         self._waiting: dict[DirectKey, list[asyncio.Future[None]]] = {}
         self._moves = SubscriberMoves(
@@ -110,6 +123,7 @@ class DirectImporter:
             sessions,
             self.routes,
             on_demand=on_demand,
+            on_left=self._interrupted,
             on_warning=on_warning,
             counters=counters,
         )
@@ -283,6 +297,7 @@ class DirectImporter:
 
     def _answered(self, key: DirectKey, endpoint: tuple[str, int] | None, reply: RosReply | None) -> RosReply | None:
         self._strays.pop((key.source, key.subscriber), None)
+        self._has_path(key)
         self._act(self.routes.answered(key, endpoint, self._now()))
         self._watch()
         return reply
@@ -317,7 +332,16 @@ class DirectImporter:
             if name not in there:
                 self._act(self.routes.left(key, self._now()))
             else:
+                self._has_path(key)
                 self._act(self.routes.arrived(key, self._now()))
+
+    def _interrupted(self, key: DirectKey) -> None:
+        if (session := self._sessions.get(key.peer)) is not None:
+            self.interruptions.begin(session.link.name, key.source, key.subscriber, self._now())
+
+    def _has_path(self, key: DirectKey) -> None:
+        if (session := self._sessions.get(key.peer)) is not None:
+            self.interruptions.end(session.link.name, key.source, key.subscriber, self._now())
 
     # --- links ------------------------------------------------------------------------------------------------------
 
@@ -332,6 +356,9 @@ class DirectImporter:
 
     def link_down(self, session: PeerSession, *, crashed: bool) -> None:
         """End direct connections to a peer that cannot be reached; unless only its agent has died."""
+        for key, _ in self.routes.connected() if not crashed else ():
+            if key.peer == session.peer:
+                self._interrupted(key)
         self._act(self.routes.link_down(session.peer, self._now(), crashed=crashed))
         for _, source in {(key.peer, key.source) for key, _ in self.routes if key.peer == session.peer}:
             entry = self._imports.get(session.peer, source)
@@ -531,6 +558,7 @@ class DirectImporter:
         if links is None:
             self._core.suspect(key.subscriber)
         self._counters.add("direct.broken")
+        self._interrupted(key)
         actions = self.routes.broken(key, self._now())
         self._act(actions)
 

@@ -17,6 +17,7 @@ from rmpa.bridge.direct.io.nodes import (
     direct_links,
     end_links,
     end_to,
+    forgotten,
     publisher_update,
     report_failure,
     standing,
@@ -50,6 +51,7 @@ class SubscriberMoves:
         sessions: The peers.
         routes: The state of each subscriber.
         on_demand: ``(peer, source, wanted)``: opens the relayed route of a source, or lets it close.
+        on_left: Called with a subscriber that has left its connection, and is called back.
         on_warning: ``(kind, subject, text)``: logs and counts a warning.
         counters: Counts ``direct.moved``.
     """
@@ -63,6 +65,7 @@ class SubscriberMoves:
         routes: DirectSubscriptions,
         *,
         on_demand: Callable[[int, Source, bool], None],
+        on_left: Callable[[DirectKey], None],
         on_warning: Callable[[str, str, str], None],
         counters: Counters,
     ) -> None:
@@ -72,6 +75,7 @@ class SubscriberMoves:
         self._sessions = sessions
         self._routes = routes
         self._on_demand = on_demand
+        self._on_left = on_left
         self._on_warning = on_warning
         self._counters = counters
         self._tasks: dict[DirectKey, asyncio.Task[None]] = {}
@@ -285,15 +289,14 @@ class SubscriberMoves:
                 self._let_go(key, publication)
                 return  # decided otherwise meanwhile
         try:
-            had, begin = publication.latched if held else (), publication.messages
+            had = publication.latched if held else ()
             if not await self._leave(key, route, publication, uri, proxy):
                 return
             publication.spare(key.subscriber, had)
             self._counters.add("direct.moved")
             await publisher_update(uri, entry.topic, list(self._core.publishers(entry.topic).values()))
-            if await self._arrived(key, publication):
-                route.missed += publication.messages - begin
-            elif self._routes.get(key) is route and route.path is Path.NONE:
+            arrived = await self._arrived(key, publication)
+            if not arrived and self._routes.get(key) is route and route.path is Path.NONE:
                 # A list of publishers that the master sent at the same time may have overtaken this one.
                 await publisher_update(uri, entry.topic, list(self._core.publishers(entry.topic).values()))
             self._repeat_later(key, entry.topic)
@@ -316,11 +319,13 @@ class SubscriberMoves:
         if links is None and endpoint is not None and standing(endpoint):
             return False  # the node is stopped: `_check` tries again
         await publisher_update(uri, topic, [one for one in self._core.publishers(topic).values() if one != proxy])
-        publication.hang_up(key.subscriber)
+        if publication.hang_up(key.subscriber):
+            await forgotten(uri, topic, proxy)
         if endpoint is not None and (problem := await end_links(endpoint, links or ())):
             self.stuck(key, endpoint, problem)
             return False
         self._routes.hung_up(key)
+        self._on_left(key)
         return True
 
     async def _arrived(self, key: DirectKey, publication: Publication) -> bool:

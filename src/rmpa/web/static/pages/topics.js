@@ -77,7 +77,7 @@ const Route = memo(({ route, own }) => {
   return html`<tr><th scope="row"><${NodeLink} name=${nodeKey(route.direction === "in" ? route.peer : "", route.node)} /><div class="muted">${route.direction === "in" ? `${route.peer} → ${own}` : `${own} → ${route.peer}`}</div></th>
     <td>${route.state}${route.problem && html`<div class="muted">${route.problem}</div>`}</td><td class="number">${hertz(route.rate)}<div class="muted">${bandwidth(route.bandwidth)}</div></td><td class="number">${seconds(route.jitter)}</td>
     <td class="number">${seconds(latency.p50)}, ${seconds(latency.p99)}<div class="muted">± ${seconds(latency.error)}</div></td>
-    <td class="number">${count((route.lost || 0) + (route.expired || 0))}</td><td class="number">${count((route.dropped || 0) + (route.oversized || 0))}</td>
+    <td class="number">${(route.events || {}).loss_unknown ? "unknown, ≥ " : ""}${count((route.lost || 0) + (route.expired || 0))}</td><td class="number">${count((route.dropped || 0) + (route.oversized || 0))}</td>
     <td>${route.transport || "–"}${route.lane && html`<div class="muted">${route.lane} lane</div>`}${route.condition_text && html`<div class="muted">${route.condition_text}</div>`}</td><td>${contract || "default"}${Object.entries(route.events || {}).map(([kind, times]) => html`<div class="muted" key=${kind}>${kind.replaceAll("_", " ")}: ${count(times)}</div>`)}</td></tr>
     ${(route.subscribers || []).map((one) => html`<${Subscriber} key=${one.node} one=${one} />`)}`;
 });
@@ -85,7 +85,7 @@ const Route = memo(({ route, own }) => {
 // A subscriber of a route where its transport is known: direct ones do not pass the agents, and their nodes tell the figures.
 const Subscriber = ({ one }) => {
   const figures = section(one, "figures");
-  const said = [one.condition && one.text, one.stuck && `cannot be moved: ${one.stuck}`, one.unmeasured, one.missed && `${count(one.missed)} missed while it was moved`].filter(Boolean).join("; ");
+  const said = [one.condition && one.text, one.stuck && `cannot be moved: ${one.stuck}`, one.unmeasured, one.interruptions && `interrupted ${count(one.interruptions)} times, the last for ${seconds(one.interrupted)}: what is lost of that time is not counted`].filter(Boolean).join("; ");
   return html`<tr><th scope="row" class="inner"><span class="mono">→ ${one.node}</span></th><td>${one.state}${said && html`<div class="muted">${said}</div>`}</td><td class="number">${hertz(figures.rate)}<div class="muted">${bandwidth(figures.bandwidth)}</div></td>
     <td class="number">–</td><td class="number">–</td><td class="number">–</td><td class="number">${figures.dropped === undefined ? "–" : count(figures.dropped)}</td><td>${one.transport || "–"}${one.endpoint && html`<div class="muted">${one.endpoint}</div>`}</td><td>${one.wanted || ""}</td></tr>`;
 };
