@@ -173,10 +173,11 @@ class Host:
         An outage of a carrier takes up to a second longer than asked for, because the kernel gathers its changes.
         """
         wire = self.cables[cable]
-        port = ["-n", wire.switch, "link", "set", wire.port, "type", "bridge_slave", "state"]
-        _ip(*port, "0")
+        # Not `ip link set type bridge_slave state`: the kernel takes it and goes on forwarding.
+        port = ["bridge", "-n", wire.switch, "link", "set", "dev", wire.port, "state"]
+        _run([*port, "0"])
         time.sleep(seconds)
-        _ip(*port, "3")
+        _run([*port, "3"])
 
     def switch_off(self, cable: int = 0) -> None:
         """Take the interface down inside the host (its routes go with it)."""

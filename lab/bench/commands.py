@@ -27,6 +27,7 @@ from lab.bench import (
     parked,
     period,
     profile,
+    radio,
     roscore,
     roundtrips,
     scale,
@@ -82,6 +83,13 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
         "a command beside images on 100 Mbit/s",
         crosstraffic.measure,
         realtime=partial(crosstraffic.measure, realtime=True),
+    ),
+    "radio": Measurement(
+        "a command over a radio that loses packets, has a long queue, or is cut",
+        radio.measure,
+        (why_no_ros, why_no_hosts),
+        parts=radio.PARTS,
+        only=radio.measure,
     ),
     "load": Measurement("a command while every core is busy", load.measure),
     "storm": Measurement(
@@ -147,7 +155,8 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
     default="",
     metavar="KEYS",
     help="path: these contenders, comma-separated (lab/bench/contenders.py has them); "
-    f"web: of {', '.join(web.PARTS)}; gateway: of {', '.join(gateway.PARTS)}.",
+    f"web: of {', '.join(web.PARTS)}; gateway: of {', '.join(gateway.PARTS)}; "
+    f"radio: of {', '.join(radio.PARTS)}.",
 )
 @click.option(
     "--realtime",

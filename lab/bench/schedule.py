@@ -179,10 +179,10 @@ class MeasuredStream:
             if time.monotonic() > deadline:
                 raise Deadline(f"nothing of {self.source.name} came to {self.target.name}")
 
-    def run(self, size: int, rate: float, seconds: float) -> Arrivals:
+    def run(self, size: int, rate: float, seconds: float, *, settle: float = _SETTLE) -> Arrivals:
         """Send for so long; return what came."""
         self.begin(size, rate, seconds)
-        return self.end()
+        return self.end(settle=settle)
 
     def begin(self, size: int, rate: float, seconds: float) -> None:
         """Start a round; ``end`` returns what came of it."""
@@ -196,14 +196,14 @@ class MeasuredStream:
         """Let so much of a round that was begun go by."""
         time.sleep(_START + self._lead / self._rate + seconds)
 
-    def end(self) -> Arrivals:
-        """Wait until all is sent, and nothing more arrives; return what came."""
+    def end(self, *, settle: float = _SETTLE) -> Arrivals:
+        """Wait until all is sent, and nothing more arrives for ``settle`` seconds; return what came."""
         if self._begun is None:
             raise BedError("begin() comes first")
         late = _numbers(flow.sent(self._begun), "late_ns")
         usage = self._meter.read()
         self._require_transport()
-        came = flow.noted(self.target, self._topics, self._home, self._begun.number, settle=_SETTLE)
+        came = flow.noted(self.target, self._topics, self._home, self._begun.number, settle=settle)
         arrivals = parse(came, late, self._lead)
         arrivals.usage, arrivals.total = usage, len(late)
         return arrivals

@@ -187,6 +187,12 @@ PATHS_MAX: Final = 4096
 EXPRESS_UNSENT_BYTES: Final = 64 * KIB
 """Unsent bytes of one link that the kernel may hold (TCP_NOTSENT_LOWAT): control frames cannot overtake them, and the
 drop policy does not reach them. On 5 Mbit/s a pong was 1.2 s late without this bound, 0.3 s with it."""
+EXPRESS_RTO_MIN_US: Final = 5000
+"""Microseconds that TCP waits on the express lane for an acknowledgement, beyond the round trip and its variation,
+before it repeats a packet (TCP_RTO_MIN_US); its own value is 200 ms. At 5 % loss 95 % of commands at 50 Hz came within
+50 ms without it, and 100 % with it."""
+EXPRESS_RTO_MAX_MS: Final = 1000
+"""Milliseconds that TCP waits there between two repetitions at most (TCP_RTO_MAX_MS): the least that Linux takes."""
 CONNECTION_URGENT_BYTES: Final = 32 * MIB
 """Bytes of control frames that may wait for one link: two of the longest. They are never dropped, so beyond this the
 link is closed."""

@@ -26,16 +26,37 @@ _RTT: Final = struct.Struct("=68xI")  # microseconds
 _BYTES_ACKED: Final = struct.Struct("=120xQ")
 _DELIVERED: Final = struct.Struct("=192xI")  # since Linux 4.18
 _TIME_STAMPS: Final = 12
+_QUICK_REPETITION: Final = (
+    (16, 1),  # TCP_THIN_LINEAR_TIMEOUTS, Linux 2.6.34
+    (44, limits.EXPRESS_RTO_MAX_MS),  # TCP_RTO_MAX_MS, 6.15
+    (45, limits.EXPRESS_RTO_MIN_US),  # TCP_RTO_MIN_US, 6.18
+)
+"""Numbers of linux/tcp.h, which Python's ``socket`` lacks."""
+_BULK_CONGESTION: Final = b"bbr"
 
 
 def tune_express(sock: socket.socket, lanes: LaneSettings, counters: Counters) -> None:
-    """Set up the express lane: no Nagle, a time-out for dead peers, a short kernel queue, a high priority."""
+    """Set up the express lane: no Nagle, a time-out for dead peers, a short kernel queue, a high priority.
+
+    Lost packets are repeated sooner where the kernel has options for it: TCP waits 0.2 s before the first repetition,
+    and each time twice as long as before.
+    """
     _tune(sock, limits.EXPRESS_UNSENT_BYTES, lanes.express_dscp, lanes.express_priority, counters)
+    for name, value in _QUICK_REPETITION:
+        with contextlib.suppress(OSError):
+            sock.setsockopt(socket.IPPROTO_TCP, name, value)
 
 
 def tune_bulk(sock: socket.socket, lanes: LaneSettings, counters: Counters) -> None:
-    """Set up the bulk lane: the shortest kernel queue, a low priority."""
+    """Set up the bulk lane: the shortest kernel queue, a low priority, congestion control by BBR if it is permitted.
+
+    BBR keeps the queues short that are behind this host, as in a radio or router; *cubic* fills them until packets are
+    lost, and commands wait there too. A route's own ``congctl`` replaces what is set before a connection is made, so
+    this is called again then.
+    """
     _tune(sock, limits.BULK_UNSENT_BYTES, lanes.bulk_dscp, lanes.bulk_priority, counters)
+    with contextlib.suppress(OSError):
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, _BULK_CONGESTION)
 
 
 def unacknowledged(sock: socket.socket) -> int:
