@@ -1,8 +1,8 @@
 """A bad radio between two hosts: classic ROS and RMPA relayed, each on a cable and a switch of its own.
 
-The switch loses packets at random in both directions, or its ports have the queue: 100 ms of it at 20 Mbit/s, behind the
-host, where the host's priorities do not reach; or it drops all packets for two seconds while both carriers stay. All hosts
-use *cubic*, as Linux does by default.
+The switch loses packets at random in both directions, or its ports have the queue: 100 ms of it at 20 Mbit/s, behind
+the host, where the host's priorities do not reach; or it drops all packets for two seconds while both carriers stay.
+All hosts use *cubic*, as Linux does by default.
 """
 
 from __future__ import annotations
@@ -169,7 +169,9 @@ def _cut(host: Host, command: schedule.MeasuredStream, score: RadioScore) -> Non
     restored = time.monotonic_ns()
     came = command.end(settle=_SETTLE)
     score.commands.add(came)
-    again = [at for due, at in zip(came.due, came.came, strict=True) if due > restored and at - due < 1000 * _DEADLINE]
+    again = [
+        at for due, at in zip(came.due, came.came, strict=True) if due > restored and at - due < 1000 * _DEADLINE
+    ]
     score.back.append((again[0] - restored) / 1e6 if again else 1000 * _CUT_ROUND)
 
 

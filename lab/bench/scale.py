@@ -142,9 +142,9 @@ class Fan(schedule.MeasuredStream):
         self.far: Process | None = None
         self.far_latencies: list[float] = []
 
-    def end(self) -> schedule.Arrivals:
+    def end(self, *, settle: float = schedule.SETTLE) -> schedule.Arrivals:
         """Also read what came to the other receiver."""
-        arrivals = super().end()
+        arrivals = super().end(settle=settle)
         self.far_latencies = []
         if self.far is not None and self._begun is not None:
             came = flow.noted(self.far, self._topics, self._home, self._begun.number, settle=0)

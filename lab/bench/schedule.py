@@ -42,7 +42,7 @@ LEAD_IN: Final = 0.2
 """Seconds of each round whose messages are thrown away: caches and the processor's clock come up."""
 _START: Final = 0.02
 """Seconds from the command to the first message."""
-_SETTLE: Final = 0.3
+SETTLE: Final = 0.3
 """Seconds without an arrival after which a round is over."""
 _FLOWING_DEADLINE: Final = 30.0
 _HOST_LATENESS: Final = 2.0
@@ -179,7 +179,7 @@ class MeasuredStream:
             if time.monotonic() > deadline:
                 raise Deadline(f"nothing of {self.source.name} came to {self.target.name}")
 
-    def run(self, size: int, rate: float, seconds: float, *, settle: float = _SETTLE) -> Arrivals:
+    def run(self, size: int, rate: float, seconds: float, *, settle: float = SETTLE) -> Arrivals:
         """Send for so long; return what came."""
         self.begin(size, rate, seconds)
         return self.end(settle=settle)
@@ -196,7 +196,7 @@ class MeasuredStream:
         """Let so much of a round that was begun go by."""
         time.sleep(_START + self._lead / self._rate + seconds)
 
-    def end(self, *, settle: float = _SETTLE) -> Arrivals:
+    def end(self, *, settle: float = SETTLE) -> Arrivals:
         """Wait until all is sent, and nothing more arrives for ``settle`` seconds; return what came."""
         if self._begun is None:
             raise BedError("begin() comes first")

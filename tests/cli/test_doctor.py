@@ -42,7 +42,7 @@ def test_every_check_answers(loopback: Place) -> None:
     checks = {check for check, _ in answers}
     assert checks == {
         *("settings", "agent", "interface", "multicast", "firewall", "rp_filter", "route", "port", "ROS", "clock"),
-        "mtu",
+        "radio",
         *("realtime", "files", "kernel limits", "stale connections", "exposed nodes"),
     }
     assert {check.name for check in CHECKS} <= checks

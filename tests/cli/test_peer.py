@@ -106,17 +106,6 @@ def test_info(place: Place, agent: Agent) -> None:
     assert place.run("peer", "info", "10.0.0.2:40002")[1] == out
 
 
-def test_a_path_that_drops_large_packets(place: Place, agent: Agent) -> None:
-    joystick = SNAPSHOT.peers[0]
-    assert joystick.link is not None
-    link = msgspec.structs.replace(joystick.link, packet=1252, path_problem="a hole", path_remedy="mend it")
-    agent(snapshot=msgspec.structs.replace(SNAPSHOT, peers=(msgspec.structs.replace(joystick, link=link),), notes=()))
-    _, _, err = place.run("peer", "list")
-    assert err == "! joystick: a hole; mend it\n"
-    _, out, _ = place.run("peer", "info", "joystick")
-    assert "Packets:      of at most 1252 bytes to it\nPath:         a hole\nWhat to do:   mend it\n" in out
-
-
 def test_an_unknown_peer(place: Place, agent: Agent) -> None:
     agent()
     message = "rmpa: base knows no peer 'joystik'; did you mean joystick?\n"

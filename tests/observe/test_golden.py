@@ -26,10 +26,11 @@ from rmpa.observe.doctor.network import (
     MulticastEcho,
     NetworkInterface,
     Port,
+    Radio,
     judge_interfaces,
-    judge_mtu_probing,
     judge_multicast,
     judge_ports,
+    judge_radio,
     judge_routes,
     judge_rp_filter,
 )
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
     from rmpa.observe.peer_info import PeerInfo
     from rmpa.observe.why.diagnosis import Diagnosis
 
+RADIO: Final = Radio("wlan0", "10.0.0.0/24")
 GOLDEN: Final = Path(__file__).with_name("golden")
 JOYSTICK, PC = SNAPSHOT.peers
 (ROUTE,) = SNAPSHOT.topics[0].routes
@@ -66,12 +68,6 @@ def with_files(*, near: bool = False, problem: str = "") -> Snapshot:
 
 def with_peers(*peers: PeerInfo) -> Snapshot:
     return msgspec.structs.replace(SNAPSHOT, peers=peers, notes=())
-
-
-def holed() -> PeerInfo:
-    assert JOYSTICK.link is not None
-    link = msgspec.structs.replace(JOYSTICK.link, packet=1252, path_problem="a hole", path_remedy="mend it")
-    return msgspec.structs.replace(JOYSTICK, link=link)
 
 
 def with_stuck() -> Snapshot:
@@ -100,7 +96,6 @@ def findings() -> Iterator[Check]:
         "none": with_files(near=True, problem="node /x has to wait: none left; raise it"),
         "alone": with_peers(),
         "stuck": with_stuck(),
-        "holed": with_peers(holed()),
         "refused": with_peers(msgspec.structs.replace(PC, state="refused", conflicts=("no remedy",), last_error="")),
     }
     yield from judge_agents(shown, "0.1.0")
@@ -122,8 +117,9 @@ def findings() -> Iterator[Check]:
         yield judge_rules(rules, "UDP port 11411")
     for values in ({}, {"all": 1, "wlan0": 0, "eth0": 0}, {"all": 2}):
         yield from judge_rp_filter(values, (LO, WLAN, ETH))
-    for probing, hole in ((None, True), (1, True), (0, False), (0, True)):
-        yield judge_mtu_probing(probing, black_hole=hole)
+    marked = Radio("wlan0", "10.0.0.0/24", "40ms")
+    for radios, quick in ((), True), ((RADIO,), True), ((RADIO, marked), False):
+        yield from judge_radio(radios, quick=quick, bbr=quick)
     yield from judge_routes({})
     yield from judge_routes({"10.1.0.2 (arm)": "Network is unreachable", "10.0.0.2 (base)": ""})
     yield from judge_ports(
@@ -221,7 +217,7 @@ def snapshots() -> Iterator[Snapshot]:
         route = msgspec.structs.replace(healthy, **changes)
         out = msgspec.structs.replace(route, direction="out", state="away", kept=7, node="/mine")
         topics = (msgspec.structs.replace(topic, routes=(route, healthy, out)),)
-        yield msgspec.structs.replace(with_peers(holed(), PC), topics=topics)
+        yield msgspec.structs.replace(with_peers(JOYSTICK, PC), topics=topics)
     yield with_stuck()
     refused = msgspec.structs.replace(SNAPSHOT.topics[1], mismatches=("pc/viewer wants another md5",))
     gone = UnreachableInfo(node="/odd", uri="http://nosuch:1/", problem="no such name", ago=20.0, withdrawn=True)

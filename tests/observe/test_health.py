@@ -62,15 +62,6 @@ def test_agent_peers_and_incoming_topics_have_a_status() -> None:
     assert all(found[name].values[key] for name in found for key in found[name].values)
 
 
-def test_a_path_problem_is_a_warning() -> None:
-    assert JOYSTICK.link is not None
-    link = msgspec.structs.replace(JOYSTICK.link, packet=1252, path_problem="a hole", path_remedy="mend it")
-    found = judged(Health(), with_routes(HEALTHY, peers=(msgspec.structs.replace(JOYSTICK, link=link), PC)))
-    status = found["rmpa: joystick"]
-    assert (status.level, status.message) == (DiagnosticLevel.WARN, "a hole; mend it")
-    assert (status.values["packet (B)"], status.values["path"]) == ("1252", "a hole")
-
-
 def test_outgoing_topics_have_no_status() -> None:
     assert list(judged(Health(), msgspec.structs.replace(SNAPSHOT, topics=SNAPSHOT.topics[1:]))) == [
         HERE,

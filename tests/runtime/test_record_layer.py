@@ -13,7 +13,6 @@ pytest.importorskip("cryptography")
 
 from rmpa.core.errors import LocalProtocolError
 from rmpa.runtime.record_layer import RecordIncomplete, SecureSocket, TlsHandshake
-from rmpa.runtime.segments import SegmentedSocket
 from tests.runtime.secure_pairs import Slow, make_context, make_contexts, secure_pair
 from tests.trust.authority import Authority
 
@@ -206,12 +205,6 @@ def test_plain_bytes_end_the_connection(contexts: tuple[ssl.SSLContext, ssl.SSLC
     sockets[0].send(bytes(100))
     with pytest.raises(ssl.SSLError):
         other.recv_into(memoryview(bytearray(100)))
-
-
-def test_small_packets_below(contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets) -> None:
-    one, other = secure_pair(contexts, SegmentedSocket(sockets[0], 512), SegmentedSocket(sockets[1], 512))
-    message = random.Random(7).randbytes(100_000)
-    assert _transfer(one, other, [[message]], 65536) == message
 
 
 def test_bytes_behind_the_handshake_are_read_first(

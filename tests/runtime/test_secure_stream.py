@@ -236,14 +236,3 @@ async def test_what_is_no_tls_ends_the_connection(contexts: Contexts, sockets: S
     await until(lambda: bool(end.ends))
     assert isinstance(end.ends[0], ssl.SSLError)
     assert not end.got
-
-
-async def test_small_packets_below_tls(contexts: Contexts, sockets: Sockets) -> None:
-    one, other = (SecureEnd(s, secure) for s, secure in zip(sockets, secure_pair(contexts, *sockets), strict=True))
-    one.stream.segment(512)
-    one.send(b"x" * 100_000)
-    one.stream.segment(1200)
-    one.send(b"y" * 100_000)
-    await until(lambda: other.got == [b"x" * 100_000, b"y" * 100_000])
-    one.stream.close()
-    other.stream.close()

@@ -124,7 +124,7 @@ def list_(
 def _urgency(info: PeerInfo) -> tuple[int, int, str]:
     """The order of a list that is not shown whole: problems first, then by traffic."""
     link = info.link
-    problem = info.conflicts or info.beyond or (link is not None and link.path_problem)
+    problem = info.conflicts or info.beyond
     usual = info.state in _USUAL and not problem
     return int(usual), 0 if link is None else -(link.bytes_in + link.bytes_out), info.name
 
@@ -156,8 +156,6 @@ def _troubles(snapshot: Snapshot, peers: Sequence[PeerInfo]) -> list[str]:
     for info in peers:
         found += [f"{info.name}: {conflict}" for conflict in info.conflicts]
         found += [bound.text for bound in info.beyond]
-        if info.link is not None and info.link.path_problem:
-            found.append(f"{info.name}: {info.link.path_problem}; {info.link.path_remedy}")
         if info.last_error and info.state not in {"linked", "relayed", "parked"}:
             again = "" if info.next_attempt is None else f"; next attempt in {duration(info.next_attempt)}"
             found.append(f"{info.name}: {info.last_error}{again}")
@@ -248,10 +246,6 @@ def _facts(info: PeerInfo) -> list[tuple[str, str]]:
         if info.direct_in or info.direct_out:
             ours = f"{info.direct_in} of the subscribers here to its nodes"
             facts.append(("Direct", f"{ours}, {info.direct_out} of its subscribers to nodes here"))
-        if link.packet is not None:
-            facts.append(("Packets", f"of at most {link.packet} bytes to it"))
-        if link.path_problem:
-            facts += [("Path", link.path_problem), ("What to do", link.path_remedy)]
     if info.state == "parked":
         facts.append(("Link", _PARKED))
     if info.last_error:

@@ -158,39 +158,19 @@ FORGET_UNANNOUNCED: Final = PEER_LEASE
 LINK_UNACKED: Final = 2.0
 """Sent bytes without an acknowledgement for this long end a connection (TCP_USER_TIMEOUT). It is two leases, so that
 the lease, which can report the reason, ends first."""
-SEGMENT_BYTES: Final = (1200, 512)
-"""Payloads of one packet that are tried, in this order, on a path that drops larger packets. With TCP_HEADERS they
-make 1252 bytes, below the MTU of all usual tunnels (IPv6 requires 1280), and 564, below IPv4's minimum of 576."""
-TCP_HEADERS: Final = 52
-"""Bytes of a packet around its payload: IPv4 (20), TCP (20), time stamps (12)."""
-EXPRESS_SEGMENT: Final = 1220
-"""Payload of one packet of an express lane to another machine (TCP_MAXSEG), 1272 bytes with TCP_HEADERS: commands,
-keepalives and the graph fit through usual tunnels from the first packet on."""
-STALL_LOOK: Final = 0.1
-"""Interval of the samples of a connection whose data is being retransmitted."""
-STALL_SUSPECTED: Final = 0.3
-"""Seconds without progress, but with retransmissions, after which a small packet tests the path. TCP's first
-retransmission is due after 0.2 s."""
-STALL_ANSWER: Final = 0.08
-"""Seconds (or 1.5 round trips, if that is more) in which data retransmitted after the small packet's answer must be
-acknowledged; otherwise the path counts as a black hole. On a LAN that is 0.8 s after the stall began, within the
-lease of the express lane."""
-PATH_REMEMBERED: Final = 600.0
-"""How long a black hole is remembered for an address (the value of RFC 4821); the next connection after that tries
-large packets again."""
-PATH_NO_HELP: Final = 60.0
-"""How long smaller packets are not tried again for an address where they did not help."""
-PATH_PROVEN_SEGMENTS: Final = 2
-"""Full segments of the smaller size that must be acknowledged before the packet size counts as the cause."""
-PATHS_MAX: Final = 4096
-"""Addresses remembered as black holes, as many as there are links; the oldest is forgotten first."""
+SEGMENT_BYTES: Final = 1148
+"""Payload of one packet to another machine, both ways (TCP_MAXSEG): 1200 bytes with the headers of IPv4 and TCP (40)
+and time stamps (12). They fit through usual tunnels, also where the path drops larger ones silently, and carry 1.5 %
+less of a full cable than packets of 1500 bytes."""
+TIME_STAMP_BYTES: Final = 12
+"""What TCP_MAXSEG counts beside the payload (RFC 7323)."""
 EXPRESS_UNSENT_BYTES: Final = 64 * KIB
 """Unsent bytes of one link that the kernel may hold (TCP_NOTSENT_LOWAT): control frames cannot overtake them, and the
 drop policy does not reach them. On 5 Mbit/s a pong was 1.2 s late without this bound, 0.3 s with it."""
 EXPRESS_RTO_MIN_US: Final = 5000
 """Microseconds that TCP waits on the express lane for an acknowledgement, beyond the round trip and its variation,
-before it repeats a packet (TCP_RTO_MIN_US); its own value is 200 ms. At 5 % loss 95 % of commands at 50 Hz came within
-50 ms without it, and 100 % with it."""
+before it repeats a packet (TCP_RTO_MIN_US); its own value is 200 ms. At 5 % loss 95 % of commands at 50 Hz came
+within 50 ms without it, and 100 % with it."""
 EXPRESS_RTO_MAX_MS: Final = 1000
 """Milliseconds that TCP waits there between two repetitions at most (TCP_RTO_MAX_MS): the least that Linux takes."""
 CONNECTION_URGENT_BYTES: Final = 32 * MIB

@@ -57,8 +57,6 @@ def link_values(info: PeerInfo) -> dict[str, str]:
             "bytes out": str(link.bytes_out),
             "queued (B)": str(link.queued),
             "dropped": str(link.dropped),
-            "packet (B)": number(link.packet),
-            "path": link.path_problem,
             "topics in": str(info.topics_in),
             "topics out": str(info.topics_out),
         }

@@ -48,9 +48,6 @@ class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
         rests: Whether the link is at rest: nothing depends on it, and keepalives come every 5 s, with more than 50
             peers more rarely.
         lease: Seconds of silence after which the link counts as lost.
-        packet: Bytes of the largest packets that are sent, headers included.
-        path_problem: What is wrong with the network path, ready to read; empty if nothing is known.
-        path_remedy: What to do about that.
         lanes: Its lanes, ``express`` first; empty from an agent that does not report them.
     """
 
@@ -67,9 +64,6 @@ class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
     heard_ago: float | None = None
     rests: bool = False
     lease: float = 1.0
-    packet: int | None = None
-    path_problem: str = ""
-    path_remedy: str = ""
     lanes: tuple[LaneInfo, ...] = ()
 
 

@@ -15,10 +15,8 @@ from typing import TYPE_CHECKING, Final, Protocol, cast
 
 from rmpa.core.errors import LocalProtocolError
 from rmpa.core.sizes import KIB
-from rmpa.runtime.segments import SegmentedSocket
 
 if TYPE_CHECKING:
-    import socket
     from collections.abc import Callable, Sequence
 
     from rmpa.runtime.buffers import Buffer
@@ -36,7 +34,7 @@ _scratch: Final = memoryview(bytearray(_READ))
 
 
 class DataSocket(Protocol):
-    """A connected, non-blocking socket, or ``segments.SegmentedSocket``."""
+    """A connected, non-blocking socket."""
 
     def sendmsg(self, buffers: Sequence[Buffer], /) -> int:
         """Send as much as the socket takes now."""
@@ -257,14 +255,6 @@ class SecureSocket:
             return count
         self.readable = count == size and (pending > 0 or self._tls.pending() > 0)
         return count
-
-    def segment(self, size: int) -> None:
-        """Send in packets of at most ``size`` bytes from now on."""
-        if isinstance(self._sock, SegmentedSocket):
-            self._sock.segment(size)
-        else:
-            self._sock = SegmentedSocket(cast("socket.socket", self._sock), size)
-            self._transmit = _sender(self._sock)
 
     def shutdown(self, how: int) -> None:
         """Say the end of the stream, and close one direction of the socket."""

@@ -25,7 +25,6 @@ from rmpa.core.sizes import KIB, MIB
 from rmpa.runtime import corking, limits
 from rmpa.runtime.buffers import Buffer, unsent
 from rmpa.runtime.record_layer import RecordIncomplete, SecureSocket
-from rmpa.runtime.segments import SegmentedSocket
 
 _log = logging.getLogger(__name__)
 
@@ -59,7 +58,6 @@ class Stream:
         frame: Makes the header of each fragment of an opened message; must be the outbox's own. Without it opened
             messages are sent without headers.
         keep: Whether entries stay in the outbox when the socket is gone, for the next stream.
-        segment: Bytes that one packet may carry; ``None``: the kernel decides; see ``segments``.
         secure: Encrypts and decrypts what ``sock`` carries; bytes that it holds already are delivered soon.
     """
 
@@ -72,14 +70,11 @@ class Stream:
         outbox: Outbox,
         frame: Framer | None = None,
         keep: bool = False,
-        segment: int | None = None,
         secure: SecureSocket | None = None,
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._secure = secure
-        self._sock: socket.socket | SegmentedSocket | SecureSocket = sock if secure is None else secure
-        if segment is not None:
-            self.segment(segment)
+        self._sock: socket.socket | SecureSocket = sock if secure is None else secure
         self._on_bytes = on_bytes
         self._on_close = on_close
         self._outbox = outbox
@@ -137,13 +132,6 @@ class Stream:
     def outbox(self) -> Outbox:
         """The queue of the waiting bytes, with the counts of dropped entries."""
         return self._outbox
-
-    def segment(self, size: int) -> None:
-        """Send in packets of at most ``size`` bytes from now on."""
-        if isinstance(self._sock, SecureSocket | SegmentedSocket):
-            self._sock.segment(size)
-        else:
-            self._sock = SegmentedSocket(self._sock, size)
 
     def feed(self, data: Buffer) -> None:
         """Take bytes that were read from the socket before the stream existed."""

@@ -11,7 +11,7 @@ import socket
 import sys
 from dataclasses import replace
 from ipaddress import IPv4Address
-from typing import Any
+from typing import Any, Final
 
 import pytest
 
@@ -23,7 +23,7 @@ from rmpa.core.sizes import KIB, MIB
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Lane, Refusal, Refuse
-from rmpa.mesh.io.sockets import tune_express
+from rmpa.mesh.io.sockets import may_use_bbr, repeats_quickly, tune_bulk, tune_express
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.descriptors import DESCRIPTORS
 from tests.mesh.io.meshes import DEADLINE, Peer, peers, raw, until
@@ -328,6 +328,35 @@ def test_kernel_queue_stays_short_for_a_slow_peer() -> None:
             unsent = fcntl.ioctl(sock, _SIOCOUTQNSD, bytes(4))
     assert int.from_bytes(unsent, sys.byteorder) <= 2 * limits.EXPRESS_UNSENT_BYTES
     assert counters.as_dict() == {}
+
+
+_LINUX_TCP: Final = {"rto_min_us": 45, "rto_max_ms": 44, "thin_linear_timeouts": 16}
+"""Of linux/tcp.h; a kernel may lack them."""
+
+
+def _tcp(sock: socket.socket, name: int) -> int | None:
+    try:
+        return sock.getsockopt(socket.IPPROTO_TCP, name)
+    except OSError:
+        return None
+
+
+def test_lost_packets_are_repeated_sooner_on_the_express_lane_alone() -> None:
+    counters = Counters()
+    with socket.socket() as plain, socket.socket() as express, socket.socket() as bulk:
+        for tune in (tune_express, tune_bulk):  # an accepted connection says late which lane it is
+            tune(bulk, LaneSettings(), counters)
+        tune_express(express, LaneSettings(), counters)
+        found = {name: [_tcp(sock, name) for sock in (plain, express, bulk)] for name in _LINUX_TCP.values()}
+        bulk_control = bulk.getsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, 16).rstrip(b"\0")
+        usual_control = plain.getsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, 16).rstrip(b"\0")
+    for usual, quick, slow in found.values():
+        if usual is not None and quick is not None:
+            assert (quick != usual, slow) == (True, usual)
+    if repeats_quickly():
+        assert found[_LINUX_TCP["rto_min_us"]][1] in range(5000, 12_000)
+    assert bulk_control == (b"bbr" if may_use_bbr() else usual_control)
+    assert counters.as_dict() == {}, "an option that this kernel lacks is no fault"
 
 
 async def test_a_bye_says_why() -> None:

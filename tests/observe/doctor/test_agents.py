@@ -95,20 +95,6 @@ def test_nodes_that_cannot_be_reached() -> None:
     assert all("ROS_IP=127.0.0.1" in f.remedy for f in found)
 
 
-def test_a_path_that_drops_large_packets() -> None:
-    joystick = SNAPSHOT.peers[0]
-    assert joystick.link is not None
-    link = msgspec.structs.replace(joystick.link, path_problem="a hole", path_remedy="mend it")
-    holed = msgspec.structs.replace(SNAPSHOT, peers=(msgspec.structs.replace(joystick, link=link),))
-    (found,) = [f for f in judge_agents({"base": holed}, "0.1.0") if f.name == "mtu"]
-    assert (found.where, found.level, found.text, found.remedy) == (
-        "base-joystick",
-        CheckLevel.WARN,
-        "a hole",
-        "mend it",
-    )
-
-
 def test_alone_and_of_another_version() -> None:
     alone = msgspec.structs.replace(SNAPSHOT, peers=(), notes=())
     found = judge_agents({"base": alone}, "0.2.0")

@@ -11,10 +11,11 @@ from rmpa.observe.doctor.network import (
     MulticastEcho,
     NetworkInterface,
     Port,
+    Radio,
     judge_interfaces,
-    judge_mtu_probing,
     judge_multicast,
     judge_ports,
+    judge_radio,
     judge_routes,
     judge_rp_filter,
 )
@@ -148,10 +149,14 @@ def test_ports() -> None:
     assert (shared.level, shared.text) == (CheckLevel.OK, text)
 
 
-def test_mtu_probing() -> None:
-    assert judge_mtu_probing(None, black_hole=True).level is CheckLevel.SKIPPED
-    assert judge_mtu_probing(1, black_hole=True).level is CheckLevel.OK
-    assert judge_mtu_probing(0, black_hole=False).level is CheckLevel.OK
-    warned = judge_mtu_probing(0, black_hole=True)
-    assert warned.level is CheckLevel.WARN
-    assert "tcp_mtu_probing=1" in warned.remedy
+def test_a_radio_whose_losses_are_repeated_late_or_whose_queue_is_filled() -> None:
+    wlan = Radio("wlan0", "10.0.0.0/24")
+    assert [check.level for check in judge_radio((), quick=False, bbr=False)] == [CheckLevel.SKIPPED]
+    (quick,) = judge_radio((wlan,), quick=True, bbr=True)
+    (slow,) = judge_radio((wlan,), quick=False, bbr=True)
+    assert (quick.level, slow.level) == (CheckLevel.OK, CheckLevel.WARN)
+    assert "ip route change 10.0.0.0/24 dev wlan0 rto_min 40ms" in quick.remedy
+    assert quick.remedy == slow.remedy
+    (done, queue) = judge_radio((Radio("wlan0", "10.0.0.0/24", "40ms"),), quick=False, bbr=False)
+    assert (done.level, done.remedy, queue.level) == (CheckLevel.OK, "", CheckLevel.WARN)
+    assert "tcp_allowed_congestion_control" in queue.remedy

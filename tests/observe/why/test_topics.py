@@ -143,20 +143,6 @@ def test_a_flowing_topic_passes_all_stages() -> None:
     assert by_name["reader"] == "/base takes them"
 
 
-PATH = {"path_problem": "large packets do not get through", "path_remedy": "give it its true MTU"}
-
-
-def test_a_path_problem_of_either_end_is_shown() -> None:
-    here = one(Case(peer=msgspec.structs.replace(PEER, link=msgspec.structs.replace(LINK, **PATH))))
-    (stage,) = [stage for stage in here.stages if stage.level is CheckLevel.WARN]
-    assert (stage.name, stage.remedy) == ("link", "give it its true MTU")
-    assert stage.text.endswith("large packets do not get through")
-    there = one(Case(there=msgspec.structs.replace(TopicAtPublisher(), **PATH)))
-    (stage,) = [stage for stage in there.stages if stage.level is CheckLevel.WARN]
-    assert (stage.name, stage.text) == ("path", "joystick says: large packets do not get through")
-    assert there.flows
-
-
 FAILURES: dict[str, tuple[Case, str, str, str]] = {
     # What is different: the stage that fails, a part of its text, a part of its remedy.
     "unknown peer": (Case(peer=None), "peer", "base knows no peer 'joystick' (domain 3", "rmpa doctor"),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
-import math
 import ssl
 from functools import partial
 from typing import TYPE_CHECKING, Final, Protocol
@@ -30,8 +29,6 @@ from rmpa.mesh.connection_events import (
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Feature, Lane
 from rmpa.mesh.io.securing import tls_failure
-from rmpa.mesh.io.sockets import reset_at_close, unacknowledged
-from rmpa.mesh.path_mtu import StallWatch
 from rmpa.runtime.machine_timer import MachineTimer
 from rmpa.runtime.stream import Stream
 
@@ -58,9 +55,6 @@ _SILENCE: Final = frozenset(
 """Errors of a connection that the remote side gave up after a silence, or whose process died with bytes unread."""
 _ENDED_THERE: Final = frozenset({errno.ECONNRESET, errno.EPIPE})
 """Errors of a connection that the remote kernel ended: by a reset, EPIPE after the end of the stream had come."""
-
-_ANSWERED: Final = -1
-"""Takes the place of a probe's stamp."""
 
 
 class ConnectionOwner(Protocol):
@@ -134,7 +128,6 @@ class Connection:
         endpoint: Address and port of the remote side.
         expected: The GUID that was dialled; ``None`` on an accepted connection.
         lane: What this side dials for; on an accepted connection the remote side's hello says it.
-        segment: Bytes that one packet may carry; ``None`` for as many as the kernel chooses.
         secured: What encrypts ``sock``, and the remote side's certificate; ``None`` in a mesh without trust.
         rest: The pace of all resting links of this agent.
     """
@@ -151,7 +144,6 @@ class Connection:
         endpoint: tuple[str, int],
         expected: Guid | None = None,
         lane: Lane = Lane.EXPRESS,
-        segment: int | None = None,
         secured: SecuredSocket | None = None,
         rest: RestPace | None = None,
     ) -> None:
@@ -174,8 +166,6 @@ class Connection:
         """Once ended: whether one side ended it by a frame (bye, refuse)."""
         self.held: list[bytes] = []
         """Payloads of control frames that were not sent, because this side has agreed to park the link."""
-        self.stalls = StallWatch(segment, clock.now())
-        """Judges whether sent data gets through."""
         self._owner = owner
         self._clock = clock
         self._loop = asyncio.get_running_loop()
@@ -185,9 +175,6 @@ class Connection:
         self._ended = False
         self._finishing = False
         self._on_mark: OnMark = _ignore_mark
-        self._probe: int | None = None
-        self._probed_at = -math.inf
-        self._sent_before = 0
         self._own_bytes = 0
         """Bytes of the machine's own frames that were sent."""
         self.stream = Stream(
@@ -196,7 +183,6 @@ class Connection:
             on_close=self._lost,
             # For control frames only: ``LaneSender.connect`` replaces it by the lane's outbox.
             outbox=Outbox(1, limits.CONNECTION_URGENT_BYTES),
-            segment=segment,
             secure=None if secured is None else secured.socket,
         )
         self._machine = ConnectionProtocol(
@@ -343,29 +329,6 @@ class Connection:
         finally:
             self._pings.pop(stamp, None)
 
-    def probe(self) -> None:
-        """Send a small packet now; ``take_probe`` returns whether it was answered."""
-        now = self._clock.now()
-        if self.up and now - self._probed_at >= limits.STALL_SUSPECTED:
-            self._probe, self._probed_at = self._machine.ping(now), now
-            self._send_output()
-
-    def take_probe(self) -> bool:
-        """Whether the last ``probe`` was answered since the last call."""
-        answered = self._probe == _ANSWERED
-        if answered:
-            self.forget_probe()
-        return answered
-
-    def forget_probe(self) -> None:
-        """Ignore the answer to the last ``probe``."""
-        self._probe = None
-
-    def has_sent(self) -> bool:
-        """Whether bytes were sent since the last call, or are not acknowledged yet."""
-        before, self._sent_before = self._sent_before, self.stream.bytes_out
-        return self._sent_before != before or unacknowledged(self.sock) > 0
-
     def knows(self, feature: Feature) -> bool:
         """Whether the remote side knows what was added after the first release; only once its hello has come."""
         return self._machine.remote is not None and bool(self._machine.remote.features & feature)
@@ -374,11 +337,6 @@ class Connection:
     def data_out(self) -> int:
         """Bytes that the kernel took, without keepalives and the like."""
         return self.stream.bytes_out - self._own_bytes
-
-    def segment(self, size: int) -> None:
-        """Send in packets of at most ``size`` bytes from now on."""
-        self.stalls = StallWatch(size, self._clock.now(), self.stalls)
-        self.stream.segment(size)
 
     def expel(self, refuse: Refuse) -> None:
         """Close a connection that is up because its peer was revoked, and say so; as ``close`` otherwise."""
@@ -398,12 +356,6 @@ class Connection:
         """Close at once without sending another byte, because the outbox now belongs to another connection."""
         self.stream.close()
         self._machine.lost(reason)
-
-    def reset(self, reason: str) -> None:
-        """Close at once by a TCP reset, which the remote side notices even if earlier bytes were lost."""
-        self.silent = True
-        reset_at_close(self.sock)
-        self.abort(reason)
 
     async def ended(self) -> None:
         """Wait until the socket is closed and the owner is notified."""
@@ -464,8 +416,6 @@ class Connection:
             self.send_control(payload)
 
     def _ponged(self, event: PongReceived) -> None:
-        if event.stamp == self._probe:
-            self._probe = _ANSWERED
         if (answer := self._pings.get(event.stamp)) is not None and not answer.done():
             answer.set_result(event.rtt)
         self._owner.connection_ponged(self)

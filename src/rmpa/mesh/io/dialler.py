@@ -46,9 +46,8 @@ class Dialler:
         sock = DESCRIPTORS.open_socket(Use.LINK, what=f"a link to {endpoint[0]}:{endpoint[1]}")
         try:
             (tune_bulk if lane is Lane.BULK else tune_express)(sock, self._lanes, self._counters)
-            if lane is Lane.EXPRESS and not endpoint[0].startswith("127."):
-                # Both ways. Not the bulk lane's: several such segments may still leave as one packet.
-                limit_segments(sock, limits.EXPRESS_SEGMENT, self._counters)
+            if not endpoint[0].startswith("127."):
+                limit_segments(sock, self._counters)
             async with asyncio.timeout(within):
                 await asyncio.get_running_loop().sock_connect(sock, endpoint)
         except BaseException:

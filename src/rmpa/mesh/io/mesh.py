@@ -19,7 +19,6 @@ from rmpa.mesh.io.bulk_lanes import BulkLanes
 from rmpa.mesh.io.connection import Connection
 from rmpa.mesh.io.dialler import Dialler
 from rmpa.mesh.io.link import LinkHandlers, PeerLink
-from rmpa.mesh.io.path_monitor import PathMonitor
 from rmpa.mesh.io.redials import Redials, is_over
 from rmpa.mesh.io.securing import Securing, SecuringError, prove, secure_dialled
 from rmpa.mesh.io.sockets import tune_bulk, tune_express
@@ -118,8 +117,6 @@ class Mesh:
         self._clock = clock if clock is not None else SystemClock()
         self._refusals = RefusalLog(_log, self.counters)
         self.dialler: Final = dialler if dialler is not None else Dialler(self._lanes, self.counters)
-        self.paths = PathMonitor(self._clock, self.counters, self._reachable)
-        """Checks whether large packets get through to the peers."""
         self._peering = Peering(identity, rng=rng, alive=self._alive)
         self._timer = MachineTimer(self._peering.next_timer, self._due, now=self._clock.now)
         self._connections: dict[int, Connection] = {}
@@ -183,7 +180,7 @@ class Mesh:
         ]
         for task in tasks:
             task.cancel()
-        await asyncio.gather(*self.paths.close(), *self.dialler.close(), *tasks, return_exceptions=True)
+        await asyncio.gather(*self.dialler.close(), *tasks, return_exceptions=True)
         connections = self.connections()
         for connection in connections:
             connection.close(f"{self.identity.name} ends")
@@ -334,15 +331,12 @@ class Mesh:
             self._redials.begin(link)
 
     def connection_tick(self, connection: Connection) -> None:
-        """Check whether the data that a link sends gets through, and whether a bulk lane is used."""
+        """Check whether a bulk lane is used."""
         if connection.lane == Lane.BULK:
             for each in self._links.values():
                 if each.bulk_connection is connection:
                     self._bulk_lanes.tick(each)
                     return
-        link = self._used(connection)
-        if self._running and link is not None:
-            self.paths.look(link)
 
     def connection_parted(self, connection: Connection) -> None:
         """Both sides ended a connection for now; it is not waited for its socket, since nothing more comes."""
@@ -358,7 +352,6 @@ class Mesh:
     def connection_ended(self, connection: Connection, reason: str) -> None:
         """A socket is closed."""
         now = self._clock.now()
-        self.paths.ended(connection)
         del self._connections[connection.id]
         self._pending.discard(connection.id)
         if connection.malformed:
@@ -521,17 +514,6 @@ class Mesh:
     ) -> None:
         self._open(sock, ConnectionRole.DIALLER, endpoint, link.guid, secured=secured)
 
-    async def _reachable(self, link: PeerLink) -> bool:
-        """Whether the peer of a link accepts a new connection on the path of this one; it is closed at once."""
-        host = link.remote_endpoint[0]
-        endpoints = [link.remote_endpoint] if link.dialled else [e for e in self._endpoints(link) if e[0] == host]
-        try:
-            sock, _ = await self.dialler.redial(endpoints)
-        except OSError:
-            return False
-        sock.close()
-        return True
-
     def _endpoints(self, link: PeerLink) -> list[SocketAddress]:
         """Where the peer of a link may be reached."""
         return list(dict.fromkeys([link.remote_endpoint, *self._peering.endpoints(link.guid)]))
@@ -561,7 +543,6 @@ class Mesh:
             endpoint=endpoint,
             expected=expected,
             lane=lane,
-            segment=self.paths.segment(endpoint[0]),
             secured=secured,
             rest=self._rest_pace,
         )

@@ -2,37 +2,28 @@
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import socket
-import struct
 import sys
 import termios
 from typing import TYPE_CHECKING, Final
 
 from rmpa.mesh import limits
-from rmpa.mesh.path_mtu import TcpSample
 
 if TYPE_CHECKING:
     from rmpa.config.settings import LaneSettings
     from rmpa.core.counters import Counters
 
 
-_INFO_BYTES: Final = 256
-_RETRANSMITS: Final = struct.Struct("=2xB")  # tcpi_retransmits of struct tcp_info, linux/tcp.h
-_SND_MSS: Final = struct.Struct("=16xI")
-_PMTU: Final = struct.Struct("=60xI")
-_RTT: Final = struct.Struct("=68xI")  # microseconds
-_BYTES_ACKED: Final = struct.Struct("=120xQ")
-_DELIVERED: Final = struct.Struct("=192xI")  # since Linux 4.18
-_TIME_STAMPS: Final = 12
-_QUICK_REPETITION: Final = (
-    (16, 1),  # TCP_THIN_LINEAR_TIMEOUTS, Linux 2.6.34
-    (44, limits.EXPRESS_RTO_MAX_MS),  # TCP_RTO_MAX_MS, 6.15
-    (45, limits.EXPRESS_RTO_MIN_US),  # TCP_RTO_MIN_US, 6.18
+_RTO_MIN_US: Final = 45
+_REPETITION: Final = (
+    (16, 1, 0),  # TCP_THIN_LINEAR_TIMEOUTS, Linux 2.6.34
+    (44, limits.EXPRESS_RTO_MAX_MS, 120_000),  # TCP_RTO_MAX_MS, 6.15
+    (_RTO_MIN_US, limits.EXPRESS_RTO_MIN_US, 200_000),  # TCP_RTO_MIN_US, 6.18
 )
-"""Numbers of linux/tcp.h, which Python's ``socket`` lacks."""
-_BULK_CONGESTION: Final = b"bbr"
+"""Options with their values on the express lane, and Linux's own; Python's ``socket`` lacks these numbers of
+linux/tcp.h."""
+_BBR: Final = b"bbr"
 
 
 def tune_express(sock: socket.socket, lanes: LaneSettings, counters: Counters) -> None:
@@ -42,21 +33,33 @@ def tune_express(sock: socket.socket, lanes: LaneSettings, counters: Counters) -
     and each time twice as long as before.
     """
     _tune(sock, limits.EXPRESS_UNSENT_BYTES, lanes.express_dscp, lanes.express_priority, counters)
-    for name, value in _QUICK_REPETITION:
-        with contextlib.suppress(OSError):
-            sock.setsockopt(socket.IPPROTO_TCP, name, value)
+    for name, quick, _ in _REPETITION:
+        _try(sock, name, quick)
 
 
 def tune_bulk(sock: socket.socket, lanes: LaneSettings, counters: Counters) -> None:
     """Set up the bulk lane: the shortest kernel queue, a low priority, congestion control by BBR if it is permitted.
 
-    BBR keeps the queues short that are behind this host, as in a radio or router; *cubic* fills them until packets are
-    lost, and commands wait there too. A route's own ``congctl`` replaces what is set before a connection is made, so
-    this is called again then.
+    BBR keeps the queues short that are behind this host, as in a radio or router; *cubic* fills them until packets
+    are lost, and commands wait there too. A route's own ``congctl`` replaces what is set before a connection is made,
+    so this is called again then.
     """
     _tune(sock, limits.BULK_UNSENT_BYTES, lanes.bulk_dscp, lanes.bulk_priority, counters)
-    with contextlib.suppress(OSError):
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, _BULK_CONGESTION)
+    for name, _, usual in _REPETITION:  # the lane of an accepted connection is known late
+        _try(sock, name, usual)
+    _try(sock, socket.TCP_CONGESTION, _BBR)
+
+
+def repeats_quickly() -> bool:
+    """Whether this kernel lets the express lane repeat lost packets within milliseconds."""
+    with socket.socket() as sock:
+        return _try(sock, _RTO_MIN_US, limits.EXPRESS_RTO_MIN_US)
+
+
+def may_use_bbr() -> bool:
+    """Whether this process may use BBR for the bulk lane."""
+    with socket.socket() as sock:
+        return _try(sock, socket.TCP_CONGESTION, _BBR)
 
 
 def unacknowledged(sock: socket.socket) -> int:
@@ -69,44 +72,21 @@ def unacknowledged(sock: socket.socket) -> int:
         return 0
 
 
-def sample(sock: socket.socket) -> TcpSample | None:
-    """The kernel's statistics of a connection; ``None`` where it has none, or the socket is closed."""
+def limit_segments(sock: socket.socket, counters: Counters) -> None:
+    """Before connecting: let both sides send packets that fit through usual tunnels, whatever the path's MTU is."""
     try:
-        info = sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _INFO_BYTES)
-        return TcpSample(
-            unacknowledged(sock),
-            _RETRANSMITS.unpack_from(info)[0],
-            _BYTES_ACKED.unpack_from(info)[0],
-            _DELIVERED.unpack_from(info)[0],
-            _RTT.unpack_from(info)[0] * 1e-6,
-        )
-    except (OSError, struct.error):
-        return None
-
-
-def packet_bytes(sock: socket.socket) -> int | None:
-    """Bytes of the largest packet that the kernel sends on a connection, headers included; ``None`` if unknown."""
-    try:
-        info = sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _INFO_BYTES)
-        mss: int = _SND_MSS.unpack_from(info)[0]
-        mtu: int = _PMTU.unpack_from(info)[0]
-    except (OSError, struct.error):
-        return None
-    return min(mtu, mss + limits.TCP_HEADERS)
-
-
-def limit_segments(sock: socket.socket, segment: int, counters: Counters) -> None:
-    """Before connecting: let both sides send segments of at most ``segment`` bytes (TCP_MAXSEG)."""
-    try:
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, segment + _TIME_STAMPS)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, limits.SEGMENT_BYTES + limits.TIME_STAMP_BYTES)
     except OSError:
         counters.add("link.option_refused")
 
 
-def reset_at_close(sock: socket.socket) -> None:
-    """Make ``close`` drop unsent data and reset the connection: an orderly end would have to wait for lost data."""
-    with contextlib.suppress(OSError):
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+def _try(sock: socket.socket, name: int, value: int | bytes) -> bool:
+    """Set an option of TCP that many kernels lack or do not permit."""
+    try:
+        sock.setsockopt(socket.IPPROTO_TCP, name, value)
+    except OSError:
+        return False
+    return True
 
 
 def _tune(sock: socket.socket, unsent: int, dscp: int, priority: int, counters: Counters) -> None:

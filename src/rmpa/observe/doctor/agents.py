@@ -158,8 +158,6 @@ def _peer(agent: str, peer: PeerInfo) -> Iterator[Check]:
     way = "found by multicast" if peer.source == "multicast" else f"found by {peer.source or 'its link'}"
     rest = ", at rest" if link.rests else ""
     yield Check("peer", OK, f"linked by {link.remote}{rest}, {way}", where=both)
-    if link.path_problem:
-        yield Check("mtu", WARN, link.path_problem, link.path_remedy, where=both)
     if link.dropped:
         text = f"{link.dropped} messages were given up, for the link is slower than what it should carry"
         advice = "`rmpa peer info` shows of which topics; contracts.md tells what to do (max_rate, priority)"

@@ -157,25 +157,46 @@ def judge_rp_filter(values: Mapping[str, int], interfaces: Sequence[NetworkInter
     return [Check("rp_filter", OK, "nothing is dropped for coming by the wrong interface")]
 
 
-def judge_mtu_probing(value: int | None, *, black_hole: bool) -> Check:
-    """Whether the kernel finds the MTU of a path that silently drops large packets (RFC 4821).
-
-    Agents do it for their own links; this is about all other TCP connections.
+@dataclass(frozen=True, slots=True)
+class Radio:
+    """What the kernel does for TCP over a wireless interface.
 
     Args:
-        value: ``net.ipv4.tcp_mtu_probing``: 0 never, 1 behind a black hole, 2 always; ``None``: not known.
-        black_hole: Whether an agent of this machine has a peer behind such a path.
+        name: As in ``ip link``.
+        network: Its network, as ``ip route`` has it.
+        rto_min: ``rto_min`` of its route, as ``ip route`` shows it; empty for none, or where ``ip`` is missing.
     """
-    if value is None:
-        return Check("mtu", SKIPPED, "this kernel does not tell", where="probing")
-    name = "net.ipv4.tcp_mtu_probing"
-    if value:
-        return Check("mtu", OK, f"{name} is {value}: TCP finds a path's MTU itself", where="probing")
-    if black_hole:
-        text = f"a path drops large packets, and {name} is 0: ssh and other programs hang on it"
-        return Check("mtu", WARN, text, f"sudo sysctl -w {name}=1 (on both machines)", where="probing")
-    text = f"{name} is 0, Linux's default; agents find a path that drops large packets themselves"
-    return Check("mtu", OK, text, where="probing")
+
+    name: str
+    network: str
+    rto_min: str = ""
+
+
+def judge_radio(radios: Iterable[Radio], *, quick: bool, bbr: bool) -> list[Check]:
+    """Whether packets that a radio loses are repeated soon, and whether large messages fill its queue.
+
+    Args:
+        radios: The wireless interfaces that an agent would use.
+        quick: Whether this kernel lets an agent shorten the time-outs of its own links (TCP_RTO_MIN_US).
+        bbr: Whether this process may use BBR for its large messages.
+    """
+    found = []
+    for radio in radios:
+        remedy = f"sudo ip route change {radio.network} dev {radio.name} rto_min 40ms"
+        if radio.rto_min:
+            text = f"its route has rto_min {radio.rto_min}: lost packets are repeated soon"
+            found.append(Check("radio", OK, text, where=radio.name))
+        elif quick:
+            text = "agents repeat lost commands soon; connections of nodes (direct transport) wait 200 ms"
+            found.append(Check("radio", OK, text, remedy, where=radio.name))
+        else:
+            text = "TCP waits 200 ms before it repeats a lost packet, and this kernel has no option for less"
+            found.append(Check("radio", WARN, text, remedy, where=radio.name))
+        if not bbr:
+            text = "BBR is not permitted: large messages fill the radio's queue, and commands wait behind them"
+            permit = 'sudo modprobe tcp_bbr; sudo sysctl -w net.ipv4.tcp_allowed_congestion_control="reno cubic bbr"'
+            found.append(Check("radio", WARN, text, permit, where=radio.name))
+    return found or [Check("radio", SKIPPED, "no wireless interface is used")]
 
 
 def judge_routes(routes: Mapping[str, str]) -> list[Check]:

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.io.mesh import Mesh
-    from rmpa.mesh.io.path_monitor import PathMonitor
     from rmpa.mesh.mode import MeshMode
     from rmpa.mesh.peering_events import PeerStatus
     from rmpa.runtime.stream import Stream
@@ -76,7 +75,7 @@ class PeersSection:
             info = self._peer(roster.get(guid), statuses.get(guid), session, now)
             if session is not None:
                 if session.linked:
-                    info = msgspec.structs.replace(info, link=self._link(session.link, endpoint.mesh.paths, now))
+                    info = msgspec.structs.replace(info, link=self._link(session.link, now))
                 theirs = len(self._bridge.topics.imports.offered_by(session.peer))
                 ours = self._bridge.topics.exports.topics_for(session.peer)
                 yield_to_data()
@@ -149,9 +148,8 @@ class PeersSection:
         )
 
     @staticmethod
-    def _link(link: PeerLink, paths: PathMonitor, now: float) -> LinkInfo:
+    def _link(link: PeerLink, now: float) -> LinkInfo:
         host, port = link.remote_endpoint
-        problem = paths.problem(link)
         return LinkInfo(
             remote=f"{host}:{port}",
             dialled=link.dialled,
@@ -166,9 +164,6 @@ class PeersSection:
             heard_ago=now - link.heard_at,
             rests=link.rests,
             lease=link.lease,
-            packet=paths.packet_bytes(link),
-            path_problem=problem.text if problem is not None else "",
-            path_remedy=problem.remedy if problem is not None else "",
             lanes=(
                 _lane(link.express, link.connection.stream),
                 msgspec.structs.replace(

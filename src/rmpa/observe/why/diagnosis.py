@@ -166,9 +166,6 @@ class TopicAtPublisher(msgspec.Struct, frozen=True, kw_only=True):
         subscribers: The subscribers in its own module.
         similar: A topic of that module with nearly this name, or empty; ``near`` on the wire.
         awaited: Nodes that published it before the agent was restarted and do not answer now, with their addresses.
-        path_problem: What is wrong with the network path to the agent that asks, ready to read; empty if nothing is
-            known.
-        path_remedy: What to do about that.
         permitted: Whether the permissions of its module let the module that asks subscribe; ``None``: trust is off
             there. If not, nothing else is told, also not whether there is such a topic.
     """
@@ -177,8 +174,6 @@ class TopicAtPublisher(msgspec.Struct, frozen=True, kw_only=True):
     subscribers: tuple[str, ...] = ()
     similar: str = msgspec.field(default="", name="near")
     awaited: tuple[str, ...] = ()
-    path_problem: str = ""
-    path_remedy: str = ""
     permitted: bool | None = None
 
 

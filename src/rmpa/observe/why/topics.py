@@ -111,8 +111,6 @@ def _linked(peer: PeerInfo) -> Check:
     if link.heard_ago is not None and link.heard_ago > link.lease / 2:
         text += f"; silent for {link.heard_ago:.1f} s"
         return Check("link", WARN, text, "if it stays so, the cable or the radio is the place to look at")
-    if link.path_problem:
-        return Check("link", WARN, f"{text}; {link.path_problem}", link.path_remedy)
     return Check("link", OK, text)
 
 
@@ -243,8 +241,6 @@ def _source_stages(ends: BothEnds, later: BothEnds | None, peer: str, node: str,
         if not relayed:
             return
     yield _open_route(now, report_now, peer)
-    if ends.there is not None and ends.there.path_problem:
-        yield Check("path", WARN, f"{peer} says: {ends.there.path_problem}", ends.there.path_remedy)
     if now.state in _FLOWING:
         yield _sent(now, report_now, peer, wire)
         yield _arrived(route, now, report, report_now, peer, ends.here.snapshot.agent.name)

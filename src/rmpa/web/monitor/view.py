@@ -251,8 +251,7 @@ class StateBuilder:
         entry = {
             "state": module_state(peer),
             "since": steady.moment(f"{name} since", taken - peer.since_ago),
-            "error": peer.last_error or "; ".join(peer.conflicts) if not link else link.path_problem,
-            "remedy": link.path_remedy if link else "",
+            "error": "" if link else peer.last_error or "; ".join(peer.conflicts),
             "guid": peer.guid,
             "source": peer.source,
             "via": peer.via,

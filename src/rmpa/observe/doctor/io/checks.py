@@ -15,6 +15,7 @@ from rmpa.config.settings import Settings
 from rmpa.config.sources import load_settings
 from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.discovery.io.interfaces import choose, list_interfaces
+from rmpa.mesh.io.sockets import may_use_bbr, repeats_quickly
 from rmpa.observe import limits
 from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.observe.doctor.agents import judge_agents
@@ -29,9 +30,9 @@ from rmpa.observe.doctor.kernel_limits import judge_kernel_limits, mesh_size
 from rmpa.observe.doctor.machine import judge_clock, judge_rights
 from rmpa.observe.doctor.network import (
     judge_interfaces,
-    judge_mtu_probing,
     judge_multicast,
     judge_ports,
+    judge_radio,
     judge_routes,
     judge_rp_filter,
 )
@@ -139,9 +140,8 @@ def _multicast(given: DoctorInput) -> Iterable[Check]:
     return judge_multicast(echoes, settings.multicast.group, settings.discovery_port)
 
 
-def _mtu_probing(given: DoctorInput) -> Iterable[Check]:
-    holes = any(peer.link and peer.link.path_problem for shown in given.snapshots.values() for peer in shown.peers)
-    return [judge_mtu_probing(network.read_mtu_probing(), black_hole=holes)]
+def _radio(given: DoctorInput) -> Iterable[Check]:
+    return judge_radio(network.read_radios(given.interfaces), quick=repeats_quickly(), bbr=may_use_bbr())
 
 
 def _routes(given: DoctorInput) -> Iterable[Check]:
@@ -229,7 +229,7 @@ CHECKS: Final = (
     DoctorCheck("multicast", _multicast),
     DoctorCheck("firewall", lambda given: check_firewall(given.settings)),
     DoctorCheck("rp_filter", lambda given: judge_rp_filter(network.read_rp_filter(), given.interfaces)),
-    DoctorCheck("mtu", _mtu_probing),
+    DoctorCheck("radio", _radio),
     DoctorCheck("route", _routes),
     DoctorCheck("port", _ports),
     DoctorCheck("ROS", _shell),

@@ -13,15 +13,16 @@ import psutil
 
 from rmpa.discovery.io.interfaces import choose, list_interfaces
 from rmpa.discovery.io.sockets import open_receiver
-from rmpa.observe.doctor.network import NetworkInterface, Port
+from rmpa.observe.doctor.io.programs import ask_program
+from rmpa.observe.doctor.network import NetworkInterface, Port, Radio
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from rmpa.config.settings import Settings
 
 _CONF: Final = Path("/proc/sys/net/ipv4/conf")
-_MTU_PROBING: Final = Path("/proc/sys/net/ipv4/tcp_mtu_probing")
+_INTERFACES: Final = Path("/sys/class/net")
 _CONTAINER_MARKS: Final = (Path("/.dockerenv"), Path("/run/.containerenv"))
 
 
@@ -72,12 +73,16 @@ def read_rp_filter() -> dict[str, int]:
     return found
 
 
-def read_mtu_probing() -> int | None:
-    """``net.ipv4.tcp_mtu_probing``; ``None`` where there is no such setting."""
-    try:
-        return int(_MTU_PROBING.read_text(encoding="ascii"))
-    except (OSError, ValueError):
-        return None
+def read_radios(interfaces: Iterable[NetworkInterface]) -> list[Radio]:
+    """The wireless ones of these interfaces that an agent would use, with what their routes say."""
+    found = []
+    for interface in interfaces:
+        if interface.used and interface.networks and (_INTERFACES / interface.name / "phy80211").exists():
+            network = str(interface.networks[0].network)
+            route = ask_program("ip", "-4", "route", "show", network, "dev", interface.name) or ""
+            words = route.partition(" rto_min ")[2].removeprefix("lock ").split()
+            found.append(Radio(interface.name, network, words[0] if words else ""))
+    return found
 
 
 def probe_route(host: str) -> str:

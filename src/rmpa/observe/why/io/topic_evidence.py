@@ -152,11 +152,7 @@ class TopicEvidence:
                 sources += [self._report(session, Source(topic, node), wire) for node in nodes]
                 subscribers += [node for node in state.subscribers.get(topic, {}) if not is_own(node)]
                 awaited += self.awaited(topic)
-        endpoint = self._snapshots.endpoint
-        problem = endpoint.mesh.paths.problem(session.link) if endpoint is not None else None
         return TopicAtPublisher(
-            path_problem=problem.text if problem is not None else "",
-            path_remedy=problem.remedy if problem is not None else "",
             sources=tuple(sources[: observe_limits.WHY_SOURCES_MAX]),
             subscribers=tuple(subscribers[: observe_limits.WHY_SOURCES_MAX]),
             similar="" if sources else await self._similar(session.link.name, wire),

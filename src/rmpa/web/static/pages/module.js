@@ -25,7 +25,7 @@ export function ModulePage({ name, state, connection }) {
     <${Panel} title="Lanes"><${Lanes} lanes=${section(detail, "link").lanes} linked=${Boolean(detail.link)} /><//>
     <${Panel} title="Way to it"><${Why} connection=${connection} kind="module" name=${name} /><//>`}
     ${(module.error || (module.hidden || []).length > 0) && html`<${Panel} title="What is wrong">
-      ${module.error && html`<p class="failure">${module.error}${module.remedy && html`<br /><span class="muted">${module.remedy}</span>`}</p>`}
+      ${module.error && html`<p class="failure">${module.error}</p>`}
       ${(module.hidden || []).map((text) => html`<p class="failure" key=${text}>${text}</p>`)}<//>`}
     ${!own && html`<${Panel} title="Bytes a second on the link" wide><${Lines} label="Bytes a second" series=${DIRECTIONS.map(([key, text]) => ({ label: text, value: module[key] }))} format=${bandwidth} /><//>`}
     ${resources.length > 0 && html`<${Panel} title="Smart Resources"><${Table} caption="Smart Resources" columns=${["Resource", "Quality", "Profile", "Says"]}>${resources.map(([key, one]) => html`<tr key=${key}><th scope="row"><${Link} page="resource" name=${key}>${one.name}<//></th><td><${Mark} state=${one.level} /></td><td>${one.profile || "none"}</td><td>${one.message}</td></tr>`)}<//><//>`}
@@ -43,7 +43,7 @@ const LinkPanel = ({ module, detail }) => {
     ["Round trip", seconds(module.rtt)], ["Clock offset", bounded(module.offset, module.offset_error)], ["In", bandwidth(module.bytes_in)], ["Out", bandwidth(module.bytes_out)],
     ["Waiting to be sent", module.queued ? bytes(module.queued) : undefined], ["Dropped, link too slow", module.dropped ? count(module.dropped) : undefined],
     ["Topics that it offers", count(module.topics_in)], ["Topics that it is offered", count(module.topics_out)], ["Direct subscribers here", module.direct_in || undefined],
-    ["Direct subscribers there", module.direct_out || undefined], ["Relayed by", module.via], ["Found by", module.source], ["Largest packet", link.packet && bytes(link.packet)],
+    ["Direct subscribers there", module.direct_out || undefined], ["Relayed by", module.via], ["Found by", module.source],
     ["Dialled by", link.dialled === undefined ? undefined : link.dialled ? "this module" : "the peer"], ["Next attempt in", detail.next_attempt !== undefined ? seconds(detail.next_attempt) : undefined], ["GUID", html`<code>${module.guid}</code>`]]} /><//>`;
 };
 
