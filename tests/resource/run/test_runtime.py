@@ -100,9 +100,9 @@ async def test_publish_refuses_a_message_of_another_type(core: RosCore, one: Res
     try:
         with pytest.raises(MessageError, match="date"):
             words.publish(date="x")
-        with pytest.raises(MessageError, match="words has messages of type std_msgs/String, not object"):
+        with pytest.raises(MessageError, match="words: data is a string, not <object"):
             words.publish(object())
-        with pytest.raises(LocalProtocolError, match="a message and fields"):
+        with pytest.raises(MessageError, match="words: std_msgs/String: a message and fields"):
             words.publish(words.type.make({"data": "x"}), data="y")
     finally:
         await runtime.close()

@@ -13,7 +13,7 @@ from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.http.client import call
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import DefinitionError
-from rmpa.ros.types.messages import MessageType
+from rmpa.ros.types.messages import MessageError, MessageType
 from rmpa.ros.types.service_types import ServiceType
 from tests.ros.node.peers import DEADLINE, STRING, until
 
@@ -97,6 +97,51 @@ async def test_messages_with_a_header_are_numbered_as_rospy_numbers_them(core: R
             got = [(await anext(iterator)).message for _ in range(4)]
         assert [each.header.seq for each in got] == [1, 2, 3, 99]  # what is relayed raw stays as it is
         assert {(each.header.frame_id, each.point.x) for each in got} == {("map", 7.0)}
+
+
+async def test_a_node_hears_its_own_publisher_as_rospy_and_roscpp_do(core: RosCore) -> None:
+    async with node(core, "both") as both:
+        subscriber = await both.subscribe("/t", "std_msgs/String")
+        apart = await both.subscribe("/u", "std_msgs/String", own=False)
+        for topic in ("/t", "/u"):
+            (await both.advertise(topic, "std_msgs/String", latch=True)).publish(data="hello")
+        async with asyncio.timeout(DEADLINE):
+            async for received in subscriber:
+                assert (received.message.data, received.caller_id) == ("hello", "/both")
+                break
+            async with node(core, "other") as other:  # comes later than what /both would have heard
+                (await other.advertise("/u", "std_msgs/String", latch=True)).publish("hello")
+                async for received in apart:
+                    assert received.caller_id == "/other"
+                    break
+
+
+async def test_a_message_is_published_as_an_object_as_values_or_as_fields(core: RosCore) -> None:
+    async with node(core, "talker") as talker, node(core, "echo") as echo:
+        publisher = await talker.advertise("/p", "geometry_msgs/Point")
+        subscriber = await echo.subscribe("/p")
+        await publisher.wait_for_subscriber()
+        publisher.publish(publisher.make({"x": 1}))
+        publisher.publish({"x": 1})
+        publisher.publish([1, 0, 0])
+        publisher.publish(x=1)
+        publisher.publish()
+        async with asyncio.timeout(DEADLINE):
+            iterator = aiter(subscriber)
+            got = [(await anext(iterator)).message.x for _ in range(5)]
+        assert got == [1.0, 1.0, 1.0, 1.0, 0.0]
+        for wrong, error in (
+            ({"w": 1}, "geometry_msgs/Point has no field 'w'; it has x, y, z"),
+            ("x", "geometry_msgs/Point is made of the fields x, y, z, not of 'x'"),
+            (
+                MessageType("std_msgs/String").make("x"),
+                "a message of type geometry_msgs/Point is wanted, not of std_m",
+            ),
+        ):
+            with pytest.raises(MessageError, match=error):
+                publisher.publish(wrong)
+        with pytest.raises(MessageError, match="a message and fields are given"):
+            publisher.publish([1, 0, 0], x=1)
 
 
 async def test_the_iteration_ends_with_its_subscriber_and_with_its_node(core: RosCore) -> None:

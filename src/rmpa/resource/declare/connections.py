@@ -88,15 +88,14 @@ class Output:
         return self.kind.get()
 
     def publish(self, message: object | None = None, /, **values: Any) -> None:
-        """Publish a whole message, or one made of field values.
+        """Publish a message: an object, plain values (see ``MessageType.make``), or fields by name.
 
         While the resource is not active, messages are dropped, except those of functions of profiles and contexts:
         these are queued until it is active.
 
         Raises:
-            MessageError: The message does not fit the output's type.
-            LocalProtocolError: The resource does not run, the calling profile or context function was given up, or
-                both a message and field values are given.
+            MessageError: The message does not fit the output's type, or both a message and field values are given.
+            LocalProtocolError: The resource does not run, or the calling profile or context function was given up.
         """
         if self.on_publish is None:
             raise LocalProtocolError(f"{self.name} has nowhere to go: its resource does not run (rmpa run)")

@@ -146,7 +146,7 @@ class ResourceClient:
             raise UnreachableError("resource", self.resource, "await observe() once before")
         pairs: Any = [{"key": key.replace("__", "."), "value": str(value)} for key, value in values.items()]
         status: Any = [{"name": self._node.name, "values": pairs}]
-        self._observed.publish(self._observed.make({"header": {"stamp": time.time()}, "status": status}))
+        self._observed.publish(header={"stamp": time.time()}, status=status)
 
     def release(self) -> None:
         """Release the requirement."""
@@ -178,7 +178,7 @@ class ResourceClient:
         self._answer = None
         status: Any = [{"name": self._node.name, "hardware_id": self._mark, "values": pairs}]
         # The stamp identifies a latched request that arrives again, so that its expiry does not start again.
-        self._requirements.publish(self._requirements.make({"header": {"stamp": time.time()}, "status": status}))
+        self._requirements.publish(header={"stamp": time.time()}, status=status)
 
     def _response_received(self, received: Received) -> None:
         for status in received.message.status:

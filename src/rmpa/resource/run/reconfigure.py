@@ -74,7 +74,7 @@ class Reconfigure(RuntimePart):
         described = await node.advertise(
             f"{node.name}/parameter_descriptions", MessageType(DESCRIPTION_TYPE), latch=True
         )
-        described.publish(described.make(description(self._entries)))
+        described.publish(description(self._entries))
         self._updates = await node.advertise(f"{node.name}/parameter_updates", MessageType(CONFIG_TYPE), latch=True)
         self.publish()
         kind = await asyncio.to_thread(ServiceType, SERVICE_TYPE)  # reads our file of definitions
@@ -145,7 +145,7 @@ class Reconfigure(RuntimePart):
         if self._updates is None or self._quiet or values == self._published:
             return
         self._published = values
-        self._updates.publish(self._updates.make(config(values, self._entries)))
+        self._updates.publish(config(values, self._entries))
         if self._mirror is None or self._mirror.done():
             self._mirror = asyncio.get_running_loop().create_task(self._to_server(), name="mirror parameters")
 

@@ -11,7 +11,7 @@ import time
 from collections import Counter, deque
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.core.errors import LocalProtocolError, RmpaError
+from rmpa.core.errors import RmpaError
 from rmpa.resource import limits
 from rmpa.resource.declare.fence import current_fence
 from rmpa.resource.run.descriptor import TOPIC, describe, topic_of
@@ -162,7 +162,7 @@ class Runtime:
         publisher, before = self._texts[name]
         if text != before:
             self._texts[name] = (publisher, text)
-            publisher.publish(publisher.make({"data": text}))
+            publisher.publish(data=text)
 
     def publish_descriptor(self) -> None:
         """Publish the descriptor again after the declaration has changed."""
@@ -321,16 +321,11 @@ class Runtime:
     ) -> None:
         """Serialize a message in the caller's thread, so that the caller gets the errors, and send it in the loop."""
         kind = output.type
-        if message is not None and values:
-            raise LocalProtocolError(f"{output.name}: a message and fields; give one or the other")
-        if message is None:
-            message = kind.make(dict(values))
-        else:
-            given = getattr(message, "__msgtype__", "").replace("/msg/", "/")
-            if given != kind.name:
-                shown = given or type(message).__name__
-                raise MessageError(f"{output.name} has messages of type {kind.name}, not {shown}")
-        raw, fence = bytes(numbers.stamp(kind.serialize(message))), current_fence()
+        try:
+            payload = kind.serialize(kind.given(message, values))
+        except MessageError as error:
+            raise MessageError(f"{output.name}: {error}") from None
+        raw, fence = bytes(numbers.stamp(payload)), current_fence()
         if fence is None:
             self.call_in_loop(self.send, output, raw)
             return

@@ -4,7 +4,7 @@
 
     async with Node("talker") as node:
         publisher = await node.advertise("/chatter", "std_msgs/String")
-        publisher.publish(publisher.make("hello"))
+        publisher.publish(data="hello")
 
     async with Node("echo", anonymous=True) as node:
         async for received in await node.subscribe("/chatter"):
@@ -197,10 +197,11 @@ class Node:
         callback: Callable[[Received], None] | None = None,
         *,
         on_bytes: Callable[[memoryview, Mapping[str, str]], None] | None = None,
+        own: bool = True,
         nodelay: bool = True,
         queue_messages: int = limits.RECEIVED_QUEUE,
     ) -> Subscriber:
-        """Subscribe to a topic.
+        """Subscribe to a topic, of this node's own publisher too, as rospy and roscpp do.
 
         Args:
             topic: Resolved in the namespace.
@@ -209,6 +210,7 @@ class Node:
                 ``async for`` on the result.
             on_bytes: ``(data, header)``: called in place of ``callback`` with a message's bytes, a view that is valid
                 during the call only, and the publisher's connection header.
+            own: Whether what this node publishes on the topic is received too.
             nodelay: Whether to ask publishers for TCP_NODELAY.
             queue_messages: Messages queued for the ``async for``; above it the oldest is dropped.
 
@@ -231,7 +233,7 @@ class Node:
             callback,
             on_bytes=on_bytes,
             type_name=type_name,
-            own_uri=self.uri,
+            own_uri="" if own else self.uri,
             nodelay=nodelay,
             queue_messages=queue_messages,
             number=self._slave.next_number,

@@ -16,7 +16,7 @@ from rmpa.ros.types.messages import MessageError
 from rmpa.ros.wire.tcpros import ANY, printable
 
 if TYPE_CHECKING:
-    from rmpa.ros.types.messages import MessageType, Plain
+    from rmpa.ros.types.messages import MessageType
     from rmpa.ros.types.service_types import ServiceType
     from rmpa.ros.wire.tcpros import Buffer
 
@@ -146,10 +146,7 @@ class ServiceClient:
 
 
 def _serialize(kind: MessageType, value: object) -> Buffer:
-    if value is None or isinstance(value, dict | list | str | int | float):
-        plain: Plain = value
-        value = kind.make(plain)
-    return kind.serialize(value)
+    return kind.serialize(kind.given(value))
 
 
 async def probe(uri: str, service: str, caller_id: str, timeout: float) -> ServiceConnection:  # noqa: ASYNC109

@@ -362,7 +362,7 @@ class Subscription:
         caller_id: The node's name.
         on_message: ``(connection, framed)``; the view is only valid during the call.
         on_refused: ``(connection, text)``.
-        own_uri: The node's slave API, which is ignored in the list: a node does not subscribe to itself.
+        own_uri: The node's slave API, if it is ignored in the list: the node does not subscribe to itself.
         type_name: The type to ask for.
         md5sum: The md5 sum to ask for.
         definition: The definition to send.

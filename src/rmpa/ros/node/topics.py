@@ -115,15 +115,21 @@ class Publisher:
         """A message of this topic's type from plain values; see ``MessageType.make``."""
         return self._known().make(values)
 
-    def publish(self, message: object) -> int:
-        """Publish a message object; return the number of older messages dropped for slow subscribers.
+    def publish(self, message: object = None, /, **fields: object) -> int:
+        """Publish a message; return the number of older messages dropped for slow subscribers.
+
+        Args:
+            message: A message object, or plain values (see ``MessageType.make``): a mapping of fields, a list of all
+                fields, or the value itself where the type has one field.
+            fields: In place of ``message``: fields by name; the others are 0, empty or false.
 
         ``header.seq`` counts the messages, 1, 2, 3 …, as rospy has it.
 
         Raises:
             MessageError: The message does not fit the type.
         """
-        payload: Buffer = self._known().serialize(message)
+        kind = self._known()
+        payload: Buffer = kind.serialize(kind.given(message, fields))
         return self.publish_raw(self.numbers.stamp(payload) if self.numbers is not None else payload)
 
     def publish_raw(self, payload: Buffer) -> int:
@@ -170,7 +176,7 @@ class Subscriber:
         *,
         on_bytes: Callable[[memoryview, Mapping[str, str]], None] | None = None,
         type_name: str = ANY,
-        own_uri: str,
+        own_uri: str = "",
         nodelay: bool,
         queue_messages: int,
         number: Callable[[], int],

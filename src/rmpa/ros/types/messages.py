@@ -140,6 +140,22 @@ class MessageType:
         """
         return self._make(self.name, values, "")
 
+    def given(self, message: object = None, fields: Mapping[str, object] | None = None) -> Any:
+        """The message object that a program gives: itself, plain values as for ``make``, or fields by name.
+
+        Raises:
+            MessageError: It is of another type, has both a message and fields, or a value does not fit.
+        """
+        if fields:
+            if message is not None:
+                raise MessageError(f"{self.name}: a message and fields are given; give one or the other")
+            return self.make(fields)
+        of = getattr(message, "__msgtype__", None)
+        if of is not None and of != _inner(self.name):
+            raise MessageError(f"a message of type {self.name} is wanted, not of {of.replace('/msg/', '/')}")
+        plain: Any = message
+        return message if of is not None else self.make(plain)
+
     def to_plain(self, message: object) -> dict[str, Plain]:
         """Convert a message object to plain values; times are ``{secs, nsecs}``."""
         return self._plain(self.name, message)

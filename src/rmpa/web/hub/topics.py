@@ -188,7 +188,8 @@ class HubTopics:
         )
 
     async def _register(self, there: _Topic, node: Node) -> Subscriber:
-        return await node.subscribe(there.name, there.kind, on_bytes=functools.partial(self._take, there))
+        take = functools.partial(self._take, there)
+        return await node.subscribe(there.name, there.kind, on_bytes=take, own=False)
 
     def _judge(self, there: _Topic) -> None:
         """Compare the types that are wanted with those that are published.
