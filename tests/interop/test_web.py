@@ -177,7 +177,7 @@ async def test_a_joystick_drives_a_robot_of_another_module_until_its_browser_is_
     await wheels.expect_event("up")
     async with http_client(tablet) as http, looking.monitor(http) as monitor:
         assert "drive" not in monitor.hello["may"]
-        await monitor.send("drive", topic="/cmd_vel", linear=1, angular=0)
+        await monitor.send("drive", topic="/cmd_vel", linear=1, angular=0, hold=1, n=1, at=0)
         assert "may not drive" in (await monitor.next("failed"))["error"]
         assert "Publishers: None" in await asyncio.to_thread(arm.ros.tool, "rostopic", "info", "/cmd_vel")
     async with Chromium(tablet) as page:
@@ -202,6 +202,36 @@ async def test_a_joystick_drives_a_robot_of_another_module_until_its_browser_is_
         async with http_client(tablet) as http:
             await driving.wait_counts(http, "rmpa_web_clients", "protocol", lambda found: not found)
         assert wheels.events("speed")[-1]["linear"] == 0
+
+
+@needs_browser
+async def test_a_robot_does_not_move_by_what_tcp_kept_while_the_network_was_away(
+    lab: Lab, modules: ModuleFactory, web: WebFactory
+) -> None:
+    """The stick is held, the network goes, the stick is let go, the network is back: the robot stays where it is."""
+    (base,) = modules("base")
+    driving = web(base.agent, "--drive")
+    tablet = lab.host("tablet", 0)
+    wheels = base.ros.rospy("wheels", name="wheels", topic="/cmd_vel")
+    await wheels.expect_event("up")
+    async with Chromium(tablet) as page:
+        await driving.open(page, "drive")
+        await page.wait("document.querySelector('.stick.off')")
+        await page.run("document.querySelector('input[type=checkbox]').click()")
+        await page.wait("document.querySelector('.stick:not(.off)')")
+        await page.run("document.querySelector('.stick').focus()")
+        for outage in (1.0, 3.0):
+            mark = wheels.mark_events()
+            await page.down("ArrowUp")
+            await wheels.expect_event("speed", where=lambda event: event["linear"] == pytest.approx(HELD), since=mark)
+            cut = asyncio.create_task(asyncio.to_thread(tablet.outage, outage))
+            await wheels.expect_event("speed", where=lambda event: event["linear"] == 0, since=mark + 2)
+            mark = wheels.mark_events()
+            await page.up("ArrowUp")
+            await cut
+            await page.wait("document.body.innerText.includes('late, and are dropped')")
+            assert not [event for event in wheels.events("speed", since=mark) if event["linear"]]
+        assert page.errors == []
 
 
 async def test_what_is_asked_of_a_peer_is_answered(lab: Lab, modules: ModuleFactory, web: WebFactory) -> None:

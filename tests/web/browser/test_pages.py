@@ -439,11 +439,15 @@ async def test_a_robot_moves_only_while_the_stick_is_held(site: Site) -> None:
     await page.run("document.querySelector('.stick').focus()")
     await page.down("ArrowUp")
     await page.wait("document.querySelector('.stick + p').textContent.includes('forward 60 %')")
+    deadline = time.monotonic() + 10
+    while len(site.server.speeds) < 2 and time.monotonic() < deadline:
+        await page.run("new Promise((done) => setTimeout(done, 50))")
     await page.up("ArrowUp")
     await page.wait("document.querySelector('.stick + p').textContent.includes('forward 0 %')")
     await page.wait("window.rmpa.socket.bufferedAmount === 0")
     deadline = time.monotonic() + 10
     while not (site.server.speeds and site.server.speeds[-1].linear == 0) and time.monotonic() < deadline:
         await page.run("new Promise((done) => setTimeout(done, 50))")
-    assert site.server.speeds[0].linear == pytest.approx(0.6 * 0.15 * limits.DRIVE_SPEED)
+    assert site.server.speeds[0].linear == 0  # one command alone moves nothing
+    assert site.server.speeds[1].linear == pytest.approx(0.6 * 0.15 * limits.DRIVE_SPEED)
     assert site.server.speeds[-1].linear == 0

@@ -67,9 +67,16 @@ class Page:
         self.state: Any = {}
         self.messages: list[dict[str, Any]] = []
         self.pictures: list[bytes] = []
+        self.commands = 0
 
     async def send(self, op: str, **values: Any) -> None:
         await self.socket.send_str(json.dumps({"op": op, **values}))
+
+    async def drive(self, linear: float, angular: float = 0.0) -> None:
+        """A command of the joystick, made now: both ends have one clock here."""
+        self.commands += 1
+        made = {"hold": 1, "n": self.commands, "at": asyncio.get_running_loop().time()}
+        await self.send("drive", topic="/cmd_vel", linear=linear, angular=angular, **made)
 
     async def read(self) -> None:
         message = await self.socket.receive()
@@ -270,7 +277,7 @@ async def test_a_page_that_may_only_look_changes_nothing(core: RosCore) -> None:
         ):
             answer = await page.ask(number, what, name="/speed", value=1, service="/light", resource="/arm")
             assert "may" in answer["error"]
-        await page.send("drive", topic="/cmd_vel", linear=1, angular=0)
+        await page.drive(1)
         assert "may not drive" in (await page.next("failed", id=0))["error"]
         assert not core.publishers("/cmd_vel")
 
@@ -281,7 +288,7 @@ async def test_the_joystick_drives_and_a_lost_page_stops_the_robot(core: RosCore
         await base.subscribe("/cmd_vel", TWIST, lambda message: got.append(struct.unpack("<6d", message.raw)))
         async with asyncio.timeout(DEADLINE):
             while not any(speed[0] == 0.5 * limits.DRIVE_SPEED for speed in got):
-                await page.send("drive", topic="/cmd_vel", linear=0.5, angular=-1)
+                await page.drive(0.5, -1)
                 await asyncio.sleep(0.05)
         assert got[-1][5] == -limits.DRIVE_TURN
         assert page.socket._response.connection is not None
@@ -297,7 +304,7 @@ async def test_a_joystick_that_is_let_go_stops_the_robot(core: RosCore) -> None:
         await base.subscribe("/cmd_vel", TWIST, lambda message: got.append(struct.unpack("<6d", message.raw)))
         async with asyncio.timeout(DEADLINE):
             while not any(got):
-                await page.send("drive", topic="/cmd_vel", linear=1, angular=0)
+                await page.drive(1)
                 await asyncio.sleep(0.05)
         # Nothing more is sent: the dead-man's timer of the server stops the robot.
         await until(lambda: got[-1] == (0.0,) * 6)

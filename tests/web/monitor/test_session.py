@@ -20,6 +20,7 @@ from rmpa.web.monitor.session import FollowLog, MonitorClose, MonitorSession, Qu
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+STOP = Speed("/cmd_vel", 0.0, 0.0)
 ALL = dataclasses.replace(FULL, drive=True)
 
 
@@ -38,6 +39,8 @@ class Page:
         self.details: Any = {("topic", "/odom"): {"rate": 50.0}}
         self.decoded = 0
         self.ticks = 0
+        self.tick_at = 0.0
+        self.n = 0
         self.session = MonitorSession(
             lambda kind, name: self.details.get((kind, name)), self._decode, rights, self.now, lambda: self.unsent
         )
@@ -60,6 +63,7 @@ class Page:
             message = json.loads(output)
             if message["op"] == "tick":
                 self.ticks += 1
+                self.tick_at = message["at"]
                 continue
             new.append(message)
             if message["op"] == "state":
@@ -69,6 +73,21 @@ class Page:
             self.number = message.get("n", self.number)
         self.frames += new
         return new
+
+    def drive(
+        self,
+        linear: float,
+        angular: float = 0.0,
+        topic: str = "/cmd_vel",
+        hold: int = 1,
+        at: float | None = None,
+        n: int | None = None,
+    ) -> list[Any]:
+        """A command of the joystick; the new frames."""
+        self.n += n is None
+        at = self.now if at is None else at
+        numbers = {"hold": hold, "n": n or self.n, "at": at}
+        return self.send("drive", topic=topic, linear=linear, angular=angular, **numbers)
 
     @property
     def idle(self) -> bool:
@@ -223,38 +242,88 @@ def test_who_may_only_look_can_change_nothing(what: str) -> None:
 
 def test_who_may_only_look_cannot_drive() -> None:
     page = Page(FULL)
-    assert "may not drive" in page.send("drive", topic="/cmd_vel", linear=1, angular=0)[0]["error"]
+    assert "may not drive" in page.drive(1)[0]["error"]
     assert page.others == []
 
 
 def test_a_robot_is_stopped_when_nobody_commands_it_any_more() -> None:
     page = Page()
-    page.send("drive", topic="/cmd_vel", linear=0.5, angular=-1)
-    assert page.others == [Speed("/cmd_vel", 0.5 * limits.DRIVE_SPEED, -limits.DRIVE_TURN)]
+    page.drive(0.5, -1)
+    page.drive(0.5, -1)
+    assert page.others == [STOP, Speed("/cmd_vel", 0.5 * limits.DRIVE_SPEED, -limits.DRIVE_TURN)]
     assert page.session.next_timer() == pytest.approx(page.now + limits.DRIVE_TIMEOUT)
     page.after(limits.DRIVE_TIMEOUT / 2)
-    assert len(page.others) == 1
-    page.after(limits.DRIVE_TIMEOUT)
-    assert page.others[-1] == Speed("/cmd_vel", 0.0, 0.0)
-    page.after(10)
     assert len(page.others) == 2
+    page.after(limits.DRIVE_TIMEOUT)
+    assert page.others[2:] == [STOP]
+    page.after(10)
+    assert len(page.others) == 3
+
+
+def test_what_tcp_kept_over_a_cut_moves_nothing() -> None:
+    page = Page()
+    page.drive(1)
+    page.drive(1)
+    made = page.now
+    page.after(limits.DRIVE_TIMEOUT)
+    page.after(5)  # the cable is cut, and the stick let go; then all comes at once
+    del page.others[:]
+    told = [frame for n in range(30) for frame in page.drive(1, at=made + n / 10)]
+    assert page.others == []
+    assert [frame["error"] for frame in told] == ["commands reach the server 5.3 s late, and are dropped"]
+    page.send("release", hold=1)
+    page.drive(1, hold=1)  # of the hold that has ended
+    assert page.others == []
+    page.drive(1, hold=2)
+    page.drive(1, hold=2)
+    assert page.others == [STOP, Speed("/cmd_vel", limits.DRIVE_SPEED, 0.0)]
+
+
+def test_the_first_command_after_a_gap_is_zero() -> None:
+    page = Page()
+    for _ in range(2):
+        page.drive(1)
+        assert page.others[-1] == STOP
+        page.drive(1)
+        assert page.others[-1] != STOP
+        page.after(limits.DRIVE_TIMEOUT)
+        assert page.others[-1] == STOP
+
+
+def test_no_command_counts_twice_or_behind_a_newer_one() -> None:
+    page = Page()
+    page.drive(0, hold=3)
+    del page.others[:]
+    page.drive(1, hold=2)
+    page.drive(1, hold=3, n=1)
+    assert page.others == []
+
+
+def test_a_page_learns_the_clock_by_which_it_dates_its_commands() -> None:
+    page = Page()
+    (hello,) = page.take(page.session.open("pc"))
+    assert hello["at"] == page.now
+    page.after(limits.TICK_PERIOD)
+    assert page.tick_at == page.now
 
 
 @pytest.mark.parametrize("how", ["release", "close", "another topic"])
 def test_a_robot_is_stopped_at_once(how: str) -> None:
     page = Page()
-    page.send("drive", topic="/cmd_vel", linear=1, angular=0)
+    page.drive(1)
+    page.drive(1)
     if how == "release":
-        page.send("release")
+        page.send("release", hold=1)
     elif how == "close":
         page.take(page.session.close())
     else:
-        page.send("drive", topic="/other", linear=0, angular=0)
-    assert page.others[1] == Speed("/cmd_vel", 0.0, 0.0)
+        page.drive(1, topic="/other")
+    assert page.others[2] == STOP
+    assert page.others[3:] == ([Speed("/other", 0.0, 0.0)] if how == "another topic" else [])
 
 
 WATCH = {"op": "watch", "id": 1, "topic": "/a", "how": "value"}
-DRIVE = {"op": "drive", "topic": "/cmd_vel", "linear": 0, "angular": 0}
+DRIVE = {"op": "drive", "topic": "/cmd_vel", "linear": 0, "angular": 0, "hold": 1, "n": 1, "at": 0}
 
 
 @pytest.mark.parametrize(
@@ -287,7 +356,7 @@ def test_a_name_that_is_none_fails_and_the_page_stays(topic: str) -> None:
     page = Page(Rights(drive=True))
     (failed,) = page.send("watch", id=1, topic=topic, how="value")
     assert (failed["op"], failed["id"]) == ("failed", 1)
-    (failed,) = page.send("drive", topic=topic, linear=0, angular=0)
+    (failed,) = page.drive(0, topic=topic)
     assert (failed["op"], failed["id"]) == ("failed", 0)
     assert page.others == []
 
@@ -358,7 +427,7 @@ def test_an_id_that_no_picture_can_carry_closes_the_connection(id_: int) -> None
 
 def test_a_robot_is_stopped_while_the_page_takes_nothing() -> None:
     page = Page()
-    page.send("drive", topic="/cmd_vel", linear=1, angular=0)
+    page.drive(1)
     page.unsent = 10_000_000
     due = page.session.next_timer()
     assert due is not None

@@ -63,15 +63,24 @@ class Log(msgspec.Struct, frozen=True, tag_field="op", tag="log"):
 
 
 class Drive(msgspec.Struct, frozen=True, tag_field="op", tag="drive"):
-    """A joystick: speeds in m/s and rad/s, from -1 to 1 of what is allowed; repeated every 0.1 s while it is held."""
+    """A joystick: speeds from -1 to 1 of what is allowed; repeated every 0.1 s while it is held.
+
+    ``hold`` numbers the times that the stick was taken, and ``n`` the commands, both rising; ``at`` is when it was
+    made, by the server's clock as the page knows it (``joystick``).
+    """
 
     topic: str
     linear: float
     angular: float
+    hold: int
+    n: int
+    at: float
 
 
 class ReleaseJoystick(msgspec.Struct, frozen=True, tag_field="op", tag="release"):
-    """The joystick is let go: the robot is stopped at once."""
+    """The joystick is let go: the robot is stopped at once, and nothing more of that hold drives it."""
+
+    hold: int
 
 
 ClientMessage: TypeAlias = Ack | Look | Watch | Unwatch | AskQuestion | Log | Drive | ReleaseJoystick

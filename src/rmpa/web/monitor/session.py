@@ -17,6 +17,7 @@ from rmpa.core.names import is_global_name
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.web.hub import requests
 from rmpa.web.monitor import limits
+from rmpa.web.monitor.joystick import Joystick
 from rmpa.web.monitor.messages import (
     LOG_TOPIC,
     VERSION,
@@ -70,10 +71,6 @@ _PERMISSIONS = {
 
 _NO_TOKEN = "this page may not read parameters", "open it with a token: rmpa web --token-file FILE, or --control"
 _NO_CONTROL = "this page may only look", "start rmpa web with --control"
-
-
-_TICK = '{"op":"tick"}'
-"""A page that hears nothing for some ticks takes its connection for lost: scripts do not see WebSocket's pings."""
 
 
 def permissions(rights: Rights) -> tuple[str, ...]:
@@ -155,8 +152,8 @@ class MonitorSession:
         self._tick = now + limits.TICK_PERIOD
         self._watches: dict[int, WatchState] = {}
         self._questions: set[int] = set()
-        self._driven: str = ""
-        self._drive_until = 0.0
+        self._joystick = Joystick()
+        self._opened = now
         self.skipped = 0
 
     # --- the client ---
@@ -165,6 +162,7 @@ class MonitorSession:
         """The first message, before any state; ``agent`` is the name of the agent's module."""
         fastest = {"linear": limits.DRIVE_SPEED, "angular": limits.DRIVE_TURN}
         about = {"version": VERSION, "agent": agent, "period": limits.PATCH_PERIOD, "fastest": fastest}
+        about["at"] = self._opened
         yield _text({"op": "hello", **about, "may": permissions(self._rights)})
 
     def receive(self, text: str | bytes, now: float) -> Iterator[Output]:
@@ -202,6 +200,7 @@ class MonitorSession:
         elif isinstance(message, Drive):
             yield from self._drive(message, now)
         elif isinstance(message, ReleaseJoystick):
+            self._joystick.release(message.hold)
             yield from self._stop()
         yield from self.handle_timer(now)
 
@@ -231,15 +230,23 @@ class MonitorSession:
             yield self._failed(0, "this page may not drive", "start rmpa web with --drive")
             return
         _check_topic(message.topic)
-        if self._driven and self._driven != message.topic:
+        joystick = self._joystick
+        if not joystick.takes(message, now):
+            if joystick.is_new_late(message, now):
+                late = f"commands reach the server {now - message.at:.1f} s late, and are dropped"
+                yield self._failed(0, late, f"above {limits.DRIVE_TIMEOUT:g} s the robot stays where it is")
+            return
+        if joystick.topic != message.topic:
             yield from self._stop()
-        self._driven, self._drive_until = message.topic, now + limits.DRIVE_TIMEOUT
-        yield Speed(message.topic, message.linear * limits.DRIVE_SPEED, message.angular * limits.DRIVE_TURN)
+        if joystick.drive(message.topic, now):
+            yield Speed(message.topic, message.linear * limits.DRIVE_SPEED, message.angular * limits.DRIVE_TURN)
+        else:
+            yield Speed(message.topic, 0.0, 0.0)
 
     def _stop(self) -> Iterator[Output]:
-        if self._driven:
-            yield Speed(self._driven, 0.0, 0.0)
-        self._driven = ""
+        topic = self._joystick.stop()
+        if topic:
+            yield Speed(topic, 0.0, 0.0)
 
     def close(self) -> Iterator[Output]:
         """The connection has ended: the robot is stopped, and what was open is closed."""
@@ -297,13 +304,11 @@ class MonitorSession:
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is to be called; ``None`` for not before something else happens."""
-        dues: list[float | None] = [self._tick]
+        dues: list[float | None] = [self._tick, self._joystick.due]
         if self._unsent() == 0:
             dues += [watch.due(0.0) for watch in self._watches.values()]
         elif self._watches:
             dues.append(self._looked + limits.UNSENT_RETRY)
-        if self._driven:
-            dues.append(self._drive_until)
         if self._stale and self._state is not None and self._number - self._acknowledged < limits.UNACKNOWLEDGED_MAX:
             dues.append(self._patched + limits.PATCH_PERIOD)
         return min((due for due in dues if due is not None), default=None)
@@ -311,7 +316,7 @@ class MonitorSession:
     def handle_timer(self, now: float) -> Iterator[Output]:
         """Send what is due, and stop a robot that no client commands any more."""
         self._looked = now
-        if self._driven and now >= self._drive_until:
+        if self._joystick.due is not None and now >= self._joystick.due:
             yield from self._stop()
         if (
             self._stale
@@ -323,7 +328,8 @@ class MonitorSession:
         if now >= self._tick:
             self._tick = now + limits.TICK_PERIOD
             if self._unsent() == 0:
-                yield _TICK
+                # Scripts do not see WebSocket's pings: a page that misses some ticks takes the connection for lost.
+                yield _text({"op": "tick", "at": now})
 
     def _send_state(self, now: float) -> Iterator[Output]:
         if self._state is None:

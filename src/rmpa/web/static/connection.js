@@ -5,6 +5,7 @@ import { adopt, applyPatch } from "./state.js";
 const FIRST_WAIT = 300; // milliseconds until the next attempt, doubled up to LAST_WAIT
 const LAST_WAIT = 5000;
 const ANSWER_WAIT = 30000;
+const TICKS = 10; // of which the fastest counts: over 20 s two clocks do not drift apart
 const SILENT = 7000; // milliseconds without a word after which the connection is lost; the server says something every 2 s
 
 export class Connection {
@@ -22,6 +23,7 @@ export class Connection {
     this.counter = 0;
     this.wait = FIRST_WAIT;
     this.frames = { patches: 0, bytes: 0 };
+    this.ticks = []; // how far this page's clock was ahead of the server's at each of the last ticks, in seconds
     this.heard = 0;
     this.open();
     setInterval(() => this.phase === "open" && Date.now() - this.heard > SILENT && this.drop(), 1000);
@@ -51,6 +53,7 @@ export class Connection {
       if (socket !== this.socket) return;
       opened = true;
       this.heard = Date.now();
+      this.ticks = [];
       this.phase = "open";
       this.wait = FIRST_WAIT;
       if (this.looks.length) this.send({ op: "look", at: this.looks });
@@ -98,7 +101,11 @@ export class Connection {
     switch (message.op) {
       case "hello":
         this.hello = message;
+        this.tick(message.at);
         this.changed();
+        break;
+      case "tick":
+        this.tick(message.at);
         break;
       case "state":
         this.state = adopt(message.state);
@@ -123,6 +130,15 @@ export class Connection {
       case "log":
         for (const sink of this.logSinks) sink(message.lines);
     }
+  }
+
+  tick(at) {
+    this.ticks = [...this.ticks.slice(-TICKS + 1), performance.now() / 1000 - at];
+  }
+
+  // The server's clock, behind by what the fastest of the last ticks took: a command that says it is at most as old as it seems.
+  serverTime() {
+    return performance.now() / 1000 - Math.min(...this.ticks);
   }
 
   // The acknowledgement is sent when the browser has drawn: the server waits for it before it sends more than one further patch.

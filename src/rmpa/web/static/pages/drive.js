@@ -15,15 +15,16 @@ export function DrivePage({ state, connection }) {
   const [share, setShare] = useState(0.15);
   const fastest = connection.hello.fastest || { linear: 0, angular: 0 };
   const allowed = connection.may("drive");
+  const hold = useRef(0); // the server drops old commands, and those of an earlier hold
   return html`<${Page} title="Drive" kind="A joystick for geometry_msgs/Twist"><div class="grid">
     <${Panel} title="What is driven"><div class="form"><label>Topic<input class="mono" list="twists" value=${topic} onInput=${(event) => { arm(false); setTopic(event.target.value); }} /></label><datalist id="twists">${topics.map((each) => html`<option key=${each} value=${each} />`)}</datalist>
       <label>Fastest: ${(share * fastest.linear).toFixed(2)} m/s, ${(share * fastest.angular).toFixed(2)} rad/s<input type="range" min="0.05" max="1" step="0.05" value=${share} onInput=${(event) => setShare(Number(event.target.value))} /></label>
       <label class="row"><span><input type="checkbox" checked=${armed} disabled=${!allowed} onChange=${(event) => arm(event.target.checked)} /> The robot may move: I see it</span></label>
       <p class="muted">${allowed ? "It drives only while the stick is held. Let go, lose the connection or leave the page, and it is stopped within 0.3 s." : "This page may not drive. Start rmpa web with --drive, and open the address that it prints."}</p></div><//>
-    <${Panel} title="Joystick"><${Stick} on=${allowed && armed} send=${(linear, angular) => connection.send({ op: "drive", topic, linear: linear * share, angular: angular * share })} release=${() => connection.send({ op: "release" })} /><//></div><//>`;
+    <${Panel} title="Joystick"><${Stick} on=${allowed && armed} take=${() => { hold.current = ++connection.counter; }} send=${(linear, angular) => connection.send({ op: "drive", topic, linear: linear * share, angular: angular * share, hold: hold.current, n: ++connection.counter, at: connection.serverTime() })} release=${() => connection.send({ op: "release", hold: hold.current })} /><//></div><//>`;
 }
 
-function Stick({ on, send, release }) {
+function Stick({ on, take, send, release }) {
   const [at, setAt] = useState({ x: 0, y: 0 });
   const held = useRef(null), pad = useRef(), pressed = useRef(new Set());
   const stop = () => {
@@ -40,6 +41,7 @@ function Stick({ on, send, release }) {
     setAt(next);
     if (held.current) return void Object.assign(held.current, next); // the timer sends it: pointers move 60 times a second
     held.current = { ...next, timer: setInterval(() => command.current(held.current.y, -held.current.x), PERIOD) };
+    take();
     send(next.y, -next.x);
   };
   const command = useRef(send); // the newest: the timer outlives a change of the fastest speed
