@@ -10,6 +10,41 @@ from tests.web.server.test_server import TOKEN, running
 from tests.web.snapshots import FULL
 
 
+async def test_a_link_with_the_token_on_another_site_opens_the_page_for_good() -> None:
+    if BINARY is None:
+        pytest.skip("Chromium is not installed: apt install chromium")
+    async with running(TOKEN) as site, Chromium() as page:
+        server = f"http://127.0.0.1:{site.server.port}/"
+
+        async def links(_request: web.Request) -> web.Response:
+            text = (
+                f"<!doctype html><a id=bare href={server}>bare</a><a id=token href={server}?token={TOKEN}>token</a>"
+            )
+            return web.Response(text=text, content_type="text/html")
+
+        apps = web.Application()
+        apps.router.add_get("/", links)
+        runner = web.AppRunner(apps)
+        await runner.setup()
+        try:
+            await web.TCPSite(runner, "127.0.0.1", 0).start()
+            elsewhere = f"http://localhost:{runner.addresses[0][1]}/"
+            for link, shown in (("bare", "needs a token"), ("token", ""), ("bare", "")):
+                await page.goto(elsewhere)
+                await page.wait(f"location.href === {elsewhere!r} && document.readyState === 'complete'")
+                await page.run(f"document.getElementById('{link}').click()")
+                await page.wait(f"location.href.startsWith({server!r}) && document.readyState === 'complete'")
+                if shown:
+                    assert shown in await page.run("document.body.innerText")
+                    assert await page.run("document.contentType") == "text/html"
+                    continue
+                assert await page.run("document.title") == "RMPA"
+                assert await page.run("location.search") == ""  # the token has left the address
+                assert await page.run(f"fetch({server!r} + 'api/v1/peers').then((answer) => answer.status)") == 200
+        finally:
+            await runner.cleanup()
+
+
 async def app(_request: web.Request) -> web.Response:
     return web.Response(text="<!doctype html><title>app</title>", content_type="text/html")
 

@@ -189,7 +189,7 @@ async def test_a_token_is_asked_for_and_moves_from_the_url_into_a_cookie() -> No
         status, headers, _ = await site.get(f"/?token={TOKEN}&dark=1")
         assert (status, headers["Location"]) == (303, "/?dark=1")
         cookie, *attributes = headers["Set-Cookie"].split("; ")
-        assert {"HttpOnly", "SameSite=Strict", "Path=/"} <= set(attributes)
+        assert {"HttpOnly", "SameSite=Lax", "Path=/"} <= set(attributes)
         assert (await site.get("/", Cookie=f"other=1; {cookie}"))[0] == 200
 
 

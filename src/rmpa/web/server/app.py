@@ -7,6 +7,7 @@ upgrades included, before its handler runs.
 from __future__ import annotations
 
 import asyncio
+import html
 import logging
 import time
 from typing import TYPE_CHECKING, Final
@@ -66,6 +67,17 @@ HEADERS: Final = {
 """Of every response."""
 OPENER_POLICY: Final = ("Cross-Origin-Opener-Policy", "same-origin")
 """Of responses to loopback: in plain HTTP browsers ignore it from elsewhere, and report that as an error."""
+_REFUSED_PAGE: Final = """<!doctype html>
+<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
+<meta name="color-scheme" content="light dark"><title>RMPA: refused</title>
+<h1>RMPA does not show this page</h1><p>{text}.</p>{help}
+"""
+"""Without a style: the server's files need the token, too."""
+_SIGN_IN: Final = (
+    "<p>Open the address that <code>rmpa web</code> printed when it made the token, once: it ends with "
+    "<code>/?token=…</code>, and this browser keeps it from then on. The token is in the file <code>web-token</code> "
+    "of the module's state directory; <code>rmpa web</code> says at its start where that is.</p>"
+)
 PREFLIGHT: Final = {
     "Access-Control-Allow-Methods": ", ".join(_METHODS),
     "Access-Control-Allow-Headers": "Authorization",
@@ -211,7 +223,7 @@ class Routes:
     def _refused(self, request: web.Request, reason: str, problem: rest.RestResponse) -> web.Response:
         address = request.remote or "?"
         self._refusals.refuse(time.monotonic(), reason, address, f"{address}: {rest.detail_of(problem)}")
-        response = _response(problem)
+        response = _page_of(problem) if _is_for_people(request) else _response(problem)
         if problem.status == 401:
             response.headers["WWW-Authenticate"] = 'Bearer realm="rmpa"'
         if request.body_exists:
@@ -222,9 +234,9 @@ class Routes:
         query = {name: value for name, value in request.query.items() if name != TOKEN_PARAMETER}
         response = web.Response(status=303, headers={"Location": str(request.rel_url.with_query(query))})
         token = request.query[TOKEN_PARAMETER]
-        response.set_cookie(
-            self.policy.cookie, token, httponly=True, secure=request.secure, samesite="Strict", path="/"
-        )
+        # Strict would leave the cookie out of the redirected request where the link stands on a page of another site,
+        # and of each reload behind it. Lax sends it with such a navigation alone, which no other site can read.
+        response.set_cookie(self.policy.cookie, token, httponly=True, secure=request.secure, samesite="Lax", path="/")
         return response
 
     # --- the paths ---
@@ -310,6 +322,19 @@ def _upgraded(request: web.Request, on_unmasked: Callable[[], None]) -> Callable
         return int
     connection.upgrade(on_unmasked)
     return lambda: connection.received
+
+
+def _is_for_people(request: web.Request) -> bool:
+    """Whether a browser shows the response: programs ask for no HTML."""
+    return not is_upgrade(request) and "text/html" in request.headers.get("Accept", "")
+
+
+def _page_of(problem: rest.RestResponse) -> web.Response:
+    text = html.escape(rest.detail_of(problem))
+    help_ = _SIGN_IN if problem.status == 401 else ""
+    page = _REFUSED_PAGE.format(text=text[:1].upper() + text[1:], help=help_)
+    headers = {"Content-Type": "text/html; charset=utf-8", **dict(problem.headers)}
+    return web.Response(status=problem.status, body=page.encode(), headers=headers)
 
 
 def _response(made: rest.RestResponse) -> web.Response:
