@@ -94,6 +94,10 @@ def test_both_ends_say_which_subscriber_is_direct_and_why_another_is_not(modules
         assert said["arrived"][1].endswith(" Hz, as /viewer counts")
         assert "route" not in said, "no message passes the agents"
 
+    # In the publisher's graph the subscriber stands as its proxy: a stealth relay, which asks the master, sees it.
+    assert "/rmpa/b/viewer" in a.ros.tool("rostopic", "info", TOPIC).partition("Subscribers:")[2]
+    assert "/viewer of peer b, by its proxy /rmpa/b/viewer" in a.agent.rmpa("topic", "info", TOPIC)[1]
+
     # Another subscriber connects within its machine only, so it is relayed: both transports at once.
     b.ros.env["ROS_IP"] = "127.0.0.1"
     flows(b.ros.node(client, "listener", topic=TOPIC, name="bound"))

@@ -75,9 +75,14 @@ GrantAction = WithdrawGrant | Retry | EndConnections
 
 
 class DirectGrants:
-    """The grants of this module's publishers."""
+    """The grants of this module's publishers.
 
-    def __init__(self) -> None:
+    Args:
+        on_change: ``(peer, source, subscriber, granted)``: a subscriber has got a grant, or has none any more.
+    """
+
+    def __init__(self, on_change: Callable[[int, Source, str, bool], None] = lambda *_: None) -> None:
+        self._on_change = on_change
         self._grants: dict[Source, dict[tuple[int, str], Granted]] = {}
         self._count: dict[int, int] = {}
         self._refused: dict[Source, dict[int, None]] = {}
@@ -151,9 +156,11 @@ class DirectGrants:
     def grant(self, peer: int, source: Source, subscriber: str, granted: Granted) -> None:
         """Note a grant; one of the same subscriber is replaced."""
         grants = self._grants.setdefault(source, {})
-        if (peer, subscriber) not in grants:
-            self._count[peer] = self._count.get(peer, 0) + 1
+        is_new = (peer, subscriber) not in grants
         grants[peer, subscriber] = granted
+        if is_new:
+            self._count[peer] = self._count.get(peer, 0) + 1
+            self._on_change(peer, source, subscriber, True)
         self._confirm(peer, source, subscriber)
 
     def release(self, peer: int, source: Source, subscriber: str) -> list[GrantAction]:
@@ -288,6 +295,7 @@ class DirectGrants:
         if not grants:
             del self._grants[source]
         self._count[peer] -= 1
+        self._on_change(peer, source, subscriber, False)
         self._confirm(peer, source, subscriber)
         return True
 

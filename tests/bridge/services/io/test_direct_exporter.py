@@ -38,8 +38,8 @@ class Module:
         trust = Permissions(TrustSettings()) if secured else None
         local = lambda _, service: service if self.permitted else None  # noqa: E731 - a double
         rpc = SimpleNamespace(
-            on_request=self.handlers.__setitem__,
-            on_notification=self.handlers.__setitem__,
+            on_request=self._on,
+            on_notification=self._on,
             notify=lambda _, what, __: self.told.append(what),
         )
         self.sut = DirectServiceExporter(
@@ -52,6 +52,9 @@ class Module:
             counters=Counters(),
             gate=PermissionGate(trust),
         )
+
+    def _on(self, what: str, handler: object, _needs: object) -> None:
+        self.handlers[what] = handler
 
     def ask(self) -> str:
         """Peer 1 asks for a direct call; returns the condition that is not met."""

@@ -11,6 +11,7 @@ import pytest
 from rmpa.bridge import limits
 from rmpa.bridge.direct import requests
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
+from rmpa.bridge.direct.publisher_side import Granted
 from rmpa.bridge.direct.requests import CloseDirect, OpenDirect
 from rmpa.bridge.messages import Source
 from rmpa.bridge.permission_gate import PermissionGate
@@ -29,6 +30,24 @@ URI = "http://10.0.0.1:1234/"
 AUTO = Contract(transport=Transport.AUTO)
 
 
+class Proxies:
+    """The proxies of one peer, made at once."""
+
+    def __init__(self, prefix: str) -> None:
+        self._prefix = prefix
+        self._users: dict[tuple[str, object], Any] = {}
+
+    def get(self, node: str) -> Any:
+        return SimpleNamespace(name=self._prefix + node, uri="http://10.0.0.1:99/")
+
+    def hold(self, node: str, key: object, user: Any) -> None:
+        self._users[node, key] = user
+        user.ready(self.get(node))
+
+    def release(self, node: str, key: object) -> None:
+        self._users.pop((node, key)).left(self.get(node))
+
+
 class Module:
     """The module of /talker, and what its agent told its peers."""
 
@@ -36,6 +55,7 @@ class Module:
         self.publishers = {"/chatter": {"/talker": URI}}
         self.subscribers: dict[str, dict[str, str]] = {}
         self.offered = {SOURCE: SimpleNamespace(type="std_msgs/String", origin=None, uri=URI)}
+        self.registered: list[tuple[str, ...]] = []
         self.suspected: list[str] = []
         self.forgotten: list[str] = []
         self.told: list[tuple[int, str, dict[str, Any]]] = []
@@ -56,6 +76,7 @@ class Module:
                     subscribers=lambda topic: state.subscribers.get(topic, {}),
                     publishers=lambda topic: state.publishers.get(topic, {}),
                     suspect=self.suspected.append,
+                    call=lambda method, *params: self.registered.append((method, *params)),
                 ),
             ),
             cast("Any", SimpleNamespace(offered=self.offered, local=self._local)),
@@ -68,14 +89,17 @@ class Module:
             cast(
                 "Any",
                 SimpleNamespace(
-                    on_request=self.handlers.__setitem__,
-                    on_notification=self.handlers.__setitem__,
+                    on_request=self._on,
+                    on_notification=self._on,
                     notify=lambda session, what, args: self.told.append((session.peer, what, args)),
                 ),
             ),
             Counters(),
             self.permissions,
         )
+
+    def _on(self, what: str, handler: object, _needs: object) -> None:
+        self.handlers[what] = handler
 
     def permit(self, trust: TrustSettings) -> None:
         """The mesh is secured, with these permissions."""
@@ -85,7 +109,13 @@ class Module:
     def _session(number: int) -> Any:
         link = SimpleNamespace(name=f"peer{number}", silent=True)
         return SimpleNamespace(
-            peer=number, link=link, linked=True, reachable=True, same_machine=False, address=f"10.0.0.{number}"
+            peer=number,
+            link=link,
+            linked=True,
+            reachable=True,
+            same_machine=False,
+            address=f"10.0.0.{number}",
+            proxies=Proxies(f"/rmpa/peer{number}"),
         )
 
     def _local(self, _peer: int, source: Source) -> Source | None:
@@ -330,3 +360,27 @@ async def test_an_interruption_by_a_lost_link_is_told_after_it(module: Module) -
     module.sut.gone(module.sessions[1])
     await module.open()
     assert lasting.ended is not None
+
+
+async def test_a_subscriber_stands_in_the_graph_as_its_proxy_while_it_is_granted(module: Module) -> None:
+    there = ("registerSubscriber", "/rmpa/peer1/viewer", "/chatter", "*", "http://10.0.0.1:99/")
+    gone = ("unregisterSubscriber", "/rmpa/peer1/viewer", "/chatter", "http://10.0.0.1:99/")
+    await module.open()
+    await module.open()
+    assert module.registered == [there]
+    module.sut.reconcile({"/chatter": {"/rmpa/peer1/viewer": "http://10.0.0.1:99/"}})
+    assert module.registered == [there]
+    module.sut.reconcile({})
+    assert module.registered == [there, there], "the core has been restarted"
+    module.close()
+    assert module.registered == [there, there, gone]
+
+
+async def test_one_publisher_of_two_that_goes_leaves_the_subscriber_in_the_graph(module: Module) -> None:
+    other = Source("/chatter", "/other")
+    await module.open()
+    module.sut.grants.grant(1, other, "/viewer", Granted(AUTO, 1, URI))
+    module.sut.grants.gone(SOURCE)
+    assert len(module.registered) == 1
+    module.sut.grants.gone(other)
+    assert [method for method, *_ in module.registered] == ["registerSubscriber", "unregisterSubscriber"]

@@ -16,13 +16,15 @@ from rmpa.bridge.direct.requests import DirectClosed, RetryDirect
 from rmpa.bridge.messages import Source
 from rmpa.bridge.permission_gate import OPEN_GATE, Needs, PermissionGate
 from rmpa.bridge.policy import is_own
+from rmpa.bridge.session.peer_proxies import ProxyCallbacks
 from rmpa.bridge.topics.audience import compares_names
 from rmpa.config.permission_rules import Access
 from rmpa.core.contract import combine
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
+from rmpa.ros.wire.tcpros import ANY
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from rmpa.bridge.direct.io.endpoints import LocalEndpoints
     from rmpa.bridge.direct.publisher_side import GrantAction
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
     from rmpa.core.contract import Contracts
     from rmpa.core.counters import Counters
     from rmpa.ros.core.api import Core
+    from rmpa.ros.node.slave_node import SlaveNode
 
 _log = logging.getLogger(__name__)
 
@@ -70,10 +73,12 @@ class DirectExporter:
         self._sessions = sessions
         self._rpc = rpc
         self._counters = counters
-        self.grants = DirectGrants()
+        self.grants = DirectGrants(self._changed)
         """The grants in force."""
         self.interruptions = Interruptions()
         """When peers' subscribers were without a grant because their link was lost."""
+        self._standing: dict[tuple[int, str, str], set[Source]] = {}
+        """By peer, subscriber and topic: the granted sources for which the subscriber's proxy is registered."""
         self._expiries: dict[int, asyncio.TimerHandle] = {}
         rpc.on_request(requests.OPEN, self._open, Needs((Access.SUBSCRIBE,), "the topic: only what is offered"))
         rpc.on_notification(requests.CLOSE, self._close, Needs((), "what was granted to the peer itself"))
@@ -139,6 +144,40 @@ class DirectExporter:
             expiry.cancel()
         self._expiries.clear()
         await self._endpoints.close()
+
+    # --- the local graph --------------------------------------------------------------------------------------------
+
+    def _changed(self, peer: int, source: Source, subscriber: str, granted: bool) -> None:
+        """Has the proxy of a peer's subscriber stand in the graph as a subscriber while it is granted."""
+        key = (peer, subscriber, source.topic)
+        sources = self._standing.setdefault(key, set())
+        before = bool(sources)
+        (sources.add if granted else sources.discard)(source)
+        if not sources:
+            del self._standing[key]
+        session = self._sessions.get(peer)
+        if session is None or before == bool(sources):
+            return  # with the session its proxies go
+        held, topic = f"subscriber of {source.topic}", source.topic
+        if sources:
+            user = ProxyCallbacks(lambda proxy: self._stand(topic, proxy), lambda proxy: self._go(topic, proxy))
+            session.proxies.hold(subscriber, held, user)
+        else:
+            session.proxies.release(subscriber, held)
+
+    def _stand(self, topic: str, proxy: SlaveNode) -> None:
+        self._core.call("registerSubscriber", proxy.name, topic, ANY, proxy.uri)
+
+    def _go(self, topic: str, proxy: SlaveNode) -> None:
+        self._core.call("unregisterSubscriber", proxy.name, topic, proxy.uri)
+
+    def reconcile(self, subscribers: Mapping[str, Mapping[str, str]]) -> None:
+        """Register missing subscribers again: the core has been restarted."""
+        for peer, subscriber, topic in list(self._standing):
+            session = self._sessions.get(peer)
+            proxy = session.proxies.get(subscriber) if session is not None else None
+            if proxy is not None and proxy.name not in subscribers.get(topic, {}):
+                self._stand(topic, proxy)
 
     # --- requests --------------------------------------------------------------------------------------------------
 

@@ -451,6 +451,7 @@ class Topics(Part):
             return any(not is_own(node) for node in state.subscribers.get(topic, ()))
 
         self._absent.unheard(subscribed)
+        self.direct_exports.reconcile(state.subscribers)
         for topics in list(self._peers.values()):
             topics.unheard(subscribed)
             yield_to_data()
