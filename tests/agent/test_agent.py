@@ -124,6 +124,10 @@ async def test_a_topic_of_one_module_is_heard_in_another(settings: Callable[...,
         assert got[0].header["md5sum"] == "992ce8a1687cec8c8bd883ec73ca41d1"
         assert "string data" in got[0].header["message_definition"]
         assert got[0].caller_id == "/rmpa/a/talker"
+        nodes = b.core.state().nodes
+        assert {"/rmpa", "/rosout", "/rmpa/a/talker", "/hearer"} <= nodes.keys()
+        for api in nodes.values():
+            assert (await call_api(api, "getMasterUri", "/rosnode")).value == b.core.uri
 
 
 async def test_three_modules_hear_each_other_and_nothing_loops(settings: Callable[..., Settings]) -> None:

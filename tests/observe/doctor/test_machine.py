@@ -7,7 +7,14 @@ from dataclasses import replace
 import pytest
 
 from rmpa.observe.check import CheckLevel
-from rmpa.observe.doctor.machine import KernelRights, WallClock, judge_clock, judge_peer_clock, judge_rights
+from rmpa.observe.doctor.machine import (
+    KernelRights,
+    WallClock,
+    judge_clock,
+    judge_peer_clock,
+    judge_rights,
+    judge_sim_time,
+)
 
 GOOD = WallClock(stepped=0.00001, synchronised=True, error=0.004, year=2026)
 FREE = KernelRights(fifo="", memlock=None, wanted=True, files=65536)
@@ -28,6 +35,14 @@ def test_clock(clock: WallClock, subject: str, level: CheckLevel) -> None:
     found = {finding.where: finding for finding in judge_clock(clock)}
     assert found[subject].level is level
     assert bool(found[subject].remedy) is (level in (CheckLevel.WARN, CheckLevel.FAIL))
+
+
+def test_simulated_time_needs_a_clock() -> None:
+    assert judge_sim_time("base", None) == []
+    (runs,) = judge_sim_time("base", ["/gazebo"])
+    (stands,) = judge_sim_time("base", [])
+    assert (runs.level, stands.level) == (CheckLevel.OK, CheckLevel.WARN)
+    assert "nodes that start stand still at time 0" in stands.text
 
 
 @pytest.mark.parametrize(

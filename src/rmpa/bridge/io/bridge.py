@@ -137,6 +137,7 @@ class Bridge:
 
     async def start(self) -> None:
         """Start the agent's node, the parts and the following of the local graph."""
+        self.node.master_uri = self._core.uri  # only now does the embedded core listen
         await self.node.start()
         await self.proxy_nodes.start()
         self._core.on_change(self._graph_changed)

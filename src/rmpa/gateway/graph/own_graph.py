@@ -225,6 +225,7 @@ class AgentGraph(Part):
 
     async def begin(self) -> None:
         """Begin to follow the graph, once the agent has started and its place in the network is known."""
+        self._node.master_uri = self._core.uri
         await self._node.start()
         self._sources.begin()
 

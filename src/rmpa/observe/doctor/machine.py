@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from rmpa.core.sizes import KIB
 from rmpa.observe import limits
 from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +51,22 @@ def judge_clock(clock: WallClock) -> list[Check]:
         remedy = "install chrony, and let all modules follow one of them; latencies are right all the same"
         found.append(Check("clock", WARN, text, remedy, where="synchronised"))
     return found
+
+
+def judge_sim_time(agent: str, clocks: Sequence[str] | None) -> list[Check]:
+    """Whether a module's simulated time runs.
+
+    Args:
+        agent: Its name.
+        clocks: The nodes that publish ``/clock``; ``None`` if its ``/use_sim_time`` is not set.
+    """
+    where = f"simulated time of {agent}"
+    if clocks is None:
+        return []
+    if clocks:
+        return [Check("clock", OK, f"/clock comes from {', '.join(clocks)}", where=where)]
+    text = "/use_sim_time is true, and no node publishes /clock: nodes that start stand still at time 0"
+    return [Check("clock", WARN, text, "start the simulator, or `rosparam delete /use_sim_time`", where=where)]
 
 
 def judge_peer_clock(agent: str, peer: str, offset: float, error: float | None) -> Check:

@@ -96,6 +96,15 @@ class SlaveNode:
         )
 
     @property
+    def master_uri(self) -> str:
+        """The answer to ``getMasterUri``; to be set by the owner of a node that is made before its master listens."""
+        return self._api.master_uri
+
+    @master_uri.setter
+    def master_uri(self, uri: str) -> None:
+        self._api.master_uri = uri
+
+    @property
     def uri(self) -> str:
         """The slave API's URI, ``http://host:port/``; empty before ``start()``."""
         return self._api.uri

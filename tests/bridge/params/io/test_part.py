@@ -421,6 +421,20 @@ async def test_other_rules_leave_the_rest_alone(sides: Any) -> None:
     assert list(base.params._server.followed) == ["/arm"]
 
 
+@pytest.mark.parametrize("before", [None, False])
+async def test_time_that_is_no_longer_followed_is_as_it_was(sides: Any, before: bool | None) -> None:
+    simulator, pad = Side("sim", time=TimeSettings(share=True)), Side("pad", time=TimeSettings(follow="sim"))
+    sides(simulator, pad)
+    simulator.core.set("/use_sim_time", True)
+    if before is not None:
+        pad.core.set("/use_sim_time", before)
+    join(simulator, pad)
+    await until(lambda: pad.core.get("/use_sim_time") is True)
+    pad.params.reload(Settings())
+    await pad.look()
+    assert pad.core.get("/use_sim_time") is before
+
+
 async def test_a_namespace_that_may_not_be_read_in_full_is_not_followed(sides: Any) -> None:
     base = Side("base", ParamSettings(remote_get=("/arm", "/arm/p")))
     pad = Side("pad", follows(ARM))

@@ -11,6 +11,7 @@ from rmpa.bridge.params import transfer
 from rmpa.bridge.params.io.core import ParamCore, read_text
 from rmpa.bridge.params.rules import Following, learn
 from rmpa.bridge.permission_gate import Needs
+from rmpa.config.param_rules import SIM_TIME
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 
@@ -53,6 +54,8 @@ class ParamFollower:
         self._working: asyncio.Task[None] | None = None
         self._asking: dict[int, asyncio.Task[None]] = {}
         self._subscribed: set[str] = set()
+        self._time_before: list[str | None] = []
+        """What ``/use_sim_time`` was here before it was followed; empty if it was not followed."""
         self._left: set[str] = set()
         rpc.on_notification(transfer.VALUE, self._told, Needs((), "what `[[param]]` follows from this very peer"))
 
@@ -112,6 +115,8 @@ class ParamFollower:
         for key in [key for key in self._left if all(key != entry.rule.to for entry in self.following)]:
             await self._core.leave(key)
             self._subscribed.discard(key)
+            if key == SIM_TIME and self._time_before:
+                await self._reset_time(self._time_before.pop())
         self._left.clear()
         if restarted:
             self._subscribed.clear()
@@ -125,6 +130,14 @@ class ParamFollower:
             if session.peer in refused:
                 self._ask(session)
         self._work_soon()
+
+    async def _reset_time(self, text: str | None) -> None:
+        """Set ``/use_sim_time`` as it was: with it and no clock a node that starts stands at time 0."""
+        if text is None:
+            await self._core.delete(SIM_TIME)
+        else:
+            await self._core.set(SIM_TIME, await read_text(text))
+        _log.info("= %s is no longer followed, and as before: %s", SIM_TIME, "not set" if text is None else "set")
 
     async def close(self) -> None:
         """Stop following; the values stay."""
@@ -256,6 +269,8 @@ class ParamFollower:
         """Make the local value equal to the owner's; return whether it was different."""
         key, text = entry.rule.to, entry.text
         here = await self._core.get_text(key)
+        if key == SIM_TIME and not self._time_before:
+            self._time_before.append(here)
         if here == text:
             return False
         if text is None:

@@ -27,7 +27,7 @@ from rmpa.observe.doctor.io.kernel_limits import read_kernel_limits
 from rmpa.observe.doctor.io.multicast import hear_ourselves
 from rmpa.observe.doctor.io.programs import resolve
 from rmpa.observe.doctor.kernel_limits import judge_kernel_limits, mesh_size
-from rmpa.observe.doctor.machine import judge_clock, judge_rights
+from rmpa.observe.doctor.machine import judge_clock, judge_rights, judge_sim_time
 from rmpa.observe.doctor.network import (
     judge_interfaces,
     judge_multicast,
@@ -197,6 +197,12 @@ def _accepts(uri: str) -> bool:
         return False
 
 
+def _clock(given: DoctorInput) -> Iterable[Check]:
+    yield from judge_clock(machine.read_clock())
+    for name, shown in given.snapshots.items():
+        yield from judge_sim_time(name, machine.read_sim_time(shown.agent.core_uri))
+
+
 def _rights(given: DoctorInput) -> Iterable[Check]:
     rights = machine.probe_rights(wanted=given.settings.realtime.enabled, agents=bool(given.snapshots))
     return judge_rights(rights)
@@ -233,7 +239,7 @@ CHECKS: Final = (
     DoctorCheck("route", _routes),
     DoctorCheck("port", _ports),
     DoctorCheck("ROS", _shell),
-    DoctorCheck("clock", lambda _: judge_clock(machine.read_clock())),
+    DoctorCheck("clock", _clock),
     DoctorCheck("realtime", _rights),
     DoctorCheck("kernel limits", _kernel_limits),
     DoctorCheck("stale connections", _stale_connections),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import ctypes
 import os
 import resource
@@ -10,9 +11,13 @@ import time
 from pathlib import Path
 from typing import Final
 
+from rmpa.core.errors import RmpaError
 from rmpa.observe import limits
 from rmpa.observe.doctor.machine import KernelRights, WallClock
+from rmpa.ros.http.client import call_api
 from rmpa.runtime import limits as runtime_limits
+
+_CALLER: Final = "/rmpa_doctor"
 
 _UNSYNCHRONISED: Final = 0x40
 """STA_UNSYNC of adjtimex(2)."""
@@ -48,6 +53,26 @@ def read_clock() -> WallClock:
         error=told.maxerror * 1e-6,
         year=time.gmtime().tm_year,
     )
+
+
+def read_sim_time(core_uri: str) -> list[str] | None:
+    """The nodes that publish ``/clock`` at a core with ``/use_sim_time``; ``None`` without, or if it is silent."""
+    try:
+        return asyncio.run(_clocks(core_uri))
+    except (RmpaError, TimeoutError):
+        return None
+
+
+async def _clocks(core_uri: str) -> list[str] | None:
+    async with asyncio.timeout(limits.DOCTOR_NODES_TIMEOUT):
+        used = await call_api(core_uri, "getParam", _CALLER, "/use_sim_time")
+        if used.code != 1 or not used.value:
+            return None
+        match (await call_api(core_uri, "getSystemState", _CALLER)).value:
+            case [list(publishers), *_]:
+                found = [row[1] for row in publishers if isinstance(row, list) and row[:1] == ["/clock"]]
+                return [str(node) for nodes in found if isinstance(nodes, list) for node in nodes]
+    return []
 
 
 def probe_rights(*, wanted: bool, agents: bool) -> KernelRights:
