@@ -512,7 +512,10 @@ def test_two_peers_of_one_name_both_stay_and_it_is_said_once(one: Harness) -> No
         one.run(5)
     conflicts = [e for e in one.membership.events() if isinstance(e, PeerConflict)]
     assert [str(c) for c in conflicts] == [
-        "two peers are named base: 10.0.0.3:40003#1 and 10.0.0.2:40002#1; rename one: --name"
+        (
+            "two modules are named base: 10.0.0.3:40003#1 and 10.0.0.2:40002#1, so rules and commands that name it "
+            "may mean either; rename one: rmpa up --name"
+        )
     ]
     assert one.present() == ["base", "base"]
     assert all("rename one" in view.conflicts[0] for view in one.membership.peers())

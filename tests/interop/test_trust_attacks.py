@@ -31,6 +31,7 @@ from tests.interop.secured import (
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from lab.bed.agents import Agent
     from lab.bed.namespaces import Host, Lab
     from lab.bed.processes import Event
     from rmpa.trust.io.store import TrustStore
@@ -86,6 +87,7 @@ def fortress(tmp_path: Path, modules: ModuleFactory, lab: Lab) -> Fortress:
 
 
 def test_a_module_without_trust_is_told_so_and_stays_outside(fortress: Fortress, agent: AgentFactory) -> None:
+    fortress.a.agent.rmpa("doctor")
     answer = fortress.attack("plain", **fortress.target, here=fortress.eve.address)
     assert (answer["answer"], answer["code"]) == ("refused", REASONS["plain"])
     assert counter(fortress.a.agent, "link.refused.plain") == 1
@@ -93,7 +95,23 @@ def test_a_module_without_trust_is_told_so_and_stays_outside(fortress: Fortress,
     outsider = agent(fortress.eve, name="eve", flags=("--seed", seed))
     eventually(lambda: counter(fortress.a.agent, "beacon.untagged") > 0, what="beacons of eve are refused")
     assert not any(row["state"] == "linked" for row in outsider.peers().values())
+    for agent_, other, joins in ((fortress.a.agent, "eve", "there"), (outsider, "a", "here")):
+        line = functools.partial(_line_of, agent_, other)
+        assert "not of this mesh" in eventually(line, what=f"{other} is told as a stranger")
+        assert f"rmpa trust join TOKEN {joins}" in line()
+        code, why = agent_.rmpa("why", "--module", other)
+        assert code == 1
+        assert f"{other} is not of this mesh" in why
+    told = [line for line in fortress.a.agent.process.output.splitlines() if "not of this mesh" in line]
+    assert told
+    assert all("eve at " in line for line in told), "a packet of rmpa doctor is no module"
     fortress.held()
+
+
+def _line_of(agent: Agent, other: str) -> str:
+    """What `rmpa peer list` says below its table of one module."""
+    _, out = agent.rmpa("peer", "list")
+    return next((line for line in out.splitlines() if line.startswith(f"! {other}: ")), "")
 
 
 def test_a_secured_agent_never_goes_back_to_plain(fortress: Fortress) -> None:

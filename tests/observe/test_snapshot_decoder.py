@@ -77,7 +77,7 @@ def test_all_of_a_snapshot_is_decoded() -> None:
     members = {field.name for field in msgspec.structs.fields(Snapshot)}
     given = dict.fromkeys(members) | {"agent": AGENT, "taken": 1.0, "peers": [peer()], "topics": []}
     given |= {"services": [], "counters": {"a": 1}, "notes": ["n"], "unreachable": []}
-    given |= {"topics_left": 3, "services_left": 4}
+    given |= {"topics_left": 3, "services_left": 4, "strangers": [peer()]}
     given |= {"trust": TrustStatus(on=True, module="base", folder="f", agent="secured")}
     assert None not in given.values(), "a new member of Snapshot: SnapshotDecoder needs it too"
     decoded = SnapshotDecoder().decode(msgspec.json.encode({"ok": True, "value": given}))

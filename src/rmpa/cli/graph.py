@@ -78,7 +78,7 @@ def find_peer(snapshot: Snapshot, wanted: str) -> PeerInfo:
     Raises:
         RmpaError: There is none; the text offers the nearest name.
     """
-    for info in snapshot.peers:
+    for info in (*snapshot.peers, *snapshot.strangers):
         if wanted in (info.name, info.guid, info.guid.partition("#")[0]):
             return info
     names = [info.name for info in snapshot.peers]

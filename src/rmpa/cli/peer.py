@@ -17,6 +17,7 @@ from rmpa.cli.topic_crossing import shown_state
 from rmpa.core.errors import PeerRefused
 from rmpa.core.stats import SampleSummary
 from rmpa.observe.io.control_client import ControlClient, choose_agent
+from rmpa.observe.peer_info import FOREIGN
 from rmpa.observe.snapshot import PingReply
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ _COLOURS: Final = {
     "linking": "yellow",
     "refused": "red",
     "conflict": "red",
+    "foreign": "yellow",
 }
 _USUAL: Final = frozenset({"linked", "relayed", "parked"})
 """States that are no problem."""
@@ -92,16 +94,17 @@ def list_(
     with connect(agent) as client:
         snapshot = client.snapshot(topics=())
     selection = Selection(pattern, limit=limit, everything=everything)
-    fitting = set(selection.names(peer.name for peer in snapshot.peers))
-    peers = [p for p in snapshot.peers if p.name in fitting and (not states or p.state in states)]
+    known = (*snapshot.peers, *snapshot.strangers)
+    fitting = set(selection.names(peer.name for peer in known))
+    peers = [p for p in known if p.name in fitting and (not states or p.state in states)]
     if as_json:
         print_json(peers)
         return
-    if not snapshot.peers:
+    if not known:
         where = ", ".join(snapshot.agent.interfaces) or "no interface"
         click.echo(f"{snapshot.agent.name} knows no peers yet (domain {snapshot.agent.domain}, looking on {where})")
     elif not peers:
-        click.echo(summary(len(snapshot.peers), "peers", (p.state for p in snapshot.peers)) + "; none of them fits")
+        click.echo(summary(len(known), "peers", (p.state for p in known)) + "; none of them fits")
     else:
         if selection.is_long(peers):
             peers.sort(key=_urgency)
@@ -218,12 +221,13 @@ def _facts(info: PeerInfo) -> list[tuple[str, str]]:
     if info.via:
         topics = f"{info.topics_in} topics that it publishes"
         return [("Peer", info.name), ("GUID", info.guid), ("State", f"relayed: {info.via} passes on {topics}")]
+    strange = info.state == FOREIGN
     facts = [
         ("Peer", info.name),
         ("GUID", info.guid),
         ("State", f"{info.state} for {duration(info.since_ago)}"),
         ("Addresses", ", ".join(info.addresses) or "-"),
-        ("Found", f"{duration(info.found_ago)} ago by {info.source or 'a link'}"),
+        ("Found", f"{duration(info.found_ago)} ago by {info.source or ('a beacon' if strange else 'a link')}"),
         ("Last beacon", f"{duration(info.beacon_ago)} ago" if info.beacon_ago is not None else "-"),
     ]
     if info.probes is not None:

@@ -119,8 +119,8 @@ class PeerConflict:
         host, port = self.identity.guid.endpoint
         if self.kind is ConflictKind.NAME:
             return (
-                f"two peers are named {self.identity.name}: {self.identity.guid} and {self.other.guid}; "
-                "rename one: --name"
+                f"two modules are named {self.identity.name}: {self.identity.guid} and {self.other.guid}, so rules "
+                "and commands that name it may mean either; rename one: rmpa up --name"
             )
         if self.kind is ConflictKind.OWN_GUID:
             what = f"the live peer {self.identity.name} has our own GUID address {host}:{port}"

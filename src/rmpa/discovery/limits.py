@@ -132,6 +132,12 @@ members too, which are sent again, and which links do not need."""
 BEACONS_UNPROVED_BURST: Final = 1000
 BEACONS_UNPROVED_PAUSE: Final = 0.05
 """Seconds for which a socket is not read then."""
+STRANGERS_SHOWN: Final = 32
+"""Modules that are not of this mesh and are shown to users; what they say of themselves may be invented."""
+STRANGER_KEPT: Final = 30.0
+"""How long such a module is shown after its last beacon: six heartbeats."""
+STRANGER_BEACONS_PER_SECOND: Final = 50.0
+"""Refused beacons a second that are parsed for the names of such modules: 0.1 % of a core."""
 BEACONS_PER_SOURCE: Final = 200
 """Packets a second from one address; a host with twenty agents that all start at once stays below."""
 BEACONS_UNLINKED_PER_SECOND: Final = 200.0

@@ -32,7 +32,7 @@ from rmpa.mesh.peering_events import (
     PeerStatus,
     SocketAddress,
 )
-from rmpa.trust.reasons import TrustReason
+from rmpa.trust.reasons import NOT_OF_THIS_MESH, TrustReason
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -569,4 +569,12 @@ def _status(peer: _Peer) -> PeerStatus:
         peer.last_error,
         peer.next_attempt,
         peer.last_endpoint,
+        _foreign(peer),
     )
+
+
+def _foreign(peer: _Peer) -> TrustReason | None:
+    """Why an unlinked peer is not of this mesh, if its last refusal says so."""
+    if peer.link is None and peer.refused is not None and peer.refused.code in NOT_OF_THIS_MESH:
+        return TrustReason(peer.refused.code)
+    return None

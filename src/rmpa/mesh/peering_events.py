@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from rmpa.core.guid import Guid
     from rmpa.core.identity import Identity
     from rmpa.mesh.handshake import Refuse
+    from rmpa.trust.reasons import TrustReason
 
 SocketAddress = tuple[str, int]
 
@@ -100,6 +101,7 @@ class PeerStatus:
         last_error: Why there is no link, as far as is known; for a linked peer, why its previous link ended.
         next_attempt: When it is dialled next, monotonic seconds.
         endpoint: The endpoint that is dialled, or was dialled last.
+        foreign: Why it is not of this mesh, if its last refusal says so.
     """
 
     identity: Identity
@@ -111,3 +113,4 @@ class PeerStatus:
     last_error: str
     next_attempt: float | None
     endpoint: SocketAddress | None
+    foreign: TrustReason | None = None

@@ -235,7 +235,7 @@ def _judge_peer(info: PeerInfo, dropped: int, *, was_linked: bool) -> tuple[Chec
     if info.state == _LINKED and link is not None:
         if dropped:
             return WARN, f"{dropped} messages dropped: the link takes them too slowly"
-        troubles = [bound.text for bound in info.beyond]
+        troubles = [*info.conflicts, *(bound.text for bound in info.beyond)]
         if info.offers is not None and info.offers.right is False:
             troubles.append(_OFFERS_DIFFER)
         if troubles:

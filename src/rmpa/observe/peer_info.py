@@ -5,7 +5,12 @@ Times are seconds; ``…_ago`` counts back from the snapshot.
 
 from __future__ import annotations
 
+from typing import Final
+
 import msgspec
+
+FOREIGN: Final = "foreign"
+"""The state of a module that is heard, or refuses this one, because it is not of this mesh."""
 
 
 class LaneInfo(msgspec.Struct, kw_only=True, frozen=True):
@@ -127,8 +132,9 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
         instance: The random id of its run, 32 hexadecimal digits.
         addresses: Where it can be reached, best first.
         state: ``linked``; ``linking`` (dialling, or waiting to be dialled); ``refused`` (by either side);
-            ``conflict`` (shares a GUID or a name with another); ``relayed`` (has no link; another peer relays its
-            topics); ``parked`` (both sides ended the link, as nothing needed it; it is made again on demand).
+            ``conflict`` (shares a GUID or an address with another, so it cannot be linked); ``relayed`` (has no link;
+            another peer relays its topics); ``parked`` (both sides ended the link, as nothing needed it; it is made
+            again on demand); ``foreign`` (is not of this mesh).
         since_ago: Seconds since it came into this state.
         found_ago: Seconds since it was found.
         beacon_ago: Seconds since its last beacon.
@@ -136,7 +142,8 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
         link: The link, while there is one.
         last_error: Why the last attempt or link failed, ready to read; empty if none did.
         next_attempt: Seconds until the next attempt to dial.
-        conflicts: What is wrong with its identity, each ready to read.
+        conflicts: What is wrong with its identity or its names, each ready to read. Only in the state ``conflict``
+            they keep it from being linked; else its messages come.
         topics_in: The number of topics that it offers.
         topics_out: The number of topics that it is offered.
         via: The name of the peer that relays its topics, if one does.

@@ -28,6 +28,7 @@ class _SnapshotParts(msgspec.Struct, kw_only=True, frozen=True):
     trust: TrustStatus | None = None
     topics_left: int = 0
     services_left: int = 0
+    strangers: tuple[PeerInfo, ...] = ()
 
 
 class _SnapshotReply(msgspec.Struct, frozen=True):
@@ -90,6 +91,7 @@ class SnapshotDecoder:
                 trust=parts.trust,
                 topics_left=parts.topics_left,
                 services_left=parts.services_left,
+                strangers=parts.strangers,
             )
         except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
             raise RemoteProtocolError(f"not a snapshot: {error}") from None

@@ -57,6 +57,24 @@ _REMEDIES: Final = {
 }
 
 
+NOT_OF_THIS_MESH: Final = {
+    TrustReason.PLAIN: "it has joined a secured mesh and this module has not; join it by rmpa trust join TOKEN here, "
+    "with a token of rmpa trust invite at the authority of that mesh",
+    TrustReason.UNSECURED: "it has not joined this secured mesh; let it join by rmpa trust invite at the authority "
+    "and rmpa trust join TOKEN there",
+    TrustReason.FOREIGN: "it has joined another secured mesh; to have both in one, rmpa trust leave and rmpa trust "
+    "join TOKEN there, with a token of the authority here",
+    TrustReason.KEY: "its group key is unknown here; if it has joined another mesh, rmpa trust leave and rmpa trust "
+    "join TOKEN there; if it is of this one, rmpa trust renew here",
+}
+"""Why a module is not of this mesh, and what to do; behind a semicolon, as for ``Check.from_message``."""
+
+
+def not_of_this_mesh(reason: TrustReason) -> str:
+    """``not of this mesh: it has not joined this secured mesh; let it join by …``."""
+    return f"not of this mesh: {NOT_OF_THIS_MESH[reason]}"
+
+
 class TrustError(RemoteProtocolError):
     """A secured mesh refuses a connection, a certificate or a request.
 

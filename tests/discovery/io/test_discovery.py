@@ -285,7 +285,7 @@ async def test_two_of_one_name_are_told(
     pair = [Agent("base", settings) for _ in range(2)]
     await start(agents, *pair)
     await until(lambda: all(any(isinstance(e, PeerConflict) for e in agent.events) for agent in pair))
-    assert "rename one: --name" in caplog.text
+    assert "rename one: rmpa up --name" in caplog.text
 
 
 async def test_an_unknown_interface_is_said_and_used_when_it_comes(

@@ -236,8 +236,35 @@ def test_refused_packets_are_logged_with_what_to_do(caplog: pytest.LogCaptureFix
     door.hears(packet(FRIEND, 1))
     door.hears(door.signed(1, WALL + 60))
     texts = [record.getMessage() for record in caplog.records]
-    assert "rmpa trust join there" in texts[0]
-    assert "60 s ahead of our clock" in texts[1]
+    assert "friend at 10.0.0.2 is not of this mesh" in texts[0]
+    assert "rmpa trust join TOKEN there" in texts[0]
+    assert "60 s ahead of ours" in texts[1]
+    (shown,) = door.intake.strangers.shown(10.0)
+    assert shown.identity == FRIEND
+    assert "60 s ahead of ours" in shown.problem, "the last word on it"
+
+
+def test_a_packet_that_is_no_beacon_of_this_domain_is_not_told_of(caplog: pytest.LogCaptureFixture) -> None:
+    """`rmpa doctor` sends such a packet to look whether multicast comes back."""
+    door = SecuredDoor()
+    other = Identity(FRIEND.guid, FRIEND.instance, "friend", domain=7)
+    for data in (packet(other, 1), packet(FRIEND, 1)[:20] + bytes(60)):
+        assert not door.hears(data)
+    assert door.counters["beacon.untagged"] == 2
+    assert not caplog.records
+    assert not door.intake.strangers.shown(10.0)
+
+
+def test_strangers_fill_no_table_and_no_time(caplog: pytest.LogCaptureFixture) -> None:
+    door = SecuredDoor()
+    assert not door.hears(packet(FRIEND, 1))
+    for n in range(5000):
+        assert not door.hears(forged(n), host=f"10.9.{n // 250}.{n % 250}", now=10.0 + n / 1000)
+    shown = door.intake.strangers.shown(15.0)
+    assert shown[0].identity == FRIEND, "one that was there before stays"
+    assert len(shown) == limits.STRANGERS_SHOWN
+    assert len(caplog.records) < limits.STRANGERS_SHOWN
+    assert not door.intake.strangers.shown(15.0 + limits.STRANGER_KEPT)
 
 
 def test_an_extended_beacon_has_room_for_the_trailer() -> None:

@@ -91,6 +91,7 @@ class Case:
     known: bool = True
     carrier: str = ""
     files: FilesInfo | None = None
+    stranger: PeerInfo | None = None
 
     def ends(
         self, route: RouteInfo | None, source: PublisherReport | None, readers: tuple[SubscriberConnection, ...]
@@ -102,7 +103,13 @@ class Case:
             routes=(route,) if route is not None else (),
         )
         agent = msgspec.structs.replace(SNAPSHOT.agent, files=self.files)
-        snapshot = Snapshot(agent=agent, taken=0.0, peers=(self.peer,) if self.peer else (), topics=(topic,))
+        snapshot = Snapshot(
+            agent=agent,
+            taken=0.0,
+            peers=(self.peer,) if self.peer else (),
+            strangers=(self.stranger,) if self.stranger else (),
+            topics=(topic,),
+        )
         there = self.there
         if there is not None and source is not None:
             there = msgspec.structs.replace(there, sources=(source,))
@@ -143,17 +150,38 @@ def test_a_flowing_topic_passes_all_stages() -> None:
     assert by_name["reader"] == "/base takes them"
 
 
+def test_two_modules_of_one_name_are_told_and_what_they_publish_arrives() -> None:
+    twin = msgspec.structs.replace(PEER, conflicts=("two modules are named joystick; rename one",))
+    found = one(Case(peer=twin))
+    assert found.flows
+    stage = found.stages[0]
+    assert (stage.name, stage.level, stage.remedy) == ("peer", CheckLevel.WARN, "rename one")
+
+
+def test_a_module_of_another_mesh_is_told_as_such() -> None:
+    told = "not of this mesh: it has not joined; let it join"
+    stranger = msgspec.structs.replace(PEER, state="foreign", link=None, last_error=told)
+    found = one(Case(peer=None, stranger=stranger))
+    (stage,) = found.stages
+    assert (stage.name, stage.level) == ("peer", CheckLevel.FAIL)
+    assert (stage.text, stage.remedy) == ("joystick is not of this mesh: it has not joined", "let it join")
+
+
 FAILURES: dict[str, tuple[Case, str, str, str]] = {
     # What is different: the stage that fails, a part of its text, a part of its remedy.
     "unknown peer": (Case(peer=None), "peer", "base knows no peer 'joystick' (domain 3", "rmpa doctor"),
     "conflict": (
-        Case(peer=msgspec.structs.replace(PEER, conflicts=("shares its name",))),
+        Case(peer=msgspec.structs.replace(PEER, state="conflict", conflicts=("shares its address",))),
         "peer",
-        "shares its name",
+        "shares its address",
         "--name",
     ),
     "shared address": (
-        Case(peer=msgspec.structs.replace(PEER, conflicts=("its address is also b's; give one another",))),
+        Case(
+            peer=msgspec.structs.replace(
+                PEER, state="conflict", conflicts=("its address is also b's; give one another",)
+            )
+        ),
         "peer",
         "its address is also b's",
         "give one another",

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
     from rmpa.discovery.beacon import Address
     from rmpa.discovery.events import Event, Output, PeerView
+    from rmpa.discovery.strangers import Stranger
     from rmpa.discovery.swim.events import DetectorView, MemberView, SendSwim, SwimEvent
     from rmpa.trust.packets import PacketTrust
 
@@ -219,6 +220,10 @@ class Discovery:
         """All known peers, in GUID order."""
         return self._membership.peers()
 
+    def strangers(self) -> tuple[Stranger, ...]:
+        """The modules that are heard and are not of this mesh."""
+        return self._filter.strangers.shown(self._clock.now())
+
     @property
     def interfaces(self) -> tuple[Interface, ...]:
         """The interfaces in use."""
@@ -358,10 +363,12 @@ class Discovery:
 
     def notes(self) -> tuple[str, ...]:
         """Problems of the network, as texts for the user."""
+        strangers = {host for one in self.strangers() for host, _ in one.identity.endpoints}
         silent = [
             f"seed {host}:{port}: no answer; is `rmpa up` running there, in domain {self._settings.domain} too, "
             "and its UDP port open?"
             for host, port in self._membership.silent_seeds()
+            if host not in strangers
         ]
         return (*sorted(self._warned), *silent)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections import OrderedDict
 from dataclasses import dataclass
@@ -13,9 +14,11 @@ from rmpa.core.token_bucket import TokenBucket
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import RUN_AT, Beacon, BeaconOtherDomain, BeaconOtherVersion, sender_of
 from rmpa.discovery.parsed_heartbeats import ParsedHeartbeats
+from rmpa.discovery.strangers import Strangers
 from rmpa.discovery.swim.packets import SwimPacket, is_swim
 from rmpa.trust.keyring import KeyPurpose
 from rmpa.trust.packets import TRAILER_BYTES, Verdict
+from rmpa.trust.reasons import TrustReason, not_of_this_mesh
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -28,13 +31,12 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _INTERFACES: Final = 256
-_NOT_JOINED: Final = "it has not joined this mesh: rmpa trust invite at the authority, rmpa trust join there"
 _REFUSED: Final = {
-    Verdict.UNTAGGED: f"sends beacons without a proof; {_NOT_JOINED}",
-    Verdict.UNKNOWN_KEY: "has a group key that is unknown here: it is of another mesh, or one of us must renew",
-    Verdict.FORGED: "sends beacons with a wrong proof: it is of another mesh, or they are forged",
+    Verdict.UNTAGGED: TrustReason.UNSECURED,
+    Verdict.UNKNOWN_KEY: TrustReason.KEY,
+    Verdict.FORGED: TrustReason.FOREIGN,
 }
-"""What is logged of packets that are refused; repeats are only counted."""
+"""What is told of the senders of packets that are refused; repeats are only counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +82,8 @@ class PacketFilter:
         self._unlinked: dict[tuple[int, bool], TokenBucket] = {}
         self._swim = TokenBucket(limits.SWIM_PER_SECOND, limits.SWIM_BURST)
         self._unproved = TokenBucket(limits.BEACONS_UNPROVED_PER_SECOND, limits.BEACONS_UNPROVED_BURST)
+        self.strangers = Strangers()
+        """The modules whose beacons are refused, for the user."""
         self.overrun = False
         """Whether packets without a valid proof come faster than they can be looked at: pause the reading."""
         self._refusals = RefusalLog(_log, counters)
@@ -177,11 +181,21 @@ class PacketFilter:
         if found.verdict is Verdict.ACCEPTED:
             return found
         self.overrun = not self._unproved.take(now)
-        text = _refusal(found)
-        if text:
-            self._refusals.refuse(now, f"beacon.{found.verdict}", host, f"{host} {text}")
+        problem = _problem(found)
+        beacon = self._stranger(data, now) if problem and not swim else None
+        if beacon is not None and self.strangers.hear(beacon, problem, now):
+            identity = beacon.identity
+            at = str(identity.guid.address)  # that of the packet is another one by each interface of a machine
+            self._refusals.refuse(now, f"beacon.{found.verdict}", at, f"{identity.name} at {host} is {problem}")
         else:
             self._counters.add(f"beacon.{found.verdict}")
+        return None
+
+    def _stranger(self, data: bytes, now: float) -> Beacon | None:
+        """The beacon in a refused packet; ``None``: it is none of this domain, or too many came."""
+        if self.strangers.may_read(now):
+            with contextlib.suppress(RemoteProtocolError):
+                return Beacon.parse(data, self._domain)
         return None
 
     def _recognise(self, data: bytes, key: int) -> Recognised | None:
@@ -224,11 +238,9 @@ class PacketFilter:
         return count >= limits.BEACONS_PER_SOURCE
 
 
-def _refusal(found: Verification) -> str:
-    """What is logged of a packet that is refused; empty: it is only counted."""
+def _problem(found: Verification) -> str:
+    """What is told of the sender of a packet that is refused; empty: it is only counted."""
     if found.verdict is Verdict.CLOCK:
         ahead = "ahead of" if found.skew > 0 else "behind"
-        return (
-            f"sends beacons {abs(found.skew)} s {ahead} our clock: set both clocks, or they are sent again by another"
-        )
-    return _REFUSED.get(found.verdict, "")
+        return f"refused: its clock is {abs(found.skew)} s {ahead} ours, or its beacons are replayed; set both clocks"
+    return not_of_this_mesh(_REFUSED[found.verdict]) if found.verdict in _REFUSED else ""

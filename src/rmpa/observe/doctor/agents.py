@@ -72,7 +72,9 @@ def _agent(snapshot: Snapshot, version: str) -> Iterator[Check]:
         yield _files(agent, agent.files)
     text = f"{agent.proxies} nodes of peers, {agent.proxy_sockets} listening sockets: {agent.proxy_listening}"
     yield Check("proxies", OK, text, where=here)
-    if not snapshot.peers:
+    for stranger in snapshot.strangers[: limits.DOCTOR_PEERS_LISTED]:
+        yield Check.from_message("peer", WARN, stranger.last_error, where=f"{here}-{stranger.name}")
+    if not snapshot.peers and not snapshot.strangers:
         text = f"knows no peer (domain {agent.domain}, looking on {', '.join(agent.interfaces) or 'no interface'})"
         advice = (
             f"is `rmpa up` running elsewhere with --domain {agent.domain}? `rmpa multicast` tries the way by hand"
@@ -144,7 +146,8 @@ def _peers(agent: str, peers: Sequence[PeerInfo]) -> Iterator[Check]:
 def _peer(agent: str, peer: PeerInfo) -> Iterator[Check]:
     both = f"{agent}-{peer.name}"
     for conflict in peer.conflicts:
-        yield Check.from_message("peer", FAIL, conflict, "give each module a --name of its own", both)
+        level = FAIL if peer.state == "conflict" else WARN
+        yield Check.from_message("peer", level, conflict, "give each module a --name of its own", both)
     link = peer.link
     if peer.state in _WITHOUT_LINK:
         yield Check("peer", OK, f"{peer.state}: {_WITHOUT_LINK[peer.state]}", where=both)

@@ -9,11 +9,12 @@ import msgspec
 from rmpa.bridge.session.peer_session import PeerState
 from rmpa.mesh.lane_demand import LaneState
 from rmpa.observe.io.direct_section import direct_counts
-from rmpa.observe.peer_info import BoundInfo, LaneInfo, LinkInfo, OffersInfo, PeerInfo, ProbesInfo
+from rmpa.observe.peer_info import FOREIGN, BoundInfo, LaneInfo, LinkInfo, OffersInfo, PeerInfo, ProbesInfo
 from rmpa.observe.shared_address import mark_shared_addresses
 from rmpa.observe.snapshot import DetectorInfo
 from rmpa.runtime.event_loop import yield_to_data
 from rmpa.runtime.system_clock import SystemClock
+from rmpa.trust.reasons import not_of_this_mesh
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
     from rmpa.discovery.events import PeerView
     from rmpa.discovery.io.discovery import Discovery
+    from rmpa.discovery.strangers import Stranger
     from rmpa.discovery.swim.events import DetectorView, MemberView
     from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink
@@ -60,7 +62,7 @@ class PeersSection:
         self._clock = SystemClock()
 
     def infos(self, endpoint: EndpointView) -> tuple[PeerInfo, ...]:
-        """Every peer that is known, by name."""
+        """Every peer that is known, by name, and behind them the modules that are not of this mesh."""
         now = self._clock.now()
         links = {session.link.guid: session for session in self._bridge.sessions.reachable()}
         yield_to_data()  # a millisecond each with a full roster
@@ -96,9 +98,12 @@ class PeersSection:
                 info = msgspec.structs.replace(info, probes=_probes(probed, now))
             infos.append(info)
         relayed = self._relayed({info.instance: info for info in infos})
-        infos = [info for info in infos if info.instance not in {one.instance for one in relayed}]
+        infos = [info for info in infos if info.instance not in {one.instance for one in relayed}] + relayed
         own = {str(address) for address in (endpoint.identity.guid.address, *endpoint.identity.addresses)}
-        return mark_shared_addresses(sorted((*infos, *relayed), key=lambda info: (info.name, info.guid)), own)
+        strangers = endpoint.discovery.strangers()
+        infos += [_stranger(one, now) for one in strangers if one.identity.guid not in {*roster, *statuses, *links}]
+        infos.sort(key=lambda info: (info.state == FOREIGN, info.name, info.guid))
+        return mark_shared_addresses(infos, own)
 
     def _beyond(self, session: PeerSession) -> tuple[BoundInfo, ...]:
         name, peer = session.link.name, session.peer
@@ -125,6 +130,8 @@ class PeersSection:
             state, since = "linked", session.link.since or now
         elif session is not None:
             state, since = "parked" if session.state is PeerState.PARKED else "linking", session.away_since
+        elif status is not None and status.foreign is not None:
+            state, since = FOREIGN, unlinked
         elif view is not None and not view.present:
             state, since = "conflict", view.since
         elif status is not None and status.state == "refused":
@@ -132,6 +139,9 @@ class PeersSection:
         else:
             state, since = "linking", unlinked
         next_attempt = status.next_attempt if status is not None else None
+        last_error = status.last_error if status is not None else ""
+        if status is not None and status.foreign is not None:
+            last_error, next_attempt = not_of_this_mesh(status.foreign), None
         return PeerInfo(
             name=identity.name,
             guid=str(identity.guid),
@@ -142,7 +152,7 @@ class PeersSection:
             found_ago=now - view.since if view else None,
             beacon_ago=now - view.heard if view else None,
             source=view.found_by.value if view else "link",
-            last_error=status.last_error if status is not None else "",
+            last_error=last_error,
             next_attempt=max(0.0, next_attempt - now) if next_attempt is not None else None,
             conflicts=conflicts,
         )
@@ -172,6 +182,21 @@ class PeersSection:
                 ),
             ),
         )
+
+
+def _stranger(one: Stranger, now: float) -> PeerInfo:
+    identity = one.identity
+    return PeerInfo(
+        name=identity.name,
+        guid=str(identity.guid),
+        instance=identity.instance.hex(),
+        state=FOREIGN,
+        since_ago=now - one.since,
+        addresses=tuple(f"{host}:{port}" for host, port in identity.endpoints),
+        found_ago=now - one.since,
+        beacon_ago=now - one.heard,
+        last_error=one.problem,
+    )
 
 
 def _probes(member: MemberView, now: float) -> ProbesInfo:

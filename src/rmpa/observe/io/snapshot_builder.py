@@ -18,6 +18,7 @@ from rmpa.observe.io.peers_section import PeersSection, detector_info, own_text
 from rmpa.observe.io.services_section import ServicesSection
 from rmpa.observe.io.topics_section import TopicsSection, unreachable_infos
 from rmpa.observe.peer_agent import PeerAgent
+from rmpa.observe.peer_info import FOREIGN
 from rmpa.observe.snapshot import AgentInfo, FilesInfo, Snapshot
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.descriptors import DESCRIPTORS
@@ -152,10 +153,12 @@ class SnapshotBuilder:
             topics, topics_left = self._topics.used(most)
         if most is not None and services is None:
             services, services_left = self._services.used(most)
+        known = self._peers.infos(endpoint) if endpoint is not None and peers else ()
         return Snapshot(
             agent=self._agent(endpoint),
             taken=time.time(),
-            peers=self._peers.infos(endpoint) if endpoint is not None and peers else (),
+            peers=tuple(info for info in known if info.state != FOREIGN),
+            strangers=tuple(info for info in known if info.state == FOREIGN),
             topics=self._topics.infos(topics),
             services=self._services.infos(services),
             topics_left=topics_left,

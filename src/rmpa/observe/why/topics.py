@@ -19,7 +19,7 @@ from rmpa.config import limits as config_limits
 from rmpa.config.permission_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.observe import limits as observe_limits
-from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check
+from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check, CheckLevel
 from rmpa.observe.why.diagnosis import (
     PERMISSION_HERE,
     PERMISSION_THERE,
@@ -33,7 +33,7 @@ from rmpa.observe.why.direct_stages import adrift_stages, connected_directly, di
 from rmpa.ros import limits as ros_limits
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from rmpa.observe.peer_info import PeerInfo
     from rmpa.observe.snapshot import RouteInfo, Snapshot
@@ -47,14 +47,20 @@ _FLOWING: Final = frozenset({"open", "lingering"})
 
 def find_peer(snapshot: Snapshot, name: str) -> PeerInfo | None:
     """The peer with a name or GUID; of several peers of one name, a linked one."""
-    fitting = [p for p in snapshot.peers if name in (p.name, p.guid, p.guid.partition("#")[0])]
+    fitting = _fitting(snapshot.peers, name)
     return min(fitting, key=lambda p: (p.state != "linked", p.state != "parked"), default=None)
+
+
+def _fitting(peers: Iterable[PeerInfo], name: str) -> list[PeerInfo]:
+    return [p for p in peers if name in (p.name, p.guid, p.guid.partition("#")[0])]
 
 
 def peer_stages(snapshot: Snapshot, name: str) -> tuple[Check, ...]:
     """The first two stages: whether the peer is known, and whether it is linked."""
     agent = snapshot.agent
     peer = find_peer(snapshot, name)
+    if peer is None and (strangers := _fitting(snapshot.strangers, name)):
+        return (Check.from_message("peer", FAIL, f"{name} is {strangers[0].last_error}"),)
     if peer is None:
         where = ", ".join(agent.interfaces) or "no interface"
         known = [p.name for p in snapshot.peers]
@@ -67,10 +73,8 @@ def peer_stages(snapshot: Snapshot, name: str) -> tuple[Check, ...]:
             "and --seed HOST:PORT reaches it where there is none"
         )
         return (Check("peer", FAIL, text, remedy),)
-    if peer.conflicts:
-        texts, remedies = zip(*(conflict.partition("; ")[::2] for conflict in peer.conflicts), strict=True)
-        remedy = "; ".join(filter(None, remedies)) or "give each module a --name and an address of its own"
-        return (Check("peer", FAIL, "; ".join(texts), remedy),)
+    if peer.state == "conflict":
+        return (_conflict(peer, FAIL),)
     if peer.state == "relayed":
         outside = peer.guid == OUTSIDE_GUID
         heard = Check(
@@ -78,12 +82,22 @@ def peer_stages(snapshot: Snapshot, name: str) -> tuple[Check, ...]:
         )
         return (heard, Check("link", OK, f"no link of its own; {peer.via} passes on what it publishes"))
     found = Check("peer", OK, f"{peer.name} is known, by {peer.source or 'its link'} ({peer.guid})")
+    if peer.conflicts:  # two peers of one name, say: both are linked
+        found = _conflict(peer, WARN)
     if peer.state == "parked":
         text = f"parked for {peer.since_ago:.0f} s: nothing needed the link; it is made on demand, in a round trip"
         return (found, Check("link", OK, text))
     if peer.state != "linked" or peer.link is None:
         return (found, _unlinked(peer))
     return (found, _linked(peer))
+
+
+def _conflict(peer: PeerInfo, level: CheckLevel) -> Check:
+    texts, remedies = zip(
+        *(conflict.partition("; ")[::2] for conflict in peer.conflicts or (peer.state,)), strict=True
+    )
+    remedy = "; ".join(filter(None, remedies)) or "give each module a --name and an address of its own"
+    return Check("peer", level, "; ".join(texts), remedy)
 
 
 def _unlinked(peer: PeerInfo) -> Check:

@@ -174,7 +174,10 @@ class StateBuilder:
             "parked": sum(peer.state == "parked" for peer in snapshot.peers),
             "recorded": recorded,
             "parameters": parameters,
-            "notes": list(snapshot.notes[:100]),
+            "notes": [
+                *snapshot.notes[:100],
+                *(f"{one.name}: {one.last_error}" for one in snapshot.strangers),
+            ],
             "unreachable": [str(each) for each in snapshot.unreachable[:100]],
         }
         hidden = {
@@ -251,7 +254,7 @@ class StateBuilder:
         entry = {
             "state": module_state(peer),
             "since": steady.moment(f"{name} since", taken - peer.since_ago),
-            "error": "" if link else peer.last_error or "; ".join(peer.conflicts),
+            "error": "; ".join(filter(None, ("" if link else peer.last_error, *peer.conflicts))),
             "guid": peer.guid,
             "source": peer.source,
             "via": peer.via,

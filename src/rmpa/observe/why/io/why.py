@@ -231,6 +231,8 @@ class WhyService:
         text = f"neither {here} nor a linked peer ({', '.join(linked) or 'there is none'}) publishes {topic}"
         remedy = "`rmpa topic list` shows what there is, `rmpa peer list` who"
         remedy = f"did you mean {similar}?" if similar else remedy
+        if not linked and (strangers := self._snapshots.build(()).strangers):
+            remedy = f"{strangers[0].name} is {strangers[0].last_error}"
         return Diagnosis.of((Check("publisher", FAIL, text, remedy),), name=topic, peer="", to=here)
 
     async def _arrives(self, name: str, topic: str) -> tuple[Diagnosis, ...]:
