@@ -163,6 +163,8 @@ async def test_violation_raises_an_alarm_and_changes_the_profile(sonar: Sonar, c
     assert pairs(alarm)["noise"].startswith("wanted at most 0.2 m, given 0.5")
     seen = await status(quality, lambda s: s.name == "sonar" and pairs(s).get("profile") == "fine" and s.level == OK)
     assert "reaction" in pairs(seen)
+    later = await status(quality, lambda s: s.name == "sonar" and pairs(s)["level_for"] > pairs(seen)["level_for"])
+    assert later.level == OK
     over = await status(alarms, lambda s: pairs(s)["cleared"] == "true")
     assert over.level == OK
     done.set()

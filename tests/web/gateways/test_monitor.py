@@ -139,9 +139,9 @@ async def text_topic(talker: Node, name: str, text: str) -> Any:
     return publisher
 
 
-async def status_topic(talker: Node, name: str, level: DiagnosticLevel, message: str) -> Any:
+async def status_topic(talker: Node, name: str, level: DiagnosticLevel, message: str, **values: str) -> Any:
     publisher = await talker.advertise(name, MessageType(ARRAY_TYPE), latch=True)
-    status = DiagnosticStatus(level, "arm", message, "arm", {"rate": "9 Hz"})
+    status = DiagnosticStatus(level, "arm", message, "arm", {"rate": "9 Hz", **values})
     publisher.publish_raw(frame_array(1, time.time_ns(), [status.serialize()])[LENGTH.size :])
     return publisher
 
@@ -344,6 +344,16 @@ async def test_a_smart_resource_shows_with_its_alarms_and_leaves_with_its_node(c
             history = (await page.ask(1, "history"))["value"]
             assert [(each["resource"], each["text"]) for each in history] == [("lab:/arm", "rate is low")]
         await page.sees(lambda: not page.state["resources"])
+
+
+async def test_an_alarm_stands_for_as_long_as_its_resource_says_whenever_the_server_started(core: RosCore) -> None:
+    descriptor = msgspec.json.encode(describe(Resource("arm", role="acting"), "/arm")).decode()
+    async with page_of(core) as (page, _), node(core, "arm") as arm:
+        await text_topic(arm, "/arm/descriptor", descriptor)
+        await status_topic(arm, "/arm/quality", DiagnosticLevel.WARN, "adapting", level_for="3600.0 s")
+        began = time.time() - 3600
+        await page.sees(lambda: page.state.get("alarms", {}).get("/arm"))
+        assert abs(page.state["alarms"]["/arm"]["at"] - began) < 60
 
 
 async def test_a_broken_descriptor_is_no_resource(core: RosCore) -> None:

@@ -67,7 +67,39 @@ def test_a_killed_module_shows_in_the_next_state_and_comes_back_to_its_place() -
     assert [state["modules"]["base"]["state"] for state in states] == ["up", "up", "linking", "away", "up", "up"]
     assert "refused" in states[2]["modules"]["base"]["error"]
     assert "base>pc" not in states[2]["flows"]
+    assert states[2]["modules"]["base"]["since"] == states[3]["modules"]["base"]["since"]
     assert len({json.dumps(state["ring"]) for state in states}) == 1
+
+
+def test_what_a_lost_module_said_last_is_no_news() -> None:
+    one = next(one for one in RESOURCES if one.peer == "base")
+    alarm: Tree = {"id": one.key, "module": "base", "resource": one.key, "level": "ERROR", "text": "hot", "at": 1.0}
+    well, lost, back = (
+        build(snapshot, resources=[one], alarms=[alarm]) for snapshot in (RECORDED[0], RECORDED[3], RECORDED[4])
+    )
+    assert (well["resources"][one.key]["level"], well["resources"][one.key]["state"]) == ("OK", "active")
+    assert (lost["resources"][one.key]["level"], lost["resources"][one.key]["state"]) == ("STALE", "not known")
+    assert (list(well["alarms"]), list(lost["alarms"])) == ([one.key], [])
+    assert back["resources"] == well["resources"]
+
+
+def test_a_module_that_left_the_roster_is_away_since_nothing_came_of_it() -> None:
+    builder = StateBuilder(FULL.agent.name)
+    builder.build(FULL)
+    left: Any = builder.build(msgspec.structs.replace(FULL, taken=FULL.taken + 60, peers=()))
+    assert left["modules"]["arm"] == {
+        "state": "away", "since": FULL.taken, "error": "has left the roster: no beacon and no link"
+    }  # fmt: skip
+    assert left["modules"]["hand"]["since"] == FULL.taken - 1  # it had no link before
+
+
+def test_an_agent_that_has_just_started_has_lost_nothing() -> None:
+    builder = StateBuilder(FULL.agent.name)
+    builder.build(FULL)
+    fresh = msgspec.structs.replace(FULL.agent, uptime=2.0, started=FULL.taken + 8)
+    started: Any = builder.build(msgspec.structs.replace(FULL, agent=fresh, taken=FULL.taken + 10, peers=()))
+    assert {started["modules"][name]["state"] for name in ("arm", "hand")} == {"linking"}
+    assert "just started" in started["modules"]["arm"]["error"]
 
 
 def test_byte_rates_come_from_the_links_counters() -> None:

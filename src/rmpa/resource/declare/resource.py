@@ -50,7 +50,7 @@ RESERVED: Final = frozenset(
     }
 )  # fmt: skip
 """Names below a resource's node that are reserved for topics, services and parameters of every resource."""
-NOT_ATTRIBUTES: Final = frozenset({"expires", "priority", "profile", "reaction"})
+NOT_ATTRIBUTES: Final = frozenset({"expires", "level_for", "priority", "profile", "reaction"})
 """Keys of requirements and quality reports that cannot be names of attributes."""
 
 

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from rmpa.resource.run.runtime import Runtime
     from rmpa.ros.node.topics import Publisher
 
+LEVEL_FOR: Final = "level_for"
+"""The value of ``quality`` that has how long its level has stood: an age, since the clocks of modules differ."""
 _LATCHED: Final = {"quality": False, "alarms": False, "responses": True}
 
 
@@ -32,6 +34,8 @@ class StatusPublisher:
         self._name = runtime.resource.name
         self.publishers: dict[str, Publisher] = {}
         self._responses: list[bytes] | None = None
+        self._level: tuple[DiagnosticLevel, float] | None = None
+        """The level of ``quality``, and since when, in monotonic seconds."""
 
     async def start(self) -> None:
         """Advertise the topics."""
@@ -48,8 +52,12 @@ class StatusPublisher:
         self.publishers.clear()
 
     def quality(self, level: DiagnosticLevel, message: str, values: Mapping[str, str]) -> None:
-        """Publish the quality of a window, also on ``/diagnostics``."""
-        status = [DiagnosticStatus(level, self._name, message, self._name, values)]
+        """Publish the quality of a window, also on ``/diagnostics``, with how long it has had this level."""
+        now = time.monotonic()
+        if self._level is None or self._level[0] != level:
+            self._level = level, now
+        lasting = {LEVEL_FOR: f"{now - self._level[1]:.1f} s"}
+        status = [DiagnosticStatus(level, self._name, message, self._name, {**values, **lasting})]
         self._publish("quality", status)
         self._publish("diagnostics", status)
 

@@ -80,6 +80,9 @@ SILENT_AFTER_REST: Final = 8.0
 AWAY_AFTER: Final = 7.0
 """Time without a beacon, or a packet of the failure detector, after which a module without a link is shown as away.
 Heartbeats come every 5 s; in a large mesh they are rarer, and probes come."""
+AGENT_SETTLES: Final = 10.0
+"""Time after the start of this module's agent in which peers that it has not found yet do not count as lost: beacons
+come every 5 s at the latest, and links take seconds where names or addresses are resolved."""
 FORGET_AFTER: Final = 600.0
 """Time for which a module that has left the roster keeps its place in the ring."""
 STEADY: Final = 0.03

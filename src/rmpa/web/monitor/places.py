@@ -63,6 +63,10 @@ class Places:
         """Modules whose place is kept although they are not in ``present``, in order of their names."""
         return sorted(self._places.keys() - set(present) - {self._own})
 
+    def seen(self, name: str) -> float:
+        """When a module that has a place was present last, on the clock of ``update``."""
+        return self._seen[name]
+
     def _forget(self, name: str) -> None:
         self._seen.pop(name, None)
         self._places.pop(name, None)

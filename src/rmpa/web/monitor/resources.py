@@ -68,8 +68,14 @@ class ResourceFacts(msgspec.Struct, kw_only=True, frozen=True):
             return None
 
 
-def resource_entry(facts: ResourceFacts, own: str) -> Tree:
-    """What the state says of a resource; ``resource_detail`` has the rest."""
+def resource_entry(facts: ResourceFacts, own: str, *, lost: bool = False) -> Tree:
+    """What the state says of a resource; ``resource_detail`` has the rest.
+
+    Args:
+        facts: The resource.
+        own: This module's name.
+        lost: Whether nothing comes of its module any more: what it said last is no news then.
+    """
     descriptor = facts.descriptor
     health = facts.health or {}
     profiles = descriptor.get("profiles", ())
@@ -79,12 +85,12 @@ def resource_entry(facts: ResourceFacts, own: str) -> Tree:
         "role": descriptor.get("role"),
         "physical": descriptor.get("physical"),
         "description": descriptor.get("description"),
-        "state": facts.state,
+        "state": "not known" if lost else facts.state,
         "profile": facts.profile,
         "profiles": [str(each.get("name", "")) for each in profiles if isinstance(each, dict)],
         "context": facts.context,
-        "level": facts.level,
-        "message": health.get("message", ""),
+        "level": "STALE" if lost else facts.level,
+        "message": f"nothing comes from {facts.peer}" if lost else health.get("message", ""),
         "clients": len(facts.clients),
     }
     made = without_nulls(entry)

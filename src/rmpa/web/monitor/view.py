@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from itertools import islice
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias, cast
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, cast
 
 import msgspec
 
@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from rmpa.web.monitor.resources import ResourceFacts
 
 _STATES = {"refused": "refused", "conflict": "refused", "relayed": "relayed", "parked": "parked"}
+_GONE: Final = "has left the roster: no beacon and no link"
+_LOST: Final = frozenset({"linking", "refused", "away"})
+"""States of a module of which nothing comes any more."""
 
 
 def module_state(peer: PeerInfo) -> str:
@@ -157,19 +160,22 @@ class StateBuilder:
         self._places.update((peer.name for peer in peers if not many or peer.state != "parked"), taken)
         topics, flows = self._topics_and_flows(snapshot.topics)
         nodes = self._nodes.build(snapshot)
+        modules = dict(self._modules(snapshot, peers))
+        lost = {name for name, module in modules.items() if _is_lost(module)}
         state: Tree = {
             "reach": {"ok": True},
             "agent": self._agent(snapshot),
             "ring": {"slots": self._places.slots, "places": dict(self._places.places)},
-            "modules": dict(self._modules(snapshot, peers)),
+            "modules": modules,
             "flows": {**flows, **resource_flows(resources, self.own, self._steady)},
             "topics": topics,
             "services": self._services(snapshot.services[: limits.SERVICES_SHOWN]),
             "nodes": dict(islice(nodes.items(), limits.NODES_SHOWN)),
-            "resources": {one.key: resource_entry(one, self.own) for one in resources},
+            "resources": {one.key: resource_entry(one, self.own, lost=one.peer in lost) for one in resources},
             "alarms": {
                 str(alarm.get("id", index)): {**alarm, "module": alarm.get("module") or self.own}
                 for index, alarm in enumerate(alarms)
+                if alarm.get("module") not in lost
             },
             "parked": sum(peer.state == "parked" for peer in snapshot.peers),
             "recorded": recorded,
@@ -245,8 +251,20 @@ class StateBuilder:
         yield self.own, {"state": "here", "since": round(snapshot.agent.started, 1)}
         for peer in peers:
             yield peer.name, self._module(peer, snapshot.taken)
+        starts = snapshot.agent.uptime < limits.AGENT_SETTLES
         for name in self._places.absent(peer.name for peer in snapshot.peers):
-            yield name, {"state": "away", "error": "has left the roster: no beacon and no link"}
+            if starts:
+                text = "not found yet: the agent of this module has just started"
+                yield name, {"state": "linking", "since": round(snapshot.agent.started, 1), "error": text}
+            else:
+                yield name, {"state": "away", "since": self._lost_since(name), "error": _GONE}
+
+    def _lost_since(self, name: str) -> float:
+        """Since when nothing comes of a module that is in the roster no more."""
+        known = self._sections.get("modules")
+        before = known.get(name) if isinstance(known, dict) else None
+        since = before.get("since") if isinstance(before, dict) and _is_lost(before) else None
+        return since if isinstance(since, float) else round(self._places.seen(name), 1)
 
     def _module(self, peer: PeerInfo, taken: float) -> Tree:
         link, steady, name = peer.link, self._steady, peer.name
@@ -376,6 +394,10 @@ def _topic_entry(own: str, figures: _Figures, facts: _Facts) -> Tree:
         "problem": problem,
         "crosses": crosses,
     })  # fmt: skip
+
+
+def _is_lost(module: Value) -> bool:
+    return isinstance(module, dict) and module.get("state") in _LOST
 
 
 def _is_direct(subscriber: SubscriberTransport) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import msgspec
@@ -10,12 +11,13 @@ import msgspec
 from rmpa.web import limits
 from rmpa.web.monitor.io.mesh_feed import MeshFeed
 from rmpa.web.monitor.view import service_key
-from rmpa.web.server.agent_watch import AgentWatch
-from tests.web.snapshots import FULL
+from rmpa.web.server.agent_watch import AgentWatch, Reading
+from tests.web.snapshots import FULL, peer
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from rmpa.observe.peer_info import PeerInfo
     from rmpa.observe.snapshot import Snapshot
     from rmpa.web.monitor.io.resource_watch import ResourceWatch
     from rmpa.web.monitor.patch import Tree
@@ -27,10 +29,16 @@ TOPIC, SERVICE = FULL.topics[0], FULL.services[0]
 
 
 class Resources:
-    """There are no Smart Resources."""
+    """There are no Smart Resources; ``history`` has what was recorded of links."""
 
     facts: ClassVar[dict[str, Any]] = {}
     recorded = 0
+
+    def __init__(self) -> None:
+        self.history: list[str] = []
+
+    def record(self, _level: str, text: str, **_whose: str) -> None:
+        self.history.append(text)
 
     def alarms(self) -> tuple[Tree, ...]:
         return ()
@@ -45,8 +53,10 @@ class Feed:
         self.now = 0.0
         self.asked: list[tuple[Sequence[str], Sequence[str]]] = []
         self.shown = asyncio.Event()
-        self.watch = AgentWatch(lambda: usual, read_named=self._named)
-        self.feed = MeshFeed(self.watch, cast("ResourceWatch", Resources()), lambda _: None)
+        self.usual = usual
+        self.watch = AgentWatch(lambda: self.usual, read_named=self._named)
+        self.resources = Resources()
+        self.feed = MeshFeed(self.watch, cast("ResourceWatch", self.resources), lambda _: None)
         self.feed._left_out._clock = lambda: self.now
 
     def _named(self, topics: Sequence[str], services: Sequence[str]) -> Snapshot:
@@ -136,4 +146,24 @@ async def test_a_snapshot_with_everything_needs_no_further_question() -> None:
     assert found is not None
     assert "entry" not in found
     assert feed.asked == []
+    await feed.close()
+
+
+async def test_a_new_start_of_the_own_agent_is_no_loss_and_a_module_that_stays_away_is_one() -> None:
+    feed = Feed(FULL)
+    numbers = itertools.count(1)
+
+    def read(uptime: float, *peers: PeerInfo) -> list[str]:
+        agent = msgspec.structs.replace(FULL.agent, uptime=uptime)
+        snapshot = msgspec.structs.replace(FULL, agent=agent, taken=FULL.taken + uptime, peers=peers)
+        feed.feed._take(Reading(next(numbers), 0.0, snapshot))
+        feed.resources.history, told = [], feed.resources.history
+        return told
+
+    arm, hand = peer("arm"), peer("hand")
+    assert read(100.0, arm, hand) == []
+    feed.feed._take(Reading(next(numbers), 0.0, None, "no agent answers; start one"))
+    assert read(1.0) == read(2.0, peer("arm", state="linking", link=None)) == read(3.0, arm) == []
+    assert read(60.0, arm) == ["hand: is away: has left the roster: no beacon and no link"]
+    assert read(61.0, arm, hand) == ["hand: linked"]
     await feed.close()

@@ -12,7 +12,7 @@ from rmpa.config.permission_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import RmpaError
 from rmpa.observe import limits as observe_limits
-from rmpa.observe.check import FAIL, Check
+from rmpa.observe.check import FAIL, OK, Check
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.observe.why.io.topic_evidence import name_in
 from rmpa.observe.why.services import ServiceAtClient, ServiceAtServer, ServiceTransport
@@ -71,7 +71,7 @@ class ServiceEvidence:
         if own:
             text = f"{own[0]} of this module provides {service}; clients here call it without us"
             remedy = f"whether another module may call it: `rmpa why {here}:{service}` over there"
-        stage = Check("server", FAIL, text, remedy)
+        stage = Check("server", OK if own else FAIL, text, remedy)
         return Diagnosis.of((stage,), kind="service", name=service, peer="", to=here)
 
     async def here(self, session: PeerSession, service: str, wire: str) -> ServiceAtClient:

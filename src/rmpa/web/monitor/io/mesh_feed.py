@@ -163,7 +163,9 @@ class MeshFeed:
             facts = tuple(self._resources.facts.values())
             standing, recorded = self._resources.alarms(), self._resources.recorded
             self._state = self._builder.build(reading.snapshot, facts, standing, recorded, self._parameters())
-        self._record_links(self._state)
+            # An agent that has just started finds its peers one by one: they are compared when it has had the time.
+            if reading.snapshot.agent.uptime >= limits.AGENT_SETTLES:
+                self._record_links(self._state)
         self._show()
 
     def _show(self) -> None:

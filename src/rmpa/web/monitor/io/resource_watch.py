@@ -15,6 +15,7 @@ from rmpa.core.errors import RmpaError
 from rmpa.resource.run.descriptor import TOPIC as DESCRIPTOR
 from rmpa.resource.run.descriptor import Descriptor
 from rmpa.resource.run.dynamic_reconfigure import CONFIG_TYPE
+from rmpa.resource.run.status_publisher import LEVEL_FOR
 from rmpa.ros.types.diagnostic_array import ARRAY_TYPE, DiagnosticLevel
 from rmpa.web.hub.clients import OWN_CLIENT
 from rmpa.web.monitor import limits
@@ -117,9 +118,7 @@ class ResourceWatch:
         standing: list[Tree] = []
         for key, facts in self.facts.items():
             level = facts.level
-            before = self._since.get(key)
-            if before is None or before[0] != level:
-                before = self._since[key] = level, self._now()
+            since = self._stands_since(key, facts)
             if level in _BAD:
                 standing.append({
                     "id": key,
@@ -127,9 +126,17 @@ class ResourceWatch:
                     "resource": key,
                     "level": level,
                     "text": str((facts.health or {}).get("message", "")),
-                    "at": round(before[1], 1),
+                    "at": round(since, 1),
                 })  # fmt: skip
         return standing
+
+    def _stands_since(self, key: str, facts: ResourceFacts) -> float:
+        """Since when a resource has its level: as it says itself, or else since it was heard with it."""
+        before = self._since.get(key)
+        if before is None or before[0] != facts.level:
+            lasted = facts.quality(LEVEL_FOR) or 0.0
+            before = self._since[key] = facts.level, self._now() - max(0.0, lasted)
+        return before[1]
 
     def record(self, level: str, text: str, **whose: str) -> None:
         """Add to the history: of a ``resource``, by its key, or of a ``module``, by its name."""
