@@ -154,7 +154,7 @@ async def test_the_page_goes_on_by_itself_when_the_agent_was_killed_and_is_back(
         await goes_on(page)
 
         base.agent.kill()
-        await page.wait_text("The agent does not answer")
+        await page.wait_text("The agent has not answered")
         await restart(base.agent)
         await page.wait("!document.querySelector('.banner')")
         await goes_on(page)

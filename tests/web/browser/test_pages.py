@@ -72,7 +72,7 @@ async def test_a_phone_shows_a_page_without_sideways_scrolling_and_with_large_ta
     await site.page.look(360, 740)
     page = await site.open(address)
     await page.wait_text(PAGES[address])
-    assert await page.run("document.documentElement.scrollWidth - innerWidth") == 0
+    assert await page.run("document.documentElement.scrollWidth") == 360  # innerWidth grows with what is too wide
     small = await page.run(
         "[...document.querySelectorAll('.top a, .top button, main button:not(.field), .module, .concerns a,"
         " input:not([type=checkbox]), select')]"
@@ -102,7 +102,7 @@ async def test_a_killed_module_shows_within_a_second_and_a_half_and_so_does_its_
 async def test_without_an_agent_the_page_says_so_and_comes_back_by_itself(site: Site) -> None:
     page = await site.open()
     site.server.agent.scene = "mute"
-    await page.wait_text("The agent does not answer")
+    await page.wait_text("The agent has not answered")
     await page.wait_text("Start one with `rmpa up`.")
     assert "Nothing is wrong" not in await page.run("document.body.innerText")
     assert await page.run("document.querySelectorAll('[data-module]').length") == 4
@@ -161,14 +161,19 @@ async def test_the_colours_can_be_chosen_and_stay(site: Site) -> None:
 
 async def test_only_what_flows_moves_and_nothing_where_motion_is_to_be_reduced(site: Site) -> None:
     page = await site.open()
-    moving = (
-        "document.getAnimations().filter((each) => each.playState === 'running')"
-        ".map((each) => each.effect.target.classList[0])"
+    await page.run(
+        "window.moved = []; new MutationObserver((all) => window.moved.push(...all.map((each) => each.target)))"
+        ".observe(document.querySelector('.ring'), {attributes: true, subtree: true}); true"
     )
-    assert await page.run(moving) == []
+    assert await page.run("document.getAnimations().length") == 0
     await page.look(still=False)
-    await page.wait(f"{moving}.length === 5")
-    assert set(await page.run(moving)) == {"stream"}
+    await page.wait("window.moved.filter((each) => each.classList.contains('medium')).length > 3")
+    assert await page.run("window.moved.every((each) => each.closest('.streams') && each.tagName === 'g')") is True
+    assert await page.run("document.querySelectorAll('.streams .stream').length") == 5
+    await page.look(still=True)
+    await page.run("new Promise((done) => setTimeout(done, 300)).then(() => { window.moved.length = 0; })")
+    await page.run("new Promise((done) => setTimeout(done, 500))")
+    assert await page.run("window.moved.length") == 0
 
 
 async def test_only_what_changed_is_drawn_again(site: Site) -> None:
@@ -350,15 +355,26 @@ async def test_a_parameter_that_another_node_changes_shows_by_itself(site: Site)
     await page.wait_text("kinetic")
 
 
+FIELD = "document.querySelector('form.edit input')"
+
+
+async def edit(page: Chromium, text: str, *, enter: bool = True) -> None:
+    """Put a text in place of all that the field has which is edited, and press Enter."""
+    await page.wait(FIELD)
+    await page.run(
+        f"{FIELD}.value = {json.dumps(text)}; {FIELD}.dispatchEvent(new Event('input', {{bubbles: true}}))"
+    )
+    if enter:
+        await page.run(f"{FIELD}.form.requestSubmit()")
+
+
 async def test_an_edit_that_was_begun_is_kept_when_other_parameters_change(site: Site) -> None:
     page = await site.open("params")
     await click(page, '"noetic"')
-    await page.wait("document.querySelector('form.row input')")
-    await page.run("(() => { const field = document.querySelector('form.row input'); field.value = 'half';"
-                   " field.dispatchEvent(new Event('input', {bubbles: true})); })()")  # fmt: skip
+    await edit(page, "half", enter=False)
     site.server.params["/fresh"] = "come"
     await page.wait_text("come")
-    assert await page.run("document.querySelector('form.row input').value") == "half"
+    assert await page.run(f"{FIELD}.value") == "half"
 
 
 @pytest.mark.parametrize(
@@ -411,12 +427,125 @@ async def test_a_service_is_called(site: Site) -> None:
 async def test_a_parameter_is_changed(site: Site) -> None:
     page = await site.open("params")
     await click(page, '"noetic"')
-    await page.wait("document.querySelector('form.row input')")
-    await page.run("(() => { const field = document.querySelector('form.row input'); field.value = 'melodic';"
-                   " field.dispatchEvent(new Event('input', {bubbles: true})); })()")  # fmt: skip
-    await click(page, "Set")
+    await edit(page, "melodic")
     await page.wait_text('"melodic"')
     assert site.server.params["/rosdistro"] == "melodic"
+
+
+RATE = "[...document.querySelectorAll('button.field')].find((each) => each.ariaLabel.startsWith('Change rate'))"
+
+
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [("", "Type a number"), ("0,4", "write it as 0.4"), ("fast", "not a number"), ("500", "not within 1 … 100")],
+)
+async def test_what_is_no_value_of_a_setting_is_not_sent_and_the_draft_stays(
+    site: Site, typed: str, said: str
+) -> None:
+    page = await site.open("resource/base%3A%2Fbase")
+    await page.wait(f"{RATE}?.click() ?? !!{RATE}")
+    await edit(page, typed)
+    await page.wait_text(said)
+    assert await page.run(f"{FIELD}.value") == typed
+    assert "configure" not in [each.what for each in site.server.asked]
+    await edit(page, "40")
+    await page.wait_text("rate is 40 now")  # as the server says it
+    assert site.server.asked[-1].args == {"resource": "/base", "peer": "base", "name": "rate", "value": 40}
+
+
+async def test_each_edit_has_the_cursor_and_escape_gives_it_back(site: Site) -> None:
+    page = await site.open("params")
+    for label in ("Change /rosdistro", "Change /use_sim_time", "Change /rosdistro"):
+        button = (
+            f"[...document.querySelectorAll('button.field')].find((each) => each.ariaLabel.startsWith({label!r}))"
+        )
+        await page.wait(f"{button}?.click() ?? !!{button}")
+        await page.wait(f"{FIELD} && document.activeElement === {FIELD}")
+        await page.press("Escape")
+        await page.wait(f"!{FIELD} && document.activeElement.ariaLabel.startsWith({label!r})")
+
+
+@pytest.mark.parametrize(("typed", "sent"), [("True", True), ("1", None), ("on", None), ("", None)])
+async def test_a_parameter_keeps_its_type(site: Site, typed: str, sent: bool | None) -> None:
+    page = await site.open("params")
+    await click(page, "false")
+    await edit(page, typed)
+    await page.wait(f"!{FIELD}" if sent is not None else "document.querySelector('form.edit .failure')")
+    assert site.server.params["/use_sim_time"] is (sent or False)
+
+
+async def test_a_lost_connection_keeps_values_edits_and_rights(site: Site) -> None:
+    page = await site.open("params")
+    await click(page, '"noetic"')
+    await page.wait(FIELD)
+    await page.run("window.Real = WebSocket; window.WebSocket = function () { return { close() {} }; }; rmpa.drop()")
+    await page.wait_text("No connection to rmpa web")
+    await edit(page, "half")
+    await page.wait_text("Nothing was sent")
+    text = await page.run("document.body.innerText")
+    assert "wheel" in text
+    assert "may only look" not in text
+    await page.run("window.WebSocket = window.Real; rmpa.retry()")
+    await page.wait("!document.querySelector('.banner')")
+    assert await page.run(f"{FIELD}.value") == "half"
+    await edit(page, "melodic")
+    await page.wait_text('"melodic"')
+
+
+async def test_the_heading_of_another_page_has_the_focus_and_a_dialog_gives_it_back(site: Site) -> None:
+    page = await site.open()
+    for key in "gt":  # its script is not loaded yet
+        await page.press(key)
+    await page.wait("document.activeElement.tagName === 'H1' && document.activeElement.textContent === 'Topics'")
+    await page.run("document.querySelector('[aria-label^=Search]').focus()")
+    for ends in ("Escape", "Enter"):
+        await page.press("/")
+        await page.wait("document.activeElement.type === 'search'")
+        await page.press("Escape")
+        await page.wait("!document.querySelector('dialog')")
+        assert await page.run("document.activeElement.ariaLabel") == "Search (/)", ends
+
+
+async def test_a_page_that_is_opened_in_the_background_is_whole(site: Site) -> None:
+    await site.page.send(
+        "Page.addScriptToEvaluateOnNewDocument",
+        source="Object.defineProperty(document, 'hidden', {get: () => true})",
+    )
+    page = await site.open("topic/%2Fodom")
+    await page.wait_text("No rule of [[contract]] names it")
+
+
+async def test_long_lists_are_drawn_in_parts(site: Site) -> None:
+    page = await site.open("module/base")
+    topics = {f"/many/t{number:04}": {"type": "a/B", "from": ["base"], "to": []} for number in range(1952)}
+    await receive(page, {"topics": topics})
+    rows = "[...document.querySelectorAll('tbody th')].filter((each) => each.textContent.startsWith('/many/')).length"
+    await page.wait(f"{rows} > 100")
+    assert await page.run(rows) <= 200
+    await click(page, "Show 200 more of 1,753")
+    await page.wait(f"{rows} > 390")
+
+
+async def test_characters_that_turn_or_hide_a_name_are_seen(site: Site) -> None:
+    page = await site.open("topics")
+    evil = "/a\u202egpj.elif\u200b\x07"
+    await receive(page, {"topics": {evil: {"type": "a/B", "from": [], "to": []}}})
+    await page.wait_text("/a\\u202egpj.elif\\u200b\\u0007")
+    assert await page.run("/[\u202e\u200b\x07]/.test(document.body.textContent)") is False
+    await page.run("[...document.querySelectorAll('th a')].find((each) => each.textContent.includes('gpj')).click()")
+    await page.wait("document.querySelector('h1').textContent.includes('u202e') && document.title.includes('u202e')")
+    assert await page.run(f"decodeURIComponent(location.hash) === {json.dumps('#/topic/' + evil)}") is True
+
+
+async def test_the_gravest_stands_first_and_a_lost_module_above_what_follows_from_it(site: Site) -> None:
+    page = await site.open("", "killed")
+    await page.wait("document.querySelector('.module.away')")
+    problem = {"type": "a/B", "problem": "its peer is away"}
+    alarm = {"level": "ERROR", "text": "hot", "resource": "velocity:/velocity", "module": "velocity", "at": 1.0}
+    await receive(page, {"topics": {"/a": problem, "/b": problem}, "alarms": {"x": alarm}})
+    whose = "[...document.querySelectorAll('.concerns strong')].map((each) => each.textContent)"
+    await page.wait(f"{whose}.length === 3")
+    assert await page.run(whose) == ["velocity:/velocity", "base", "2 topics"]
 
 
 async def test_who_may_only_look_sees_no_way_to_change_anything(site: Site) -> None:

@@ -356,6 +356,32 @@ async def test_an_alarm_stands_for_as_long_as_its_resource_says_whenever_the_ser
         assert abs(page.state["alarms"]["/arm"]["at"] - began) < 60
 
 
+async def test_a_setting_is_checked_and_the_page_is_told_what_the_resource_made_of_it(core: RosCore) -> None:
+    motor = Resource("motor", role="acting")
+    motor.parameter("speed", 1.0, low=0.0, high=1.0)
+    descriptor = msgspec.json.encode(describe(motor, "/motor")).decode()
+    sent: list[Any] = []
+
+    async def take(request: Any) -> dict[str, object]:
+        [pair] = request.config.doubles
+        sent.append(pair.value)
+        return {"config": {"doubles": [{"name": pair.name, "value": min(1.0, pair.value)}]}}
+
+    async with page_of(core) as (page, _), node(core, "motor") as server:
+        await text_topic(server, "/motor/descriptor", descriptor)
+        await server.advertise_service("/motor/set_parameters", "dynamic_reconfigure/Reconfigure", take)
+        await page.sees(lambda: page.state.get("resources", {}).get("/motor"))
+        setting = {"resource": "/motor", "name": "speed"}
+        for number, (value, told) in enumerate(
+            [(0.5, "speed is 0.5"), (5, "speed is 1.0: 5 is beyond its bounds")], start=1
+        ):
+            assert (await page.ask(number, "configure", value=value, **setting))["value"]["text"] == told
+        for number, value in enumerate((None, "0,4", True), start=9):
+            refused = await page.ask(number, "configure", value=value, **setting)
+            assert (refused["op"], "no value of the type double" in refused["error"]) == ("failed", True)
+        assert sent == [0.5, 5.0]
+
+
 async def test_a_broken_descriptor_is_no_resource(core: RosCore) -> None:
     async with page_of(core) as (page, _), node(core, "odd") as odd:
         await text_topic(odd, "/odd/descriptor", "{")

@@ -410,6 +410,9 @@ class FakeServer:
     def _answer_context(self, _args: dict[str, Any]) -> Any:
         return {"text": "chosen"}
 
+    def _answer_configure(self, args: dict[str, Any]) -> Any:
+        return {"value": args["value"], "text": f"{args['name']} is {args['value']} now"}
+
     def _answer_history(self, _args: dict[str, Any]) -> Any:
         lines = ((300, "WARN", "adapting: acceleration"), (200, "OK", "well again"))
         now = time.time()

@@ -1,7 +1,8 @@
 // The frame around all pages: address, navigation, search, keys, colours, and what to say when the agent is gone.
 
-import { html, render, Component } from "./vendor/htm-preact.js";
+import { html, render, Component } from "./markup.js";
 import { Connection } from "./connection.js";
+import { sentence } from "./format.js";
 import { section } from "./state.js";
 import { Mark, Since } from "./parts.js";
 import { Mandala } from "./mandala.js";
@@ -35,10 +36,20 @@ class App extends Component {
 
   componentDidMount() {
     addEventListener("hashchange", () => {
-      this.setState({ ...address(), overlay: "", nav: false }, () => { this.look(); document.querySelector("h1")?.focus({ preventScroll: true }); scrollTo(0, 0); });
+      this.arrives = true;
+      this.setState({ ...address(), overlay: "" }, () => this.look());
     });
     addEventListener("keydown", (event) => this.key(event));
     window.rmpa = this.connection; // for the console and for tests
+  }
+
+  // The heading of another page gets the focus as soon as there is one: the page may have to be loaded first.
+  componentDidUpdate() {
+    const heading = this.arrives && document.querySelector("main h1");
+    if (!heading) return;
+    this.arrives = false;
+    heading.focus({ preventScroll: true });
+    scrollTo(0, 0);
   }
 
   // Many messages, one drawing: in the next frame, or soon in a hidden tab, which has none.
@@ -98,13 +109,19 @@ class App extends Component {
   banner() {
     const { connection } = this;
     const reach = section(connection.state, "reach");
-    if (connection.phase === "lost")
-      return html`<div class="banner bad" role="status"><${Mark} state="refused" word="" /><span><strong>No connection to <code>rmpa web</code></strong> for <${Since} moment=${connection.lostAt / 1000} />.
-        ${connection.state ? " What is shown is as it was last known." : ""} The page connects again by itself.${connection.reason ? ` It said: ${connection.reason}` : ""}</span><button type="button" onClick=${() => connection.retry()}>Now</button></div>`;
+    const { notice } = connection;
+    if (connection.phase === "lost") {
+      const known = connection.state ? "What is shown, and what you have typed, stays; nothing can be sent." : "";
+      return html`<${Banner} mark="refused" action="Try now" act=${() => connection.retry()}>
+        <strong>No connection to <code>rmpa web</code></strong> for <${Since} moment=${connection.lostAt / 1000} />.
+        ${" "}${sentence(connection.reason)} ${known} The page connects again by itself.<//>`;
+    }
     if (reach.ok === false)
-      return html`<div class="banner bad" role="status"><${Mark} state="refused" word="" /><span><strong>The agent does not answer</strong> for <${Since} moment=${reach.since} />: ${reach.error}. ${reach.remedy} What is shown is as it was last known; this page comes back by itself.</span></div>`;
-    if (connection.notice)
-      return html`<div class="banner warn" role="status"><${Mark} state="WARN" word="" /><span>${connection.notice.error}. ${connection.notice.remedy}</span><button type="button" onClick=${() => { connection.notice = null; this.setState({}); }}>Close</button></div>`;
+      return html`<${Banner} mark="refused"><strong>The agent has not answered</strong> for <${Since} moment=${reach.since} />.
+        ${" "}${sentence(reach.error)} ${sentence(reach.remedy)} What is shown is what was last known. This page comes back by itself.<//>`;
+    if (notice)
+      return html`<${Banner} mark="WARN" action="Close" act=${() => { connection.notice = null; this.setState({}); }}>
+        ${sentence(notice.error)} ${sentence(notice.remedy)}<//>`;
     return null;
   }
 
@@ -121,7 +138,7 @@ class App extends Component {
       <a class="skip" href="#main" onClick=${(event) => { event.preventDefault(); document.querySelector("h1")?.focus(); }}>To the content</a>
       <header class="top">
         <a class="brand" href="#/"><img src="static/icon.svg" alt="" width="28" height="28" /><span>RMPA<small>${agent || "…"}</small></span></a>
-        <nav aria-label="Pages">${PAGES.filter(([each]) => each !== "drive" || connection.may("drive") || page === "drive").map(([each, title]) => html`<a key=${each} href=${`#/${each}`} aria-current=${each === current ? "page" : undefined}>${title}${each === "alarms" && alarms > 0 ? html`<b class="badge">${alarms}<span class="unseen"> alarms stand</span></b>` : ""}</a>`)}</nav>
+        <nav aria-label="Pages">${PAGES.filter(([each]) => each !== "drive" || connection.may("drive") || page === "drive").map(([each, title]) => html`<a key=${each} href=${`#/${each}`} aria-current=${each === current ? "page" : undefined}>${title}${each === "alarms" && alarms > 0 ? html`<b class="badge">${alarms}<span class="unseen"> ${alarms > 1 ? "alarms stand" : "alarm stands"}</span></b>` : ""}</a>`)}</nav>
         <div class="tools">
           <button type="button" class="icon" aria-label="Search (/)" title="Search (/)" onClick=${() => this.setState({ overlay: "search" })}><svg viewBox="0 0 20 20" aria-hidden="true"><circle cx="8.5" cy="8.5" r="5.5" /><path d="m12.5 12.5 5 5" /></svg></button>
           <button type="button" class="icon" aria-label=${dark ? "Light colours (c)" : "Dark colours (c)"} title="Colours (c)" onClick=${() => this.turn()}><svg viewBox="0 0 20 20" aria-hidden="true"><circle cx="10" cy="10" r="7" /><path class="fill" d="M10 3a7 7 0 0 1 0 14Z" /></svg></button>
@@ -134,6 +151,9 @@ class App extends Component {
       ${overlay === "keys" && html`<${Shortcuts} pages=${PAGES} onClose=${() => this.setState({ overlay: "" })} />`}`;
   }
 }
+
+const Banner = ({ mark, action, act, children }) => html`<div class="banner ${mark === "WARN" ? "warn" : "bad"}" role="status">
+  <${Mark} state=${mark} word="" /><span>${children}</span>${act && html`<button type="button" onClick=${act}>${action}</button>`}</div>`;
 
 applyTheme();
 const root = document.getElementById("app");

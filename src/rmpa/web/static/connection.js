@@ -31,7 +31,8 @@ export class Connection {
     document.addEventListener("visibilitychange", () => document.hidden || this.retry());
   }
 
-  may(right) { return this.phase === "open" && this.hello.may.includes(right); }
+  // What this page may do; a lost connection takes nothing from it but the joystick.
+  may(right) { return this.hello.may.includes(right) && (right !== "drive" || this.phase === "open"); }
 
   retry() {
     if (this.phase !== "lost") return;
@@ -68,7 +69,8 @@ export class Connection {
     this.phase = "lost";
     this.reason = event.reason;
     if (!opened) this.explain();
-    for (const question of this.questions.values()) question.reject({ error: "the connection was lost", remedy: "" });
+    const failure = { error: "the connection was lost before the answer came", remedy: "Look whether it was done." };
+    for (const question of this.questions.values()) { clearTimeout(question.timer); question.reject(failure); }
     this.questions.clear();
     this.timer = setTimeout(() => this.open(), this.wait * (0.75 + Math.random() / 2));
     this.wait = Math.min(LAST_WAIT, this.wait * 2);
@@ -187,7 +189,7 @@ export class Connection {
   ask(what, args = {}) {
     const id = ++this.counter;
     return new Promise((resolve, reject) => {
-      if (this.phase !== "open") return reject({ error: "there is no connection to rmpa web", remedy: "" });
+      if (this.phase !== "open") return reject({ error: "there is no connection to rmpa web", remedy: "Nothing was sent." });
       const timer = setTimeout(() => this.settle(id)?.reject({ error: "no answer came within 30 s", remedy: "" }), ANSWER_WAIT);
       this.questions.set(id, { resolve, reject, timer });
       this.send({ op: "ask", id, what, args });

@@ -41,3 +41,20 @@ export function clock(moment) {
   return at.toDateString() === new Date().toDateString() ? time : `${at.toLocaleDateString("en-GB", { day: "numeric", month: "short" })} ${time}`;
 }
 export const bounded = (value, error) => (known(value) ? `${seconds(value)} ± ${seconds(error)}` : NONE);
+
+// A text as it can be read: characters that are not seen, or that turn the reading direction, by their codes.
+const UNSEEN = new RegExp("[\\0-\\x08\\v\\f\\x0e-\\x1f\\x7f-\\x9f\\xad\\u061c\\u180e\\u200b-\\u200f\\u2028-\\u202e" +
+  "\\u2060-\\u206f\\ufeff\\ufff9-\\ufffb\\u{e0000}-\\u{e007f}]", "gu");
+const code = (character) => {
+  const hex = character.codePointAt(0).toString(16);
+  return hex.length > 4 ? `\\u{${hex}}` : `\\u${hex.padStart(4, "0")}`;
+};
+export const plain = (text) => text.replace(UNSEEN, code);
+
+// A text as a sentence, to stand beside others.
+export function sentence(text) {
+  const said = (text || "").trim();
+  if (!said) return "";
+  const begun = /^[a-z]+ /.test(said) && !said.startsWith("rmpa ") ? said[0].toUpperCase() + said.slice(1) : said;
+  return /[.!?…]$/.test(begun) ? begun : `${begun}.`;
+}

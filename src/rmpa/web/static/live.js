@@ -1,6 +1,6 @@
 // Live messages of one topic: the newest value, plots of any number in it, images, laser scans, and the pose of a robot.
 
-import { html, useEffect, useRef, useState } from "./vendor/htm-preact.js";
+import { html, useEffect, useRef, useState } from "./markup.js";
 import { bytes, clock } from "./format.js";
 import { Choice, Failure, Panel } from "./parts.js";
 import { Plot, append } from "./plot.js";

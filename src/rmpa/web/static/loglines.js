@@ -1,6 +1,6 @@
 // Lines of the log: kept while a page shows them, newest first.
 
-import { html, useEffect, useState } from "./vendor/htm-preact.js";
+import { html, useEffect, useState } from "./markup.js";
 import { clock } from "./format.js";
 import { Mark, NodeLink } from "./parts.js";
 

@@ -1,13 +1,16 @@
 // The first page: all modules on a ring, their links, and what flows. A module keeps its place for as long as it is known.
 
-import { html, useEffect, useRef, useState } from "./vendor/htm-preact.js";
+import { html, useEffect, useRef, useState } from "./markup.js";
 import { bandwidth, hertz, seconds } from "./format.js";
 import { entries, section } from "./state.js";
 import { Link, Mark, Page, Panel, Since, Table, href, known, memo, shape } from "./parts.js";
 
 const SIZE = 1000;
 const CENTRE = SIZE / 2;
-const SPEEDS = [[0, ""], [0.5, "slow"], [5, "medium"], [30, "fast"]];
+const SPEEDS = [[0, "still"], [0.5, "slow"], [5, "medium"], [30, "fast"]];
+const PERIODS = { slow: 2.4, medium: 1.4, fast: 0.8 }; // seconds in which a dot comes to the place of the next one
+const DOTS = 20.1; // from one dot to the next
+const STEP = 125; // milliseconds between two positions of the dots: without a GPU each costs a drawing
 
 function geometry(slots, compact) {
   const node = compact ? (slots <= 8 ? 104 : 62) : slots <= 8 ? 78 : slots <= 16 ? 62 : slots <= 32 ? 40 : 22;
@@ -45,8 +48,14 @@ export function chord(a, b, node, aside) {
   return { d: `M${start.x.toFixed(1)} ${start.y.toFixed(1)}Q${middle.x.toFixed(1)} ${middle.y.toFixed(1)} ${end.x.toFixed(1)} ${end.y.toFixed(1)}`, at };
 }
 
-const speed = (rate) => SPEEDS.reduce((found, [least, word]) => (rate > least ? word : found), "");
+const speedOf = (rate) => SPEEDS.reduce((found, [least, word]) => (rate > least ? word : found), "");
 const width = (bytes) => Math.min(9, 2 + Math.max(0, Math.log10((bytes || 0) / 100)) * 1.4);
+
+// What moves is a picture of its own beneath the others, which are not drawn again with it.
+const Stream = memo(({ flow, a, b, geo, both }) => {
+  const line = chord(a, b, geo.node, both ? 9 : 0);
+  return html`<path class="stream ${flow.by === "resource" ? "declared" : ""}" d=${line.d} stroke-width=${width(flow.bandwidth)} />`;
+});
 
 const Flow = memo(({ flow, from, to, a, b, geo, both, labelled, compact }) => {
   const line = chord(a, b, geo.node, both ? 9 : 0);
@@ -56,12 +65,30 @@ const Flow = memo(({ flow, from, to, a, b, geo, both, labelled, compact }) => {
   labelled = labelled && !(compact && geo.slots > 6 && flow.by === "resource");
   return html`<g class="flow ${flow.by === "resource" ? "declared" : ""}">
     <title>${from} to ${to}: ${text || "rate not known"}, ${flow.topics.join(", ")}</title>
-    <path class="pipe" d=${line.d} stroke-width=${width(flow.bandwidth) + 4} />
-    <path class="stream ${speed(flow.rate || 0)}" d=${line.d} stroke-width=${width(flow.bandwidth)} marker-end="url(#arrow)" />
+    <path class="pipe" d=${line.d} stroke-width=${width(flow.bandwidth) + 4} marker-end="url(#arrow)" />
     ${labelled && text && html`<text class="rate" x=${label.x} y=${label.y + 6}>${text}</text>`}
     ${labelled && !compact && text && geo.slots <= 8 && flow.bandwidth && html`<text class="minor" x=${label.x} y=${label.y + 30}>${bandwidth(flow.bandwidth)}</text>`}
   </g>`;
 });
+
+const Streams = ({ flows, at, both, geo, moves }) => {
+  const picture = useRef();
+  useEffect(() => {
+    if (!moves) return undefined;
+    const move = () => {
+      if (document.hidden) return;
+      const now = performance.now() / 1000;
+      for (const [speed, period] of Object.entries(PERIODS))
+        picture.current.querySelector(`.${speed}`).style.strokeDashoffset = -((now / period) % 1) * DOTS;
+    };
+    const timer = setInterval(move, STEP);
+    return () => clearInterval(timer);
+  }, [moves]);
+  const of = (speed) => flows.filter(([, , flow]) => speedOf(flow.rate || 0) === speed).map(([from, to, flow]) =>
+    html`<${Stream} key=${`${from}>${to}`} flow=${flow} a=${at(from)} b=${at(to)} geo=${geo} both=${both(from, to)} />`);
+  return html`<svg ref=${picture} class="streams" viewBox="0 0 ${SIZE} ${SIZE}" aria-hidden="true">
+    ${SPEEDS.map(([, speed]) => html`<g key=${speed} class=${speed}>${of(speed)}</g>`)}</svg>`;
+};
 
 const Wire = memo(({ name, module, a, b, geo, labelled }) => {
   const line = chord(a, b, geo.node, 0);
@@ -123,15 +150,15 @@ function step(event, order) {
   [...event.currentTarget.querySelectorAll("[data-module]")].find((each) => each.dataset.module === next)?.focus();
 }
 
-function useCompact() {
-  const query = useRef(matchMedia("(max-width: 640px)")).current;
-  const [compact, set] = useState(query.matches);
+function useQuery(text) {
+  const query = useRef(matchMedia(text)).current;
+  const [matches, set] = useState(query.matches);
   useEffect(() => {
     const change = () => set(query.matches);
     query.addEventListener("change", change);
     return () => query.removeEventListener("change", change);
   }, []);
-  return compact;
+  return matches;
 }
 
 const fixed = new Map(); // one object for each place, so that what did not move is not drawn again
@@ -154,8 +181,9 @@ function same(key, list) {
   return list;
 }
 
-export function Ring({ state }) {
-  const compact = useCompact();
+export function Ring({ state, current }) {
+  const compact = useQuery("(max-width: 640px)");
+  const still = useQuery("(prefers-reduced-motion: reduce)");
   const ring = section(state, "ring"), places = section(ring, "places");
   const geo = sizes(ring.slots || 4, compact);
   const modules = section(state, "modules");
@@ -167,18 +195,18 @@ export function Ring({ state }) {
   const alarms = entries(state, "alarms");
   const labelled = names.length <= 16;
   const taken = new Set(names.map((name) => places[name]));
-  return html`<svg class="mandala ${compact ? "compact" : ""} ${geo.slots > 8 ? "many" : ""}" viewBox="0 0 ${SIZE} ${SIZE}" role="group" aria-label="Modules, their links, and what flows between them" onKeyDown=${(event) => step(event, names)}>
+  const both = (from, to) => `${to}>${from}` in section(state, "flows");
+  return html`<div class="ring"><${Streams} flows=${flows} at=${at} both=${both} geo=${geo} moves=${current && !still && flows.length > 0} />
+  <svg class="mandala ${compact ? "compact" : ""} ${geo.slots > 8 ? "many" : ""}" viewBox="0 0 ${SIZE} ${SIZE}" role="group" aria-label="Modules, their links, and what flows between them" onKeyDown=${(event) => step(event, names)}>
     <defs><marker id="arrow" viewBox="0 0 8 8" refX="6.5" refY="4" markerWidth="14" markerHeight="14" markerUnits="userSpaceOnUse" orient="auto"><path class="head" d="M.8.8 7 4 .8 7.2 2.6 4Z" /></marker></defs>
     <circle class="dial" cx=${CENTRE} cy=${CENTRE} r=${geo.ring} />
     ${Array.from({ length: geo.slots }, (_, slot) => slot).filter((slot) => !taken.has(slot)).map((slot) => html`<circle key=${slot} class="vacant" cx=${point(slot, geo).x} cy=${point(slot, geo).y} r="5" />`)}
     <g>${names.filter((name) => name !== own).map((name) => html`<${Wire} key=${name} name=${name} module=${modules[name]} a=${at(own)} b=${at(name)} geo=${geo} labelled=${labelled && !compact} />`)}</g>
-    <g>${flows.map(([from, to, flow]) => html`<${Flow} key=${`${from}>${to}`} from=${from} to=${to} flow=${flow} a=${at(from)} b=${at(to)} geo=${geo} labelled=${labelled} compact=${compact} both=${`${to}>${from}` in section(state, "flows")} />`)}</g>
+    <g>${flows.map(([from, to, flow]) => html`<${Flow} key=${`${from}>${to}`} from=${from} to=${to} flow=${flow} a=${at(from)} b=${at(to)} geo=${geo} labelled=${labelled} compact=${compact} both=${both(from, to)} />`)}</g>
     <g>${names.map((name) => html`<${Module} key=${name} name=${name} module=${modules[name]} at=${at(name)} geo=${geo} compact=${compact}
       resources=${same(name, resources.filter(([, one]) => one.module === name))} alarms=${alarms.filter(([, one]) => one.module === name).length} />`)}</g>
-  </svg>`;
+  </svg></div>`;
 }
-
-const URGENT = ["ERROR", "WARN", "STALE"];
 
 function concerns(state) {
   const found = [];
@@ -195,7 +223,7 @@ function concerns(state) {
     found.push({ id: `t${text}`, level: "WARN", text: several ? `${text}: ${names.slice(0, 3).join(", ")}${names.length > 3 ? " …" : ""}` : text, who: several ? `${names.length} topics` : names[0], to: several ? href("topics") : href("topic", names[0]) });
   }
   for (const note of state.notes || []) found.push({ id: `n${note}`, level: "WARN", text: note, who: "the agent", to: href("module", section(state, "agent").name) });
-  return found.sort((a, b) => URGENT.indexOf(a.level) - URGENT.indexOf(b.level));
+  return found.sort((a, b) => LEVELS.indexOf(a.level) - LEVELS.indexOf(b.level)); // of one level: what causes, then what follows
 }
 
 export function Concerns({ state, connection }) {
@@ -227,13 +255,15 @@ export function Mandala({ state, connection }) {
   const places = section(section(state, "ring"), "places");
   const ordered = modules.sort(([a], [b]) => (places[a] ?? 1e9) - (places[b] ?? 1e9));
   return html`<${Page} title="Mesh" kind=${`Domain ${section(state, "agent").domain ?? "–"} · ${up} of ${total} modules up${state.parked ? `, ${state.parked} of them parked` : ""}${current ? "" : " when last heard of"}`}>
-    <div class="overview"><div class="stage-area"><${Ring} state=${state} />
+    <div class="overview"><div class="stage-area"><${Ring} state=${state} current=${current} />
       <p class="legend" aria-hidden="true">${marks.map((each) => html`<${Mark} key=${each} state=${each} />`)}<span class="mark flowkey"><svg viewBox="0 0 26 16"><path d="M1 8h22" /></svg>messages</span></p></div>
     <div class="beside">
       <${Panel} title="What is wrong"><${Concerns} state=${state} connection=${connection} /><//>
-      <${Panel} title="Modules"><${Table} caption="Modules" columns=${["Module", "Link", "#Round trip", "#In", "#Out", "Profile"]}>${ordered.map(([name, module]) => html`<${Row} key=${name} name=${name} module=${module} resources=${same(`row ${name}`, resources.filter(([, one]) => one.module === name))} />`)}<//>
+      <${Panel} title="Modules"><${Table} caption="Modules" columns=${["Module", "Link", "#Round trip", "#In", "#Out", "Profile"]} list=${ordered}>
+        ${([name, module]) => html`<${Row} key=${name} name=${name} module=${module} resources=${same(`row ${name}`, resources.filter(([, one]) => one.module === name))} />`}<//>
         ${total > modules.length && html`<p class="empty">The server leaves out ${total - modules.length} further modules.</p>`}<//>
-      <${Panel} title="Flows"><${Table} caption="Flows between modules" columns=${["From → to", "#Messages", "#Bytes", "Topics"]} empty="No messages cross at present.">${entries(state, "flows").map(([key, flow]) => { const [from, to] = key.split(">"); return html`<${FlowRow} key=${key} from=${from} to=${to} flow=${flow} />`; })}<//><//>
+      <${Panel} title="Flows"><${Table} caption="Flows between modules" columns=${["From → to", "#Messages", "#Bytes", "Topics"]} empty="No messages cross at present." list=${entries(state, "flows")}>
+        ${([key, flow]) => { const [from, to] = key.split(">"); return html`<${FlowRow} key=${key} from=${from} to=${to} flow=${flow} />`; }}<//><//>
     </div></div><//>`;
 }
 

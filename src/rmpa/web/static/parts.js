@@ -1,7 +1,7 @@
 // Small parts that all pages are made of.
 
-import { Component, html, useEffect, useRef, useState } from "./vendor/htm-preact.js";
-import { ago } from "./format.js";
+import { Component, html, useEffect, useLayoutEffect, useRef, useState } from "./markup.js";
+import { ago, count, plain } from "./format.js";
 
 // Each state and level has a word, a colour (by its class) and a shape, so that none of them is needed to tell them apart.
 export const STATES = {
@@ -64,13 +64,26 @@ export function Facts({ rows }) {
   return html`<dl class="facts">${shown.map(([name, value]) => html`<div key=${name}><dt>${name}</dt><dd>${value}</dd></div>`)}</dl>`;
 }
 
-export function Table({ caption, columns, children, empty }) {
-  const rows = Array.isArray(children) ? children.flat() : [children];
+const MOST = 200; // entries of a list that are drawn at first, and more with each press of a button
+
+// The first entries of a list, and the button for more of them, where there are more.
+export function useFirst(list) {
+  const [most, setMost] = useState(MOST);
+  const left = list.length - most;
+  const more = left > 0 && html`<p class="more"><button type="button" onClick=${() => setMost(most + MOST)}>
+    Show ${Math.min(MOST, left)} more of ${count(left)}</button></p>`;
+  return [left > 0 ? list.slice(0, most) : list, more];
+}
+
+// Its children are its rows; or, of a list that may be long, the function that draws one of `list`.
+export function Table({ caption, columns, list, children, empty }) {
+  const [first, more] = useFirst(list || [children].flat());
+  const rows = list ? first.map(children) : first;
   if (!rows.filter(Boolean).length) return html`<p class="empty">${empty || "Nothing here."}</p>`;
   return html`<div class="scroll" tabindex="0" role="region" aria-label=${caption}><table>
     <caption class="unseen">${caption}</caption>
     <thead><tr>${columns.map((column) => html`<th key=${column} scope="col" class=${column.startsWith("#") ? "number" : ""}>${column.replace("#", "") || html`<span class="unseen">Action</span>`}</th>`)}</tr></thead>
-    <tbody>${rows}</tbody></table></div>`;
+    <tbody>${rows}</tbody></table>${more}</div>`;
 }
 
 export const Panel = ({ title, children, aside, wide }) => html`<section class=${wide ? "panel wide" : "panel"}>
@@ -78,7 +91,7 @@ export const Panel = ({ title, children, aside, wide }) => html`<section class=$
 
 export const Page = ({ title, kind, aside, children }) => {
   const heading = useRef();
-  useEffect(() => { document.title = `${title} · RMPA`; }, [title]);
+  useEffect(() => { document.title = `${plain(title)} · RMPA`; }, [title]);
   return html`<div class="page"><header class="title"><div>${kind && html`<p class="kind">${kind}</p>`}<h1 ref=${heading} tabindex="-1">${title}</h1></div><div class="actions">${aside}</div></header>${children}</div>`;
 };
 
@@ -95,6 +108,39 @@ export function Since({ moment, text }) {
 
 export const Uptime = ({ since }) => html`<${Since} moment=${since} text=${(shown) => shown} />`;
 
+// A value that can be changed: a button, and once it is pressed a field, which has the cursor. Escape or a button leaves
+// it, and the first button has the focus again. `save` gets the text and returns a promise: of `{ failure }`, and then
+// the draft stays; else of `{ said }`, what has become of it.
+export function Editable({ label, shown, begin, save, choices, children }) {
+  const [draft, setDraft] = useState(null);
+  const [state, set] = useState({});
+  const place = useRef(), was = useRef(false);
+  const open = draft !== null;
+  useLayoutEffect(() => {
+    if (open || was.current) place.current?.focus();
+    if (open) place.current?.select?.();
+    was.current = open;
+  }, [open]);
+  const leave = (next = {}) => { setDraft(null); set(next); };
+  const submit = (event) => {
+    event.preventDefault();
+    set({ waits: true });
+    save(place.current.value).then((done) => (done.failure ? set(done) : leave(done)));
+  };
+  if (!open)
+    return html`<button ref=${place} type="button" class="field" aria-label=${`Change ${label}, now ${shown}`}
+      onClick=${() => { setDraft(begin); set({}); }}>${shown}</button>
+      <span role="status" class="muted said">${state.said}</span>`;
+  const field = { ref: place, value: draft, onInput: (event) => setDraft(event.target.value) };
+  const input = choices
+    ? html`<select ...${field}>${choices.map((each) => html`<option key=${each} value=${each}>${each}</option>`)}</select>`
+    : html`<input ...${field} />`;
+  return html`<form class="row edit" onSubmit=${submit}
+    onKeyDown=${(event) => { if (event.key === "Escape") { event.stopPropagation(); leave(); } }}>
+    <label><span>${label}</span>${input}</label><button class="primary" disabled=${state.waits}>Set</button>
+    <button type="button" onClick=${() => leave()}>Leave</button>${children}<${Failure} failure=${state.failure} /></form>`;
+}
+
 // One question to the server, asked by a button or at once; `show` draws the answer.
 export function Question({ connection, what, args, label, show, now }) {
   const [state, set] = useState({});
@@ -109,21 +155,22 @@ export function Question({ connection, what, args, label, show, now }) {
 }
 
 // The answer to a question, asked again every `period` seconds while the page is seen; 0: once. Another `key` asks anew.
+// The first time it is asked in any case: a page may have been opened in the background.
 export function useAnswer(connection, what, args, period = 0, key = "") {
   const [state, set] = useState({});
   const open = connection.phase === "open";
   useEffect(() => {
     if (!open) return undefined;
     let ended = false, timer;
-    const ask = async () => {
-      if (!document.hidden) {
+    const ask = async (first) => {
+      if (first || !document.hidden) {
         const next = await connection.ask(what, args).then((value) => ({ value }), (failure) => ({ failure }));
         if (ended) return;
         set(next);
       }
-      if (period) timer = setTimeout(ask, period * 1000);
+      if (period && !ended) timer = setTimeout(ask, period * 1000);
     };
-    ask();
+    ask(true);
     return () => { ended = true; clearTimeout(timer); };
   }, [what, JSON.stringify(args), key, open]);
   return state;
@@ -137,9 +184,16 @@ export const ModuleLink = ({ name }) => html`<a class="whole" href=${href("modul
 
 const VERDICTS = { ok: "OK", warn: "WARN", fail: "ERROR", unknown: "STALE" };
 const WORDS = { topic: ["It flows", "It does not flow"], service: ["It can be called", "It cannot be called"], module: ["It is reached", "It is not reached"] };
+const NO_DEMAND = "demand"; // the last stage where nothing is in the way, and no node wants it
+function verdict({ kind, flows, stages }) {
+  if (flows && stages?.at(-1)?.name === NO_DEMAND) return ["STALE", "Nothing is in its way, and no node subscribes"];
+  const [well, ill] = WORDS[kind] || WORDS.topic;
+  return flows ? ["OK", well] : ["ERROR", ill];
+}
+
 export function Diagnosis({ value }) {
   if (!Array.isArray(value) || !value.length) return html`<p class="empty">There is nothing to say.</p>`;
-  return value.map((one) => html`<div class="diagnosis"><p><${Mark} state=${one.flows ? "OK" : "ERROR"} word=${(WORDS[one.kind] || WORDS.topic)[one.flows ? 0 : 1]} />
+  return value.map((one) => html`<div class="diagnosis"><p><${Mark} state=${verdict(one)[0]} word=${verdict(one)[1]} />
     ${one.kind !== "module" && one.node && html` <span class="muted">from ${one.node}${one.peer && ` of ${one.peer}`} to ${one.to}</span>`}</p>
     <ol class="stages">${(one.stages || []).map((stage) => html`<li class=${known(VERDICTS[stage.verdict]).tone}>
       <span class="stage"><svg viewBox="0 0 16 16" aria-hidden="true">${shape(VERDICTS[stage.verdict])}</svg>${stage.name}</span>

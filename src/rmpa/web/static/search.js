@@ -1,6 +1,6 @@
 // Search over all that has a name, and the list of keys.
 
-import { html, useEffect, useRef, useState } from "./vendor/htm-preact.js";
+import { html, useEffect, useLayoutEffect, useRef, useState } from "./markup.js";
 import { entries, section } from "./state.js";
 import { href } from "./parts.js";
 
@@ -30,10 +30,10 @@ export function find(state, text, parameters = []) {
 
 function Dialog({ label, onClose, children }) {
   const dialog = useRef();
-  useEffect(() => {
-    const before = document.activeElement;
-    dialog.current.showModal();
-    return () => before?.focus?.();
+  useLayoutEffect(() => {
+    const shown = dialog.current;
+    shown.showModal();
+    return () => shown.close(); // gives the focus back: while it is shown, nothing else takes it
   }, []);
   return html`<dialog ref=${dialog} aria-label=${label} onClose=${onClose} onClick=${(event) => event.target === dialog.current && onClose()}>${children}</dialog>`;
 }

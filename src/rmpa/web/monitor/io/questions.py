@@ -303,15 +303,23 @@ class Answers:
         kind = next((each["type"] for each in known if each.get("name") == name), None)
         if kind not in _LISTS:
             raise ConfigError("name", f"{resource} has no parameter {name[:80]!r}")
-        await self._reconfigure(args, {_LISTS[kind]: [{"name": name, "value": value}]})
-        return {"text": f"{name} is set"}
+        if not _is_of(kind, value):
+            raise ConfigError(name, f"{str(value)[:40]!r} is no value of the type {kind}")
+        config = await self._reconfigure(args, {_LISTS[kind]: [{"name": name, "value": value}]})
+        taken = next((each["value"] for each in config[_LISTS[kind]] if each["name"] == name), value)
+        kept = taken == value
+        text = f"{name} is {_written(taken)}" + ("" if kept else f": {_written(value)} is beyond its bounds")
+        return {"value": taken, "text": text}
 
-    async def _reconfigure(self, args: Args, config: Args) -> None:
+    async def _reconfigure(self, args: Args, config: Args) -> Args:
+        """Ask a resource for another configuration; returns the one that it has then."""
         resource = _name(args, "resource")
         service = self._service({"service": f"{resource}/{_SET_PARAMETERS}", "peer": args.get("peer", "")})
         kind = self._hub.types.service(SERVICE_TYPE)
         body = codec_for(kind.request).write({"config": config}, time.time_ns()).payload
-        await self._hub.calls.call(service, kind.md5sum, body, _CALL_TIMEOUT)
+        response = await self._hub.calls.call(service, kind.md5sum, body, _CALL_TIMEOUT)
+        taken: Args = _json(codec_for(kind.response).json(memoryview(response)))["config"]
+        return taken
 
     async def _choose(self, args: Args, what: str) -> Any:
         choice = _text(args, "choice")
@@ -383,6 +391,17 @@ def _as_before(name: str, present: object, value: object) -> object:
         raise ConfigError(name, "it holds binary data", "set it with `rmpa param set -b FILE`")
     is_whole = isinstance(value, int) and not isinstance(value, bool)
     return float(cast("int", value)) if isinstance(present, float) and is_whole else value
+
+
+def _is_of(kind: str, value: object) -> bool:
+    """Whether a value for JSON is one of this type of a parameter: nothing is read into another one."""
+    if isinstance(value, bool):
+        return kind == "bool"
+    return isinstance(value, {"bool": bool, "str": str, "int": int}.get(kind, int | float))
+
+
+def _written(value: object) -> str:
+    return msgspec.json.encode(value).decode()
 
 
 def _text(args: Args, key: str) -> str:

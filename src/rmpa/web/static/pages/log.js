@@ -1,6 +1,6 @@
 // The log of all nodes of this module, /rosout, newest first.
 
-import { html, useState } from "../vendor/htm-preact.js";
+import { html, useState } from "../markup.js";
 import { section } from "../state.js";
 import { Choice, Page, Panel } from "../parts.js";
 import { Lines, useLog } from "../loglines.js";

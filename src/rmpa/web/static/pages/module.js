@@ -1,11 +1,11 @@
 // A module: its link, its clock, what it offers, and what of it is hidden or dropped.
 
-import { html } from "../vendor/htm-preact.js";
+import { html } from "../markup.js";
 import { bandwidth, bounded, bytes, count, duration, percent, seconds } from "../format.js";
 import { entries, section } from "../state.js";
 import { Facts, Gone, Link, Mark, Page, Panel, Since, Table, Uptime, Why, useAnswer } from "../parts.js";
 import { NODE_COLUMNS, NodeRow } from "./nodes.js";
-import { TopicRow, isData } from "./topics.js";
+import { TOPIC_COLUMNS, TopicRow, isData } from "./topics.js";
 import { Lines } from "../plot.js";
 
 const DIRECTIONS = [["bytes_in", "received"], ["bytes_out", "sent"]];
@@ -29,12 +29,17 @@ export function ModulePage({ name, state, connection }) {
       ${(module.hidden || []).map((text) => html`<p class="failure" key=${text}>${text}</p>`)}<//>`}
     ${!own && html`<${Panel} title="Bytes a second on the link" wide><${Lines} label="Bytes a second" series=${DIRECTIONS.map(([key, text]) => ({ label: text, value: module[key] }))} format=${bandwidth} /><//>`}
     ${resources.length > 0 && html`<${Panel} title="Smart Resources"><${Table} caption="Smart Resources" columns=${["Resource", "Quality", "Profile", "Says"]}>${resources.map(([key, one]) => html`<tr key=${key}><th scope="row"><${Link} page="resource" name=${key}>${one.name}<//></th><td><${Mark} state=${one.level} /></td><td>${one.profile || "none"}</td><td>${one.message}</td></tr>`)}<//><//>`}
-    ${nodes.length > 0 && html`<${Panel} title=${`Nodes of ${name}`}><${Table} caption="Nodes" columns=${NODE_COLUMNS}>${nodes.slice(0, 100).map(([key, one]) => html`<${NodeRow} key=${key} name=${key} node=${one} />`)}<//>${nodes.length > 100 && html`<p class="empty"><a href="#/nodes">${nodes.length - 100} more</a></p>`}<//>`}
+    ${nodes.length > 0 && html`<${Panel} title=${`Nodes of ${name}`}><${Table} caption="Nodes" columns=${NODE_COLUMNS} list=${nodes}>
+      ${([key, one]) => html`<${NodeRow} key=${key} name=${key} node=${one} />`}<//><//>`}
     ${own && html`<${Counters} state=${state} connection=${connection} />`}
-    <${Panel} title=${`Topics of ${name}`} wide><${Table} caption="Topics" columns=${["Topic", "Type", "#Rate", "#Bytes", "#Latency", "#Lost", "From → to"]} empty=${all.length ? "It publishes no data." : "It publishes no topic."}>${topics.map(([topic, one]) => html`<${TopicRow} key=${topic} name=${topic} topic=${one} />`)}<//>
-      ${all.length > topics.length && html`<details><summary>${all.length - topics.length} of its Smart Resources, about themselves, and of the log</summary><${Table} caption="Topics of Smart Resources" columns=${["Topic", "Type", "#Rate", "#Bytes", "#Latency", "#Lost", "From → to"]}>${all.filter((each) => !topics.includes(each)).map(([topic, one]) => html`<${TopicRow} key=${topic} name=${topic} topic=${one} />`)}<//></details>`}<//>
+    <${Panel} title=${`Topics of ${name}`} wide><${TopicTable} list=${topics} empty=${all.length ? "It publishes no data." : "It publishes no topic."} />
+      ${all.length > topics.length && html`<details><summary>${all.length - topics.length} of its Smart Resources, about themselves, and of the log</summary>
+        <${TopicTable} list=${all.filter(([topic]) => !isData(topic, state))} /></details>`}<//>
   </div><//>`;
 }
+
+const TopicTable = ({ list, empty }) => html`<${Table} caption="Topics" columns=${TOPIC_COLUMNS} empty=${empty} list=${list}>
+  ${([topic, one]) => html`<${TopicRow} key=${topic} name=${topic} topic=${one} />`}<//>`;
 
 const LinkPanel = ({ module, detail }) => {
   const link = section(detail, "link");
@@ -70,5 +75,6 @@ const Agent = ({ agent, detail }) => html`<${Panel} title="Agent"><${Facts} rows
 const Counters = ({ state, connection }) => {
   const counters = entries(section(state, "detail"), "counters:");
   connection.look([...new Map([...connection.looks, ["counters", ""]].map((each) => [each.join(), each])).values()]);
-  return html`<${Panel} title="Counted by the agent"><${Table} caption="Counters" columns=${["Reason", "#Count"]}>${counters.map(([name, value]) => html`<tr key=${name}><th scope="row"><code>${name}</code></th><td class="number">${count(value)}</td></tr>`)}<//><//>`;
+  return html`<${Panel} title="Counted by the agent"><${Table} caption="Counters" columns=${["Reason", "#Count"]} list=${counters}>
+    ${([name, value]) => html`<tr key=${name}><th scope="row"><code>${name}</code></th><td class="number">${count(value)}</td></tr>`}<//><//>`;
 };

@@ -1,13 +1,12 @@
 // All nodes, and one of them: its module, topics, services, connections and log lines.
 
-import { html, useState } from "../vendor/htm-preact.js";
+import { html, useState } from "../markup.js";
 import { count, hertz } from "../format.js";
 import { entries, section } from "../state.js";
 import { Facts, Failure, Gone, Link, Mark, ModuleLink, NodeLink, Page, Panel, Table, memo, useAnswer } from "../parts.js";
 import { Lines, useLog } from "../loglines.js";
 
 const NODE_PERIOD = 5; // seconds after which the node that is shown is asked again
-const MOST = 300;
 
 export const NodeRow = memo(({ name, node, own }) => html`<tr><th scope="row"><${NodeLink} name=${name}>${node.name}<//>${node.problem && html`<div class="muted"><${Mark} state="WARN" word="" />${node.problem}</div>`}</th>
   ${own && html`<td><${ModuleLink} name=${node.module || own} /></td>`}<td class="number">${node.publishes || 0}</td><td class="number">${node.module ? "–" : node.subscribes || 0}</td><td class="number">${node.serves || 0}</td></tr>`);
@@ -21,8 +20,9 @@ export function Nodes({ state }) {
   const hidden = section(state, "hidden").nodes;
   return html`<${Page} title="Nodes" kind=${`${all.length} in all modules`}>
     <input class="filter" type="search" placeholder="Filter by name or module" aria-label="Filter by name or module" value=${text} onInput=${(event) => setText(event.target.value)} />
-    <${Panel}><${Table} caption="Nodes" columns=${["Node", "Module", ...NODE_COLUMNS.slice(1)]} empty="No node is like that.">${shown.slice(0, MOST).map(([name, one]) => html`<${NodeRow} key=${name} name=${name} node=${one} own=${own} />`)}<//>
-    <p class="empty">${shown.length > MOST ? `${shown.length - MOST} more: filter by name. ` : ""}${hidden ? `The server leaves out ${hidden} further nodes. ` : ""}Of peers, the nodes that offer something to this module.</p><//><//>`;
+    <${Panel}><${Table} caption="Nodes" columns=${["Node", "Module", ...NODE_COLUMNS.slice(1)]} empty="No node is like that." list=${shown}>
+      ${([name, one]) => html`<${NodeRow} key=${name} name=${name} node=${one} own=${own} />`}<//>
+    <p class="empty">${hidden ? `The server leaves out ${hidden} further nodes. ` : ""}Of peers, the nodes that offer something to this module.</p><//><//>`;
 }
 
 export function NodePage({ name, state, connection }) {
@@ -44,9 +44,9 @@ export function NodePage({ name, state, connection }) {
       ["Publishes", count(publishes.length)], ["Subscribes", facts || !peer ? count(subscribes.length) : undefined], ["Services", count(services.length)]]} />
       ${problem && html`<p class="failure">${problem}</p>`}
       ${failure && html`<p class="empty">The node cannot be asked: ${failure.error}. ${failure.remedy}</p>`}<//>
-    <${Panel} title="Services"><${Table} caption="Services" columns=${["Service", "Type"]} empty="It offers no service.">${services.map((each) => { const service = section(state, "services")[each]; return html`<tr key=${each}><th scope="row">${service ? html`<${Link} page="service" name=${each}>${service.name}<//>` : html`<span class="mono">${each.slice(each.indexOf(":") + 1)}</span>`}</th><td class="muted">${service ? service.type || "not asked yet" : "not known here"}</td></tr>`; })}<//><//>
+    <${Panel} title="Services"><${Table} caption="Services" columns=${["Service", "Type"]} empty="It offers no service." list=${services}>${(each) => { const service = section(state, "services")[each]; return html`<tr key=${each}><th scope="row">${service ? html`<${Link} page="service" name=${each}>${service.name}<//>` : html`<span class="mono">${each.slice(each.indexOf(":") + 1)}</span>`}</th><td class="muted">${service ? service.type || "not asked yet" : "not known here"}</td></tr>`; }}<//><//>
     ${[["Publishes", publishes, facts?.publications, "It publishes nothing."], ["Subscribes", subscribes, facts?.subscriptions, peer && !facts ? "Not known: only its own module knows what it subscribes to." : "It subscribes to nothing."]].map(([title, names, types, empty]) => html`<${Panel} key=${title} title=${title}>
-      <${Table} caption=${title} columns=${["Topic", "Type", "#Rate"]} empty=${empty}>${names.map((each) => html`<tr key=${each}><th scope="row">${topics[each] ? html`<${Link} page="topic" name=${each} />` : html`<span class="mono">${each}</span>`}</th><td class="muted">${topics[each]?.type || types?.[each] || ""}</td><td class="number">${topics[each] ? hertz(topics[each].rate) : html`<span class="muted">not known here</span>`}</td></tr>`)}<//><//>`)}
+      <${Table} caption=${title} columns=${["Topic", "Type", "#Rate"]} empty=${empty} list=${names}>${(each) => html`<tr key=${each}><th scope="row">${topics[each] ? html`<${Link} page="topic" name=${each} />` : html`<span class="mono">${each}</span>`}</th><td class="muted">${topics[each]?.type || types?.[each] || ""}</td><td class="number">${topics[each] ? hertz(topics[each].rate) : html`<span class="muted">not known here</span>`}</td></tr>`}<//><//>`)}
     <${Connections} facts=${facts} failure=${failure} module=${peer || own} own=${own} />
     <${NodeLog} node=${node} peer=${peer} connection=${connection} />
   </div><//>`;
@@ -57,8 +57,8 @@ const OtherEnd = ({ name, module, own }) => (name === "/rmpa" || name.endsWith("
 
 const Connections = ({ facts, failure, module, own }) => html`<${Panel} title="Connections" wide>${facts && !facts.connections
   ? html`<p class="empty">${facts.problem ? "Not known: the node does not answer." : "Not told by this peer: its agent is of an earlier release."}</p>`
-  : html`<${Table} caption="Connections" columns=${["Topic", "Way", "Other end", "State"]} empty=${facts ? "It has no connection." : failure ? "Not known: the node cannot be asked." : "Asking …"}>${(facts?.connections || []).map((one, at) => html`<tr key=${at}><th scope="row"><${Link} page="topic" name=${one.topic} /></th><td class="muted">${one.inbound ? "← from" : "→ to"}</td>
-    <td><${OtherEnd} name=${one.other} module=${module} own=${own} /></td><td><${Mark} state=${one.connected ? "up" : "silent"} word=${one.connected ? "connected" : "not connected"} /></td></tr>`)}<//>`}<//>`;
+  : html`<${Table} caption="Connections" columns=${["Topic", "Way", "Other end", "State"]} empty=${facts ? "It has no connection." : failure ? "Not known: the node cannot be asked." : "Asking …"} list=${facts?.connections || []}>${(one, at) => html`<tr key=${at}><th scope="row"><${Link} page="topic" name=${one.topic} /></th><td class="muted">${one.inbound ? "← from" : "→ to"}</td>
+    <td><${OtherEnd} name=${one.other} module=${module} own=${own} /></td><td><${Mark} state=${one.connected ? "up" : "silent"} word=${one.connected ? "connected" : "not connected"} /></td></tr>`}<//>`}<//>`;
 
 function NodeLog({ node, peer, connection }) {
   const lines = useLog(connection, false).filter((line) => line.node === node);

@@ -1,8 +1,10 @@
 // The parameters of this module's core, or of a peer's, as a tree; each value can be changed.
 
-import { html, useEffect, useRef, useState } from "../vendor/htm-preact.js";
+import { html, useEffect, useRef, useState } from "../markup.js";
 import { entries, section } from "../state.js";
-import { Choice, Failure, Page, Panel } from "../parts.js";
+import { Choice, Editable, Failure, Page, Panel, useFirst } from "../parts.js";
+import { plain } from "../format.js";
+import { another, fresh, kind } from "../typed.js";
 
 // Parameters as one tree: a namespace is an object.
 export function grow(values) {
@@ -32,15 +34,18 @@ export function Params({ name, state, connection }) {
     if (answer.values) setValues(answer.values);
     setFailure(null);
   };
-  const ask = (what, args = {}) => connection.ask(what, { peer, ...args }).then((answer) => { take(answer); return true; }, (failure) => { setFailure(failure); return false; });
-  useEffect(() => { shown.current = { peer }; setValues(null); ask("params"); }, [module, connection.phase]);
+  const open = connection.phase === "open";
+  const ask = (what, args = {}) => connection.ask(what, { peer, ...args }).then((answer) => { take(answer); return answer; });
+  const read = (args) => ask("params", args).catch(setFailure);
+  useEffect(() => { shown.current = { peer }; setValues(null); }, [module]);
+  useEffect(() => { if (open) read(); }, [module, open]); // what was read stays while there is no connection
   // Changes by others: this module's core tells them, a peer is asked while the page is seen.
-  useEffect(() => { if (!peer && shown.current.digest) ask("params", { has: shown.current.digest }); }, [state.parameters]);
+  useEffect(() => { if (open && !peer && shown.current.digest) read({ has: shown.current.digest }); }, [state.parameters]);
   useEffect(() => {
-    if (!peer) return undefined;
-    const timer = setInterval(() => document.hidden || !shown.current.digest || ask("params", { has: shown.current.digest }), PEER_PERIOD);
+    if (!peer || !open) return undefined;
+    const timer = setInterval(() => document.hidden || !shown.current.digest || read({ has: shown.current.digest }), PEER_PERIOD);
     return () => clearInterval(timer);
-  }, [module, connection.phase]);
+  }, [module, open]);
   const choices = entries(state, "modules").filter(([, one]) => one.state === "up" || one.state === "here").map(([name]) => [name, name]);
   return html`<${Page} title="Parameters" kind=${`Of the core of ${module}`}>
     <div class="row filter-row"><${Choice} label="Module" value=${module} onChoose=${setModule} options=${choices} /></div>
@@ -55,29 +60,44 @@ const isTree = (value) => value !== null && typeof value === "object" && !Array.
 
 function Namespace({ tree, path, text, may, ask }) {
   const rows = Object.entries(tree).filter(([key, value]) => holds(value, `${path}/${key}`, text)).sort(([a], [b]) => a.localeCompare(b));
+  const [first, more] = useFirst(rows);
   if (!rows.length) return html`<p class="empty">No parameter is like that.</p>`;
-  return html`<ul>${rows.map(([key, value]) => html`<li key=${key}>${isTree(value)
+  return html`<ul>${first.map(([key, value]) => html`<li key=${key}>${isTree(value)
     ? html`<details open><summary><span class="key">${key}/</span></summary><${Namespace} tree=${value} path=${`${path}/${key}`} text=${text} may=${may} ask=${ask} /></details>`
-    : html`<${Leaf} name=${`${path}/${key}`} short=${key} value=${value} may=${may} ask=${ask} />`}</li>`)}</ul>`;
+    : html`<${Leaf} name=${`${path}/${key}`} short=${key} value=${value} may=${may} ask=${ask} />`}</li>`)}</ul>${more}`;
 }
 
 function Leaf({ name, short, value, may, ask }) {
-  const [draft, setDraft] = useState(null);
   const [sure, setSure] = useState(false);
-  const written = JSON.stringify(value);
-  const save = (event) => { event.preventDefault(); ask("set_param", { name, value: parse(draft) }).then((done) => done && setDraft(null)); };
-  if (draft === null)
-    return html`<span class="key">${short}:</span> ${may ? html`<button type="button" class="field" aria-label=${`Change ${name}, now ${written}`} onClick=${() => setDraft(written)}>${written}</button>` : written}`;
-  return html`<form class="row" onSubmit=${save}><label><span>${name}</span><input autofocus value=${draft} onInput=${(event) => setDraft(event.target.value)} onKeyDown=${(event) => event.key === "Escape" && setDraft(null)} /></label>
-    <button class="primary">Set</button><button type="button" onClick=${() => { setDraft(null); setSure(false); }}>Leave</button><button type="button" onClick=${() => (sure ? ask("delete_param", { name }) : setSure(true))}>${sure ? "Really delete it" : "Delete"}</button></form>`;
+  const [failure, setFailure] = useState(null);
+  const written = plain(JSON.stringify(value)); // a code in JSON is the same text
+  const save = (draft) => {
+    const typed = another(draft, value);
+    if (typed.error) return Promise.resolve({ failure: typed });
+    return ask("set_param", { name, value: typed.value }).then(() => ({}), (failure) => ({ failure }));
+  };
+  const remove = () => (sure ? ask("delete_param", { name }).catch(setFailure) : setSure(true));
+  if (!may) return html`<span class="key">${short}:</span> ${written}`;
+  return html`<span class="key">${short}:</span> <${Editable} label=${name} shown=${written} begin=${written} save=${save}>
+    <button type="button" onClick=${remove}>${sure ? "Really delete it" : "Delete"}</button><${Failure} failure=${failure} /><//>`;
 }
-
-// JSON where it is some, else the text itself.
-export function parse(text) { try { return JSON.parse(text); } catch { return text; } }
 
 function Setter({ ask }) {
   const [name, setName] = useState("/");
-  const [value, setValue] = useState("");
-  return html`<form class="row" onSubmit=${(event) => { event.preventDefault(); ask("set_param", { name, value: parse(value) }); }}>
-    <label>Name<input class="mono" value=${name} onInput=${(event) => setName(event.target.value)} /></label><label>Value: JSON, or text<input class="mono" value=${value} onInput=${(event) => setValue(event.target.value)} /></label><button class="primary">Set</button></form>`;
+  const [text, setText] = useState("");
+  const [state, set] = useState({});
+  const typed = fresh(text);
+  const save = (event) => {
+    event.preventDefault();
+    if (typed.error) return set({ failure: typed });
+    const said = `${name} is the ${kind(typed.value)} ${JSON.stringify(typed.value)}`;
+    ask("set_param", { name, value: typed.value }).then(() => set({ said }), (failure) => set({ failure }));
+  };
+  const edit = (take) => (event) => { take(event.target.value); set({}); };
+  return html`<form class="row" onSubmit=${save}>
+    <label>Name<input class="mono" value=${name} onInput=${edit(setName)} /></label>
+    <label>Value: JSON, or text<input class="mono" value=${text} onInput=${edit(setText)} /></label>
+    <button class="primary">Set</button>
+    <p role="status" class="muted said">${state.said || (text && !typed.error && `It is sent as a ${kind(typed.value)}.`)}</p>
+    <${Failure} failure=${state.failure} /></form>`;
 }

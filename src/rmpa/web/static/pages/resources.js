@@ -1,16 +1,18 @@
 // Smart Resources, and one of them: profiles and why one of them runs, what clients asked, contexts, configuration.
 
-import { html, useState } from "../vendor/htm-preact.js";
+import { html, useState } from "../markup.js";
 import { seconds } from "../format.js";
 import { entries, section } from "../state.js";
-import { Facts, Failure, Gone, Link, Mark, ModuleLink, Page, Panel, Table, memo } from "../parts.js";
+import { Editable, Facts, Failure, Gone, Link, Mark, ModuleLink, Page, Panel, Table, memo } from "../parts.js";
+import { setting } from "../typed.js";
 
 const Row = memo(({ name, one }) => html`<tr><th scope="row"><${Link} page="resource" name=${name}>${one.name}<//><div class="muted">${one.description}</div></th><td><${ModuleLink} name=${one.module} /></td><td>${one.role}${one.physical ? "" : html` <span class="muted">simulated</span>`}</td>
   <td><${Mark} state=${one.level} /><div class="muted">${one.message}</div></td><td>${one.profile || "none"}</td><td>${one.context || "–"}</td><td class="number">${one.clients || 0}</td></tr>`);
 
 export function Resources({ state }) {
   const all = entries(state, "resources");
-  return html`<${Page} title="Smart Resources" kind=${`${all.length} in all modules`}><${Panel}><${Table} caption="Smart Resources" columns=${["Resource", "Module", "Role", "Quality", "Profile", "Context", "#Clients"]} empty="No module has a Smart Resource.">${all.map(([key, one]) => html`<${Row} key=${key} name=${key} one=${one} />`)}<//><//><//>`;
+  return html`<${Page} title="Smart Resources" kind=${`${all.length} in all modules`}><${Panel}><${Table} caption="Smart Resources" columns=${["Resource", "Module", "Role", "Quality", "Profile", "Context", "#Clients"]} empty="No module has a Smart Resource." list=${all}>
+    ${([key, one]) => html`<${Row} key=${key} name=${key} one=${one} />`}<//><//><//>`;
 }
 
 export function ResourcePage({ name, state, connection }) {
@@ -31,22 +33,24 @@ export function ResourcePage({ name, state, connection }) {
     <${Panel} title="Who asked what"><${Table} caption="Clients" columns=${["Client", "Is told", "Asks"]} empty="No client asks for anything.">${(detail.clients || []).map((client) => html`<tr key=${client.name}><th scope="row">${client.name}</th><td><${Mark} state=${client.level} word=${client.message} /></td><td>${Object.entries(client.values || {}).map(([key, value]) => html`<div key=${key}>${key} ${value}</div>`)}</td></tr>`)}<//><//>
     <${Panel} title="Contexts"><${Table} caption="Contexts" columns=${["Context", "When", "Requires", "Profiles", ""]} empty="It has no contexts.">${(detail.contexts || descriptor.contexts || []).map((each) => html`<tr key=${each.name}><th scope="row">${each.name === one.context ? html`<${Mark} state="up" word=${each.name} />` : each.name}</th><td>${each.when || "by hand"}</td><td>${Object.entries(each.requires || {}).map(([key, value]) => `${key} ${value}`).join(", ") || "–"}</td><td>${(each.profiles || []).join(", ") || "all"}</td>
       <td class="number">${connection.may("resource") && html`<button type="button" onClick=${() => choose("context", each.name === one.context ? "" : each.name)}>${each.name === one.context ? "Leave" : "Enter"}</button>`}</td></tr>`)}<//><//>
-    <${Panel} title="Configuration"><${Table} caption="Parameters" columns=${["Parameter", "#Value", "Range", "Description"]} empty="It has no parameters.">${(descriptor.parameters || []).map((each) => html`<tr key=${each.name}><th scope="row">${each.name}</th><td class="number"><${Setting} value=${section(detail, "parameters")[each.name] ?? each.default} about=${each} set=${connection.may("resource") ? (value) => connection.ask("configure", { ...whose, name: each.name, value }).then(() => setFailure(null), setFailure) : null} /></td><td>${each.choices?.length ? each.choices.join(" | ") : each.low !== undefined || each.high !== undefined ? `${each.low ?? ""} … ${each.high ?? ""}` : each.type}</td><td>${each.description}</td></tr>`)}<//><//>
+    <${Panel} title="Configuration"><${Table} caption="Parameters" columns=${["Parameter", "#Value", "Range", "Description"]} empty="It has no parameters.">${(descriptor.parameters || []).map((each) => html`<tr key=${each.name}><th scope="row">${each.name}</th><td class="number"><${Setting} value=${section(detail, "parameters")[each.name] ?? each.default} about=${each} set=${connection.may("resource") ? (value) => connection.ask("configure", { ...whose, name: each.name, value }) : null} /></td><td>${each.choices?.length ? each.choices.join(" | ") : each.low !== undefined || each.high !== undefined ? `${each.low ?? ""} … ${each.high ?? ""}` : each.type}</td><td>${each.description}</td></tr>`)}<//><//>
     <${Panel} title="Topics"><${Table} caption="Topics" columns=${["Topic", "Way", "Type", "Contract"]}>${[["outputs", "out"], ["inputs", "in"]].flatMap(([list, way]) => (descriptor[list] || []).map((each) => html`<tr key=${way + each.topic}><th scope="row"><${Link} page="topic" name=${each.topic} /></th><td>${way}</td><td>${each.type}</td><td>${Object.entries(each.contract || {}).map(([key, value]) => `${key} ${value}`).join(", ") || "–"}</td></tr>`))}<//><//>
   </div><//>`;
 }
 
-// A parameter's value; with the right to, it can be changed.
+// A parameter's value; with the right to, it can be changed. What the resource made of it is said.
 function Setting({ value, about, set }) {
-  const [draft, setDraft] = useState(null);
   const written = typeof value === "string" ? value : JSON.stringify(value);
-  if (!set) return html`${written} ${about.unit}`;
-  if (draft === null) return html`<button type="button" class="field" aria-label=${`Change ${about.name}, now ${written}`} onClick=${() => setDraft(written)}>${written || "–"} ${about.unit}</button>`;
-  const save = (event) => { event.preventDefault(); set(typed(draft, about.type)); setDraft(null); };
-  return html`<form class="row" onSubmit=${save}><label><span class="unseen">${about.name}</span><input autofocus value=${draft} onInput=${(event) => setDraft(event.target.value)} onKeyDown=${(event) => event.key === "Escape" && setDraft(null)} /></label><button class="primary">Set</button></form>`;
+  const shown = `${written || "–"} ${about.unit || ""}`.trim();
+  if (!set) return shown;
+  const save = (draft) => {
+    const typed = setting(draft, about);
+    if (typed.error) return Promise.resolve({ failure: typed });
+    return set(typed.value).then((answer) => ({ said: answer.text }), (failure) => ({ failure }));
+  };
+  const choices = about.choices?.length ? about.choices.map(String) : about.type === "bool" ? ["true", "false"] : null;
+  return html`<${Editable} label=${about.name} shown=${shown} begin=${written ?? ""} save=${save} choices=${choices} />`;
 }
-
-const typed = (text, type) => (type === "str" ? text : type === "bool" ? text.trim() === "true" : Number(text));
 
 // "0.000797688 m/s²" with four digits.
 function quantity(text) {

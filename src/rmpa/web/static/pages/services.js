@@ -1,11 +1,12 @@
 // All services, and one of them: its types, and a call.
 
-import { html, useState } from "../vendor/htm-preact.js";
+import { html, useState } from "../markup.js";
 import { count, seconds } from "../format.js";
 import { entries, section } from "../state.js";
 import { Facts, Failure, Gone, Link, ModuleLink, NodeLink, Page, Panel, Question, Table, Why, memo, nodeKey } from "../parts.js";
+import { json } from "../typed.js";
 
-const STATES = { home: "stays in its module", hidden: "hidden here", idle: "no node calls it", open: "in use" };
+const STATES = { home: "stays in its module", hidden: "hidden here", idle: "not in use", open: "in use" };
 
 const Row = memo(({ name, service, own }) => html`<tr><th scope="row"><${Link} page="service" name=${name}>${service.name}<//>${service.problem && html`<div class="muted">${service.problem}</div>`}</th>
   <td><${ModuleLink} name=${service.module || own} /></td><td><${NodeLink} name=${nodeKey(service.module, service.node)}>${service.node}<//></td><td>${service.type || html`<span class="muted">not asked yet</span>`}</td><td>${STATES[service.state] || service.state}</td><td class="number">${count(service.calls || 0)}</td><td class="number">${count(service.failed || 0)}</td></tr>`);
@@ -17,8 +18,9 @@ export function Services({ state }) {
   const shown = all.filter(([name, one]) => `${name} ${one.type || ""}`.toLowerCase().includes(text.toLowerCase()));
   return html`<${Page} title="Services" kind=${`${all.length} in all modules`}>
     <input class="filter" type="search" placeholder="Filter by name or type" aria-label="Filter by name or type" value=${text} onInput=${(event) => setText(event.target.value)} />
-    <${Panel}><${Table} caption="Services" columns=${["Service", "Module", "Node", "Type", "State", "#Calls", "#Failed"]} empty="No service is like that.">${shown.slice(0, 300).map(([key, one]) => html`<${Row} key=${key} name=${key} service=${one} own=${section(state, "agent").name} />`)}<//>
-    ${(shown.length > 300 || hidden) && html`<p class="empty">${shown.length > 300 ? `${shown.length - 300} more: filter by name. ` : ""}${hidden ? `${count(hidden)} more services are not listed: the search (/) finds them by name.` : ""}</p>`}<//><//>`;
+    <${Panel}><${Table} caption="Services" columns=${["Service", "Module", "Node", "Type", "State", "#Calls", "#Failed"]} empty="No service is like that." list=${shown}>
+      ${([key, one]) => html`<${Row} key=${key} name=${key} service=${one} own=${section(state, "agent").name} />`}<//>
+    ${hidden && html`<p class="empty">${count(hidden)} more services are not listed: the search (/) finds them by name.</p>`}<//><//>`;
 }
 
 export function ServicePage({ name, state, connection }) {
@@ -41,8 +43,8 @@ function Call({ connection, service, about }) {
   const allowed = connection.may("call");
   const call = (event) => {
     event.preventDefault();
-    let request;
-    try { request = JSON.parse(text || "{}"); } catch (error) { return set({ failure: { error: `The request is not JSON: ${error.message}` } }); }
+    const { value: request, error } = json(text.trim() || "{}");
+    if (error) return set({ failure: { error } });
     set({ waits: true });
     connection.ask("call", { service: service.name, peer: service.module || "", request }).then((answer) => set({ answer }), (failure) => set({ failure }));
   };

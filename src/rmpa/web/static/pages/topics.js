@@ -1,13 +1,13 @@
 // All topics, and one of them: which node sends it to which, how fast, how late, what is lost, and what is in it.
 
-import { html, useState } from "../vendor/htm-preact.js";
+import { html, useState } from "../markup.js";
 import { bandwidth, clock, count, hertz, seconds } from "../format.js";
 import { entries, section } from "../state.js";
 import { Choice, Facts, Failure, Gone, Link, Mark, NodeLink, NodeLinks, Page, Panel, Table, Why, memo, nodeKey, useAnswer } from "../parts.js";
 import { Lines } from "../plot.js";
 import { Live } from "../live.js";
 
-const COLUMNS = ["Topic", "Type", "#Rate", "#Bytes", "#Latency", "#Lost", "From → to"];
+export const TOPIC_COLUMNS = ["Topic", "Type", "#Rate", "#Bytes", "#Latency", "#Lost", "From → to"];
 
 export const TopicRow = memo(({ name, topic }) => html`<tr>
   <th scope="row"><${Link} page="topic" name=${name} />${topic.problem && html`<div class="muted"><${Mark} state="WARN" word=${""} />${topic.problem}</div>`}</th>
@@ -27,8 +27,6 @@ const FILTERS = {
   data: ["Data", (one, name, state) => isData(name, state)], flowing: ["Flowing", (one) => one.rate !== undefined], all: ["All", () => true],
   wrong: ["With a problem", (one) => one.problem || one.lost || one.dropped],
 };
-const MOST = 300;
-
 export function Topics({ state }) {
   const [filter, setFilter] = useState("data");
   const [text, setText] = useState("");
@@ -38,9 +36,10 @@ export function Topics({ state }) {
   const hidden = section(state, "hidden").topics;
   return html`<${Page} title="Topics" kind=${`${all.filter(([, one]) => one.rate !== undefined).length} of ${all.length} flow between modules`} aside=${html`<${Choice} label="Which topics" value=${filter} onChoose=${setFilter} options=${Object.entries(FILTERS).map(([key, [word]]) => [key, word])} />`}>
     <input class="filter" type="search" placeholder="Filter by name or type" aria-label="Filter by name or type" value=${text} onInput=${(event) => setText(event.target.value)} />
-    <${Panel}><${Table} caption="Topics" columns=${COLUMNS} empty="No topic is like that.">${shown.slice(0, MOST).map(([name, one]) => html`<${TopicRow} key=${name} name=${name} topic=${one} />`)}<//>
+    <${Panel}><${Table} caption="Topics" columns=${TOPIC_COLUMNS} empty="No topic is like that." list=${shown}>
+      ${([name, one]) => html`<${TopicRow} key=${name} name=${name} topic=${one} />`}<//>
     ${filter === "data" && all.length > shown.length && !text && html`<p class="empty">${all.length - shown.length} topics of the log and of Smart Resources about themselves are left out. <button type="button" onClick=${() => setFilter("all")}>Show all</button></p>`}
-    ${(shown.length > MOST || hidden) && html`<p class="empty">${shown.length > MOST ? `${shown.length - MOST} more: filter by name. ` : ""}${hidden ? `${count(hidden)} more topics are not listed: the search (/) finds them by name.` : ""}</p>`}<//><//>`;
+    ${hidden && html`<p class="empty">${count(hidden)} more topics are not listed: the search (/) finds them by name.</p>`}<//><//>`;
 }
 
 const FIGURES = [["rate", "Rate", hertz], ["p50", "Latency, median", seconds], ["p99", "Latency, 99th percentile", seconds], ["jitter", "Jitter", seconds], ["bandwidth", "Bytes", bandwidth], ["lost", "Lost", count]];
@@ -65,7 +64,8 @@ export function TopicPage({ name, state, connection }) {
     <${Live} connection=${connection} topic=${name} type=${topic.type} />
     ${flowing.length > 0 && html`<${Panel} wide title="Figures" aside=${html`<${Choice} label="Figure" value=${figure} onChoose=${setFigure} options=${FIGURES.map(([key, word]) => [key, word])} />`}>
       <${Lines} key=${figure} label=${figure} format=${format} series=${flowing.map(([key, route]) => ({ label: key, value: figureOf(route, figure) }))} /><//>`}
-    <${Panel} title="Routes" wide><${Table} caption="Routes" columns=${["Source", "State", "#Rate", "#Jitter p99", "#Latency p50, p99", "#Lost", "#Dropped", "Transport", "Contract"]} empty="It has no route to or from a peer.">${routes.map(([key, route]) => html`<${Route} key=${key} route=${route} own=${own} />`)}<//><//>
+    <${Panel} title="Routes" wide><${Table} caption="Routes" columns=${["Source", "State", "#Rate", "#Jitter p99", "#Latency p50, p99", "#Lost", "#Dropped", "Transport", "Contract"]} empty="It has no route to or from a peer." list=${routes}>
+      ${([key, route]) => html`<${Route} key=${key} route=${route} own=${own} />`}<//><//>
     <${ContractPanel} connection=${connection} topic=${name} type=${topic.type} own=${own} routes=${routes.length} />
     <${Events} routes=${routes} />
   </div><//>`;
