@@ -9,10 +9,10 @@ import pytest
 
 from rmpa.cli.graph import read_name
 from rmpa.cli.message_text import flatten, pick, shorten, to_text
-from rmpa.cli.output import Column, duration, print_table, printable, size
+from rmpa.cli.output import Column, duration, print_error, print_table, printable, size
 from rmpa.cli.topic_crossing import facts
 from rmpa.cli.topic_pub import fill_stamps, read_values
-from rmpa.core.errors import ConfigError, RmpaError
+from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.observe.snapshot import RouteInfo
 from tests.observe.samples import DIRECT
 
@@ -58,6 +58,13 @@ def test_sizes(count: float | None, text: str) -> None:
 def test_nothing_from_outside_moves_the_cursor() -> None:
     assert printable("a\x1b[2J\nb") == "a\\x1b[2J\\nb"
     assert to_text({"data": "\x1b[31m"}) == 'data: "\\x1b[31m"'
+
+
+def test_an_error_in_the_words_of_a_peer_turns_and_hides_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    print_error(PeerRefused("arm", "\x1b[2Jfine\u202e\nand so on"))
+    error = capsys.readouterr().err
+    assert "\\x1b[2Jfine\\u202e\nand so on" in error
+    assert all(character.isprintable() for character in error.replace("\n", ""))
 
 
 def test_messages_as_text() -> None:

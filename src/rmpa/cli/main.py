@@ -131,7 +131,9 @@ def _run(arguments: Sequence[str] | None) -> int:
     except (click.Abort, KeyboardInterrupt):
         return 130
     except RmpaError as error:
-        click.echo(f"rmpa: {error}", err=True)
+        from rmpa.cli.output import print_error
+
+        print_error(error)
         return _failed(arguments, str(error), 2 if isinstance(error, ConfigError) else 1)
     return code if isinstance(code, int) else 0
 

@@ -108,6 +108,11 @@ def warn(text: str) -> None:
     click.secho(f"! {printable(text)}", err=True, fg="yellow")
 
 
+def print_error(error: object) -> None:
+    """``rmpa: …`` on stderr. An error may hold the words of a peer or a node: control characters are escaped."""
+    click.echo("\n".join(map(printable, f"rmpa: {error}".split("\n"))), err=True)
+
+
 def print_line(text: str = "", colour: str | None = None) -> None:
     """One line on standard output at once; control characters are escaped, and terminals show the colour."""
     text = printable(text)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, NoReturn, Self
 
 import click
 
-from rmpa.cli.output import printable
+from rmpa.cli.output import print_error, printable
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
 from rmpa.runtime import limits
 
@@ -356,7 +356,7 @@ async def _run(resources: list[Resource], uri: str, agent: ModuleAgent | None, s
     if left := await _left_behind():
         _log.warning("! %s does not come back; it is left behind", ", ".join(left))
         if failure is not None:
-            click.echo(f"rmpa: {failure}", err=True)
+            print_error(failure)
         if agent is not None:
             agent.end()
         _leave(1)
