@@ -130,7 +130,7 @@ async def test_the_keyboard_reaches_everything(site: Site) -> None:
     await page.wait("location.hash === '#/topic/%2Fvelocity_order' && !document.querySelector('dialog')")
     for key in "gr":
         await page.press(key)
-    await page.wait("location.hash === '#/resources'")
+    await page.wait("location.hash === '#/resources' && document.activeElement.textContent === 'Smart Resources'")
     await page.press("?")
     await page.wait("document.querySelector('dialog').textContent.includes('Around the ring')")
     await page.press("Escape")

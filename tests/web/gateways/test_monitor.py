@@ -155,6 +155,7 @@ async def test_a_page_is_greeted_and_gets_the_state_then_its_changes(core: RosCo
         assert peer.name in page.state["modules"]
         agent.snapshot = msgspec.structs.replace(agent.snapshot, peers=())
         await page.sees(lambda: page.state["modules"][peer.name]["state"] == "away")
+        await page.sees(lambda: page.state["recorded"])
         [*_, last] = (await page.ask(1, "history"))["value"]
         assert (last["module"], last["level"]) == (peer.name, "WARN")
         assert "is away" in last["text"]
@@ -168,7 +169,7 @@ async def test_a_link_that_is_parked_and_made_again_is_no_event(core: RosCore) -
             agent.snapshot = msgspec.structs.replace(agent.snapshot, peers=(one, *others))
             await page.sees(lambda word=word: page.state.get("modules", {}).get(linked.name, {}).get("state") == word)
         agent.snapshot = msgspec.structs.replace(agent.snapshot, peers=(*others,))
-        await page.sees(lambda: page.state["modules"][linked.name]["state"] == "away")
+        await page.sees(lambda: page.state["modules"][linked.name]["state"] == "away" and page.state["recorded"])
         events = [each["text"] for each in (await page.ask(1, "history"))["value"] if each["module"] == linked.name]
         assert [text.partition(": ")[2].partition(":")[0] for text in events] == ["is away"]
 

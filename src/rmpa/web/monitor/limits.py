@@ -83,6 +83,8 @@ Heartbeats come every 5 s; in a large mesh they are rarer, and probes come."""
 AGENT_SETTLES: Final = 10.0
 """Time after the start of this module's agent in which peers that it has not found yet do not count as lost: beacons
 come every 5 s at the latest, and links take seconds where names or addresses are resolved."""
+LOSS_STANDS: Final = 1.5
+"""Time for which a link must be lost before the history says so: an agent that ends loses its links first."""
 FORGET_AFTER: Final = 600.0
 """Time for which a module that has left the roster keeps its place in the ring."""
 STEADY: Final = 0.03

@@ -37,7 +37,7 @@ class Resources:
     def __init__(self) -> None:
         self.history: list[str] = []
 
-    def record(self, _level: str, text: str, **_whose: str) -> None:
+    def record(self, _level: str, text: str, _at: float, **_whose: str) -> None:
         self.history.append(text)
 
     def alarms(self) -> tuple[Tree, ...]:
@@ -56,7 +56,9 @@ class Feed:
         self.usual = usual
         self.watch = AgentWatch(lambda: self.usual, read_named=self._named)
         self.resources = Resources()
-        self.feed = MeshFeed(self.watch, cast("ResourceWatch", self.resources), lambda _: None)
+        self.feed = MeshFeed(
+            self.watch, cast("ResourceWatch", self.resources), lambda _: None, clock=lambda: self.now
+        )
         self.feed._left_out._clock = lambda: self.now
 
     def _named(self, topics: Sequence[str], services: Sequence[str]) -> Snapshot:
@@ -153,17 +155,20 @@ async def test_a_new_start_of_the_own_agent_is_no_loss_and_a_module_that_stays_a
     feed = Feed(FULL)
     numbers = itertools.count(1)
 
-    def read(uptime: float, *peers: PeerInfo) -> list[str]:
+    def read(now: float, uptime: float, *peers: PeerInfo) -> list[str]:
+        feed.now = now
         agent = msgspec.structs.replace(FULL.agent, uptime=uptime)
-        snapshot = msgspec.structs.replace(FULL, agent=agent, taken=FULL.taken + uptime, peers=peers)
+        snapshot = msgspec.structs.replace(FULL, agent=agent, taken=FULL.taken + now, peers=peers)
         feed.feed._take(Reading(next(numbers), 0.0, snapshot))
         feed.resources.history, told = [], feed.resources.history
         return told
 
     arm, hand = peer("arm"), peer("hand")
-    assert read(100.0, arm, hand) == []
+    assert read(0.0, 100.0, arm, hand) == read(1.0, 101.0) == []  # it ends, and loses its links first
     feed.feed._take(Reading(next(numbers), 0.0, None, "no agent answers; start one"))
-    assert read(1.0) == read(2.0, peer("arm", state="linking", link=None)) == read(3.0, arm) == []
-    assert read(60.0, arm) == ["hand: is away: has left the roster: no beacon and no link"]
-    assert read(61.0, arm, hand) == ["hand: linked"]
+    assert read(3.0, 1.0) == read(4.0, 2.0, peer("arm", state="linking", link=None)) == read(5.0, 3.0, arm) == []
+    assert read(62.0, 60.0, arm) == []
+    assert read(64.0, 62.0, arm) == ["hand: is away: has left the roster: no beacon and no link"]
+    assert read(65.0, 63.0, arm, hand) == ["hand: linked"]
+    assert read(66.0, 64.0, arm) == read(67.0, 65.0, arm, hand) == []  # gone for less than the time that counts
     await feed.close()

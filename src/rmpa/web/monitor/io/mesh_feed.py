@@ -69,6 +69,8 @@ class MeshFeed:
         self._task: asyncio.Task[None] | None = None
         self._wake = asyncio.Event()
         self._links: dict[str, str] = {}
+        self._doubted: dict[str, float] = {}
+        """Since when a link seems lost, by module."""
         self._left_out = LeftOut(watch, self._show)
 
     @property
@@ -150,6 +152,7 @@ class MeshFeed:
             return
         self._number = reading.number
         if reading.snapshot is None:
+            self._doubted.clear()
             if self._silent_since is None:
                 self._silent_since = self._clock()
             builder = self._builder or StateBuilder("")
@@ -175,16 +178,27 @@ class MeshFeed:
                 show(self._state)
 
     def _record_links(self, state: Tree) -> None:
-        """Note in the history which links were lost, and which are back."""
+        """Note in the history which links were lost, and which are back.
+
+        A loss counts once it has stood for a moment: an agent that ends tells for as long that it has no peers.
+        """
         modules = state.get("modules")
+        moment = self._clock()
         for name, module in modules.items() if isinstance(modules, dict) else ():
             if not isinstance(module, dict):
                 continue
             now, before = str(module.get("state", "")), self._links.get(name)
+            level = _LEVELS.get(now, "WARN")
+            if before in (None, now) or level == "OK":
+                since = moment
+                self._doubted.pop(name, None)
+            elif moment - (since := self._doubted.setdefault(name, moment)) < limits.LOSS_STANDS:
+                continue
             self._links[name] = now
             if before not in (None, now) and not {before, now} <= _PARKING:
                 error = str(module.get("error") or "")
                 text = f"{name}: {WORDS.get(now, now)}" + (f": {error}" if error else "")
-                self._resources.record(_LEVELS.get(now, "WARN"), text, module=name)
+                self._resources.record(level, text, since, module=name)
         if isinstance(modules, dict):
             self._links = {name: state for name, state in self._links.items() if name in modules}
+            self._doubted = {name: since for name, since in self._doubted.items() if name in modules}

@@ -138,10 +138,10 @@ class ResourceWatch:
             before = self._since[key] = facts.level, self._now() - max(0.0, lasted)
         return before[1]
 
-    def record(self, level: str, text: str, **whose: str) -> None:
+    def record(self, level: str, text: str, at: float, **whose: str) -> None:
         """Add to the history: of a ``resource``, by its key, or of a ``module``, by its name."""
         self.recorded += 1
-        self.history.append({"at": round(self._now(), 3), "level": level, "text": text, **whose})
+        self.history.append({"at": round(at, 3), "level": level, "text": text, **whose})
 
     # --- inside -----------------------------------------------------------------------------------------------
 
@@ -225,7 +225,7 @@ class ResourceWatch:
     def _alarm(self, key: str, values: Any) -> None:
         for status in map(_status, values["status"]):
             self._since[key] = status["level"], self._now()
-            self.record(status["level"], status["message"], resource=key)
+            self.record(status["level"], status["message"], self._now(), resource=key)
 
 
 def _described(text: str) -> dict[str, Any]:
