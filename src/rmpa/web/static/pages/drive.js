@@ -1,6 +1,6 @@
 // A joystick for a robot. It drives only while it is held; the server stops the robot 0.3 s after the last command.
 
-import { html, useEffect, useRef, useState } from "../vendor/htm-preact.js";
+import { html, useEffect, useRef, useState } from "../markup.js";
 import { entries } from "../state.js";
 import { Page, Panel } from "../parts.js";
 
