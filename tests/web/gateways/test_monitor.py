@@ -377,8 +377,8 @@ async def test_a_setting_is_checked_and_the_page_is_told_what_the_resource_made_
             [(0.5, "speed is 0.5"), (5, "speed is 1.0: 5 is beyond its bounds")], start=1
         ):
             assert (await page.ask(number, "configure", value=value, **setting))["value"]["text"] == told
-        for number, value in enumerate((None, "0,4", True), start=9):
-            refused = await page.ask(number, "configure", value=value, **setting)
+        for number, wrong in enumerate((None, "0,4", True), start=9):
+            refused = await page.ask(number, "configure", value=wrong, **setting)
             assert (refused["op"], "no value of the type double" in refused["error"]) == ("failed", True)
         assert sent == [0.5, 5.0]
 

@@ -290,7 +290,7 @@ async def test_a_page_of_the_monitor_gets_no_denied_parameter_and_changes_none()
         assert "motors" not in shown["values"]
         assert await ask("params", "boss", has=shown["digest"]) == {"digest": shown["digest"]}
         assert "/motors/pid" not in (await ask("param_names", "boss"))["names"]
-        resources.record("WARN", "the lens is hot", resource="/camera")
+        resources.record("WARN", "the lens is hot", 1.0, resource="/camera")
         assert [each["text"] for each in await ask("history", "boss")] == ["the lens is hot"]
         assert await ask("history", "wall") == []
         for what, args in (

@@ -160,7 +160,7 @@ class StateBuilder:
         self._places.update((peer.name for peer in peers if not many or peer.state != "parked"), taken)
         topics, flows = self._topics_and_flows(snapshot.topics)
         nodes = self._nodes.build(snapshot)
-        modules = dict(self._modules(snapshot, peers))
+        modules: Tree = dict(self._modules(snapshot, peers))
         lost = {name for name, module in modules.items() if _is_lost(module)}
         state: Tree = {
             "reach": {"ok": True},
