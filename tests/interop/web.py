@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import itertools
 import json
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -153,7 +154,7 @@ class Monitor(Socket):
     async def ask(self, what: str, **args: Any) -> dict[str, Any]:
         """The server's ``answer``, or its ``failed``."""
         number = next(self._numbers)
-        await self.send("ask", id=number, what=what, args=args)
+        await self.send("ask", id=number, what=what, args=args, at=time.monotonic())
         while True:
             message = await self.next("answer", "failed")
             if message["id"] == number:

@@ -28,6 +28,7 @@ from rmpa.config.service_rules import SERVICE_RULES, ServiceRule
 from rmpa.config.values import (
     BOOL,
     BOUND,
+    COMMAND_AGE,
     CORE_KEEP,
     CORE_MODE,
     CPU,
@@ -303,6 +304,12 @@ class WebSettings:
         BOOL,
         "Let the monitor's joystick command a robot; clients then need the token.",
         env="RMPA_WEB_DRIVE",
+    )
+    command_age_ms: int = setting(
+        0,
+        COMMAND_AGE,
+        "Drop what rosbridge and Foxglove clients publish, call and set if it may be older than this; 0: take all.",
+        env="RMPA_WEB_COMMAND_AGE_MS",
     )
 
 

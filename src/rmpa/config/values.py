@@ -221,6 +221,7 @@ def whole_number(low: int, high: int, what: str, metavar: str = "N") -> ValueTyp
 BOOL: Final = ValueType(read_bool, {"type": "boolean"})
 DOMAIN: Final = whole_number(0, core_limits.DOMAIN_MAX, "a domain id")
 PORT: Final = whole_number(1, 65535, "a port", "PORT")
+COMMAND_AGE: Final = whole_number(0, 60_000, "milliseconds (0: any age)", "MS")
 PORT_OR_ANY: Final = whole_number(0, 65535, "a port (0: any)", "PORT")
 DSCP: Final = whole_number(0, 63, "a DSCP (the TOS byte / 4; CS6 is 48)")
 PACKET_PRIORITY: Final = whole_number(0, 6, "SO_PRIORITY without CAP_NET_ADMIN")

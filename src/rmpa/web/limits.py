@@ -87,6 +87,8 @@ EARLY_MESSAGES: Final = 100
 """Messages of one topic that wait until it is registered and its first subscriber is connected."""
 EARLY_BYTES: Final = 4 * MIB
 """Bytes of these; the oldest is dropped, the newest always fits."""
+EARLY_AGE: Final = 3.0
+"""Time that one of these waits at most, as while the core is away: an older one is dropped, if it is not latched."""
 EARLY_WAIT: Final = 1.0
 """Time that they wait for the first subscriber to connect."""
 PACKAGES_WALKED: Final = 20_000

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import json
 import socket
 import ssl
@@ -14,13 +15,15 @@ from typing import TYPE_CHECKING, Any
 import aiohttp
 
 from rmpa.ros.types.messages import MessageType
-from rmpa.web.hub.rights import READ_ONLY
+from rmpa.web.hub.rights import FULL, READ_ONLY
 from rmpa.web.server.tls import tls_context
 from tests.ros.node.peers import DEADLINE, LATCHED, STRING, until
 from tests.web.gateways.server import Client, Server, running_server
 from tests.web.hub.client import node
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
     from rmpa.ros.core.embedded import RosCore
     from rmpa.ros.node.topics import Publisher
 
@@ -296,6 +299,73 @@ async def test_the_hub_has_nothing_left_of_a_client_that_went(core: RosCore, mon
             await until(lambda: publisher.subscribers == 0 and not core.publishers("/u"))
         assert not server.gateways.connections
         assert not server.hub.topics.names
+
+
+@contextlib.asynccontextmanager
+async def cable(port: int) -> AsyncIterator[tuple[int, asyncio.Event]]:
+    """A port in front of another, and what is set while bytes pass: all others wait, as over a cut."""
+    up, tasks = asyncio.Event(), set[asyncio.Future[None]]()
+    up.set()
+
+    async def pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            while data := await reader.read(1 << 16):
+                await up.wait()
+                writer.write(data)
+        finally:
+            writer.close()
+            with contextlib.suppress(ConnectionError):
+                await writer.wait_closed()
+
+    async def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        there, back = await asyncio.open_connection("127.0.0.1", port)
+        tasks.update(map(asyncio.ensure_future, (pump(reader, back), pump(there, writer))))
+
+    server = await asyncio.start_server(accept, "127.0.0.1", 0)
+    try:
+        yield server.sockets[0].getsockname()[1], up
+    finally:
+        server.close()
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def test_what_tcp_kept_over_a_cut_is_dropped_where_commands_may_not_be_old(core: RosCore) -> None:
+    rights = dataclasses.replace(FULL, command_age=1.0)
+    heard: list[bytes] = []
+    async with (
+        running_server(core, rights) as server,
+        node(core, "robot") as robot,
+        cable(server.port) as (port, up),
+        server.session.ws_connect(f"ws://127.0.0.1:{port}/") as socket,
+    ):
+        await robot.subscribe("/cmd", callback=lambda message: heard.append(message.raw))
+        client = Client(socket)
+        answers: list[dict[str, Any]] = []
+
+        async def read() -> None:
+            async for message in socket:
+                answers.append(json.loads(message.data))  # noqa: PERF401 - each is looked at as it comes
+
+        reading = asyncio.ensure_future(read())  # and answer the pings
+        await client.send("advertise", topic="/cmd", type="std_msgs/String")
+        while not heard:
+            await client.send("publish", topic="/cmd", msg={"data": "go"})
+            await asyncio.sleep(0.02)
+        up.clear()
+        await client.send("publish", topic="/cmd", msg={"data": "old"})
+        await client.send("call_service", service="/rosout/get_loggers", id="old")
+        await asyncio.sleep(1.2)
+        up.set()
+        await until(lambda: any("s late" in str(each.get("values")) for each in answers))
+        assert any(each["op"] == "status" and "/cmd: it may have come" in each["msg"] for each in answers)
+        while not any(b"new" in each for each in heard):
+            await client.send("publish", topic="/cmd", msg={"data": "new"})
+            await asyncio.sleep(0.02)
+        assert not [each for each in heard if b"old" in each]
+        await socket.close()
+        await reading
 
 
 async def test_a_client_without_a_sign_of_life_is_disconnected(core: RosCore, monkeypatch: Any) -> None:

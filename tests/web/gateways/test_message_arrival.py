@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import pytest
+
 from rmpa.web import limits
-from rmpa.web.gateways.message_arrival import MessageArrival
+from rmpa.web.gateways.message_arrival import CommandAge, MessageArrival
 
 LONG = limits.MESSAGE_TIMEOUT
 
@@ -33,3 +35,29 @@ def test_without_a_count_of_bytes_nothing_takes_too_long() -> None:
     arrival = MessageArrival()
     assert not arrival.takes_too_long(0, 0.0)
     assert not arrival.takes_too_long(0, 2 * LONG)
+
+
+def test_a_frame_is_younger_than_the_last_ping_that_was_answered_before_it() -> None:
+    age = CommandAge(10.0)
+    assert age.bound(10.5) == 0.5  # since the handshake
+    first, second, third = age.ping(11.0), age.ping(11.1), age.ping(11.2)
+    assert first is not None
+    assert second is not None
+    assert third is not None
+    assert age.bound(11.2) == pytest.approx(1.2)
+    age.pong(second)  # a client may answer the newest alone
+    assert age.bound(11.3) == pytest.approx(0.2)
+    for payload in (first, second, b"", b"mine", b"12345"):
+        age.pong(payload)
+    assert age.bound(11.3) == pytest.approx(0.2)
+    age.pong(third)
+    assert age.bound(60.0) == pytest.approx(48.8)
+
+
+def test_no_more_pings_wait_than_some_while_a_cut_lasts() -> None:
+    age = CommandAge(0.0)
+    pings = [ping for second in range(60) if (ping := age.ping(float(second))) is not None]
+    assert len(pings) == 8
+    age.pong(pings[-1])
+    assert age.bound(60.0) == 53.0
+    assert age.ping(60.0) is not None

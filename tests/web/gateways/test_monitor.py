@@ -112,7 +112,7 @@ class Page:
         return first
 
     async def ask(self, number: int, what: str, **args: Any) -> dict[str, Any]:
-        await self.send("ask", id=number, what=what, args=args)
+        await self.send("ask", id=number, what=what, args=args, at=asyncio.get_running_loop().time())
         await self.sees(lambda: any(each.get("id") == number for each in self.messages))
         [answer] = [each for each in self.messages if each.get("id") == number]
         self.messages.remove(answer)

@@ -209,6 +209,26 @@ async def test_what_is_published_while_the_node_is_made_anew_is_sent_then(
         await until(lambda: heard[-1] == TWO)
 
 
+async def test_what_waits_too_long_for_the_core_is_not_sent(core: RosCore, monkeypatch: Any) -> None:
+    monkeypatch.setattr("rmpa.web.limits.EARLY_AGE", 0.0)  # all that waits for the registration is too old
+    async with running_hub(core) as hub, node(core, "echo") as echo:
+        heard: list[bytes] = []
+        for topic in ("/cmd", "/state"):
+            await echo.subscribe(topic, callback=lambda message: heard.append(message.raw))
+        client = FakeClient(hub)
+        client.ask(AdvertiseTopic(1, "/cmd", "std_msgs/String"))
+        client.ask(PublishMessage(1, ONE))
+        client.ask(AdvertiseTopic(2, "/state", "std_msgs/String", latch=True))
+        client.ask(PublishMessage(2, TWO))
+        await until(lambda: heard)
+        await until(lambda: core.publishers("/cmd") and core.publishers("/state"))
+        while len(heard) < 2:
+            client.ask(PublishMessage(1, b"\x05\0\0\0three"))
+            await asyncio.sleep(0.01)
+        assert ONE not in heard
+        assert TWO in heard  # the last state counts, however old it is
+
+
 async def test_two_versions_of_a_type_are_kept_apart(core: RosCore) -> None:
     async with running_hub(core) as hub:
         for text in ("float64 a", "int32 b"):

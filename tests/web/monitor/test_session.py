@@ -299,6 +299,19 @@ def test_no_command_counts_twice_or_behind_a_newer_one() -> None:
     assert page.others == []
 
 
+@pytest.mark.parametrize(
+    ("what", "late"), [("call", True), ("set_param", True), ("profile", True), ("params", False)]
+)
+def test_an_order_that_comes_late_is_not_carried_out(what: str, late: bool) -> None:
+    page = Page()
+    page.now += 10
+    frames = page.send("ask", id=1, what=what, at=page.now - limits.ORDER_AGE - 0.1)
+    assert [frame["op"] for frame in frames] == (["failed"] if late else [])
+    assert len(page.others) == (not late)
+    page.send("ask", id=2, what=what, at=page.now - limits.ORDER_AGE)
+    assert page.others[-1].id == 2
+
+
 def test_a_page_learns_the_clock_by_which_it_dates_its_commands() -> None:
     page = Page()
     (hello,) = page.take(page.session.open("pc"))

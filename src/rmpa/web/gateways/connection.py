@@ -17,10 +17,19 @@ from aiohttp import WebSocketError, WSCloseCode, WSMsgType
 from rmpa.core.errors import RmpaError
 from rmpa.web import limits
 from rmpa.web.gateways.frame_writer import FrameWriter
-from rmpa.web.gateways.message_arrival import MessageArrival
+from rmpa.web.gateways.message_arrival import CommandAge, MessageArrival
 from rmpa.web.gateways.websocket_frames import Opcode
 from rmpa.web.hub.fair_queue import FairQueue
-from rmpa.web.hub.requests import ReceivedMessage, Unsubscribe
+from rmpa.web.hub.requests import (
+    CallService,
+    DeleteParam,
+    Failed,
+    FindService,
+    PublishMessage,
+    ReceivedMessage,
+    SetParam,
+    Unsubscribe,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -34,6 +43,8 @@ if TYPE_CHECKING:
     from rmpa.web.hub.rights import Rights
 
 _log = logging.getLogger(__name__)
+_Command: TypeAlias = PublishMessage | CallService | FindService | SetParam | DeleteParam
+"""What may act on a robot; a call without a type begins with the search for it."""
 OutFrame: TypeAlias = "tuple[Opcode, Sequence[Payload]]"
 """A frame for the client: its kind, and its payload in pieces."""
 _OVERHEAD: Final = 128
@@ -42,6 +53,8 @@ _TURN: Final = 16
 """Entries that are written before other tasks have their turn."""
 _SILENT_LOOKS: Final = 3
 """Looks without a sign of life, each after half of ``limits.PING_INTERVAL``."""
+_AGE_PINGS: Final = 4
+"""Pings within the age that a client's commands may have."""
 _INTERNAL_ERROR: Final = 1011
 """A WebSocket's close code, RFC 6455, section 7.4.1."""
 
@@ -59,6 +72,8 @@ class ClientConnection(ABC):
 
     kind = ""
     """The protocol's name, for logs and lists."""
+    dates_commands = False
+    """Whether the protocol itself says how old a command is."""
     timer_waits = True
     """Whether the session's timer waits while the client takes nothing; else the session itself holds back."""
 
@@ -80,6 +95,8 @@ class ClientConnection(ABC):
         self._heard = 0
         self._received: Callable[[], int] = int
         self._arrival = MessageArrival()
+        self._age: CommandAge | None = None
+        self._late_told = -limits.DROPS_SHOWN
         self._priority = priority
         self._unadvertise_delay = unadvertise_delay
         self._wake = asyncio.Event()
@@ -118,6 +135,9 @@ class ClientConnection(ABC):
     def encode(self, message: ReceivedMessage) -> Iterable[OutFrame]:
         """The frames of a message; called when the connection can take them."""
 
+    def show_late(self, text: str) -> None:  # noqa: B027 - not each protocol can tell
+        """Tell the client that what it publishes comes too late."""
+
     @abstractmethod
     def show_drops(self, dropped: dict[str, int]) -> None:
         """Tell the client how many messages of which topics it has missed so far."""
@@ -140,10 +160,11 @@ class ClientConnection(ABC):
         self._queue(handle, frame, size, self.client.subscriptions.get(handle, ""))
 
     def ask(self, request: Request) -> None:
-        """Pass a request on to the hub; what waits for an ended subscription is dropped."""
+        """Pass a request on to the hub, but no command that may be too old; an ended subscription's queue goes."""
         if isinstance(request, Unsubscribe):
             self.queue.end(request.handle)
-        self.hub.ask(self.client, request)
+        if not (isinstance(request, _Command) and self._refuses(request)):
+            self.hub.ask(self.client, request)
 
     def end(self, code: int, reason: str, refusal: str = "") -> None:
         """Close the WebSocket; what the client still sends is ignored.
@@ -225,7 +246,11 @@ class ClientConnection(ABC):
             self._out = FrameWriter(self._transport, writer.drain)
             socket_.before_close = self._out.hand_over
             self.opened()
-            for name, work in (("write to", self._write(socket_, self._out)), ("watch", self._watch())):
+            works = [("write to", self._write(socket_, self._out)), ("watch", self._watch())]
+            if self.rights.command_age and not self.dates_commands:
+                self._age = CommandAge(self._loop.time())
+                works.append(("ask the age of", self._ask_age(self._age)))
+            for name, work in works:
                 tasks.append(self._loop.create_task(work, name=f"{name} {self.client.name}"))
             await self._read(socket_)
         finally:
@@ -249,6 +274,8 @@ class ClientConnection(ABC):
             self._heard += 1
             if self._heard % _TURN == 0:
                 await asyncio.sleep(0)  # frames that have arrived already do not suspend this task
+            if message.type == WSMsgType.PONG and self._age is not None:
+                self._age.pong(bytes(message.data))
             if message.type in (WSMsgType.PING, WSMsgType.PONG):
                 self._arrival.control_frame(len(message.data))
             else:
@@ -301,6 +328,27 @@ class ClientConnection(ABC):
                 self._send(Opcode.PING, ())
         _log.info("= %s gave no sign of life, and is disconnected", self.client.name)
         self._abort()
+
+    async def _ask_age(self, age: CommandAge) -> None:
+        while True:
+            payload = age.ping(self._loop.time())
+            if payload is not None:
+                self._send(Opcode.PING, (payload,))
+            await asyncio.sleep(self.rights.command_age / _AGE_PINGS)
+
+    def _refuses(self, request: _Command) -> bool:
+        """Whether a command may be too old; the client is told."""
+        now, most = self._loop.time(), self.rights.command_age
+        if self._age is None or (age := self._age.bound(now)) <= most:
+            return False
+        text = f"it may have come {age:.1f} s late, more than {most:g} s, and is dropped"
+        remedy = "send it again; command_age_ms of [web] sets the bound"
+        if not isinstance(request, PublishMessage):
+            self.answered(Failed(request.handle, text, remedy))
+        elif now - self._late_told >= limits.DROPS_SHOWN:
+            self._late_told = now
+            self.show_late(f"what was published on {self.client.publishers.get(request.handle, '?')}: {text}")
+        return True
 
     async def _write(self, socket_: FrameSocket, out: FrameWriter) -> None:
         try:

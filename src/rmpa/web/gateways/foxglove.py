@@ -68,6 +68,10 @@ class FoxgloveConnection(ClientConnection):
                 self.ask(each)
         return frames
 
+    def show_late(self, text: str) -> None:
+        """A warning, which a later one replaces."""
+        self.push(_out(self._session.status(StatusLevel.WARNING, text, "late")))
+
     def show_drops(self, dropped: dict[str, int]) -> None:
         """A warning for each topic, which a later one replaces."""
         for topic, count in dropped.items():

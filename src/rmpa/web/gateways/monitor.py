@@ -45,6 +45,7 @@ class MonitorConnection(ClientConnection):
     """
 
     kind = "monitor"
+    dates_commands = True
     timer_waits = False  # the robot is stopped in time, whatever waits for the page
 
     def __init__(

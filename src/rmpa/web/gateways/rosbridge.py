@@ -101,6 +101,11 @@ class RosbridgeConnection(ClientConnection):
         self._flush(arm=not frames)
         return (_out(frame) for frame in frames)
 
+    def show_late(self, text: str) -> None:
+        """A status of the level ``error``."""
+        self._session.warn(text, "error")
+        self._flush()
+
     def show_drops(self, dropped: dict[str, int]) -> None:
         """A status of the level ``warning``."""
         listed = ", ".join(f"{count} of {topic}" for topic, count in dropped.items())

@@ -38,7 +38,7 @@ class _Shared:
     """Numbers its messages; ``None`` while its type is not known."""
     registration: Registration[Publisher] | None = None
     linger: asyncio.TimerHandle | None = None
-    early: deque[Payload] | None = field(default_factory=deque)
+    early: deque[tuple[float, Payload]] | None = field(default_factory=deque)
     """What was published before subscribers were connected; ``None`` from then on."""
     early_bytes: int = 0
     latched: tuple[memoryview, int] | None = None
@@ -152,18 +152,18 @@ class Publishers:
     def _wait(self, shared: _Shared, payload: Payload) -> None:
         if shared.early is None:
             shared.early, shared.early_bytes = deque(), 0
-        shared.early.append(payload)
+        shared.early.append((asyncio.get_running_loop().time(), payload))
         shared.early_bytes += len(payload)
         while len(shared.early) > limits.EARLY_MESSAGES or (
             len(shared.early) > 1 and shared.early_bytes > limits.EARLY_BYTES
         ):
-            shared.early_bytes -= len(shared.early.popleft())
+            shared.early_bytes -= len(shared.early.popleft()[1])
 
     def _number(self, shared: _Shared, kind: MessageType) -> None:
         """The type is known: number and deliver what came before."""
         shared.numbers = HeaderNumbers(kind)
         waiting, shared.early, shared.early_bytes = shared.early or (), deque(), 0
-        for payload in waiting:
+        for _, payload in waiting:
             self.publish(shared.topic, payload)
 
     def _begin(self, topic: str, type_: str, *, latch: bool) -> _Shared:
@@ -197,9 +197,11 @@ class Publishers:
                 async with asyncio.timeout(limits.EARLY_WAIT):
                     await publisher.wait_for_subscriber()
         early, shared.early = shared.early, None
-        for payload in early or ():
+        oldest = asyncio.get_running_loop().time() - limits.EARLY_AGE
+        young = [payload for came, payload in early or () if came >= oldest]  # an old command must not act late
+        for payload in young:
             publisher.publish_raw(payload)
-        if early is None and shared.latched is not None:
+        if not young and shared.latched is not None:
             publisher.publish_raw(shared.latched[0])  # a new node: its subscribers have had it, newcomers have not
         return publisher
 

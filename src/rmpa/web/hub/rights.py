@@ -60,6 +60,7 @@ class Rights:
         drive: Command a robot by the monitor's joystick.
         look: Which topics and parameters it may read; ``None``: all.
         change: What it may publish, call, serve and set, by names; ``None``: all.
+        command_age: Seconds that what it publishes, calls and sets may be old; 0: any age.
     """
 
     publish: bool = False
@@ -72,6 +73,7 @@ class Rights:
     drive: bool = False
     look: ClientRules | None = None
     change: ClientRules | None = None
+    command_age: float = 0.0
 
     def check_look(self, access: Access, name: str) -> None:
         """Check that the client may read something of this name.

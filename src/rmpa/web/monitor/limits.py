@@ -91,6 +91,8 @@ STEADY: Final = 0.03
 """Share by which a figure must change before it is shown anew, so that noise moves nothing."""
 RATE_SMOOTHING: Final = 1.0
 """Time constant of a link's byte rates."""
+ORDER_AGE: Final = 5.0
+"""Seconds that an order of a page may be old: less than the page waits for a word before it gives all up."""
 DRIVE_TIMEOUT: Final = 0.3
 """Time after the last command of a joystick after which the robot is stopped; a joystick sends every 0.1 s."""
 DRIVE_SPEED: Final = 2.0

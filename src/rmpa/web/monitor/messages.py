@@ -49,11 +49,15 @@ class Unwatch(msgspec.Struct, frozen=True, tag_field="op", tag="unwatch"):
 
 
 class AskQuestion(msgspec.Struct, frozen=True, tag_field="op", tag="ask"):
-    """A question or an order that has one answer: ``why``, ``call``, ``params``, ``set_param`` and so on."""
+    """A question or an order that has one answer: ``why``, ``call``, ``params``, ``set_param`` and so on.
+
+    ``at`` is as of ``Drive``.
+    """
 
     id: Id
     what: str
     args: dict[str, Any] = {}  # the edge: each question has its own
+    at: float = 0.0
 
 
 class Log(msgspec.Struct, frozen=True, tag_field="op", tag="log"):

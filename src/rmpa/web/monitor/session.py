@@ -69,6 +69,8 @@ _PERMISSIONS = {
     "resource": "configure_resources",
 }
 
+_CHANGES = ("call", "param", "resource")
+"""Rights of orders: one that TCP kept over a cut must not act long after the page has given it up."""
 _NO_TOKEN = "this page may not read parameters", "open it with a token: rmpa web --token-file FILE, or --control"
 _NO_CONTROL = "this page may only look", "start rmpa web with --control"
 
@@ -192,7 +194,7 @@ class MonitorSession:
             if self._watches.pop(message.id, None):
                 yield requests.Unsubscribe(message.id)
         elif isinstance(message, AskQuestion):
-            yield from self._ask(message)
+            yield from self._ask(message, now)
         elif isinstance(message, Log):
             if message.on:
                 self._rights.check_look(Access.SUBSCRIBE, LOG_TOPIC)
@@ -213,12 +215,16 @@ class MonitorSession:
         self._watches[message.id] = WatchState(message, self._decode)
         yield requests.Subscribe(message.id, message.topic)
 
-    def _ask(self, message: AskQuestion) -> Iterator[Output]:
+    def _ask(self, message: AskQuestion, now: float) -> Iterator[Output]:
         needed = QUESTIONS.get(message.what)
         if needed is None:
             raise RemoteProtocolError(f"there is no question {message.what[:40]!a}")
         if needed and needed not in permissions(self._rights):
             yield self._failed(message.id, *(_NO_TOKEN if needed == "read_params" else _NO_CONTROL))
+        elif needed in _CHANGES and now - message.at > limits.ORDER_AGE:
+            late = min(now - message.at, now - self._opened)
+            text = f"the order may have come {late:.0f} s late, and is not carried out"
+            yield self._failed(message.id, text, "look at what is, and repeat it")
         elif message.id in self._questions or len(self._questions) >= limits.ASKS_MAX:
             yield self._failed(message.id, f"{len(self._questions)} questions wait for an answer already")
         else:

@@ -143,9 +143,9 @@ class RosbridgeSession:
         self.refused = True
         self._context.status("error", "the client must authenticate first, by the op 'auth'", op.id)
 
-    def warn(self, text: str) -> None:
-        """Send a status of the level ``warning``, if the client wants those."""
-        self._context.status("warning", text)
+    def warn(self, text: str, level: str = "warning") -> None:
+        """Send a status of the server's own, if the client wants those of its level."""
+        self._context.status(level, text)
 
     def _set_level(self, op: protocol.SetLevel) -> None:
         if op.level not in LEVELS:

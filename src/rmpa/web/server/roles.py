@@ -35,6 +35,7 @@ class WebRoles:
         strict = _with_groups(settings.trust, settings.web_tokens)
         lax = replace(strict, default=Effect.ALLOW.value)
         self._strict, self._lax = Permissions(strict), Permissions(lax)
+        self._command_age = web.command_age_ms / 1000
         own = self._own(control=web.control, drive=web.drive) if has_token else READ_ONLY
         rules = ClientRules(OWN_CLIENT_NAME, self._lax)
         self._rights = {"": replace(own, look=rules, change=rules) if trusted else own}
@@ -48,16 +49,15 @@ class WebRoles:
         """
         return self._rights.get(client, READ_ONLY)
 
-    @staticmethod
-    def _own(*, control: bool, drive: bool) -> Rights:
-        return replace(FULL if control else _LOOKS, drive=drive)
+    def _own(self, *, control: bool, drive: bool) -> Rights:
+        return replace(FULL if control else _LOOKS, drive=drive, command_age=self._command_age)
 
     def _of(self, token: WebToken) -> Rights:
         look = ClientRules(token.name, self._lax)
         if token.role is WebRole.VIEWER:
             return replace(_LOOKS, look=look)
         change = look if token.role is WebRole.ADMIN else ClientRules(token.name, self._strict)
-        return replace(FULL, drive=True, look=look, change=change)
+        return replace(FULL, drive=True, look=look, change=change, command_age=self._command_age)
 
 
 def _with_groups(trust: TrustSettings, tokens: Sequence[WebToken]) -> TrustSettings:

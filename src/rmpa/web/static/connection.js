@@ -140,7 +140,7 @@ export class Connection {
 
   // The server's clock, behind by what the fastest of the last ticks took: a command that says it is at most as old as it seems.
   serverTime() {
-    return performance.now() / 1000 - Math.min(...this.ticks);
+    return this.ticks.length ? performance.now() / 1000 - Math.min(...this.ticks) : 0;
   }
 
   // The acknowledgement is sent when the browser has drawn: the server waits for it before it sends more than one further patch.
@@ -192,7 +192,7 @@ export class Connection {
       if (this.phase !== "open") return reject({ error: "there is no connection to rmpa web", remedy: "Nothing was sent." });
       const timer = setTimeout(() => this.settle(id)?.reject({ error: "no answer came within 30 s", remedy: "" }), ANSWER_WAIT);
       this.questions.set(id, { resolve, reject, timer });
-      this.send({ op: "ask", id, what, args });
+      this.send({ op: "ask", id, what, args, at: this.serverTime() });
     });
   }
 
