@@ -46,6 +46,46 @@ def until_dial(peering: Peering, now: float) -> tuple[float, tuple[str, int]]:
     return now, made[0]
 
 
+def dialled_after_silence(count: int, *, needed: bool = True, seconds: float = 12.0) -> list[tuple[float, Dial]]:
+    """The dials to peers whose links fell silent at 0 s; each of them fails after ``limits.REDIAL_TIMEOUT``."""
+    peering = of(LOW)
+    for number in range(1, count + 1):
+        identity = Identity(Guid.of(f"10.1.{number}.2", 40002), bytes([number]) * 16, f"peer{number}")
+        peering.peer_found(identity, -100.0)
+        peering.link_up(number, identity, -99.0, dialled=True, endpoint=identity.guid.endpoint)
+    peering.take()
+    for number in range(1, count + 1):
+        peering.link_down(number, "silent", 0.0, silent=True, needed=needed)
+    made: list[tuple[float, Dial]] = []
+    failing: list[tuple[float, Dial]] = []
+    for now in (tick / 100 for tick in range(round(100 * seconds))):
+        while failing and failing[0][0] <= now:
+            peering.dial_failed(failing.pop(0)[1].guid, "no answer", now)
+        peering.handle_timer(now)
+        new = [output for output in peering.take() if isinstance(output, Dial)]
+        made += [(now, dial) for dial in new]
+        failing += [(now + limits.REDIAL_TIMEOUT, dial) for dial in new]
+    return made
+
+
+def test_a_needed_peer_that_fell_silent_is_dialled_by_short_attempts() -> None:
+    """A long attempt that began shortly before the network is back waits a second for TCP's own repetition."""
+    made = dialled_after_silence(1)
+    times = [at for at, dial in made if dial.briefly]
+    assert times[-1] > limits.PURSUIT - 0.5
+    assert max(b - a for a, b in itertools.pairwise([0.0, *times])) <= 0.31
+    assert all(dial.briefly == (at < limits.PURSUIT) for at, dial in made)
+    assert not any(dial.briefly for _, dial in dialled_after_silence(1, needed=False))
+
+
+def test_many_peers_that_fall_silent_share_the_attempts() -> None:
+    made = dialled_after_silence(64)
+    first = {dial.guid: at for at, dial in reversed(made)}
+    assert len(first) == 64
+    assert max(first.values()) < 1.0
+    assert len(made) < limits.PURSUIT * limits.PURSUITS_PER_SECOND
+
+
 def test_higher_guid_dials_later() -> None:
     low, high = of(LOW), of(HIGH)
     low.peer_found(HIGH, 0.0)

@@ -177,8 +177,8 @@ class Keepalive:
         """When to check next: at the next ping, or at the end of the lease.
 
         While the connection is up and neither side changes the pace, this time may only move to a later one, because
-        the driver does not arm its timer again after each receive. The same timer checks the path MTU and whether the
-        peer is gone, so its interval stays below ``quiet_after``.
+        the driver does not arm its timer again after each receive. The same timer checks whether the peer is gone, so
+        its interval stays below ``quiet_after``.
         """
         if self._burst:
             next_ping = self._pinged + limits.WAKE_PING_INTERVAL

@@ -129,9 +129,17 @@ REDIAL_TIMEOUT: Final = 0.2
 repetition, which takes a second."""
 REDIAL_PAUSE: Final = 0.05
 """Pause between attempts to reconnect to a silent peer, where the kernel reports at once that there is no route."""
+PURSUIT: Final = 10.0
+"""A peer whose link was in use and fell silent is dialled by attempts of REDIAL_TIMEOUT for this long: the network is
+often back within seconds, and a longer attempt that began shortly before would wait for TCP's own repetition."""
+PURSUITS_PER_SECOND: Final = 200.0
+"""Such attempts a second to all these peers together, half a millisecond each: 64 peers whose network failed at once
+are dialled every 0.5 s, and take less than a tenth of a core for ten seconds."""
 AWAY_GRACE: Final = 0.5
-"""A peer whose link fell silent keeps its proxies in the local graph for this long. After an interruption of a second
-the next link is up within this time, and no node has to connect again."""
+"""A peer whose agent died keeps its proxies in the local graph for this long: it may be started again at once."""
+SILENT_GRACE: Final = 5.0
+"""A peer whose link fell silent keeps its proxies in the local graph for this long: a radio that was away for some
+seconds is back within this time, and no node has to connect again. A peer that ends says so, and leaves at once."""
 KEEP_ALL_MESSAGES: Final = 1_000_000
 """The number of messages that "all" means for a contract's history; the bound in bytes is reached first."""
 BULK_STALE_AGE: Final = 0.5

@@ -11,6 +11,7 @@ is bounded over all of them. Peers that were linked before are dialled at once.
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -91,6 +92,7 @@ class _Peer:
     tried: set[SocketAddress] = field(default_factory=set)
     next_attempt: float | None = None
     forget_at: float | None = None
+    pursued_until: float = -math.inf  # dialled by short attempts until then
     attempts: int = 0
     last_error: str = ""
     last_endpoint: SocketAddress | None = None
@@ -128,6 +130,8 @@ class Peering:
         self._never_dialled: dict[int, None] = {}
         """The peers of the queue that were never dialled."""
         self._newest_next = True
+        self._pursued: set[int] = set()
+        """Peers whose links were in use and fell silent within ``limits.PURSUIT``."""
         self._queue_at: float | None = None
         self._dial_rate = TokenBucket(limits.DIAL_STRANGERS_RATE, limits.DIAL_STRANGERS_BURST)
 
@@ -248,6 +252,7 @@ class Peering:
             peer.lower = self._ours.guid < identity.guid
             peer.backoff.reset()
         peer.link = new
+        self._end_pursuit(peer)
         peer.forget_at = peer.refused = None
         peer.parked = False
         self._dial_at(peer, None)
@@ -259,7 +264,16 @@ class Peering:
         self._by_link[link_id] = peer
         self._outputs.append(LinkUp(link_id, identity))
 
-    def link_down(self, link_id: int, reason: str, now: float, *, silent: bool = False, parked: bool = False) -> None:
+    def link_down(
+        self,
+        link_id: int,
+        reason: str,
+        now: float,
+        *,
+        silent: bool = False,
+        parked: bool = False,
+        needed: bool = False,
+    ) -> None:
         """Handle the end of a link; without effect for a link that was replaced or never up.
 
         Args:
@@ -268,6 +282,7 @@ class Peering:
             now: Monotonic seconds.
             silent: Whether the link ended by silence: the path to the peer failed, and may work again at once.
             parked: Whether both sides ended it for now: an announced peer is not dialled until ``want``.
+            needed: Whether something at either side depended on it, so that the peer is worth many attempts.
         """
         peer = self._by_link.get(link_id)
         if peer is None or peer.link is None:
@@ -291,8 +306,11 @@ class Peering:
         if not peer.announced:
             peer.forget_at = now + limits.FORGET_UNANNOUNCED
             self._set_timer(peer)
+        if silent and needed:
+            peer.pursued_until = now + limits.PURSUIT
+            self._pursued.add(peer.identity.guid.place)
         if not peer.dialling:
-            self._dial_at(peer, now + self._pause(peer) + (0.0 if peer.lower else limits.DIAL_FALLBACK))
+            self._dial_at(peer, now + self._pause(peer, now) + (0.0 if peer.lower else limits.DIAL_FALLBACK))
 
     def dial_failed(self, guid: Guid, error: str, now: float, endpoint: SocketAddress | None = None) -> None:
         """Handle a ``Dial`` without an answer, or whose connection ended before its handshake was done.
@@ -320,7 +338,7 @@ class Peering:
         if refuse.code == Refusal.ALREADY_LINKED:
             # The peer has a link that was lost here (it ends within the lease), or that is about to be accepted here.
             if peer.link is None:
-                self._dial_at(peer, now + max(limits.EXPRESS_LEASE, self._pause(peer)))
+                self._dial_at(peer, now + max(limits.EXPRESS_LEASE, self._pause(peer, now)))
             return
         if refuse.code in _UNPROVEN or not proved:
             peer.refused = refuse
@@ -401,6 +419,7 @@ class Peering:
         peer.forget_at = None
         self._dial_at(peer, None)
         if peer.link is None and not peer.dialling:
+            self._end_pursuit(peer)
             self._peers.pop(peer.identity.guid.place, None)
             self._unverified.discard(peer.identity.guid.place)
 
@@ -477,7 +496,7 @@ class Peering:
         if peer.tried.issuperset(peer.endpoints()):
             peer.tried.clear()
             peer.good = None
-            self._dial_at(peer, now + self._pause(peer))
+            self._dial_at(peer, now + self._pause(peer, now))
         else:
             self._dial_at(peer, now)
 
@@ -489,9 +508,23 @@ class Peering:
             return limits.BACKOFF_MAX
         return max(limits.BACKOFF_MAX, len(self._unverified) / limits.DIAL_STRANGERS_RATE)
 
-    def _pause(self, peer: _Peer) -> float:
+    def _pause(self, peer: _Peer, now: float) -> float:
+        if self._is_pursued(peer, now):
+            shared = len(self._pursued) / limits.PURSUITS_PER_SECOND
+            return max(limits.REDIAL_PAUSE, shared) * (0.5 + self._rng())
         peer.backoff.cap = self._cap(peer)
         return peer.backoff.delay()
+
+    def _end_pursuit(self, peer: _Peer) -> None:
+        peer.pursued_until = -math.inf
+        self._pursued.discard(peer.identity.guid.place)
+
+    def _is_pursued(self, peer: _Peer, now: float) -> bool:
+        """Whether a peer is dialled by short attempts, many of them."""
+        if now < peer.pursued_until:
+            return True
+        self._pursued.discard(peer.identity.guid.place)
+        return False
 
     def _set_timer(self, peer: _Peer) -> None:
         place = peer.identity.guid.place
@@ -512,7 +545,7 @@ class Peering:
         if due is None or now < due or peer.link is not None or peer.dialling:
             return
         if peer.verified:
-            self._dial(peer)
+            self._dial(peer, briefly=self._is_pursued(peer, now))
             return
         place = peer.identity.guid.place
         self._dial_queue[place] = None
@@ -536,7 +569,7 @@ class Peering:
             self._dial(peer)
         self._queue_at = self._dial_rate.next(now) if self._dial_queue else None
 
-    def _dial(self, peer: _Peer) -> None:
+    def _dial(self, peer: _Peer, *, briefly: bool = False) -> None:
         self._dial_at(peer, None)
         left = [e for e in peer.endpoints() if e not in peer.tried]
         if not left:
@@ -545,7 +578,7 @@ class Peering:
         peer.dialling = tuple(left)
         peer.last_endpoint = left[0]
         peer.attempts += 1
-        self._outputs.append(Dial(peer.identity.guid, peer.dialling))
+        self._outputs.append(Dial(peer.identity.guid, peer.dialling, briefly))
 
 
 def _status(peer: _Peer) -> PeerStatus:

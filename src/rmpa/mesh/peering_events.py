@@ -22,10 +22,12 @@ class Dial:
     Args:
         guid: The peer.
         endpoints: Its endpoints, best first; a peer with several addresses may be reachable at some of them only.
+        briefly: Whether to give up after one short attempt at each, because the next ``Dial`` follows soon.
     """
 
     guid: Guid
     endpoints: tuple[SocketAddress, ...]
+    briefly: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.wire.xmlrpc import RosReply
 
-GRACE = mesh_limits.AWAY_GRACE
+GRACE = mesh_limits.SILENT_GRACE
 
 
 class Keeper(Part):
@@ -62,7 +62,7 @@ class Link:
         self.identity = Identity(Guid.of(host, 1000), bytes([run_number]) * 16, self.name)
         self.guid = self.identity.guid
         self.silent = silent
-        self.parked = False
+        self.parked = self.crashed = False
         self.held: list[bytes] = []
 
 
@@ -182,6 +182,19 @@ def test_a_session_that_nothing_waits_for_ends_after_the_grace() -> None:
     assert play(scene) == ["up 1", "down", "grace over", "gone", "up 2"]
 
 
+def test_a_peer_whose_agent_died_has_a_short_grace() -> None:
+    async def scene(made: Scene) -> None:
+        link = made.link()
+        link.crashed = True
+        made.sessions.link_down(link)
+        await asyncio.sleep(mesh_limits.AWAY_GRACE / 2)
+        assert made.states() == [PeerState.SILENT]
+        await asyncio.sleep(mesh_limits.AWAY_GRACE)
+        assert made.states() == []
+
+    assert play(scene) == ["up 1", "down", "grace over", "gone"]
+
+
 def test_a_link_that_was_closed_in_order_has_no_grace() -> None:
     async def scene(made: Scene) -> None:
         made.sessions.link_down(made.link(silent=False))
@@ -204,7 +217,7 @@ def test_a_session_waits_for_as_long_as_something_is_kept() -> None:
 def test_another_run_of_the_peer_ends_the_session_that_waits() -> None:
     async def scene(made: Scene) -> None:
         made.sessions.link_down(made.link(1))
-        await asyncio.sleep(1.0)
+        await asyncio.sleep(GRACE + 1.0)
         link = made.link(2)
         assert made.states() == [PeerState.LINKED]
         [session] = made.sessions.linked()

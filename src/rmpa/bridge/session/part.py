@@ -47,7 +47,7 @@ class Part:
         """A link is gone; the peer may come back."""
 
     def grace_over(self, session: PeerSession) -> bool:  # noqa: ARG002 - for those that override it
-        """The peer is not back within ``mesh.limits.AWAY_GRACE``, or its link ended otherwise than by silence.
+        """The peer is not back within ``mesh.limits.SILENT_GRACE``, or its link ended otherwise than by silence.
 
         Returns:
             Whether the part keeps something for the peer: then the session waits.

@@ -21,7 +21,7 @@ class PeerState(Enum):
 
     ::
 
-    LINKED ──silence──► SILENT ──AWAY_GRACE──► AWAY ──nothing waits any more──► (gone)
+    LINKED ──silence──► SILENT ──SILENT_GRACE► AWAY ──nothing waits any more──► (gone)
       ▲  ├──closed in order──────────────────►  │
       ├──┼────────────── a new link ────────────┘   (from SILENT, too)
       │  └──both agree──► PARKED ──wanted──► WANTED ──WANT_GRACE──► AWAY
@@ -31,7 +31,7 @@ class PeerState(Enum):
     LINKED = auto()
     """The peer has a link."""
     SILENT = auto()
-    """Its link ended by silence; most peers are back within ``mesh.limits.AWAY_GRACE``."""
+    """Its link ended by silence; most peers are back within ``mesh.limits.SILENT_GRACE``."""
     PARKED = auto()
     """Both sides ended the link, as nothing needed it; the peer is there, and is linked again when it is wanted."""
     WANTED = auto()

@@ -155,7 +155,7 @@ class PeerSessions:
         return None
 
     def link_down(self, link: PeerLink) -> None:
-        """Detach a link that is gone; after silence its session waits for ``mesh.limits.AWAY_GRACE``."""
+        """Detach a link that is gone; after silence its session waits for ``mesh.limits.SILENT_GRACE``."""
         session = self._by_link.pop(link, None)
         if session is None:
             return
@@ -171,7 +171,7 @@ class PeerSessions:
             if link.held:
                 self.want(session)
         elif link.silent:
-            session.wait = mesh_limits.AWAY_GRACE
+            session.wait = mesh_limits.AWAY_GRACE if link.crashed else mesh_limits.SILENT_GRACE
             self._timer.arm()
         else:
             self._grace_over(session)

@@ -372,7 +372,8 @@ class Mesh:
             link.crashed = link.crashed or connection.crashed
             if discarded := link.discard():
                 self.counters.add("link.discarded", discarded)
-            self._peering.link_down(link.id, reason, now, silent=link.silent)
+            needed = link.lease <= limits.EXPRESS_LEASE  # that of a link at rest is longer
+            self._peering.link_down(link.id, reason, now, silent=link.silent, needed=needed)
         self._act(link)
 
     def _used(self, connection: Connection) -> PeerLink | None:
@@ -476,10 +477,12 @@ class Mesh:
         places = ", ".join(f"{host}:{port}" for host, port in dial.endpoints)
         _log.debug("> dialling %s at %s", dial.guid, places)
         try:
-            sock, endpoint = await self.dialler.dial(dial.endpoints)
+            connect = self.dialler.redial if dial.briefly else self.dialler.dial
+            sock, endpoint = await connect(dial.endpoints)
         except OSError as error:
             self.counters.add("link.dial_failed")
-            problem = os.strerror(error.errno) if error.errno else f"no answer within {limits.DIAL_TIMEOUT:g} s"
+            within = limits.REDIAL_TIMEOUT if dial.briefly else limits.DIAL_TIMEOUT
+            problem = os.strerror(error.errno) if error.errno else f"no answer within {within:g} s"
             self._peering.dial_failed(dial.guid, f"{places}: {problem}", self._clock.now())
             self._act()
             return

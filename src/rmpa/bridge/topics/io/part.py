@@ -277,7 +277,7 @@ class Topics(Part):
         )
 
     def link_down(self, session: PeerSession) -> None:
-        """Suspends the peer's routes; after silence its sources stay in the local graph for ``AWAY_GRACE``."""
+        """Suspends the peer's routes; after silence its sources stay in the local graph for ``SILENT_GRACE``."""
         peer, crashed = session.peer, session.link.crashed
         self.direct_imports.link_down(session, crashed=crashed)
         self.direct_exports.link_down(session, crashed=crashed)
