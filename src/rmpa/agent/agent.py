@@ -26,6 +26,8 @@ from rmpa.bridge.policy import Policy
 from rmpa.bridge.services.io.part import Services
 from rmpa.bridge.services.rules import ServiceRules
 from rmpa.core.counters import Counters
+from rmpa.observe.check import WARN
+from rmpa.observe.doctor.stale_connections import judge_stale_connections
 from rmpa.observe.io.agent_requests import AgentRequests
 from rmpa.observe.io.control_operations import ControlOperations
 from rmpa.observe.io.control_server import ControlServer
@@ -41,6 +43,7 @@ from rmpa.ros.node.logger_services import LoggerServices
 from rmpa.runtime.free_memory import FreeMemory
 from rmpa.runtime.garbage_collector import GarbageCollector
 from rmpa.runtime.system_clock import SystemClock
+from rmpa.runtime.tcp_connections import may_end_connections
 from rmpa.trust.permissions import Permissions
 
 if TYPE_CHECKING:
@@ -185,6 +188,7 @@ class Agent:
         """
         for note in permission_notes(self._settings, secured=self.bridge.gate.on):
             _log.warning("! %s", note)
+        self._warn_of_stale_connections()
         async with contextlib.AsyncExitStack() as undo:
             self._control.lock()
             undo.push_async_callback(self._control.close)
@@ -232,9 +236,18 @@ class Agent:
         for notes in self.other_notes:
             yield from notes()
 
+    def _warn_of_stale_connections(self) -> None:
+        """Say beforehand what happens when the host of a direct subscriber vanishes, if the agent may not end it."""
+        problem = may_end_connections() if self._settings.allows_direct else ""
+        for check in judge_stale_connections({"": problem}, "", direct=True):
+            if check.level is WARN:
+                _log.warning("! %s; %s", check.text, check.remedy)
+
     def apply_settings(self, settings: Settings) -> None:
         """Take settings that were read again; only those of ``agent.reload.LIVE`` differ."""
-        self._settings = settings
+        before, self._settings = self._settings, settings
+        if not before.allows_direct:
+            self._warn_of_stale_connections()
         logging.getLogger().setLevel(settings.log_level.upper())
         for part in (self.bridge, self.snapshots, self._why, self._nodes):
             part.reload(settings)
