@@ -158,6 +158,10 @@ METRIC_SERVICES: Final = 1000
 """Services in /metrics, each with some six time series."""
 METRIC_REASONS: Final = 256
 """Counters of what was refused or dropped in /metrics; there are some hundred."""
+METRIC_ROUTES_IN_THREAD: Final = 300
+"""Routes up to which /metrics is made in a thread of the server, in some 50 ms; beyond, in a process of its own."""
+METRIC_PROCESS_TIMEOUT: Final = 20.0
+"""Time for that process, which else is ended; then a thread does it."""
 METRIC_FORMATS: Final = 4
 """Formats of /metrics that are kept for the scrapes of one snapshot; clients ask for two."""
 METRIC_LABEL_CHARACTERS: Final = 256

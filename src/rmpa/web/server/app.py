@@ -18,7 +18,7 @@ from aiohttp.abc import AbstractAccessLogger
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.web import limits, rest
 from rmpa.web.gateways.gateways import MONITOR_PATH, is_upgrade
-from rmpa.web.metrics import content_type, exposition
+from rmpa.web.metrics import content_type
 from rmpa.web.server.auth import (
     TOKEN_PARAMETER,
     AccessPolicy,
@@ -30,7 +30,8 @@ from rmpa.web.server.auth import (
     is_loopback,
 )
 from rmpa.web.server.connections import GuardedConnection
-from rmpa.web.server.figures import Figures, web_metrics
+from rmpa.web.server.figures import Figures
+from rmpa.web.server.metrics_process import make_metrics
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -264,12 +265,11 @@ class Routes:
     async def _metrics(self, request: web.Request) -> web.Response:
         accept = request.headers.get("Accept", "")
         reading = await self._watch.reading()
-        async with self._encoding:  # thousands of time series take a tenth of a second: once for all, in a thread
+        async with self._encoding:  # once for all
             form = content_type(accept)
             made = self._encoded.get(form)
             if made is None or made[0] != reading.number:
-                figures = tuple(web_metrics(self._figures()))
-                body, kind = await asyncio.to_thread(exposition, reading.snapshot, accept, figures)
+                body, kind = await make_metrics(reading.snapshot, accept, self._figures())
                 made = (reading.number, body, kind)
                 self._encoded = {key: each for key, each in self._encoded.items() if each[0] == reading.number}
                 if len(self._encoded) < limits.METRIC_FORMATS:
