@@ -111,10 +111,13 @@ def no_blocking() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="session")
-def state_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where programs of the tests keep what is to survive their end."""
-    return tmp_path_factory.mktemp("state")
+@pytest.fixture(scope="session", autouse=True)
+def state_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Where programs of the tests keep what is to survive their end, those of fixtures of a module too."""
+    home = tmp_path_factory.mktemp("state")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(home))
+        yield home
 
 
 @pytest.fixture(autouse=True)

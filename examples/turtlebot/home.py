@@ -38,7 +38,8 @@ class Home:
     @property
     def variables(self) -> dict[str, str]:
         """The environment's part that keeps agents and resources to this directory."""
-        return {"RMPA_RUNTIME_DIR": str(self.agents), "RMPA_STATE_DIR": str(self.path / "state")}
+        state = str(self.path / "state")
+        return {"RMPA_RUNTIME_DIR": str(self.agents), "RMPA_STATE_DIR": state, "XDG_STATE_HOME": state}
 
     @property
     def settings(self) -> Path:

@@ -115,6 +115,7 @@ class Agent:
         places = {
             "RMPA_RUNTIME_DIR": str(self.runtime_dir),
             "RMPA_STATE_DIR": str(self.home / "state" / self.host.name),
+            "XDG_STATE_HOME": str(self.home / "state" / self.host.name),  # each host is a machine of its own
         }
         return {**kept, **places, "PYTHONUNBUFFERED": "1"}
 

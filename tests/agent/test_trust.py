@@ -16,7 +16,7 @@ pytest.importorskip("cryptography")
 
 from rmpa.agent import Agent
 from rmpa.agent.trust import RENEW, read_refusal, trust_store
-from rmpa.config.settings import Multicast, Settings, TrustSettings
+from rmpa.config.settings import Multicast, Settings, TrustSettings, WebSettings
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError
 from rmpa.ros.node.node import Node
 from rmpa.runtime.system_clock import SystemClock
@@ -25,6 +25,7 @@ from rmpa.trust.documents import DocumentKind
 from rmpa.trust.io import store as files_of
 from rmpa.trust.io.authority import found_mesh
 from rmpa.trust.io.joining import join_mesh
+from rmpa.trust.page_names import page_hosts
 from rmpa.trust.spreading import Notice
 from rmpa.trust.tokens import Token
 
@@ -231,10 +232,13 @@ async def test_a_member_cannot_keep_the_authority_busy_with_renewals(tmp_path: P
         trust = arm.trust
         assert trust is not None
         await until(lambda: trust.authority_name() == "base")
-        for _ in range(limits.RENEWALS_BURST):
-            await fleet.command("arm", "renew")
+
+        async def renew_often() -> None:
+            for _ in range(limits.RENEWALS_BURST + 1):
+                await fleet.command("arm", "renew")
+
         with pytest.raises(RmpaError, match="asks for certificates too often"):
-            await fleet.command("arm", "renew")
+            await renew_often()
 
 
 async def test_a_member_that_says_it_is_the_authority_is_not_believed(tmp_path: Path) -> None:
@@ -306,7 +310,9 @@ async def test_two_users_compare_the_code_over_the_control_socket(tmp_path: Path
 
 async def test_a_module_without_trust_is_not_linked_and_told_why(tmp_path: Path) -> None:
     async with a_fleet(tmp_path) as fleet:
-        plain = await fleet.start("plain")
+        with pytest.raises(StartError, match=r"the module plain: has no keys, .* beside keys of base"):
+            await fleet.start("plain")
+        plain = await fleet.start("plain", trust=TrustSettings(insecure=True))
         base = fleet.agents["base"]
         await until(lambda: base.snapshots.build().counters.get("beacon.untagged"))
         await until(lambda: _refusals(base, "plain"))
@@ -370,3 +376,34 @@ def test_a_copied_folder_of_another_module_is_named(tmp_path: Path) -> None:
     store.folder.parent.rename(tmp_path / "state" / "gripper")
     with pytest.raises(StartError, match=r"is of arm, but this agent is named gripper; start it with --name arm"):
         Agent(fleet.settings("gripper"))
+
+
+async def test_the_certificate_is_for_the_hosts_of_the_page_and_for_no_other_modules(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    addresses = {"base": "10.1.1.1", "arm": "10.1.1.2"}
+    web = WebSettings(hosts=("Panel.local", "www.example.com", "base"))
+
+    def hosts(agent: Agent) -> tuple[str, ...]:
+        settings = agent._settings
+        return page_hosts((addresses[settings.name], "10.9.9.9", *settings.web.hosts))
+
+    monkeypatch.setattr(Agent, "_page_hosts", hosts)
+    async with a_fleet(tmp_path) as fleet:
+        await until(lambda: _hosts(fleet.agents["base"]) >= {"10.1.1.1", "10.9.9.9"})
+        arm = await fleet.add("arm", web=web)
+        await fleet.linked("base", "arm")
+        await until(lambda: "10.1.1.2" in _hosts(arm))
+        own = {"arm", "arm.local", "localhost", "127.0.0.1", "10.1.1.2", "panel.local"}
+        assert _hosts(arm) == own, "neither a host of the Internet nor one of base"
+        # An address that changes is in it when the agent looks next.
+        addresses["arm"] = "10.1.1.3"
+        assert arm.trust is not None
+        arm.trust.look_now()
+        await until(lambda: "10.1.1.3" in _hosts(arm))
+        assert "10.1.1.2" not in _hosts(arm)
+
+
+def _hosts(agent: Agent) -> frozenset[str]:
+    assert agent.trust is not None
+    return agent.trust.membership.certificate.hosts

@@ -237,7 +237,7 @@ def test_a_token_that_cannot_be_used(machine: Callable[[str], Machine]) -> None:
 def test_errors_of_json_and_of_options(machine: Callable[[str], Machine]) -> None:
     arm = machine("arm")
     assert arm.status()["on"] is False
-    assert "trust is off: arm has joined no secured mesh" in arm.trust("status")
+    assert "trust is off: arm (name in rmpa.toml) has joined no secured mesh" in arm.trust("status")
     for words, arguments, code in (
         ("needs a TOKEN, --request or --accept", ("join",), 2),
         ("is not a time up to 30 d", ("invite", "--for", "1y"), 2),

@@ -24,6 +24,7 @@ from rmpa.config.settings import (
     RealtimeSettings,
     Ros2Settings,
     Settings,
+    TrustSettings,
     WebSettings,
 )
 from rmpa.config.sources import Loaded, find_config_file, load_settings
@@ -219,6 +220,7 @@ def test_every_flag(load: Load) -> None:
         multicast=Multicast(False),
         log_level="error",
         log_json=True,
+        trust=TrustSettings(insecure=True),  # rmpa gateway --insecure means its connections and its start
         realtime=RealtimeSettings(True),
         web=WebSettings(True),
         gateway=GatewaySettings(

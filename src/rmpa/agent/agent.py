@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import os
 import random
+import socket
 import time
 from typing import TYPE_CHECKING, Final
 
@@ -26,6 +28,7 @@ from rmpa.bridge.policy import Policy
 from rmpa.bridge.services.io.part import Services
 from rmpa.bridge.services.rules import ServiceRules
 from rmpa.core.counters import Counters
+from rmpa.discovery.io.interfaces import list_interfaces
 from rmpa.observe.check import WARN
 from rmpa.observe.doctor.stale_connections import judge_stale_connections
 from rmpa.observe.io.agent_requests import AgentRequests
@@ -44,6 +47,7 @@ from rmpa.runtime.free_memory import FreeMemory
 from rmpa.runtime.garbage_collector import GarbageCollector
 from rmpa.runtime.system_clock import SystemClock
 from rmpa.runtime.tcp_connections import may_end_connections
+from rmpa.trust.page_names import host_names, page_hosts
 from rmpa.trust.permissions import Permissions
 
 if TYPE_CHECKING:
@@ -124,7 +128,7 @@ class Agent:
         self.trust: AgentTrust | None = None
         """This module's part in a secured mesh; ``None``: trust is off."""
         if membership is not None:
-            self.trust = AgentTrust(membership, self.bridge, clock, random.random)
+            self.trust = AgentTrust(membership, self.bridge, clock, random.random, self._page_hosts)
             self.bridge.add(self.trust)
         self.network = Network(settings, self.bridge, self.trust)
         self.reloader = Reloader(settings, load, self.apply_settings)
@@ -216,6 +220,13 @@ class Agent:
             return PlainOperations(self._settings)
         return TrustOperations(self.trust, self.bridge, self._identity)
 
+    def _page_hosts(self) -> tuple[str, ...]:
+        """The names and addresses by which this module's page is opened; a gateway has none."""
+        if self._settings.relay:
+            return ()
+        addresses = [str(address) for interface in list_interfaces() for address in interface.addresses]
+        return page_hosts((*host_names(socket.gethostname()), *self._settings.web.hosts, *sorted(addresses)))
+
     def _identity(self) -> Identity | None:
         return self.network.endpoint.identity if self.network.endpoint is not None else None
 
@@ -259,6 +270,7 @@ async def _serve(
     requests: tuple[realtime.SchedulingRequest, ...],
     load: Callable[[], Loaded] | None = None,
     cpus: Collection[int] = (),
+    started: Callable[[], None] = lambda: None,
 ) -> None:
     agent = Agent(settings, requests, load)
     web = WebProcess(web_command(settings), random.random, environ=web_environment(settings, os.environ), cpus=cpus)
@@ -266,6 +278,7 @@ async def _serve(
 
     async def start() -> None:
         await agent.start()
+        await asyncio.to_thread(started)
         if settings.web.enabled:
             web.start()
 
@@ -276,14 +289,17 @@ async def _serve(
     await serve(start, close, agent.reloader)
 
 
-def run(settings: Settings, load: Callable[[], Loaded] | None = None) -> int:
+def run(
+    settings: Settings, load: Callable[[], Loaded] | None = None, started: Callable[[], None] = lambda: None
+) -> int:
     """Run an agent until SIGINT or SIGTERM; return the exit code.
 
     Args:
         settings: Complete: the name is filled in.
         load: Reads the settings again, at SIGHUP and ``rmpa reload``.
+        started: Called in a thread once the agent has started.
 
     Raises:
         StartError: The agent cannot start on this machine with these settings.
     """
-    return run_process(settings, lambda requests, cpus: _serve(settings, requests, load, cpus))
+    return run_process(settings, lambda requests, cpus: _serve(settings, requests, load, cpus, started))

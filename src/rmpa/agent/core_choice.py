@@ -7,12 +7,12 @@ import os
 from typing import TYPE_CHECKING
 
 from rmpa.bridge.policy import OWN_NODE, is_own
+from rmpa.config.state_dir import core_file
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.external import ExternalCore
 from rmpa.ros.environment import DEFAULT_MASTER_URI, RosEnvironment, host_of, is_loopback
 from rmpa.ros.http.client import is_own_name
 from rmpa.ros.node.local_addresses import local_addresses
-from rmpa.runtime.state_dir import core_file
 
 if TYPE_CHECKING:
     from rmpa.config.settings import Settings

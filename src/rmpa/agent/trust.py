@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge.permission_gate import Needs
 from rmpa.bridge.session.part import Part
+from rmpa.config.state_dir import state_dir
 from rmpa.core.backoff import Backoff
 from rmpa.core.errors import RemoteProtocolError, RmpaError, StartError, UnreachableError
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Refuse
-from rmpa.runtime.state_dir import state_dir
 from rmpa.trust import limits
+from rmpa.trust.io.open_start import check_open_start
 from rmpa.trust.io.store import AuthorityPlace, TrustStore
 from rmpa.trust.reasons import TrustReason
 from rmpa.trust.spreading import DocumentSpreading, Notice, have_args, read_document, read_have
@@ -55,7 +56,8 @@ def open_membership(settings: Settings, clock: Clock) -> Membership | None:
     """What this module has as a member of a secured mesh; ``None``: trust is off.
 
     Raises:
-        StartError: Its files are broken, the library is missing, or trust is off and ``trust.require`` is set.
+        StartError: Its files are broken, the library is missing, or trust is off and ``trust.require`` is set; or
+            trust is off, other modules of this user have keys, and ``trust.insecure`` is not set.
     """
     store = trust_store(settings)
     if store is None or not store.exists:
@@ -65,6 +67,8 @@ def open_membership(settings: Settings, clock: Clock) -> Membership | None:
                 f"the module {settings.name} has joined no secured mesh",
                 "join one: rmpa trust join TOKEN, with a token of rmpa trust invite at the authority",
             )
+        if not settings.trust.insecure:
+            check_open_start(state_dir(os.environ, settings.state_dir), settings.name, os.environ)
         return None
     try:
         from rmpa.trust.io.membership import Membership  # noqa: PLC0415 - its library takes memory: only when needed
@@ -102,6 +106,7 @@ class AgentTrust(Part):
         bridge: Its sessions and requests; counts ``trust.document_refused``.
         clock: Monotonic seconds.
         rng: Uniform numbers in [0, 1), for the delays of renewals.
+        hosts: The names and addresses by which this module's page is opened now; its certificate is to have them.
 
     Raises:
         StartError: A file of the authority is broken.
@@ -113,6 +118,7 @@ class AgentTrust(Part):
         bridge: Bridge,
         clock: Clock,
         rng: Callable[[], float],
+        hosts: Callable[[], tuple[str, ...]] = tuple,
     ) -> None:
         from rmpa.trust.documents import DocumentKind  # noqa: PLC0415 - as in ``open_membership``
         from rmpa.trust.io.authority import MeshAuthority  # noqa: PLC0415
@@ -121,6 +127,8 @@ class AgentTrust(Part):
         self.membership = membership
         self._bridge = bridge
         self._clock = clock
+        self._hosts = hosts
+        self._hosts_asked: tuple[str, ...] = ()
         self._kinds: dict[Notice, DocumentKind] = {Notice.DENY: DocumentKind.DENY, Notice.KEYS: DocumentKind.KEYS}
         self._spreading = DocumentSpreading(self._number)
         self._authority_peer: PeerSession | None = None
@@ -279,7 +287,9 @@ class AgentTrust(Part):
 
     async def _look(self) -> None:
         wall = self.membership.wall()
-        if wall is None or wall < self.membership.certificate.renew_at or self._clock.now() < self._retry_at:
+        if wall is None or self._clock.now() < self._retry_at:
+            return
+        if wall < self.membership.certificate.renew_at and not self._lacks_hosts():
             return
         try:
             await self.renew()
@@ -289,6 +299,17 @@ class AgentTrust(Part):
             self._problem = f"the last attempt to renew it: {error}"
             _log.warning("! the certificate is not renewed: %s; tried again in %.0f s", error, delay)
 
+    def _lacks_hosts(self) -> bool:
+        """Whether the certificate is not for a name or address of this machine, and the authority may be asked.
+
+        It is asked once for the same ones: it may refuse some. Only a link serves for that, so that a module which is
+        away does not dial for it.
+        """
+        hosts = self._hosts()
+        missing = set(hosts) - self.membership.certificate.hosts
+        linked = self._authority_peer is not None and self._authority_peer.reachable
+        return bool(missing) and hosts != self._hosts_asked and (self.authority is not None or linked)
+
     async def renew(self) -> None:
         """Renew the certificate now.
 
@@ -296,7 +317,8 @@ class AgentTrust(Part):
             RmpaError: The authority cannot be reached, or refuses.
         """
         if self.authority is not None:
-            self.authority.renew_own()
+            self._hosts_asked = self._hosts()
+            self.authority.renew_own(self._hosts_asked)
         elif self._authority_peer is not None and self._authority_peer.reachable:
             await self._renew_by_link(self._authority_peer)
         else:
@@ -306,9 +328,11 @@ class AgentTrust(Part):
         _log.info("= the certificate is renewed until %s", _when(self.membership.certificate.expires))
 
     async def _renew_by_link(self, session: PeerSession) -> None:
-        request = base64.b64encode(self.membership.request()).decode()
+        hosts = self._hosts()
+        request = base64.b64encode(self.membership.request(hosts)).decode()
         reply = await self._bridge.rpc.request(session, RENEW, {"request": request}, limits.JOIN_STEP_TIMEOUT)
         self.membership.renewed(_bytes(reply, "certificate"))
+        self._hosts_asked = hosts
 
     async def _renew_by_dial(self) -> None:
         from rmpa.trust.io.joining import renew_at_authority  # noqa: PLC0415

@@ -58,8 +58,8 @@ def core(port: int | None, host: str, advertise: str, keep: str, verbose: bool, 
 
 async def _run(host: str, port: int, advertise: str, *, keep: str) -> None:
     from rmpa import __version__
+    from rmpa.config.state_dir import core_file
     from rmpa.ros.core.embedded import ROS_VERSION, RosCore
-    from rmpa.runtime.state_dir import core_file
 
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()

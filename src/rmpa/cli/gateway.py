@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import importlib.util
 import logging
@@ -14,13 +15,17 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from rmpa.cli.lazy_group import LazyGroup
+from rmpa.cli.module import find_name
 from rmpa.cli.setting_options import config_option, setting_options
+from rmpa.config.module_name import GATEWAY_SUFFIX
 from rmpa.config.settings import WebSettings
 from rmpa.config.sources import load_settings
-from rmpa.core.errors import ConfigError
+from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.core.identity import peer_name_from
 from rmpa.core.log import configure_logging
+from rmpa.observe.io.control_client import ControlClient, find_agents
 from rmpa.runtime.log_writer import LogWriter
+from rmpa.trust.status import TrustStatus
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -31,9 +36,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger("rmpa.gateway")
 _LIBRARIES: Final = {"zenoh": "eclipse-zenoh", "xxhash": "xxhash"}
 """What the extra installs: the name in Python, and that of the package."""
-_OF_THE_AGENT: Final = ("core_mode", "core_master", "core_keep", "web.enabled")
-"""Settings whose options a gateway has not: its core is its own, and only for its proxies."""
-_SUFFIX: Final = "_gateway"
+_OF_THE_AGENT: Final = ("core_mode", "core_master", "core_keep", "web.enabled", "trust.insecure")
+"""Settings whose options a gateway has not: its core is its own, and only for its proxies; it has an --insecure."""
 COMMANDS: Final = {
     "zenoh-config": ("rmpa.cli.zenoh_config", "Print a configuration for zenohd, Zenoh's own router."),
 }
@@ -78,12 +82,15 @@ def gateway(context: click.Context, /, **options: object) -> int:
             raise ConfigError(flag, f"stands before {context.invoked_subcommand}", "write it behind that")
         return 0
     check_libraries()
+    found = None if options["name"] else find_name(None, {"config": options.get("config")}, _own(os.environ))
+    beside = found.chosen.name if found is not None else ""
 
     def load() -> Loaded:
-        return load_gateway(options, dict(os.environ), socket.gethostname())
+        return load_gateway(options, dict(os.environ), socket.gethostname(), beside)
 
     loaded = load()
     check_settings(loaded.settings)
+    check_agents(loaded.settings, os.environ)
     writer = LogWriter(sys.stderr.fileno())
     configure_logging(loaded.settings.log_level, writer, as_json=loaded.settings.log_json)
     for note in loaded.notes:
@@ -97,24 +104,26 @@ def gateway(context: click.Context, /, **options: object) -> int:
         writer.close()
 
 
-def load_gateway(options: Mapping[str, object], environ: Mapping[str, str], host_name: str) -> Loaded:
+def load_gateway(
+    options: Mapping[str, object], environ: Mapping[str, str], host_name: str, beside: str = ""
+) -> Loaded:
     """The settings of a gateway: those of this machine's agent, without what belongs to that process alone.
 
     Args:
         options: As for ``load_settings``.
         environ: The environment's variables; ROS_MASTER_URI means the agent's core, and is left out.
         host_name: This machine's.
+        beside: The module that it stands beside; empty: as ``load_settings`` has it.
 
     Raises:
         ConfigError: As ``load_settings``.
     """
-    environ = {name: value for name, value in environ.items() if name != "ROS_MASTER_URI"}
-    loaded = load_settings(options, environ, host_name=host_name)
+    loaded = load_settings(options, _own(environ), host_name=host_name)
     settings, given = loaded.settings, loaded.given
     defaults = type(settings)()
     settings = replace(
         settings,
-        name=settings.name if _is_option(given, "name") else peer_name_from(settings.name + _SUFFIX),
+        name=settings.name if _is_option(given, "name") else _gateway_name(beside or settings.name),
         core_mode=defaults.core_mode,
         core_master=defaults.core_master,
         core_keep="never",
@@ -125,6 +134,36 @@ def load_gateway(options: Mapping[str, object], environ: Mapping[str, str], host
         relay=True,
     )
     return replace(loaded, settings=settings)
+
+
+def _own(environ: Mapping[str, str]) -> dict[str, str]:
+    return {name: value for name, value in environ.items() if name != "ROS_MASTER_URI"}
+
+
+def _gateway_name(module: str) -> str:
+    """The gateway's name beside a module; where it has a state directory of its own, it may be kept there."""
+    return module if module.endswith(GATEWAY_SUFFIX) else peer_name_from(module + GATEWAY_SUFFIX)
+
+
+def check_agents(settings: Settings, environ: Mapping[str, str]) -> None:
+    """Check that a gateway is no less secure than the agents of this machine.
+
+    Raises:
+        StartError: One is a member of a secured mesh, the gateway is not, and ``trust.insecure`` is not set.
+    """
+    from rmpa.agent.trust import trust_store
+
+    store = trust_store(settings)
+    if settings.trust.insecure or (store is not None and store.exists):
+        return
+    for agent in find_agents(environ):
+        secured = False
+        with contextlib.suppress(RmpaError), ControlClient(agent.path) as client:
+            secured = client.call("trust", TrustStatus, what="status").agent == "secured"
+        if secured:
+            problem = f"has no keys, beside the agent {agent.name} in a secured mesh"
+            remedy = f"let it join: rmpa trust join TOKEN --name {settings.name}; or say --insecure"
+            raise StartError(f"the gateway {settings.name}", problem, remedy)
 
 
 def _is_option(given: Mapping[str, Given], name: str) -> bool:

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 from rmpa.bridge.proxy_names import proxied_peer
 from rmpa.cli.output import duration, warn
 from rmpa.cli.resource_graph import SeenResource
+from rmpa.config.state_dir import module_dir, state_dir
 from rmpa.resource.run.registry_writer import FILE
 from rmpa.resource.run.resource_registry import ResourceRegistry
 from rmpa.resource.run.store import read_state
-from rmpa.runtime.state_dir import module_dir, state_dir
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

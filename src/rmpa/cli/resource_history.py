@@ -11,10 +11,10 @@ from click.core import ParameterSource
 
 from rmpa.cli.options import completes, json_option
 from rmpa.cli.output import Column, duration, print_json, print_table
+from rmpa.config.state_dir import module_dir, state_dir
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.resource.declare.units import quantity
 from rmpa.resource.run.history import profile_runs, read_events, read_units, read_windows
-from rmpa.runtime.state_dir import module_dir, state_dir
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

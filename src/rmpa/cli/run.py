@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NoReturn, Self
 
 import click
@@ -40,8 +41,8 @@ _PR_SET_PDEATHSIG: Final = 1
 EPILOG = """\
 \b
 The file declares one or more rmpa.resource.Resource; see docs/tutorials/resources.md.
-Without --name and --master the module is named as its first resource. An agent of that name that runs already
-is used, and stays; else one is started with the options behind --, and ends with the resources.
+Without --name and --master the module is named as for rmpa up, or else as its first resource. An agent of that name
+that runs already is used, and stays; else one is started with the options behind --, and ends with the resources.
 
 \b
 Examples:
@@ -55,7 +56,7 @@ Examples:
 
 @click.command(epilog=EPILOG, context_settings={"ignore_unknown_options": False})
 @click.argument("file", type=click.Path(exists=True, dir_okay=False))
-@click.option("--name", metavar="NAME", help="The module's name. [default: the first resource's]")
+@click.option("--name", metavar="NAME", help="The module's name. [default: as rmpa up, else the first resource's]")
 @click.option("--master", metavar="URI", help="Run on this ROS core; no agent is started.")
 @click.option(
     "--set", "given", metavar="[RESOURCE.]PARAMETER=VALUE", multiple=True, help="Start with this value; repeatable."
@@ -97,11 +98,22 @@ def run(
             raise ConfigError("--", "options of an agent, but --master starts none", "leave one of them out")
         resources = prepared(path, given)
         return asyncio.run(_run(resources, master, None, state_of(name or resources[0].name)))
-    resources = prepared(path, given) if name is None else []
-    with ModuleAgent(name or resources[0].name, options) as agent:
+    module = name or _module_name(options)
+    resources = prepared(path, given) if not module else []
+    with ModuleAgent(module or resources[0].name, options) as agent:
         if not resources:  # the agent starts meanwhile
             resources = prepared(path, given)
-        return asyncio.run(_run(resources, agent.core(), agent, state_of(name or resources[0].name)))
+        return asyncio.run(_run(resources, agent.core(), agent, state_of(agent.name)))
+
+
+def _module_name(options: Sequence[str]) -> str:
+    """The module's name as ``rmpa up`` would have it, but for the host's; empty: the first resource names it."""
+    from rmpa.config.module_name import NameSource, choose_name
+    from rmpa.config.sources import load_settings
+
+    file = next((after for before, after in pairwise(options) if before == "--config"), None)
+    chosen = choose_name(load_settings({"config": file}, os.environ, host_name="").name_facts)
+    return "" if chosen.source is NameSource.DEFAULT else chosen.name
 
 
 def prepared(path: Path, given: Sequence[str] = ()) -> list[Resource]:
@@ -240,7 +252,8 @@ class ModuleAgent:
                 raise ConfigError("--", text, "leave them out, or choose another --name")
             _log.info("= using the agent %s, %s", self.name, self._uri)
             return self
-        command = [sys.executable, "-m", "rmpa.cli.main", "up", "--name", self.name, *self._options]
+        command = [sys.executable, "-m", "rmpa.cli.main", "up", *self._options]
+        environ = {**os.environ, "RMPA_NAME": self.name}  # not --name: a file's resources do not name the machine
         libc, us = ctypes.CDLL(None), os.getpid()
 
         def tie() -> None:
@@ -249,7 +262,7 @@ class ModuleAgent:
                 os._exit(1)
 
         # In a session of its own Ctrl-C does not reach the agent: it ends after the resources.
-        self.process = subprocess.Popen(command, start_new_session=True, preexec_fn=tie)  # noqa: S603, PLW1509
+        self.process = subprocess.Popen(command, start_new_session=True, preexec_fn=tie, env=environ)  # noqa: S603, PLW1509
         return self
 
     def __exit__(
@@ -305,7 +318,7 @@ def _core_of(name: str) -> str | None:
 
 def _state_dir(module: str, state: str | None) -> Path | None:
     """The directory in which the resources of a module store their state; ``None`` without a home directory."""
-    from rmpa.runtime.state_dir import module_dir, state_dir
+    from rmpa.config.state_dir import module_dir, state_dir
 
     directory = state_dir(os.environ, state)
     if directory is None:

@@ -23,6 +23,7 @@ from rmpa.cli.trust_place import (
     date_of,
     find_place,
     grouped,
+    keep_member_name,
     name_option,
 )
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError
@@ -294,6 +295,7 @@ def join(
     files = _accepted(place, Path(accept), ca) if accept is not None else _join_by_token(place, token or "", yes=yes)
     place.store.save(files)
     place.store.forget("request.key")
+    start = keep_member_name(place, file)
     import time
 
     from rmpa.trust import certificates
@@ -308,7 +310,7 @@ def join(
     if place.socket is not None:
         warn(f"the agent {place.name} runs without trust until it is started again")
     else:
-        print_line("Next: rmpa up; rmpa trust check says what other modules may do here.")
+        print_line(f"Next: {start}; rmpa trust check says what other modules may do here.")
 
 
 def _clock_problem(wall: float, issued: float, *, by_files: bool) -> str:

@@ -9,8 +9,18 @@ import click
 
 from rmpa.cli.options import json_option
 from rmpa.cli.output import Column, duration, print_json, print_line, print_table, warn
-from rmpa.cli.trust_place import check_library, config_option, confirm, date_of, find_place, grouped, name_option
+from rmpa.cli.trust_place import (
+    check_library,
+    config_option,
+    confirm,
+    date_of,
+    find_place,
+    grouped,
+    keep_member_name,
+    name_option,
+)
 from rmpa.core.errors import ConfigError, StartError
+from rmpa.trust.io.store import modules_with_keys
 from rmpa.trust.status import TrustReply, TrustStatus
 
 if TYPE_CHECKING:
@@ -40,7 +50,7 @@ def init(label: str, name: str | None, file: str | None, as_json: bool) -> None:
     from rmpa.trust.io.authority import found_mesh
 
     found_mesh(place.store, place.name, label or place.name, time.time())
-    status = _status(place)
+    status, start = _status(place), keep_member_name(place, file)
     if as_json:
         print_json(status)
         return
@@ -50,7 +60,7 @@ def init(label: str, name: str | None, file: str | None, as_json: bool) -> None:
     if place.socket is not None:
         warn(_RESTART.format(place.name))
     again = " again" if place.socket is not None else ""
-    print_line(f"Next: start rmpa up here{again}, and rmpa trust invite for each module.")
+    print_line(f"Next: {start} here{again}, and rmpa trust invite for each module.")
     print_line("Modules may do here only what [[permission]] in rmpa.toml allows: docs/permissions.md")
 
 
@@ -63,13 +73,17 @@ def status(name: str | None, file: str | None, as_json: bool) -> None:
 
     The exit code is 0 too if trust is off.
     """
-    shown = _status(find_place(name, file))
+    place = find_place(name, file)
+    shown = _status(place)
     if as_json:
         print_json(shown)
         return
     if not shown.on:
-        print_line(f"trust is off: {shown.module} has joined no secured mesh")
-        print_line("make one: rmpa trust init; or join one: rmpa trust join TOKEN")
+        print_line(f"trust is off: {place.chosen} has joined no secured mesh")
+        if others := modules_with_keys(place.state):
+            print_line(f"with keys in {place.state}: {', '.join(others)}; rmpa trust status --name {others[0]}")
+        else:
+            print_line("make one: rmpa trust init; or join one: rmpa trust join TOKEN")
     else:
         _show(shown)
     for problem in shown.problems:

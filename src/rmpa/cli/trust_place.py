@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING, TypeVar
 
 import click
 
+from rmpa.cli.module import find_module
+from rmpa.cli.output import warn
+from rmpa.config.module_name import GATEWAY_SUFFIX
 from rmpa.config.sources import load_settings
-from rmpa.core.errors import ConfigError, StartError, UnreachableError
-from rmpa.core.identity import peer_name_problem
-from rmpa.observe.io.control_client import ControlClient, find_agents
-from rmpa.runtime.state_dir import state_dir
+from rmpa.config.state_dir import keep_name, kept_name, note_state_dir
+from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
+from rmpa.observe.io.control_client import ControlClient
 from rmpa.trust.io.store import TrustStore
 from rmpa.trust.status import TrustStatus
 
@@ -25,12 +27,15 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable
 
+    from rmpa.config.module_name import ModuleName
     from rmpa.trust.io.authority import MeshAuthority
     from rmpa.trust.io.membership import Membership
 
 _T = TypeVar("_T")
 name_option = click.option(
-    "--name", metavar="NAME", help="This module. [default: the only agent that runs here; else as rmpa up has it]"
+    "--name",
+    metavar="NAME",
+    help="This module. [default: RMPA_AGENT, RMPA_NAME, rmpa.toml, the agent that runs; else as rmpa up has it]",
 )
 config_option = click.option(
     "--config", "file", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]"
@@ -42,14 +47,21 @@ class TrustPlace:
     """One module.
 
     Args:
-        name: Its name.
+        chosen: Its name, and why it was chosen.
         store: Its files.
+        state: The state directory that they are in.
         socket: The control socket of its agent; ``None``: none runs.
     """
 
-    name: str
+    chosen: ModuleName
     store: TrustStore
+    state: Path
     socket: Path | None
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self.chosen.name
 
     def call(self, what: str, reply: type[_T], **args: object) -> _T:
         """Let the agent do something.
@@ -102,31 +114,36 @@ def find_place(name: str | None, file: str | None) -> TrustPlace:
     """The module that a user means.
 
     Args:
-        name: As given; ``None``: RMPA_AGENT, the name in the settings, the only agent that runs, or the host's name.
+        name: As given; ``None``: as ``config.module_name`` chooses it.
         file: The settings' file; ``None`` for the usual places.
 
     Raises:
-        ConfigError: The name cannot be one, or a setting cannot be used.
-        StartError: There is no place for files.
+        RmpaError: As ``find_module``; or there is no place for files.
     """
-    environ = dict(os.environ)
-    loaded = load_settings({"config": file}, environ, host_name=socket.gethostname())
-    agents = {agent.name: agent.path for agent in find_agents(environ)}
-    wanted = name or environ.get("RMPA_AGENT") or ""
-    if problem := peer_name_problem(wanted) if wanted else "":
-        raise ConfigError("--name", problem)
-    if not wanted:
-        only = next(iter(agents)) if len(agents) == 1 and "name" not in loaded.given else ""
-        wanted = only or loaded.settings.name
-    socket_path = agents.get(wanted)
-    folder = ""
-    if socket_path is not None:  # it may have been started with another state directory than this shell has
-        with ControlClient(socket_path) as client:
-            folder = client.call("trust", TrustStatus, what="status").folder
-    place = Path(folder).parent.parent if folder else state_dir(environ, loaded.settings.state_dir)
-    if place is None:
+    module = find_module(name, {"config": file}, os.environ)
+    if module.state is None:
         raise StartError("the state directory", "is not known: there is no home", "set RMPA_STATE_DIR")
-    return TrustPlace(wanted, TrustStore(place, wanted), socket_path)
+    return TrustPlace(module.chosen, TrustStore(module.state, module.name), module.state, module.socket)
+
+
+def keep_member_name(place: TrustPlace, file: str | None) -> str:
+    """Keep the name of a module that has keys now as that of this machine; return the command that starts it.
+
+    The name of another module that has keys itself stays. A gateway's is none of a module.
+    """
+    if place.name.endswith(GATEWAY_SUFFIX):
+        return f"rmpa gateway --name {place.name}"
+    try:
+        kept = kept_name(place.state)
+        stays = bool(kept) and kept != place.name and TrustStore(place.state, kept).exists
+        if not stays:
+            keep_name(place.state, place.name, instead=True)
+        note_state_dir(os.environ, place.state)
+        usual = load_settings({"config": file}, os.environ, host_name=socket.gethostname()).settings.name
+    except RmpaError as error:
+        warn(f"the name {place.name} is not kept: {error}")
+        usual = ""
+    return "rmpa up" if usual == place.name else f"rmpa up --name {place.name}"
 
 
 def check_library() -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from rmpa.cli.module import find_module
 from rmpa.cli.options import agent_option, json_option
 from rmpa.config.settings import WebSettings
 from rmpa.config.sources import load_settings
@@ -21,8 +22,8 @@ from rmpa.core.errors import ConfigError
 from rmpa.core.log import configure_logging
 
 if TYPE_CHECKING:
+    from rmpa.cli.module import Module
     from rmpa.config.settings import Settings
-    from rmpa.config.sources import Loaded
     from rmpa.web.server.process import Address, WebSetup
 
 _log = logging.getLogger("rmpa.web")
@@ -31,10 +32,12 @@ _DEFAULTS = WebSettings()
 EPILOG = """\
 \b
 [web] of rmpa.toml and the variables RMPA_WEB_* give the same; options are stronger.
+It is as secure as the agent: beside one in a secured mesh it serves HTTPS with the certificate of that module, by its
+[[permission]], and begins anew where the agent comes back secured.
 
 \b
 Examples:
-  rmpa web                        for this machine: http://127.0.0.1:8480/
+  rmpa web                        for this machine: http://127.0.0.1:8480/, https:// in a secured mesh
   rmpa web --listen 0.0.0.0       for the network; prints the URL with its token once
   rmpa up --web                   the agent starts it, and again if it ends
   curl -s localhost:8480/api/v1/peers | jq '.[].name'
@@ -61,11 +64,16 @@ Examples:
     is_flag=True,
     help="Let clients publish, call and offer services, and set parameters; they then need the token.",
 )
-@click.option("--cert", metavar="FILE", help="Serve HTTPS with this certificate (PEM).")
+@click.option(
+    "--cert",
+    metavar="FILE",
+    help="HTTPS with this certificate (PEM). [default: the module's, if secured]",
+)
 @click.option("--key", metavar="FILE", help="Its private key (PEM). [default: in the certificate's file]")
 @click.option("--drive", is_flag=True, help="Let the joystick of its pages command a robot; they need the token.")
 @click.option("--config", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]")
 @click.option("--with-agent", is_flag=True, hidden=True, help="End when standard input ends.")
+@click.option("--insecure", is_flag=True, help="Start without an agent although other modules here have keys.")
 @agent_option
 @json_option
 def web(
@@ -79,6 +87,7 @@ def web(
     drive: bool,
     config: str | None,
     with_agent: bool,
+    insecure: bool,
     agent: str | None,
     as_json: bool,
 ) -> int:
@@ -87,9 +96,6 @@ def web(
     It is a process of its own: the agent does not depend on it. It starts without an agent too, and finds it later.
     """
     _check_libraries()
-
-    def read() -> Loaded:
-        return load_settings({"config": config}, dict(os.environ), host_name=socket.gethostname())
 
     def with_options(given: WebSettings) -> WebSettings:
         return replace(
@@ -104,35 +110,57 @@ def web(
             hosts=(*given.hosts, *(_host("--host", name) for name in hosts)),
         )
 
-    def setup_of(loaded: Loaded) -> WebSetup:
-        return _setup(replace(loaded.settings, web=with_options(loaded.settings.web)), agent)
+    def make() -> tuple[Module, WebSetup]:
+        module = find_module(agent, {"config": config}, os.environ, "--agent")
+        settings = module.loaded.settings
+        settings = replace(settings, web=with_options(settings.web))
+        if insecure:
+            settings = replace(settings, trust=replace(settings.trust, insecure=True))
+        return module, _setup(module, settings)
 
-    loaded = read()
-    configure_logging(loaded.settings.log_level, sys.stderr, as_json=loaded.settings.log_json)
-    for note in loaded.notes:
+    module, setup = make()
+    log = setup.settings
+    configure_logging(log.log_level, sys.stderr, as_json=log.log_json)
+    for note in module.loaded.notes:
         _log.warning("%s", note)
     from rmpa.web.server.process import serve
 
     def announce(address: Address) -> None:
         _announce(address, as_json=as_json)
 
-    work = serve(setup_of(loaded), agent, announce, with_agent=with_agent, load=lambda: setup_of(read()))
-    asyncio.run(work)
-    return 0
+    def load() -> WebSetup:
+        return make()[1]
+
+    while True:
+        pinned = module.name if module.chosen.source.said else None
+        if not asyncio.run(serve(setup, pinned, announce, with_agent=with_agent, load=load)):
+            return 0
+        module, setup = make()
 
 
-def _setup(settings: Settings, agent: str | None) -> WebSetup:
-    from rmpa.runtime.state_dir import state_dir
+def _setup(module: Module, settings: Settings) -> WebSetup:
+    """What the server of a module is made of; it is as secure as the module's agent.
+
+    Raises:
+        RmpaError: A file cannot be used; or no agent runs, the module has no keys, and others have some.
+    """
+    from rmpa.trust.io.open_start import check_open_start
     from rmpa.trust.io.store import TrustStore
     from rmpa.web.server.process import WebSetup, access_of
     from rmpa.web.server.tls import certificate_files
 
-    module = agent or os.environ.get("RMPA_AGENT") or settings.name
-    state = state_dir(os.environ, settings.state_dir or None)
-    files = certificate_files(settings.web.cert, settings.web.key, state, module)
-    trusted = state is not None and TrustStore(state, module).exists
-    access = access_of(settings.web, module, os.environ, settings.state_dir, settings.web_tokens)
-    return WebSetup(settings, access, files, trusted)
+    store = TrustStore(module.state, module.name) if module.state is not None else None
+    trusted = module.secured or (store is not None and store.exists)
+    if not trusted and module.socket is None and not settings.trust.insecure:
+        check_open_start(module.state, module.name, os.environ)
+    own_file = str(settings.config_file.absolute()) if settings.config_file is not None else ""
+    if trusted and module.config_file not in ("", own_file):  # the permissions are those that its agent reads
+        theirs = load_settings({"config": module.config_file}, os.environ, host_name=socket.gethostname())
+        settings = replace(settings, trust=theirs.settings.trust)
+    files = certificate_files(settings.web.cert, settings.web.key, store if trusted else None)
+    access = access_of(settings.web, module.name, os.environ, settings.state_dir, settings.web_tokens)
+    folder = str(store.folder) if store is not None else ""
+    return WebSetup(settings, access, files, trusted, module.name, folder)
 
 
 def _check_libraries() -> None:

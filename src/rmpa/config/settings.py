@@ -348,6 +348,14 @@ class TrustSettings:
     require: bool = setting(
         False, BOOL, "Refuse to start while this module has not joined a secured mesh.", env="RMPA_TRUST_REQUIRE"
     )
+    insecure: bool = setting(
+        False,
+        BOOL,
+        "Start without trust although other modules of this user have keys of a secured mesh; a module with keys of "
+        "its own is secured all the same.",
+        env="RMPA_TRUST_INSECURE",
+        option="--insecure",
+    )
     rules: tuple[PermissionRule, ...] = setting(
         (),
         PERMISSION_RULES,
@@ -370,7 +378,7 @@ class Settings:
         "The module's name among its peers, a ROS base name.",
         env="RMPA_NAME",
         option="--name",
-        shown_default="from the host's name",
+        shown_default="the name of the first start, else from the host's name",
     )
     domain: int = setting(
         0, DOMAIN, "Only agents of one domain join, 0 to 232.", env="RMPA_DOMAIN", option="--domain"
@@ -534,7 +542,6 @@ class Settings:
         "",
         TEXT,
         "The directory of what is kept over a restart.",
-        key="",
         env="RMPA_STATE_DIR",
         shown_default="this user's state directory",
     )

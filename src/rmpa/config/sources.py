@@ -4,6 +4,7 @@
 
     defaults < ROS environment < rmpa.toml < RMPA_* < options
 
+The module's name has one more: the name of its first start, which the state directory keeps (``config.module_name``).
 A source gives raw values and says where each was written; the types of ``config.settings`` read them. A setting that
 cannot be used is a ``ConfigError`` that names that place.
 """
@@ -18,10 +19,12 @@ from urllib.parse import urlsplit
 
 from rmpa.config.contract_rules import contract_warnings
 from rmpa.config.file import dotted, parse_config
+from rmpa.config.module_name import NameFacts, choose_name
 from rmpa.config.param_rules import follow_problems
 from rmpa.config.peer_rules import peer_warnings
 from rmpa.config.permission_rules import permission_problems
 from rmpa.config.settings import REMOVED, SETTINGS, Settings
+from rmpa.config.state_dir import NAME_FILE, kept_name, state_dir
 from rmpa.config.toml_lines import line_of
 from rmpa.config.values import BadValue, did_you_mean
 from rmpa.config.web_tokens import web_token_problems
@@ -105,11 +108,13 @@ class Loaded:
         settings: The settings.
         notes: What the user should know about them, for the log at level warning.
         given: By the setting's name: what its strongest source gives. A setting that is missing has its default.
+        name_facts: What the choice of the name depends on.
     """
 
     settings: Settings
     notes: tuple[str, ...] = ()
     given: Mapping[str, Given] = field(default_factory=dict, repr=False)
+    name_facts: NameFacts = field(default_factory=NameFacts)
 
 
 def load_settings(
@@ -137,11 +142,22 @@ def load_settings(
     from_file = _file_layer(path) if path is not None else {}
     for name, given in from_file.items():
         given.read(_BY_NAME[name])  # a mistake in the file is an error even where an option outweighs it
-    said = from_file | _variable_layer(environ, notes) | _option_layer(options)
+    from_variables, from_options = _variable_layer(environ, notes), _option_layer(options)
+    said = from_file | from_variables | from_options
     external = "core_mode" in said and said["core_mode"].read(_BY_NAME["core_mode"]) == "external"
     strongest = _ros_layer(environ, host_name, notes, external=external) | said
     values = {name: given.read(_BY_NAME[name]) for name, given in strongest.items()}
-    values.setdefault("name", peer_name_from(host_name))
+    directory = state_dir(environ, str(values.get("state_dir") or ""))
+    facts = NameFacts(
+        option=_name_in(from_options),
+        variable=_name_in(from_variables),
+        file=_name_in(from_file),
+        kept=kept_name(directory),
+        default=peer_name_from(host_name),
+    )
+    values["name"] = choose_name(facts).name
+    if directory is not None and facts.kept and "name" not in strongest:
+        strongest["name"] = Given(facts.kept, str(directory / NAME_FILE))
     settings = _assemble(values, path)
     for name, warnings in (
         ("contracts", contract_warnings(settings.contracts)),
@@ -150,7 +166,12 @@ def load_settings(
         notes += [str(strongest[name].error(warning.text, "", warning.at)) for warning in warnings]
     _check_core(strongest, notes, external=external)
     _check_together(settings, strongest)
-    return Loaded(settings, tuple(notes), strongest)
+    return Loaded(settings, tuple(notes), strongest, facts)
+
+
+def _name_in(layer: _Layer) -> str:
+    """The module's name as one source says it; empty: it does not."""
+    return str(layer["name"].read(_BY_NAME["name"])) if "name" in layer else ""
 
 
 def _assemble(values: Mapping[str, object], path: Path | None) -> Settings:

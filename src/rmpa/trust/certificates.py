@@ -2,7 +2,7 @@
 
 Keys are P-256. A module's certificate has its name as CN and as SAN ``urn:rmpa:<name>``; the SAN decides. This module
 needs the library ``cryptography`` (extra ``rmpa[trust]``); links do without it, as OpenSSL checks the chain there.
-For browsers, which ``rmpa web`` serves with it, it has host names too (``server_names``).
+For browsers, which ``rmpa web`` serves with it, it has names and addresses of its host too (``page_names``).
 
 Errors::
 
@@ -26,9 +26,12 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from rmpa.core.identity import peer_name_problem
 from rmpa.trust import limits
+from rmpa.trust.page_names import page_hosts, server_names
 from rmpa.trust.reasons import TrustError, TrustReason
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from rmpa.trust.documents import DenyList
 
 URN: Final = "urn:rmpa:"
@@ -58,10 +61,12 @@ class CertificateRequest:
     Args:
         name: The module's.
         public_key: Its public key (SubjectPublicKeyInfo, DER).
+        hosts: The names and addresses that it asks for, of those that a certificate may have.
     """
 
     name: str
     public_key: bytes
+    hosts: tuple[str, ...] = ()
 
     @property
     def key_hash(self) -> bytes:
@@ -79,6 +84,7 @@ class ModuleCertificate:
         issued: When it was issued, seconds since 1970.
         expires: When it ends.
         public_key: The key (SubjectPublicKeyInfo, DER).
+        hosts: The names and addresses of its page.
     """
 
     name: str
@@ -86,6 +92,7 @@ class ModuleCertificate:
     issued: float
     expires: float
     public_key: bytes
+    hosts: frozenset[str] = frozenset()
 
     @property
     def renew_at(self) -> float:
@@ -128,8 +135,13 @@ def make_ca(key: ec.EllipticCurvePrivateKey, label: str, serial: int, wall: floa
     return certificate.public_bytes(serialization.Encoding.DER)
 
 
-def make_request(key: ec.EllipticCurvePrivateKey, name: str) -> bytes:
+def make_request(key: ec.EllipticCurvePrivateKey, name: str, hosts: Iterable[str] = ()) -> bytes:
     """A request (DER) for a certificate of a module with this name.
+
+    Args:
+        key: The module's.
+        name: Its name.
+        hosts: Names and addresses of its page, besides those that follow from its name.
 
     Raises:
         ValueError: No module can have that name.
@@ -139,7 +151,7 @@ def make_request(key: ec.EllipticCurvePrivateKey, name: str) -> bytes:
     request = (
         x509.CertificateSigningRequestBuilder()
         .subject_name(_name(name))
-        .add_extension(_subject_alternative(name), critical=False)
+        .add_extension(_subject_alternative(name, page_hosts(hosts)), critical=False)
         .sign(key, hashes.SHA256())
     )
     return request.public_bytes(serialization.Encoding.DER)
@@ -152,6 +164,7 @@ def issue(
     serial: int,
     wall: float,
     lifetime: float = limits.CERTIFICATE_LIFETIME,
+    hosts: Iterable[str] = (),
 ) -> bytes:
     """A certificate (DER) for a request. Nothing of the request but its name and key is taken over.
 
@@ -162,9 +175,11 @@ def issue(
         serial: A random positive number of at most 159 bits.
         wall: Seconds since 1970.
         lifetime: Seconds of its validity from now on.
+        hosts: Names and addresses of its page, as the authority grants them.
     """
     authority = x509.load_der_x509_certificate(ca)
     key = _load_key(request.public_key)
+    names = (*server_names(request.name), "127.0.0.1", *hosts)
     certificate = (
         x509.CertificateBuilder()
         .subject_name(_name(request.name))
@@ -176,7 +191,7 @@ def issue(
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(_key_usage(signs_certificates=False), critical=True)
         .add_extension(x509.ExtendedKeyUsage(_PURPOSES), critical=False)
-        .add_extension(_subject_alternative(request.name, server=True), critical=False)
+        .add_extension(_subject_alternative(request.name, names), critical=False)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(_authority_key(authority)), critical=False)
         .sign(ca_key, hashes.SHA256())
@@ -199,14 +214,14 @@ def read_request(data: bytes) -> CertificateRequest:
         request = x509.load_der_x509_csr(data)
         key = request.public_key()
         valid = isinstance(key, ec.EllipticCurvePublicKey) and request.is_signature_valid
-        name = _module_name(request)
+        name, hosts = _module_name(request), page_hosts(sorted(_hosts_in(request)))
     except _UNREADABLE as error:
         raise CertificateError(TrustReason.FOREIGN, f"the request cannot be read: {error!s:.200}") from None
     if not isinstance(key, ec.EllipticCurvePublicKey) or key.curve.name != CURVE.name:
         raise CertificateError(TrustReason.FOREIGN, f"the request's key is not of {CURVE.name}")
     if not valid:
         raise CertificateError(TrustReason.FOREIGN, "the request is not signed with its own key")
-    return CertificateRequest(name, _public_bytes(key))
+    return CertificateRequest(name, _public_bytes(key), hosts)
 
 
 def verify(
@@ -254,7 +269,7 @@ def _read(data: bytes, ca: bytes) -> ModuleCertificate:
     try:
         certificate = x509.load_der_x509_certificate(data)
         certificate.verify_directly_issued_by(authority)
-        name = _module_name(certificate)
+        name, hosts = _module_name(certificate), _hosts_in(certificate)
         constraints = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value
         key = certificate.public_key()
     except InvalidSignature:
@@ -266,7 +281,7 @@ def _read(data: bytes, ca: bytes) -> ModuleCertificate:
         raise CertificateError(TrustReason.FOREIGN, "the certificate is not one of a module")
     issued = certificate.not_valid_before_utc.timestamp() + limits.CERTIFICATE_BACKDATE
     expires = certificate.not_valid_after_utc.timestamp()
-    return ModuleCertificate(name, certificate.serial_number, issued, expires, _public_bytes(key))
+    return ModuleCertificate(name, certificate.serial_number, issued, expires, _public_bytes(key), hosts)
 
 
 def check_ca(data: bytes, fingerprint: bytes) -> None:
@@ -326,6 +341,13 @@ def _module_name(holder: x509.Certificate | x509.CertificateSigningRequest) -> s
     return name
 
 
+def _hosts_in(holder: x509.Certificate | x509.CertificateSigningRequest) -> frozenset[str]:
+    """The names and addresses in a SAN that ``_module_name`` has read."""
+    alternative = holder.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    addresses = map(str, alternative.get_values_for_type(x509.IPAddress))
+    return frozenset((*alternative.get_values_for_type(x509.DNSName), *addresses))
+
+
 def _load_key(data: bytes) -> ec.EllipticCurvePublicKey:
     key = serialization.load_der_public_key(data)
     if not isinstance(key, ec.EllipticCurvePublicKey):
@@ -341,22 +363,14 @@ def _name(common: str) -> x509.Name:
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
 
 
-def _subject_alternative(name: str, *, server: bool = False) -> x509.SubjectAlternativeName:
+def _subject_alternative(name: str, hosts: Iterable[str]) -> x509.SubjectAlternativeName:
     names: list[x509.GeneralName] = [x509.UniformResourceIdentifier(URN + name)]
-    if server:
-        names += map(x509.DNSName, server_names(name))
-        names.append(x509.IPAddress(ipaddress.IPv4Address("127.0.0.1")))
+    for host in dict.fromkeys(hosts):
+        try:
+            names.append(x509.IPAddress(ipaddress.ip_address(host)))
+        except ValueError:
+            names.append(x509.DNSName(host))
     return x509.SubjectAlternativeName(names)
-
-
-def server_names(name: str) -> tuple[str, ...]:
-    """The hosts that a browser finds in a module's certificate, besides 127.0.0.1 (RFC 9525).
-
-    They follow from the module's name and are not asked for, so that no module gets those of another. A host's name
-    has ``-`` where the module's name, which is made of it, has ``_``.
-    """
-    host = name.replace("_", "-").lower()
-    return (host, f"{host}.local", "localhost")
 
 
 def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:

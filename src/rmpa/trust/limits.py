@@ -133,6 +133,8 @@ EARLIEST_TIME: Final = 1_735_689_600
 """A clock before 2025 is not set: a new mesh would have certificates that no other machine accepts."""
 CSR_MAX: Final = 4 * KIB
 """Bytes of a request for a certificate (DER); one has some 250."""
+PAGE_HOSTS_MAX: Final = 16
+"""Names and addresses that a module's certificate has for its page, besides those that follow from its name."""
 CERTIFICATE_MAX: Final = 8 * KIB
 """Bytes of a certificate (DER or PEM) that are parsed; one has some 600."""
 

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.config.state_dir import module_dir, state_dir
 from rmpa.resource import limits
 from rmpa.resource.run import store as store_module
 from rmpa.resource.run.store import ResourceStore
-from rmpa.runtime.state_dir import module_dir, state_dir
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,6 +10,7 @@ from unittest.mock import AsyncMock
 
 import pytest
 
+from rmpa.config.state_dir import core_file
 from rmpa.ros import limits
 from rmpa.ros.core import persistence, store
 from rmpa.ros.core.embedded import RosCore
@@ -17,7 +18,6 @@ from rmpa.ros.core.store import CoreStore
 from rmpa.ros.http.client import call, call_api
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
-from rmpa.runtime.state_dir import core_file
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable

@@ -94,15 +94,17 @@ def test_a_folder_that_cannot_be_entered_never_turns_trust_off(trust: TrustStore
     trust.save(FILES)
     hidden = trust.folder.rename(trust.folder.with_name("hidden"))
     trust.folder.symlink_to(trust.folder)  # an error also for root, who may enter every folder
-    seen = [trust.exists, trust.is_authority]
+    with pytest.raises(StartError, match=r"trust: cannot be searched: Too many levels"):
+        _ = trust.exists
+    assert trust.is_authority
     for read in (trust.load, trust.load_ca_key, trust.load_tokens):
         with pytest.raises(StartError, match="cannot be read"):
             read()
     trust.folder.unlink()
-    seen.append(trust.exists)
+    assert not trust.exists
     trust.folder.write_bytes(b"")
-    seen.append(trust.exists)  # a file in place of the folder: there is nothing in it
-    assert seen == [True, True, False, False]
+    with pytest.raises(StartError, match=r"trust: is not a folder, so whether .* is not known; remove it"):
+        _ = trust.exists
     trust.folder.unlink()
     hidden.rename(trust.folder)
     trust.path(store.DENY).unlink()
@@ -114,7 +116,7 @@ def test_a_folder_that_cannot_be_entered_never_turns_trust_off(trust: TrustStore
 def test_a_file_of_another_user_names_the_remedy(trust: TrustStore, monkeypatch: pytest.MonkeyPatch) -> None:
     trust.save(FILES)
 
-    def refuse(path: Path, *_args: object) -> int:
+    def refuse(path: Path, *_args: object, **_options: object) -> int:
         raise PermissionError(13, "Permission denied", str(path))
 
     with monkeypatch.context() as patch:
@@ -123,8 +125,10 @@ def test_a_file_of_another_user_names_the_remedy(trust: TrustStore, monkeypatch:
         assert trust.exists
         with pytest.raises(StartError, match="cannot be read: Permission denied; run it as the user of the agent"):
             trust.load()
-        patch.setattr(os, "access", lambda path, _: path != trust.folder.parents[2])
-        assert not trust.exists, "a user who cannot see the state directory has no state there"
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "stat", refuse)
+        with pytest.raises(StartError, match=r"cannot be searched: Permission denied, .*RMPA_STATE_DIR"):
+            _ = trust.exists
 
 
 def test_a_huge_file_is_not_read(trust: TrustStore) -> None:
@@ -182,3 +186,17 @@ def test_leaving_removes_everything(trust: TrustStore) -> None:
 def test_secrets_are_never_shown() -> None:
     assert "private" not in repr(FILES)
     assert "keys" not in repr(FILES).replace("keys=", "")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root writes for another user")
+def test_what_root_writes_belongs_to_the_owner_of_the_state_directory(tmp_path: Path) -> None:
+    state = tmp_path / "state"
+    state.mkdir()
+    os.chown(state, 4321, 4321)
+    trust = TrustStore(state, "arm")
+    trust.save(FILES)
+    assert {path.stat().st_uid for path in (trust.folder, *trust.folder.iterdir(), trust.folder.parent)} == {4321}
+    assert trust.load() == FILES  # as the agent of that user would
+    os.chown(trust.path(store.KEY), 1234, 1234)
+    with pytest.raises(StartError, match="belongs to user 1234"):
+        trust.load()

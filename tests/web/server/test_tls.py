@@ -12,6 +12,7 @@ import aiohttp
 import pytest
 
 from rmpa.core.errors import ConfigError, StartError
+from rmpa.trust.io.store import MemberFiles, TrustStore
 from rmpa.web import limits
 from rmpa.web.server.agent_watch import AgentWatch
 from rmpa.web.server.auth import AccessPolicy, own_names
@@ -91,11 +92,11 @@ def test_files_that_cannot_be_used_are_told(cert: str, key: str, problem: str) -
 
 
 def test_the_users_certificate_wins_over_the_modules_own(tmp_path: Path) -> None:
-    assert certificate_files(CERT, KEY, tmp_path, "base") == CertificateFiles(CERT, KEY)
-    assert certificate_files("", "", tmp_path, "base") == CertificateFiles()
-    assert certificate_files("", "", None, "base") == CertificateFiles()
+    store = TrustStore(tmp_path, "base")
+    assert certificate_files(CERT, KEY, store) == CertificateFiles(CERT, KEY)
+    assert certificate_files("", "", None) == CertificateFiles()
     with pytest.raises(ConfigError, match="key without a certificate"):
-        certificate_files("", KEY, tmp_path, "base")
+        certificate_files("", KEY, store)
 
 
 def test_a_broken_set_of_files_never_means_plain_http(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -103,7 +104,7 @@ def test_a_broken_set_of_files_never_means_plain_http(tmp_path: Path, caplog: py
     folder.mkdir(parents=True)
     (folder / "module.crt").write_text("something")
     with pytest.raises(StartError, match=r"module\.key: is missing; join again"):
-        certificate_files("", "", tmp_path, "base")
+        certificate_files("", "", TrustStore(tmp_path, "base"))
     assert "run it as the agent's user, or name a --cert" in caplog.text
 
 
@@ -128,7 +129,6 @@ async def test_the_modules_certificate_serves_browsers_that_trust_the_ca_and_its
     pytest.importorskip("cryptography")
     from cryptography.hazmat.primitives import serialization
 
-    from rmpa.trust.io.store import MemberFiles, TrustStore
     from tests.trust.authority import Authority, new_key
 
     lab, wall = Authority(), time.time()
@@ -141,7 +141,7 @@ async def test_the_modules_certificate_serves_browsers_that_trust_the_ca_and_its
         store.save(files)
 
     join()
-    files = certificate_files("", "", tmp_path, "base")
+    files = certificate_files("", "", store)
     monkeypatch.setattr(limits, "CERTIFICATE_LOOK_PERIOD", 0.02)
     certificate = ServerCertificate(files)
     server = WebServer(AgentWatch(lambda: SNAPSHOT), AccessPolicy(0, HOSTS), "127.0.0.1", tls=certificate.context)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import contextlib
 import functools
 import socket
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Generic, Self, TypeVar, cast
 from urllib.parse import urlsplit
 
 import msgspec
 
-from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.config.module_name import NameFacts, running_agent
+from rmpa.core.errors import ConfigError, PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.core.sizes import KIB
 from rmpa.observe import limits
 from rmpa.observe.control import GATEWAY_ROLE, ROLE, ControlReply, ControlRequest
@@ -19,7 +20,7 @@ from rmpa.observe.io.runtime_dir import runtime_dir, runtime_dirs
 from rmpa.observe.snapshot import Snapshot
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
     from types import TracebackType
 
@@ -179,7 +180,7 @@ def find_agents(environ: Mapping[str, str]) -> list[FoundAgent]:
 
 
 def choose_agent(environ: Mapping[str, str], name: str | None = None) -> FoundAgent:
-    """The named agent; else that of RMPA_AGENT, the only one, that of ROS_MASTER_URI, the only one but gateways.
+    """The named agent; else that of RMPA_AGENT, else the one that ``config.module_name.running_agent`` chooses.
 
     Raises:
         UnreachableError: No agent runs, or none of that name.
@@ -188,27 +189,43 @@ def choose_agent(environ: Mapping[str, str], name: str | None = None) -> FoundAg
     agents = find_agents(environ)
     wanted = name or environ.get("RMPA_AGENT")
     listed = ", ".join(agent.name for agent in agents)
-    if wanted:
-        for agent in agents:
-            if agent.name == wanted:
-                return agent
-        path = runtime_dir(environ) / f"{wanted}.sock"
-        remedy = f"running here: {listed}" if agents else f"start it with `rmpa up --name {wanted}`"
-        raise UnreachableError(f"agent {wanted!r}", str(path), remedy)
-    if not agents:
+    if not wanted and not agents:
         places = ", ".join(map(str, runtime_dirs(environ) or [runtime_dir(environ)]))
         raise UnreachableError("agent", places, _START_ONE)
-    if len(agents) == 1:
-        return agents[0]
-    uri = environ.get("ROS_MASTER_URI", "")
+    if not wanted:
+        facts = NameFacts()
+        if len(agents) > 1:
+            from rmpa.config.sources import load_settings  # noqa: PLC0415 - most commands need no settings
+
+            with contextlib.suppress(ConfigError):  # a broken rmpa.toml is no reason not to ask
+                facts = load_settings({}, environ, host_name=socket.gethostname()).name_facts
+        wanted = running_agent(with_running(facts, agents, environ))
+    for agent in agents:
+        if agent.name == wanted:
+            return agent
+    path = runtime_dir(environ) / f"{wanted}.sock"
+    remedy = f"running here: {listed}" if agents else f"start it with `rmpa up --name {wanted}`"
+    raise UnreachableError(f"agent {wanted!r}", str(path), remedy)
+
+
+def with_running(facts: NameFacts, agents: Sequence[FoundAgent], environ: Mapping[str, str]) -> NameFacts:
+    """What the choice of a module depends on, with the agents that run; several are asked which of them they are."""
+    gateways: tuple[str, ...] = ()
+    of_master = ""
+    if len(agents) > 1:
+        gateways = tuple(agent.name for agent in agents if _is_gateway(agent))
+        of_master = _of_master(agents, environ.get("ROS_MASTER_URI", ""))
+    names = tuple(agent.name for agent in agents)
+    return replace(facts, running=names, gateways=gateways, of_master=of_master)
+
+
+def _of_master(agents: Sequence[FoundAgent], uri: str) -> str:
+    """The agent whose core a URI names; empty: none."""
     for agent in agents if uri else ():
         with contextlib.suppress(RmpaError), ControlClient(agent.path) as client:
             if same_core(client.agent().core_uri, uri):
-                return agent
-    modules = [agent for agent in agents if not _is_gateway(agent)]
-    if len(modules) == 1:
-        return modules[0]
-    raise RmpaError(f"several agents run on this machine: {listed}; name one with --agent NAME or RMPA_AGENT")
+                return agent.name
+    return ""
 
 
 def _is_gateway(agent: FoundAgent) -> bool:

@@ -207,7 +207,7 @@ class SnapshotBuilder:
             addresses=tuple(str(a) for a in (identity.guid.address, *identity.addresses)) if identity else (),
             interfaces=tuple(i.name for i in endpoint.discovery.interfaces) if endpoint is not None else (),
             links=str(endpoint.mode) if endpoint is not None else "",
-            config_file=str(self._settings.config_file or ""),
+            config_file=str(self._settings.config_file.absolute()) if self._settings.config_file else "",
             realtime=tuple(map(str, self._sources.requests)),
             files=_files(),
             proxies=proxies,

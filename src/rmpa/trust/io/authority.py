@@ -19,11 +19,12 @@ from rmpa.trust.io.private_keys import new_key, private_key
 from rmpa.trust.io.store import Issued, MemberFiles
 from rmpa.trust.join import MeshSecrets
 from rmpa.trust.keyring import GroupKey
+from rmpa.trust.page_names import server_names
 from rmpa.trust.reasons import TrustReason
 from rmpa.trust.tokens import Token, fingerprint_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection
+    from collections.abc import Callable, Collection, Iterable
     from ipaddress import IPv4Address
 
     from cryptography.hazmat.primitives.asymmetric import ec
@@ -179,9 +180,9 @@ class MeshAuthority:
         """A random number for a certificate."""
         return _serial()
 
-    def was_issued(self, name: str) -> None:
-        """Remember that a module has a new certificate."""
-        self._issued[name] = _issued(name, self.wall_for(name))
+    def was_issued(self, name: str, hosts: tuple[str, ...] = ()) -> None:
+        """Remember that a module has a new certificate, with these hosts of its page."""
+        self._issued[name] = _issued(name, self.wall_for(name), hosts)
         while len(self._issued) > limits.ISSUED_MAX:
             del self._issued[min(self._issued, key=lambda each: self._issued[each].expires)]
         self._store.save_issued(self.issued)
@@ -201,9 +202,21 @@ class MeshAuthority:
         if name and asked.name != name:
             raise CertificateError(TrustReason.NAME, f"{name} asks for a certificate of {asked.name}")
         secrets = self.secrets
-        certificate = certificates.issue(asked, secrets.ca, self._ca_key, _serial(), self.wall_for(asked.name))
-        self.was_issued(asked.name)
+        hosts, wall = self._granted(asked), self.wall_for(asked.name)
+        certificate = certificates.issue(asked, secrets.ca, self._ca_key, _serial(), wall, hosts=hosts)
+        self.was_issued(asked.name, hosts)
         return asked, certificate
+
+    def _granted(self, asked: CertificateRequest) -> tuple[str, ...]:
+        """Of the hosts that a module asks for those that are of no other module: the first one that asks has them."""
+        wall = self.wall()
+        taken = {
+            host
+            for name, issued in self._issued.items()
+            if name != asked.name
+            for host in (*server_names(name), *(issued.hosts if issued.expires > wall else ()))
+        }
+        return tuple(host for host in asked.hosts if host not in taken)
 
     def judge_renewal(self, certificate: bytes) -> ModuleCertificate:
         """The certificate (DER) of a module that was away, if it may be renewed.
@@ -216,9 +229,9 @@ class MeshAuthority:
             certificate, member.files.ca, self.wall(), deny=member.deny, grace=limits.RENEWAL_GRACE
         )
 
-    def renew_own(self) -> None:
-        """Renew the certificate of the authority itself; raises as ``issue``."""
-        _, certificate = self.issue(self._membership.request())
+    def renew_own(self, hosts: Iterable[str] = ()) -> None:
+        """Renew the certificate of the authority itself, with these hosts of its page; raises as ``issue``."""
+        _, certificate = self.issue(self._membership.request(hosts))
         self._membership.renewed(certificate)
 
     def has_issued(self, name: str, again: str = "") -> bool:
@@ -355,8 +368,8 @@ def _serial() -> int:
     return int.from_bytes(os.urandom(20), "big") >> (160 - _SERIAL_BITS) or 1
 
 
-def _issued(name: str, wall: float) -> Issued:
-    return Issued(name, int(wall), int(wall) + limits.CERTIFICATE_LIFETIME)
+def _issued(name: str, wall: float, hosts: tuple[str, ...] = ()) -> Issued:
+    return Issued(name, int(wall), int(wall) + limits.CERTIFICATE_LIFETIME, hosts)
 
 
 def _check_clock(wall: float) -> None:

@@ -22,7 +22,7 @@ from rmpa.trust.reasons import TrustError, TrustReason
 from rmpa.trust.tokens import TokenBook
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from rmpa.core.clock import Clock
     from rmpa.trust.io.store import MemberFiles, TrustStore
@@ -164,10 +164,10 @@ class Membership:
         if self._deny.denies(name, begin + limits.CERTIFICATE_BACKDATE):
             raise TrustError(TrustReason.REVOKED, f"{name} was revoked (deny list {self._deny.number})")
 
-    def request(self) -> bytes:
-        """A request (DER) for a newer certificate of this module and its key."""
+    def request(self, hosts: Iterable[str] = ()) -> bytes:
+        """A request (DER) for a newer certificate of this module and its key, with these hosts of its page."""
         key = private_key(self.files.key, str(self.store.path(files_of.KEY)))
-        return certificates.make_request(key, self.name)
+        return certificates.make_request(key, self.name, hosts)
 
     # --- what is newer ----------------------------------------------------------------------------------------
 

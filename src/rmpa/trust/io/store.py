@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
+from rmpa.config.state_dir import module_dir
 from rmpa.core.errors import StartError
-from rmpa.runtime.state_dir import module_dir
 from rmpa.trust import limits
 from rmpa.trust.tokens import Invitation, TokenBook
 
@@ -39,12 +39,13 @@ REQUEST_KEY: Final = "request.key"
 """The key of a join by files, until its answer comes."""
 _MEMBER: Final = (KEY, CERTIFICATE, CA, KEYS)
 """Files that each member must have."""
-_SIGNS: Final = (*_MEMBER, DENY, CA_KEY, TOKENS, ISSUED)
+_SIGNS: Final = (*_MEMBER, DENY, CA_KEY, TOKENS, ISSUED, AUTHORITY)
 """Any of these is the sign of a module that has joined."""
-_ALL: Final = (*_SIGNS, AUTHORITY, REQUEST_KEY)
+_ALL: Final = (*_SIGNS, REQUEST_KEY)
 _FILE_MAX: Final = limits.DOCUMENT_MAX
 _JOIN: Final = "join again: rmpa trust invite at the authority, rmpa trust join TOKEN here; or rmpa trust leave"
 _USER: Final = "run it as the user of the agent, or give the files and their folder back to that user"
+_ELSEWHERE: Final = "choose another state directory: RMPA_STATE_DIR"
 _OPEN: Final = os.O_CLOEXEC | os.O_NOFOLLOW
 
 
@@ -74,11 +75,13 @@ class Issued(msgspec.Struct, frozen=True):
         name: The module's.
         issued: When, seconds since 1970.
         expires: When it ends.
+        hosts: The names and addresses of its page that it has, besides those that follow from its name.
     """
 
     name: str
     issued: int
     expires: int
+    hosts: tuple[str, ...] = ()
 
 
 class AuthorityPlace(msgspec.Struct, frozen=True):
@@ -104,8 +107,7 @@ class TrustStore:
     """
 
     def __init__(self, state: Path, module: str) -> None:
-        self._state = state
-        self.folder = module_dir(state, module) / FOLDER
+        self.folder = module_dir(state.absolute(), module) / FOLDER
 
     def path(self, name: str) -> Path:
         """Where a file is."""
@@ -115,10 +117,11 @@ class TrustStore:
     def exists(self) -> bool:
         """Whether trust is on here: there is any of the files, whole or not.
 
-        An error of the folder counts as yes, so that it never turns trust off. Where not even the state directory can
-        be seen, this user has no state of any kind there, and so no trust.
+        Raises:
+            StartError: It cannot be known: a folder on the way cannot be searched, is none, or is a link that leads
+                nowhere. That never counts as no.
         """
-        return any(_is_there(self.path(name)) for name in _SIGNS) and os.access(self._state.parent, os.X_OK)
+        return is_folder(self.folder) and any(_is_there(self.path(name)) for name in _SIGNS)
 
     @property
     def is_authority(self) -> bool:
@@ -215,12 +218,14 @@ class TrustStore:
         try:
             self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             self.folder.chmod(0o700)
+            self._give_to_owner(self.folder.parent, self.folder)
             with contextlib.suppress(FileNotFoundError):
                 temporary.unlink()  # of a run that was killed, with this process id
             with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _OPEN, 0o600), "wb") as file:
                 file.write(data)
                 file.flush()
                 os.fsync(file.fileno())
+            self._give_to_owner(temporary)
             temporary.replace(path)
             _sync_folder(self.folder)
         except OSError as error:
@@ -244,11 +249,18 @@ class TrustStore:
             self.folder.rmdir()
         return removed
 
+    def _give_to_owner(self, *paths: Path) -> None:
+        """As root, let what was written belong to the owner of the state directory: the agent runs as that user."""
+        owner = self.folder.parents[1].stat()
+        if os.geteuid() == 0 and owner.st_uid != 0:
+            for path in paths:
+                os.chown(path, owner.st_uid, owner.st_gid)
+
     def _read(self, name: str, remedy: str = _JOIN) -> bytes:
         path = self.path(name)
         try:
             with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | _OPEN), "rb") as file:
-                problem = _exposed(os.fstat(file.fileno()))
+                problem = _exposed(os.fstat(file.fileno()), self._owners())
                 data = b"" if problem else file.read(_FILE_MAX + 1)
         except FileNotFoundError:
             raise StartError(str(path), "is missing", remedy) from None
@@ -262,11 +274,59 @@ class TrustStore:
             raise StartError(str(path), f"is broken: {len(data)} bytes", remedy)
         return data
 
+    def _owners(self) -> set[int]:
+        """The users to whom files may belong: this one and root; for root the owner of the state directory, too."""
+        us = os.geteuid()
+        return {us, 0} if us else {0, self.folder.parents[1].stat().st_uid}
+
     def _der(self, name: str, found: Mapping[str, bytes]) -> bytes:
         try:
             return ssl.PEM_cert_to_DER_cert(found[name].decode("ascii"))
         except ValueError:
             raise StartError(str(self.path(name)), "is broken: not a certificate in PEM", _JOIN) from None
+
+
+def modules_with_keys(state: Path) -> list[str]:
+    """The modules with files of a secured mesh in a state directory.
+
+    Raises:
+        StartError: It cannot be known, as for ``TrustStore.exists``.
+    """
+    if not is_folder(state):
+        return []
+    try:
+        names = sorted(entry.name for entry in os.scandir(state) if entry.is_symlink() or entry.is_dir())
+    except OSError as error:
+        raise StartError(str(state), f"cannot be read: {error.strerror}", _USER) from None
+    return [name for name in names if TrustStore(state, name).exists]
+
+
+def is_folder(path: Path) -> bool:
+    """Whether there is a folder.
+
+    Raises:
+        StartError: It cannot be known, there is something else, or a link that leads nowhere.
+    """
+    try:
+        if stat.S_ISDIR(path.stat().st_mode):
+            return True
+        problem, remedy = "is not a folder", f"remove it, if it is of no use: rm {path}"
+    except FileNotFoundError:
+        link = next((each for each in (path, *path.parents) if each.is_symlink() and not each.exists()), None)
+        if link is None:
+            return False
+        path, problem, remedy = (
+            link,
+            f"leads to {link.readlink()}, which is not there",
+            "mount it, or remove the link",
+        )
+    except NotADirectoryError:
+        problem, remedy = "is below a file, not a folder", _ELSEWHERE
+    except PermissionError as error:
+        problem, remedy = f"cannot be searched: {error.strerror}", f"{_USER}; or {_ELSEWHERE}"
+    except OSError as error:
+        problem, remedy = f"cannot be searched: {error.strerror}", f"mend it, or {_ELSEWHERE}"
+    raise StartError(str(path), f"{problem}, so whether this module has joined a secured mesh is not known", remedy)
 
 
 def _is_there(path: Path) -> bool:
@@ -284,11 +344,11 @@ def _pem(certificate: bytes) -> bytes:
     return ssl.DER_cert_to_PEM_cert(certificate).encode()
 
 
-def _exposed(info: os.stat_result) -> str:
+def _exposed(info: os.stat_result, owners: set[int]) -> str:
     """Why a file may have been read or changed by others; empty: it was not."""
     if not stat.S_ISREG(info.st_mode):
         return "is not a file"
-    if info.st_uid not in {os.geteuid(), 0}:
+    if info.st_uid not in owners:
         return f"belongs to user {info.st_uid}"
     if info.st_mode & 0o077:
         return f"can be read by others (mode {stat.S_IMODE(info.st_mode):o})"

@@ -157,11 +157,15 @@ class ControlReader:
     Args:
         environ: Says where the sockets are.
         name: The agent's; ``None``: the one that ``choose_agent`` finds. Once found, it stays the one.
+        check: Called with each snapshot before it is used; raises ``RmpaError`` if the server is not for that agent.
     """
 
-    def __init__(self, environ: Mapping[str, str], name: str | None) -> None:
+    def __init__(
+        self, environ: Mapping[str, str], name: str | None, check: Callable[[Snapshot], None] = lambda _: None
+    ) -> None:
         self._environ = environ
         self._name = name
+        self._check = check
         self._client: ControlClient | None = None
         self._decoder = SnapshotDecoder()
         self._used = 0.0
@@ -179,13 +183,13 @@ class ControlReader:
     def read_whole(self) -> Snapshot:
         """Ask for a snapshot of which nothing is left out; raises as a call."""
         with ControlClient(choose_agent(self._environ, self._name).path, limits.WEB_WHOLE_TIMEOUT) as client:
-            return client.snapshot()
+            return self._checked(client.snapshot())
 
     def read_named(self, topics: Sequence[str], services: Sequence[str]) -> Snapshot:
         """Ask for a snapshot of these topics and services alone; raises as a call."""
         with ControlClient(choose_agent(self._environ, self._name).path, limits.WEB_WHOLE_TIMEOUT) as client:
             figures = "newest" if self.figures else False
-            return client.snapshot(topics=topics, services=services, peers=False, figures=figures)
+            return self._checked(client.snapshot(topics=topics, services=services, peers=False, figures=figures))
 
     def _read(self, **args: object) -> Snapshot:
         began = time.monotonic()
@@ -209,6 +213,10 @@ class ControlReader:
             self.close()
             raise
         self._used = time.monotonic()
+        return self._checked(snapshot)
+
+    def _checked(self, snapshot: Snapshot) -> Snapshot:
+        self._check(snapshot)
         return snapshot
 
     def close(self) -> None:

@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rmpa.config.state_dir import module_dir, state_dir
 from rmpa.core.errors import RmpaError, StartError
-from rmpa.runtime.state_dir import module_dir, state_dir
+from rmpa.trust.page_names import server_names
 from rmpa.web.gateways.gateways import Gateways
 from rmpa.web.monitor.io.monitor import Monitor
 from rmpa.web.server import auth
@@ -25,12 +26,14 @@ from rmpa.web.server.roles import WebRoles
 from rmpa.web.server.server import WebServer
 from rmpa.web.server.tls import CertificateFiles, ServerCertificate
 from rmpa.web.server.token_file import token_from
+from rmpa.web.server.trust_watch import TrustWatch
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from rmpa.config.settings import Settings, WebSettings
     from rmpa.config.web_tokens import WebToken
+    from rmpa.trust.status import TrustStatus
 
 _log = logging.getLogger(__name__)
 
@@ -80,18 +83,28 @@ class WebSetup:
         access: The tokens.
         files: The certificate of HTTPS.
         trusted: Whether this module is in a secured mesh.
+        module: The module's name.
+        trust_folder: Where its files of trust are.
     """
 
     settings: Settings
     access: TokenAccess
     files: CertificateFiles
     trusted: bool = False
+    module: str = ""
+    trust_folder: str = ""
+
+    def fits(self, agent: TrustStatus | None) -> bool:
+        """Whether a server made of this is as secure as an agent; ``None``: an agent without trust."""
+        return agent is None or (self.trusted and agent.module == self.module and agent.folder == self.trust_folder)
 
     @property
     def policy(self) -> auth.AccessPolicy:
         """Which requests are served."""
         web = self.settings.web
         hosts = auth.own_names((socket.gethostname(), *web.hosts)) | {web.listen.lower()}
+        if self.trusted:
+            hosts |= frozenset(server_names(self.module))
         origins = frozenset(origin.lower().rstrip("/") for origin in web.origins)
         clients = tuple((each.name, each.token) for each in self.access.clients)
         return auth.AccessPolicy(web.port, hosts, self.access.token, origins, clients)
@@ -157,8 +170,11 @@ async def serve(
     *,
     with_agent: bool,
     load: Callable[[], WebSetup] | None = None,
-) -> None:
+) -> bool:
     """Serve until SIGINT or SIGTERM; at SIGHUP tokens, roles and rules are read again.
+
+    Returns:
+        Whether the agent is secured in another way than this setup, so that another one is to be served.
 
     Args:
         setup: The settings, tokens and certificate.
@@ -175,7 +191,8 @@ async def serve(
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stop.set)
     web = setup.settings.web
-    reader = ControlReader(os.environ, agent)
+    trust = TrustWatch(os.environ, agent, setup.fits)
+    reader = ControlReader(os.environ, agent, trust.check)
     watch = AgentWatch(reader, read_whole=reader.read_whole, read_named=reader.read_named)
     hub = make_hub(watch, web.port)
 
@@ -187,7 +204,7 @@ async def serve(
     reload = WebReload(setup, load)
     gateways = Gateways(
         hub,
-        f"RMPA {agent or socket.gethostname()}",
+        f"RMPA {setup.module or socket.gethostname()}",
         lambda request: reload.roles.of(request[CLIENT]),
         priority_of(hub, setup.settings.make_contracts()),
         monitor,
@@ -202,19 +219,33 @@ async def serve(
             monitor.start()
             changes.start()
             reload.start(server, gateways)
+            trust.start()
             if with_agent:
                 _stop_at_end_of_input(loop, stop)
             announce(address_of(web, setup.access, server.port, is_https=certificate.context is not None))
-            await stop.wait()
-            _log.info("= ending")
+            await _first_of(stop, trust.misfit)
+            _log.info("= ending" if stop.is_set() else "= the agent is secured: beginning anew with its certificate")
             await gateways.close()
             await changes.close()
             await monitor.close()
     finally:
+        await trust.close()
         await reload.close()
         await certificate.close()
         await server.close()
         reader.close()
+    return not stop.is_set()
+
+
+async def _first_of(*events: asyncio.Event) -> None:
+    """Wait for one of several events."""
+    waits = [asyncio.ensure_future(event.wait()) for event in events]
+    try:
+        await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for wait in waits:
+            wait.cancel()
+        await asyncio.wait(waits)
 
 
 class WebReload:

@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rmpa.core.errors import ConfigError, StartError
-from rmpa.trust.io.store import CERTIFICATE, KEY, TrustStore
+from rmpa.trust.io.store import CERTIFICATE, KEY
 from rmpa.web import limits
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from rmpa.trust.io.store import TrustStore
 
 _log = logging.getLogger(__name__)
 
@@ -33,14 +35,13 @@ class CertificateFiles:
     key: str = ""
 
 
-def certificate_files(cert: str, key: str, state: Path | None, module: str) -> CertificateFiles:
+def certificate_files(cert: str, key: str, store: TrustStore | None) -> CertificateFiles:
     """The files of a server: those of the user, else the module's own if it is in a secured mesh, else none.
 
     Args:
         cert: As ``[web]`` names it.
         key: Likewise.
-        state: The state directory; ``None`` if there is none.
-        module: The module's name.
+        store: The module's files of trust; ``None``: it is in no secured mesh.
 
     Raises:
         ConfigError: There is a key without a certificate.
@@ -51,8 +52,7 @@ def certificate_files(cert: str, key: str, state: Path | None, module: str) -> C
         return CertificateFiles(cert, key)
     if key:
         raise ConfigError("web.key", "there is a key without a certificate", "name the certificate with --cert")
-    store = TrustStore(state, module) if state is not None else None
-    if store is None or not store.exists:
+    if store is None:
         return CertificateFiles()
     try:
         store.load()

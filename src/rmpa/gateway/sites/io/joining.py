@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rmpa.config.permission_rules import Access
+from rmpa.config.state_dir import module_dir, state_dir
 from rmpa.core.errors import UnreachableError
 from rmpa.gateway import limits
 from rmpa.gateway.graph.own_graph import AgentGraph
@@ -28,7 +29,6 @@ from rmpa.gateway.sites.io.site_why import SiteWhy
 from rmpa.gateway.sites.io.topic_part import SiteTopics
 from rmpa.gateway.sites.keys import SiteGateway
 from rmpa.gateway.sites.rules import CrossingRules
-from rmpa.runtime.state_dir import module_dir, state_dir
 from rmpa.runtime.system_clock import SystemClock
 from rmpa.trust.permissions import refusal
 

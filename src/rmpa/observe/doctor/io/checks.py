@@ -41,9 +41,7 @@ from rmpa.observe.doctor.stale_connections import judge_stale_connections
 from rmpa.observe.io.control_client import ControlClient, find_agents
 from rmpa.observe.snapshot import Snapshot
 from rmpa.ros.environment import DEFAULT_MASTER_URI, host_of
-from rmpa.runtime.state_dir import state_dir
 from rmpa.runtime.tcp_connections import may_end_connections
-from rmpa.trust.io.store import TrustStore
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -219,9 +217,8 @@ def _stale_connections(given: DoctorInput) -> Iterable[Check]:
 
 
 def _exposed_nodes(given: DoctorInput) -> Iterable[Check]:
-    state = state_dir(given.environ, given.settings.state_dir or None)
     for name, shown in given.snapshots.items():
-        trusted = state is not None and TrustStore(state, name).exists
+        trusted = shown.trust is not None
         found = exposed_nodes(shown.agent.core_uri, shown.agent.pid) if trusted else None
         yield judge_exposed_nodes(name, found, trusted=trusted, direct=given.settings.allows_direct)
     if not given.snapshots:

@@ -1,0 +1,151 @@
+"""The directory of files that survive a program's end, and the name of this machine's module, which is kept there."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core.errors import ConfigError, StartError
+from rmpa.core.identity import peer_name_problem
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+def state_dir(environ: Mapping[str, str], setting: str | None = None) -> Path | None:
+    """The directory of all files that survive a run; it need not exist yet.
+
+    The first of: the setting, RMPA_STATE_DIR, STATE_DIRECTORY (systemd's, for a unit with ``StateDirectory=``),
+    ``rmpa`` below XDG_STATE_HOME, ``~/.local/state/rmpa``.
+
+    Returns:
+        ``None`` if none of these is set and the user has no home directory.
+    """
+    if setting or environ.get("RMPA_STATE_DIR"):
+        return Path(setting or environ["RMPA_STATE_DIR"])
+    if environ.get("STATE_DIRECTORY"):
+        return Path(environ["STATE_DIRECTORY"].partition(":")[0])
+    if environ.get("XDG_STATE_HOME"):
+        return Path(environ["XDG_STATE_HOME"]) / "rmpa"
+    if environ.get("HOME"):
+        return Path(environ["HOME"]) / ".local" / "state" / "rmpa"
+    return None
+
+
+def module_dir(directory: Path, module: str) -> Path:
+    """The folder of one module's files within the state directory."""
+    return directory / (re.sub(r"[^\w.-]", "_", module).lstrip(".") or "_")
+
+
+def core_file(environ: Mapping[str, str], port: int, module: str = "", setting: str = "") -> Path | None:
+    """The file of a ROS core, named by module and port, so that two cores on one machine do not share a file.
+
+    Args:
+        environ: As for ``state_dir``.
+        port: The core's port; with 0 (chosen by the system) there is no file, because the next run has another port.
+        module: Empty for a core without an agent.
+        setting: As for ``state_dir``.
+    """
+    directory = state_dir(environ, setting or None)
+    if directory is None or not port:
+        return None
+    return (module_dir(directory, module) if module else directory) / f"core-{port}.sqlite"
+
+
+# --- the module's name ----------------------------------------------------------------------------------------------
+
+NAME_FILE: Final = "module-name"
+"""In the state directory: the name of this machine's module. No folder of a module is named so: it has a dash."""
+PLACES_FILE: Final = "state-directories"
+"""In the usual state directory: others in which this user's modules have joined a secured mesh, one a line."""
+_READ_MAX: Final = 64 * 1024
+_SYSTEM: Final = Path("/var/lib/rmpa")
+"""The state directory of a systemd unit with ``StateDirectory=rmpa``."""
+
+
+def kept_name(directory: Path | None) -> str:
+    """The name that is kept in a state directory; empty: none, or this user cannot read it.
+
+    Raises:
+        ConfigError: The file has something else.
+    """
+    if directory is None:
+        return ""
+    text = _read(directory / NAME_FILE).strip()
+    if text and (problem := peer_name_problem(text)):
+        raise ConfigError("the module's name", problem, "write it there, or remove the file", directory / NAME_FILE)
+    return text
+
+
+def keep_name(directory: Path, name: str, *, instead: bool = False) -> bool:
+    """Keep a name as that of this machine's module; return whether it is kept there now.
+
+    Args:
+        directory: The state directory; made if needed.
+        name: The name.
+        instead: Whether it takes the place of another one; else the first one stays.
+
+    Raises:
+        StartError: It cannot be written.
+    """
+    path = directory / NAME_FILE
+    temporary = path.with_name(f".{NAME_FILE}.{os.getpid()}")
+    try:
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        temporary.write_text(f"{name}\n", encoding="ascii")
+        try:
+            if instead:
+                temporary.replace(path)
+            else:
+                os.link(temporary, path)  # fails where there is one already: of two first starts one is the first
+        except FileExistsError:
+            return kept_name(directory) == name
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise StartError(str(path), f"cannot be written: {error.strerror}", "say --name at each start") from None
+    return True
+
+
+def usual_state_dir(environ: Mapping[str, str]) -> Path | None:
+    """The state directory where nothing names one: no setting, RMPA_STATE_DIR or STATE_DIRECTORY."""
+    said = ("RMPA_STATE_DIR", "STATE_DIRECTORY")
+    return state_dir({name: value for name, value in environ.items() if name not in said})
+
+
+def other_state_dirs(environ: Mapping[str, str], used: Path | None) -> list[Path]:
+    """State directories besides the one in use in which modules of this user may have files: as far as it is known.
+
+    Args:
+        environ: As for ``state_dir``.
+        used: The one in use.
+    """
+    usual = usual_state_dir(environ)
+    listed = _read(usual / PLACES_FILE).splitlines() if usual is not None else []
+    places = [*([usual] if usual is not None else []), *map(Path, filter(None, listed)), _SYSTEM]
+    return [place for place in dict.fromkeys(places) if place != used]
+
+
+def note_state_dir(environ: Mapping[str, str], used: Path) -> None:
+    """Note in the usual state directory that there is another one, so that a start without its name is noticed.
+
+    It is of use to the same user alone; where it cannot be written, nothing is noted.
+    """
+    usual, used = usual_state_dir(environ), used.absolute()
+    if usual is None or usual == used or used in other_state_dirs(environ, usual):
+        return
+    with contextlib.suppress(OSError):
+        usual.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with (usual / PLACES_FILE).open("a", encoding="utf-8") as file:
+            file.write(f"{used}\n")
+
+
+def _read(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return file.read(_READ_MAX).decode("utf-8", "replace")
+    except OSError:
+        return ""

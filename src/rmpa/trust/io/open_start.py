@@ -1,0 +1,73 @@
+"""Whether a module may start without trust: not beside keys of this user's other modules, unless that is said.
+
+A name or a state directory that was forgotten must not start a module of a secured mesh as an open one.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rmpa.config.state_dir import other_state_dirs
+from rmpa.core.errors import StartError
+from rmpa.trust.io.store import TrustStore, modules_with_keys
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+_SHOWN = 5
+
+
+def check_open_start(state: Path | None, module: str, environ: Mapping[str, str]) -> None:
+    """Check that an open module is what the user wants.
+
+    Args:
+        state: The state directory in use; ``None``: there is none.
+        module: The module, which has no files of trust there.
+        environ: Says where other state directories are.
+
+    Raises:
+        StartError: Another module, or another state directory, has keys of a secured mesh; or it cannot be known.
+    """
+    here = modules_with_keys(state) if state is not None else []
+    if here:
+        start = f"start as it: --name {here[0]}" if len(here) == 1 else "start as one of them with --name"
+        raise _refused(module, f"{_listed(here)} here in {state}", f"{start}; or let {module} join")
+    for place in other_state_dirs(environ, state):
+        if there := _keys_in(place):
+            start = f"start with RMPA_STATE_DIR={place}"
+            name = "" if module in there else f" and --name {there[0]}"
+            raise _refused(module, f"{_listed(there)} in {place}", f"{start}{name}; or let {module} join")
+
+
+def _refused(module: str, others: str, remedy: str) -> StartError:
+    problem = f"has no keys, and would start without trust, beside keys of {others}"
+    open_word = "or start it open: --insecure (insecure = true in [trust])"
+    return StartError(
+        f"the module {module}", problem, f"{remedy}: rmpa trust join TOKEN --name {module}; {open_word}"
+    )
+
+
+def _keys_in(place: Path) -> list[str]:
+    """The modules with keys in a state directory that is not in use; none if it is another user's."""
+    try:
+        return modules_with_keys(place)
+    except StartError:
+        # A folder of ours that is broken there says that there may be keys; one that we may not even see, that it is
+        # another user's.
+        try:
+            return [entry.name for entry in place.iterdir() if _may_have_keys(place, entry.name)]
+        except OSError:
+            return []
+
+
+def _may_have_keys(place: Path, name: str) -> bool:
+    try:
+        return TrustStore(place, name).exists
+    except StartError:
+        return True
+
+
+def _listed(names: list[str]) -> str:
+    shown = ", ".join(names[:_SHOWN])
+    return f"{shown} and {len(names) - _SHOWN} more" if len(names) > _SHOWN else shown

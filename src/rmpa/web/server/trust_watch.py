@@ -1,0 +1,103 @@
+"""Whether a server fits the agent that it speaks to: it is never less secure than that."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
+from rmpa.observe import limits as observe_limits
+from rmpa.observe.control import ControlReply, ControlRequest
+from rmpa.observe.io.control_client import choose_agent
+from rmpa.trust.status import TrustStatus
+from rmpa.web import limits
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from rmpa.observe.snapshot import Snapshot
+
+_log = logging.getLogger(__name__)
+
+
+class TrustWatch:
+    """Notices an agent that is secured in another way than this server: the server is then to be made anew.
+
+    It holds a connection to the agent's control socket, whose end tells that the agent may be another one now.
+
+    Args:
+        environ: Says where the sockets are.
+        agent: The agent's name; ``None``: the one that ``choose_agent`` finds.
+        fits: Whether this server may speak to an agent; ``None``: one without trust.
+    """
+
+    def __init__(
+        self, environ: Mapping[str, str], agent: str | None, fits: Callable[[TrustStatus | None], bool]
+    ) -> None:
+        self._environ = environ
+        self._agent = agent
+        self._fits = fits
+        self._loop = asyncio.get_running_loop()
+        self._task: asyncio.Task[None] | None = None
+        self.misfit = asyncio.Event()
+        """Set once an agent answers that this server may not speak to."""
+
+    def start(self) -> None:
+        """Begin, in a task."""
+        self._task = self._loop.create_task(self._run(), name="watch whether the agent is secured")
+
+    async def close(self) -> None:
+        """End."""
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.wait([self._task])
+
+    def check(self, snapshot: Snapshot) -> None:
+        """Check the agent that sent a snapshot; may be called in any thread.
+
+        Raises:
+            PeerRefused: This server may not show it.
+        """
+        if not self._fits(snapshot.trust):
+            self._loop.call_soon_threadsafe(self.misfit.set)
+            problem = "is secured, and this server begins anew with its certificate and permissions"
+            raise PeerRefused(f"agent {snapshot.agent.name}", problem, "ask again")
+
+    async def _run(self) -> None:
+        while not self.misfit.is_set():
+            try:
+                await self._follow()
+            except (RmpaError, OSError, EOFError, TimeoutError, asyncio.LimitOverrunError) as error:
+                _log.debug("! whether the agent is secured is not known: %s", error)
+            await asyncio.sleep(limits.TRUST_RETRY)
+
+    async def _follow(self) -> None:
+        """Ask one run of an agent, and wait for its end."""
+        agent = await asyncio.to_thread(choose_agent, self._environ, self._agent)
+        reader, writer = await asyncio.open_unix_connection(agent.path, limit=observe_limits.CONTROL_REPLY_MAX)
+        try:
+            writer.write(ControlRequest("trust", {"what": "status"}).serialize())
+            async with asyncio.timeout(limits.WEB_AGENT_TIMEOUT):
+                status = _status(await reader.readuntil(b"\n"))
+            if not self._fits(status if status.on else None):
+                self.misfit.set()
+                return
+            await reader.read()  # idle connections are ended, too: then it is asked again
+        finally:
+            writer.close()
+            with contextlib.suppress(OSError):
+                await writer.wait_closed()
+
+
+def _status(line: bytes) -> TrustStatus:
+    reply = ControlReply.parse(line)
+    if not reply.ok:
+        raise RemoteProtocolError(reply.error)
+    try:
+        return msgspec.convert(reply.value, TrustStatus)
+    except msgspec.ValidationError as error:
+        raise RemoteProtocolError(f"the agent answers trust in another way: {error}") from None

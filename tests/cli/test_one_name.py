@@ -1,0 +1,244 @@
+"""A module's name is said once: each command finds the same module, and none is less secure than it."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import json
+import os
+import socket
+import ssl
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+import pytest
+
+pytest.importorskip("cryptography")
+
+from rmpa.discovery.io.interfaces import list_interfaces
+from rmpa.trust.page_names import host_names, page_hosts
+from tests.cli.conftest import DEADLINE
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+RULES = """
+[[permission]]
+modules = ["*"]
+effect = "deny"
+subscribe = ["/secret"]
+publish = ["/forged"]
+"""
+
+
+class Machine:
+    """A machine without any setting but where its files are: nothing but a command says a name."""
+
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        kept = {k: v for k, v in os.environ.items() if not k.startswith(("ROS_", "RMPA_", "XDG_"))}
+        own = {"RMPA_RUNTIME_DIR": str(folder / "run"), "HOME": str(folder), "NO_COLOR": "1"}
+        self.folder, self.environ, self._stack, self._port = folder, kept | own, stack, 20000 + os.getpid() % 20000
+        self.state = folder / ".local/state/rmpa"
+
+    def start(self, *arguments: str, **environ: str) -> subprocess.Popen[str]:
+        with (self.folder / f"{arguments[0]}.log").open("w") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "rmpa.cli.main", *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                text=True,
+                env=self.environ | environ,
+                cwd=self.folder,
+                start_new_session=True,
+            )
+        self._stack.callback(_end, process)
+        return process
+
+    def run(self, *arguments: str, code: int = 0, **environ: str) -> str:
+        """Run a command to its end; what it says."""
+        process = self.start(*arguments, **environ)
+        assert process.wait(DEADLINE) == code, self.log(arguments[0])
+        return self.log(arguments[0])
+
+    def log(self, command: str) -> str:
+        return (self.folder / f"{command}.log").read_text()
+
+    def up(self, *arguments: str, **environ: str) -> subprocess.Popen[str]:
+        """Start an agent on loopback, and wait until it has a control socket."""
+        net = ("--multicast", f"239.255.117.117:{self._port}", "--interface", "lo", "--core-port", free_port())
+        known = self.agents()
+        process = self.start("up", *net, *arguments, **environ)
+
+        def answers() -> bool:
+            assert process.poll() is None, self.log("up")
+            return self.agents() != known
+
+        _until(answers)
+        return process
+
+    def agents(self) -> set[str]:
+        return {path.stem for path in (self.folder / "run").glob("*.sock")}
+
+    def end(self, process: subprocess.Popen[str]) -> None:
+        process.terminate()
+        process.wait(DEADLINE)
+        _until(lambda: not self.agents())
+
+    def web(self, *arguments: str) -> str:
+        """Start ``rmpa web``, and wait until it says where it is."""
+        self.start("web", "--json", *arguments)
+        _until(lambda: self.log("web").count('"url"'))
+        return self.url()
+
+    def url(self) -> str:
+        """Where ``rmpa web`` said last that it is."""
+        lines = [line for line in self.log("web").splitlines() if line.startswith('{"url"')]
+        return str(json.loads(lines[-1])["url"])
+
+
+def free_port() -> str:
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        return str(sock.getsockname()[1])
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    if process.poll() is None:
+        process.kill()
+    process.communicate()
+
+
+def _until(condition: Callable[[], object]) -> None:
+    deadline = time.monotonic() + DEADLINE
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+@pytest.fixture
+def machine() -> Iterator[Machine]:
+    # Not pytest's folder: the path of a control socket has at most 107 bytes.
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        yield Machine(Path(folder), stack)
+
+
+def test_the_first_start_names_the_machine(machine: Machine) -> None:
+    machine.end(machine.up("--name", "arm"))
+    second = machine.up("--name", "base", RMPA_NAME="other")  # not kept: there is one
+    assert machine.agents() == {"base"}
+    machine.end(second)
+    machine.up()
+    assert machine.agents() == {"arm"}
+    assert f"the module is arm, as at its first start ({machine.state / 'module-name'})" in machine.log("up")
+    assert json.loads(machine.run("trust", "status", "--json"))["module"] == "arm"
+    machine.up("--name", "second")
+    assert machine.agents() == {"arm", "second"}
+    assert json.loads(machine.run("trust", "status", "--json"))["module"] == "arm"  # of several the kept one
+    (machine.state / "module-name").unlink()
+    assert "several agents run on this machine: arm, second" in machine.run("trust", "status", code=1)
+
+
+def test_a_second_module_does_not_name_the_machine(machine: Machine) -> None:
+    machine.up(RMPA_NAME="base")
+    machine.up("--name", "second")
+    assert not (machine.state / "module-name").exists()
+
+
+def test_what_has_joined_is_what_starts_next(machine: Machine) -> None:
+    machine.end(machine.up("--name", "trial"))
+    said = machine.run("trust", "init", "--name", "sec")
+    assert "Next: rmpa up here" in said
+    refused = machine.run("up", "--name", "trial", code=1)
+    assert f"beside keys of sec here in {machine.state}; start as it: --name sec" in refused
+    assert "--insecure" in refused
+    refused = machine.run("up", code=1, RMPA_STATE_DIR=str(machine.folder / "other"))
+    assert f"start with RMPA_STATE_DIR={machine.state} and --name sec" in refused
+    machine.up("--name", "trial", "--insecure")
+    machine.up()
+    assert machine.agents() == {"sec", "trial"}
+    assert json.loads(machine.run("trust", "status", "--json"))["agent"] == "secured"
+    assert json.loads(machine.run("trust", "status", "--json", "--name", "trial"))["agent"] == "plain"
+
+
+def test_an_authority_in_a_state_directory_of_its_own_is_not_forgotten(machine: Machine) -> None:
+    data = str(machine.folder / "data")
+    machine.run("trust", "init", "--name", "sec", RMPA_STATE_DIR=data)
+    assert f"start with RMPA_STATE_DIR={data};" in machine.run("up", "--name", "sec", code=1)
+
+
+def test_a_gateway_is_no_less_secure_than_the_agent_beside_it(machine: Machine) -> None:
+    pytest.importorskip("zenoh")
+    machine.run("trust", "init", "--name", "sec")
+    machine.up(RMPA_STATE_DIR=str(machine.state))
+    gateway = ("gateway", "--router", "--listen", f"tcp/127.0.0.1:{free_port()}")
+    refused = machine.run(*gateway, code=1)
+    assert "the gateway sec_gateway: has no keys, beside the agent sec in a secured mesh" in refused
+    assert "rmpa trust join TOKEN --name sec_gateway; or say --insecure" in refused
+    # Also where nothing of the agent's files is seen.
+    other = {"HOME": "/nonexistent", "RMPA_STATE_DIR": str(machine.folder / "gw")}
+    assert "beside the agent sec" in machine.run(*gateway, code=1, **other)
+
+
+def test_the_web_server_is_as_secure_as_the_agent_whatever_their_names(machine: Machine) -> None:
+    pytest.importorskip("aiohttp")
+    (machine.folder / "agents.toml").write_text(RULES)
+    agent = machine.up("--name", "sec", "--config", "agents.toml")
+    url = machine.web("--control", "--listen", "127.0.0.1", "--port", free_port())
+    assert url.startswith("http://")
+    # The agent comes back secured: the server is made anew, with its certificate and its permissions.
+    machine.run("trust", "init")
+    machine.end(agent)
+    machine.up("--config", "agents.toml")
+    _until(lambda: machine.url().startswith("https://"))
+    ca = machine.state / "sec/trust/ca.crt"
+    token = (machine.state / "sec/web-token").read_text().strip()
+    statuses = asyncio.run(_statuses(ca, urlsplit(machine.url()).port or 0, token))
+    assert [("the client web may not" in text) for text in statuses] == [True, True], statuses
+    # A browser that knows the CA opens the page by each name and address of this machine.
+    addresses = [str(address) for interface in list_interfaces() for address in interface.addresses]
+    hosts = page_hosts((*host_names(socket.gethostname()), *sorted(addresses)))
+    port = urlsplit(machine.url()).port or 0
+    for host in ("sec", "sec.local", "localhost", "127.0.0.1", *hosts):
+        _until(functools.partial(_accepts, ca, port, host))
+    assert not _accepts(ca, port, "other.local")
+
+
+def _accepts(ca: Path, port: int, host: str) -> bool:
+    """Whether a client that knows the CA finds the server to be that host, and is served by that name."""
+    trust = ssl.create_default_context(cafile=str(ca))
+    try:
+        with (
+            socket.create_connection(("127.0.0.1", port), DEADLINE) as plain,
+            trust.wrap_socket(plain, server_hostname=host) as secured,
+        ):
+            secured.sendall(f"GET /healthz HTTP/1.1\r\nHost: {host}:{port}\r\n\r\n".encode())
+            return secured.recv(64).startswith(b"HTTP/1.1 200")
+    except ssl.SSLCertVerificationError:
+        return False
+
+
+async def _statuses(ca: Path, port: int, token: str) -> list[str]:
+    """What a rosbridge client is told that reads and forges topics which the agent's rules deny."""
+    import aiohttp
+
+    trust = ssl.create_default_context(cafile=str(ca))
+    url = f"https://127.0.0.1:{port}/?token={token}"
+    async with aiohttp.ClientSession() as session, session.ws_connect(url, ssl=trust) as client:
+        await client.send_json({"op": "subscribe", "topic": "/secret", "type": "std_msgs/String"})
+        await client.send_json({"op": "advertise", "topic": "/forged", "type": "std_msgs/String"})
+        return [(await client.receive_json(timeout=DEADLINE))["msg"] for _ in range(2)]
+
+
+def test_the_web_server_without_an_agent_is_that_of_the_module_with_keys(machine: Machine) -> None:
+    pytest.importorskip("aiohttp")
+    machine.run("trust", "init", "--name", "sec")
+    assert machine.web("--port", free_port()).startswith("https://")
+    refused = machine.run("web", "--agent", "other", code=1)
+    assert "the module other: has no keys, and would start without trust, beside keys of sec" in refused

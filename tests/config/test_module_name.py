@@ -1,0 +1,84 @@
+"""Which module a command is about, and the name that is kept for the commands to come."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.config.module_name import ModuleName, NameFacts, NameSource, choose_name
+from rmpa.config.sources import load_settings
+from rmpa.config.state_dir import (
+    NAME_FILE,
+    keep_name,
+    kept_name,
+    note_state_dir,
+    other_state_dirs,
+    usual_state_dir,
+)
+from rmpa.core.errors import ConfigError, RmpaError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.mark.parametrize(
+    ("facts", "name", "source"),
+    [
+        (NameFacts(default="host"), "host", NameSource.DEFAULT),
+        (NameFacts(kept="first", default="host"), "first", NameSource.KEPT),
+        (NameFacts(running=("a",), kept="first"), "a", NameSource.RUNNING),
+        (NameFacts(running=("a", "first"), kept="first"), "first", NameSource.RUNNING),
+        (NameFacts(running=("a", "b"), of_master="b", kept="a"), "b", NameSource.RUNNING),
+        (NameFacts(running=("a", "a_gateway"), gateways=("a_gateway",)), "a", NameSource.RUNNING),
+        (NameFacts(running=("a_gateway",), gateways=("a_gateway",)), "a_gateway", NameSource.RUNNING),
+        (NameFacts(file="said", running=("a",), kept="first"), "said", NameSource.FILE),
+        (NameFacts(variable="v", file="said", running=("a", "b")), "v", NameSource.VARIABLE),
+        (NameFacts(agent_variable="r", variable="v", file="said"), "r", NameSource.AGENT_VARIABLE),
+        (NameFacts(option="o", agent_variable="r", variable="v", running=("a",)), "o", NameSource.OPTION),
+    ],
+)
+def test_what_is_said_wins_then_what_runs_then_what_is_kept(facts: NameFacts, name: str, source: NameSource) -> None:
+    assert choose_name(facts) == ModuleName(name, source)
+
+
+def test_of_several_agents_none_is_guessed() -> None:
+    with pytest.raises(RmpaError, match=r"several agents run on this machine: a, b; name one with --agent"):
+        choose_name(NameFacts(running=("a", "b"), kept="c", default="host"))
+
+
+def test_the_first_name_is_kept_and_holds_where_none_is_said(tmp_path: Path) -> None:
+    environ = {"RMPA_STATE_DIR": str(tmp_path / "state")}
+
+    def name(**options: object) -> str:
+        return load_settings(options, environ, host_name="my-robot", cwd=tmp_path).settings.name
+
+    assert name() == "my_robot"
+    assert keep_name(tmp_path / "state", "arm")
+    assert not keep_name(tmp_path / "state", "base"), "the first one stays"
+    assert name() == "arm"
+    assert name(name="base") == "base"
+    (tmp_path / "rmpa.toml").write_text('name = "said"\n')
+    assert name() == "said"
+    assert keep_name(tmp_path / "state", "base", instead=True)
+    assert kept_name(tmp_path / "state") == "base"
+
+
+def test_a_broken_file_of_the_name_is_an_error_and_not_another_module(tmp_path: Path) -> None:
+    (tmp_path / NAME_FILE).write_text("my arm\n")
+    with pytest.raises(ConfigError, match="'my arm' is not a ROS base name") as error:
+        load_settings({}, {"RMPA_STATE_DIR": str(tmp_path)}, host_name="h", cwd=tmp_path)
+    assert str(tmp_path / NAME_FILE) in str(error.value)
+    assert "remove the file" in str(error.value)
+
+
+def test_a_state_directory_of_its_own_is_noted_in_the_usual_one(tmp_path: Path) -> None:
+    environ = {"HOME": str(tmp_path), "RMPA_STATE_DIR": str(tmp_path / "data")}
+    usual = tmp_path / ".local/state/rmpa"
+    assert usual_state_dir(environ) == usual
+    for _ in range(2):
+        note_state_dir(environ, tmp_path / "data")
+    assert other_state_dirs(environ, usual)[:1] == [tmp_path / "data"]
+    assert other_state_dirs(environ, tmp_path / "third")[:2] == [usual, tmp_path / "data"]
+    note_state_dir(environ, usual)
+    assert (usual / "state-directories").read_text() == f"{tmp_path / 'data'}\n"

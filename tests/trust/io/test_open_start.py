@@ -1,0 +1,96 @@
+"""A start without trust beside keys of this user's other modules: refused, with what to do."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.config.state_dir import note_state_dir
+from rmpa.core.errors import StartError
+from rmpa.trust.io.open_start import check_open_start
+from rmpa.trust.io.store import TrustStore
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+
+def _keys(state: Path, module: str = "sec", file: str = "module.crt") -> None:
+    (state / module / "trust").mkdir(parents=True)
+    (state / module / "trust" / file).write_text("something")
+
+
+def _only_the_authority(state: Path) -> None:
+    _keys(state, file="authority.json")
+
+
+def _dangling_module(state: Path) -> None:
+    state.mkdir()
+    (state / "sec").symlink_to(state / "not mounted")
+
+
+def _dangling_trust(state: Path) -> None:
+    (state / "sec").mkdir(parents=True)
+    (state / "sec" / "trust").symlink_to(state / "not mounted")
+
+
+def _dangling_state(state: Path) -> None:
+    state.symlink_to(state.parent / "not mounted")
+
+
+def _file_for_folder(state: Path) -> None:
+    (state / "sec").mkdir(parents=True)
+    (state / "sec" / "trust").write_text("")
+
+
+@pytest.mark.parametrize("module", ["sec", "other"])
+@pytest.mark.parametrize(
+    "made", [_keys, _only_the_authority, _dangling_module, _dangling_trust, _dangling_state, _file_for_folder]
+)
+def test_what_may_be_a_secured_module_never_counts_as_an_open_one(
+    tmp_path: Path, made: Callable[[Path], None], module: str
+) -> None:
+    state = tmp_path / "state"
+    made(state)
+    try:
+        secured = TrustStore(state, module).exists
+        if not secured:
+            check_open_start(state, module, {})
+    except StartError as error:
+        assert error.remedy  # noqa: PT017 - either is right: secured, or an error
+    else:
+        assert secured, "an open start"
+
+
+def test_keys_of_another_name_are_named_with_what_to_do(tmp_path: Path) -> None:
+    check_open_start(tmp_path, "other", {})
+    _keys(tmp_path)
+    (tmp_path / "plain").mkdir()
+    with pytest.raises(StartError) as error:
+        check_open_start(tmp_path, "other", {})
+    text = str(error.value)
+    assert "the module other: has no keys" in text
+    assert f"beside keys of sec here in {tmp_path}" in text
+    for remedy in ("start as it: --name sec", "rmpa trust join TOKEN --name other", "--insecure"):
+        assert remedy in text
+
+
+def test_another_or_a_forgotten_state_directory_is_noticed(tmp_path: Path) -> None:
+    home = {"HOME": str(tmp_path)}
+    usual, data = tmp_path / ".local/state/rmpa", tmp_path / "data"
+    _keys(data)
+    note_state_dir(home, data)
+    for used in (usual, tmp_path / "third"):  # forgotten; and another one
+        with pytest.raises(StartError, match=f"keys of sec in {data}; start with RMPA_STATE_DIR={data}; or"):
+            check_open_start(used, "sec", home)
+    with pytest.raises(StartError, match=f"RMPA_STATE_DIR={data} and --name sec"):
+        check_open_start(usual, "other", home)
+    _keys(usual)
+    with pytest.raises(StartError, match=f"keys of sec in {usual}"):
+        check_open_start(tmp_path / "third", "sec", home)
+
+
+def test_a_directory_that_is_not_in_use_and_belongs_to_another_user_does_not_matter(tmp_path: Path) -> None:
+    (tmp_path / "rmpa").write_text("")
+    check_open_start(tmp_path / "own", "m", {"XDG_STATE_HOME": str(tmp_path)})
