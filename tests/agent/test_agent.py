@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import socket
 from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
 from typing import TYPE_CHECKING
@@ -17,6 +18,7 @@ from rmpa.bridge.proxy_names import proxied_node
 from rmpa.config.settings import Multicast, PolicySettings, Settings
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.observe.io.control_client import ControlClient
+from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.http.client import call_api
 from rmpa.ros.node.node import Node
 from rmpa.ros.node.slave_node import SlaveNode
@@ -282,8 +284,24 @@ async def test_a_second_agent_of_one_name_or_port_is_refused(settings: Callable[
     async with running(settings("a")) as (a,):
         with pytest.raises(StartError, match="a"):
             await Agent(settings("a")).start()
-        with pytest.raises(StartError, match=str(core_port(a))):
+        said = rf"port {core_port(a)} is already in use by the agent a \(pid {os.getpid()}\); .*run FILE --name a"
+        with pytest.raises(StartError, match=said):
             await Agent(settings("b", core_port=core_port(a))).start()
+
+
+async def test_another_program_that_has_the_cores_port_is_named(settings: Callable[..., Settings]) -> None:
+    core = RosCore(port=0)
+    await core.start()
+    said = rf"is already in use by .+ \(pid {os.getpid()}\); join its graph with `rmpa up --core external`"
+    with pytest.raises(StartError, match=said):
+        await Agent(settings("b", core_port=core.port)).start()
+    await core.close()
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        with pytest.raises(
+            StartError, match=rf"{port} is already in use by .+ \(pid {os.getpid()}\); end that program"
+        ):
+            await Agent(settings("b", core_port=port)).start()
 
 
 async def test_a_start_that_fails_leaves_nothing_open(settings: Callable[..., Settings]) -> None:

@@ -11,7 +11,7 @@ import socket
 import time
 from typing import TYPE_CHECKING, Final
 
-from rmpa.agent.core_choice import make_core
+from rmpa.agent.core_choice import make_core, start_core
 from rmpa.agent.network import Network
 from rmpa.agent.permission_notes import permission_notes
 from rmpa.agent.process import run_process, serve
@@ -196,7 +196,7 @@ class Agent:
         async with contextlib.AsyncExitStack() as undo:
             self._control.lock()
             undo.push_async_callback(self._control.close)
-            await self.core.start()
+            await start_core(self.core, self._settings)
             undo.push_async_callback(self.core.close)
             await self.bridge.start()
             undo.push_async_callback(self.bridge.close)

@@ -7,6 +7,7 @@ has IPv4 addresses here.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import functools
 import os
@@ -119,6 +120,21 @@ def listening_sockets() -> list[ListeningSocket] | None:
         return None
     sockets = map(InetSocket.parse, found)
     return [ListeningSocket(_text(of.family, of.source), of.source_port, of.inode) for of in sockets]
+
+
+def program_at(port: int) -> str:
+    """The program that has a port, TCP or UDP, such as ``rosmaster (pid 812)``; empty where the kernel does not say.
+
+    It reads the descriptors of all processes that this user may see, which takes some 50 ms.
+    """
+    import psutil  # noqa: PLC0415 - for a text of an error
+
+    with contextlib.suppress(psutil.Error, OSError):
+        for connection in psutil.net_connections("inet"):
+            listens = connection.status in (psutil.CONN_LISTEN, psutil.CONN_NONE)
+            if listens and connection.laddr and connection.laddr.port == port and connection.pid:
+                return f"{psutil.Process(connection.pid).name()} (pid {connection.pid})"
+    return ""
 
 
 def connections(

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import socket
 from typing import TYPE_CHECKING, Final
 
@@ -412,7 +413,9 @@ async def test_port_in_use_has_a_remedy(echo: Echo) -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        with pytest.raises(StartError, match=f"port {port} is already in use; end the program"):
+        with pytest.raises(
+            StartError, match=rf"port {port} is already in use by .+ \(pid {os.getpid()}\); end that program"
+        ):
             await XmlRpcServer(echo, port=port).start()
     with pytest.raises(StartError, match="does not have that address"):
         await XmlRpcServer(echo, host="192.0.2.1").start()

@@ -13,6 +13,7 @@ from rmpa.core.errors import StartError
 from rmpa.core.open_files import remedy
 from rmpa.ros import limits
 from rmpa.runtime.descriptors import DESCRIPTORS
+from rmpa.runtime.tcp_connections import program_at
 
 if TYPE_CHECKING:
     from rmpa.runtime.descriptors import Use
@@ -41,7 +42,8 @@ async def listen(name: str, host: str, port: int, use: Use) -> socket.socket:
             sock.close()
             raise
     except OSError as error:
-        raise _start_error(error, f"{name} at {host}:{port}", port) from error
+        owner = await asyncio.to_thread(program_at, port) if error.errno == errno.EADDRINUSE else ""
+        raise _start_error(error, f"{name} at {host}:{port}", port, owner) from error
     return sock
 
 
@@ -55,13 +57,13 @@ async def _resolve(host: str, port: int) -> tuple[str, int]:
     return str(found[0][4][0]), port
 
 
-def _start_error(error: OSError, where: str, port: int) -> StartError:
+def _start_error(error: OSError, where: str, port: int, owner: str) -> StartError:
     match error.errno:
         case errno.EADDRINUSE:
             return StartError(
                 where,
-                f"port {port} is already in use",
-                "end the program that listens there (another core?) or choose another port",
+                f"port {port} is already in use" + (f" by {owner}" if owner else ""),
+                "end that program (another core?) or choose another port",
             )
         case errno.EACCES | errno.EPERM:
             return StartError(where, "this user may not use that port", "choose a port above 1023")

@@ -15,6 +15,7 @@ from rmpa.discovery.io.interfaces import choose, list_interfaces
 from rmpa.discovery.io.sockets import open_receiver
 from rmpa.observe.doctor.io.programs import ask_program
 from rmpa.observe.doctor.network import NetworkInterface, Port, Radio
+from rmpa.runtime.tcp_connections import program_at
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -112,7 +113,7 @@ def probe_ports(settings: Settings, ours: Mapping[int, str], agents: Mapping[int
     try:
         open_receiver(settings.multicast.group, number).close()
     except OSError as error:
-        ports.append(Port("beacons (UDP)", number, error.strerror or str(error), _owner(number)))
+        ports.append(Port("beacons (UDP)", number, error.strerror or str(error), program_at(number)))
     else:
         ports.append(Port("beacons (UDP)", number, owner=_users(number, agents)))
     return tuple(ports)
@@ -125,18 +126,8 @@ def _tcp(what: str, host: str, number: int, ours: Mapping[int, str]) -> Port:
             probe.bind((host, number))
         except OSError as error:
             owner = ours.get(number, "")
-            return Port(what, number, error.strerror or str(error), owner or _owner(number), ours=bool(owner))
+            return Port(what, number, error.strerror or str(error), owner or program_at(number), ours=bool(owner))
     return Port(what, number)
-
-
-def _owner(number: int) -> str:
-    """The program that has a port, ready to read; empty where the kernel does not say."""
-    with contextlib.suppress(psutil.Error, OSError):
-        for connection in psutil.net_connections("inet"):
-            listens = connection.status in (psutil.CONN_LISTEN, psutil.CONN_NONE)
-            if listens and connection.laddr and connection.laddr.port == number and connection.pid:
-                return f"{psutil.Process(connection.pid).name()} (pid {connection.pid})"
-    return ""
 
 
 def _users(number: int, agents: Mapping[int, str]) -> str:
