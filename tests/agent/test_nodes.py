@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
-from rmpa.config.settings import NodeSettings
+from rmpa.bridge.io.node_presence import NodePresence
+from rmpa.config.settings import NodeSettings, PeerRule, PolicySettings
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.http.client import call_api
 from rmpa.ros.node.node import Node
+from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node_info import NodeEnd, NodeFacts, NodePing, PeerNodes
 from tests.agent.test_agent import node, running, settings, until
 
@@ -181,3 +183,46 @@ async def test_taking_a_proxys_name_ends_no_node_elsewhere(
         assert await call_api(proxy(a, "talker"), "shutdown", "/master", reason) == (1, "shutdown", 0)
         assert (await ask(a, NodePing, "node.ping", "/talker")).pid
         assert not ended.is_set()
+
+
+def loggers(agent: Agent, name: str) -> str:
+    """The address of the one service by which a node stands in a module's graph; empty if it does not."""
+    return next(iter(agent.core.state().services.get(f"/rmpa/b/{name}/get_loggers", {}).values()), "")
+
+
+async def test_a_node_that_only_subscribes_stands_in_the_other_graphs(settings: Callable[..., Settings]) -> None:
+    async with running(settings("a"), settings("b")) as (a, b):
+        async with node("viewer", b) as viewer, node("talker", b) as talker:
+            await viewer.subscribe("/chatter", "std_msgs/String")
+            await talker.advertise("/news", "std_msgs/String")
+            await until(lambda: loggers(a, "viewer") and proxy(a, "talker"))
+            assert not loggers(a, "talker"), "it is known by what crosses of it"
+            assert "/rmpa/b/viewer" in a.core.state().nodes
+            assert "/chatter" not in a.core.state().subscribers, (
+                "no publisher here may think that it has a subscriber"
+            )
+            connection = await ServiceConnection.open(loggers(a, "viewer"), "/rmpa/b/viewer/get_loggers", "/client")
+            assert await connection.call(b"", 20.0) == (True, bytes(4))
+            connection.close()
+            reply = await call_api(a.core.state().nodes["/rmpa/b/viewer"], "getPid", "/rosnode")
+            assert reply.code == 1
+            assert "/rmpa/a/viewer" not in b.core.state().nodes, "proxies are not told on"
+
+            await viewer.advertise("/seen", "std_msgs/String")
+            await until(lambda: not loggers(a, "viewer"))
+            assert "/rmpa/b/viewer" in a.core.state().nodes
+        await until(lambda: not [name for name in a.core.state().nodes if name.startswith("/rmpa/b/")])
+
+
+async def test_modules_that_ignore_each_other_do_not_show_their_nodes(settings: Callable[..., Settings]) -> None:
+    strict = replace(settings("b"), peers=(PeerRule("a", policy=PolicySettings(deny=("/**",))),))
+    async with running(settings("a"), strict) as (a, b), node("viewer", b) as viewer, node("other", a) as other:
+        await viewer.subscribe("/chatter", "std_msgs/String")
+        await other.subscribe("/chatter", "std_msgs/String")
+        for each in (a, b):
+            (presence,) = [part for part in each.bridge._parts if isinstance(part, NodePresence)]
+            presence._tell()
+        await ask(a, tuple[PeerNodes, ...], "node.list")  # behind what was told, over the same link
+        await ask(b, tuple[PeerNodes, ...], "node.list", peer="a")
+        for each in (a, b):
+            assert not [name for name in each.core.state().nodes if name.startswith(("/rmpa/a/", "/rmpa/b/"))]

@@ -21,6 +21,7 @@ from rmpa.agent.trust_operations import PlainOperations, TrustOperations
 from rmpa.agent.web_process import WebProcess, web_command, web_environment
 from rmpa.bridge.io.bridge import Bridge
 from rmpa.bridge.io.limit_reports import LimitReports
+from rmpa.bridge.io.node_presence import NodePresence
 from rmpa.bridge.io.node_requests import NodeRequests
 from rmpa.bridge.naming import Names
 from rmpa.bridge.params.io.part import Params
@@ -123,7 +124,17 @@ class Agent:
         reports = LimitReports(
             self.bridge.sessions, self.bridge.rpc, self.bridge.topics, self.services, settings.limits
         )
-        for part in (self.params, self.services, reports):
+        self._nodes = NodeRequests(settings, self.core, self.bridge.rpc, self.bridge.gate)
+        presence = NodePresence(
+            self.core,
+            self.bridge.sessions,
+            self.bridge.rpc,
+            self.bridge.topics,
+            self.services,
+            settings,
+            self._nodes.visible,
+        )
+        for part in (self.params, self.services, reports, presence):
             self.bridge.add(part)
         self.trust: AgentTrust | None = None
         """This module's part in a secured mesh; ``None``: trust is off."""
@@ -155,7 +166,6 @@ class Agent:
             trust=self.trust.status if self.trust is not None else lambda: None,
         )
         self.snapshots = SnapshotBuilder(settings, sources)
-        self._nodes = NodeRequests(settings, self.core, self.bridge.rpc, self.bridge.gate)
         AgentRequests(self.bridge.rpc, self.snapshots)
         self.sites = SiteRequests(self.bridge.rpc, self.bridge.sessions.linked, self.bridge.gate)
         """Answers questions about other sites; a gateway answers them itself."""

@@ -117,6 +117,9 @@ call of it starts the time anew: `rosnode kill -a` asks all nodes of the graph, 
 CALL_BACK_DELAYS: Final = (0.05, 1.0)
 """Seconds after which a proxy whose subscribers were disconnected is registered again: at once, and once more for
 slow subscribers."""
+NODES_PAUSE: Final = 1.0
+"""Seconds from a change of the graph until peers are told of the nodes of which nothing crosses: a node that starts
+registers in several steps."""
 RECONCILE_INTERVAL: Final = 5.0
 """Seconds between two comparisons of the plan with what is really open, so that nothing stays stuck."""
 RECONCILE_SKIPS: Final = 11

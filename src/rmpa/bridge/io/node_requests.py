@@ -90,14 +90,14 @@ class NodeRequests:
             for access, table in zip((Access.SUBSCRIBE, Access.PUBLISH, Access.CALL), tables, strict=True)
         ]
 
-    def _visible(self, peer: str) -> Collection[str]:
+    def visible(self, peer: str) -> Collection[str]:
         """The nodes that a peer is told of: those of which it may have something."""
         if not self._gate.on:
             return self._core.state().nodes
         return {node for table in self._tables(peer) for nodes in yielding_to_data(table.values()) for node in nodes}
 
     async def _info(self, asker: PeerSession, args: dict[str, Any]) -> NodeFacts:
-        self._own(args, self._visible(asker.link.name))
+        self._own(args, self.visible(asker.link.name))
         return self._permitted(asker.link.name, await self.info(args))
 
     async def info(self, args: Mapping[str, object]) -> NodeFacts:
@@ -136,7 +136,7 @@ class NodeRequests:
         )
 
     async def _ping(self, asker: PeerSession, args: dict[str, Any]) -> NodePing:
-        node, uri = self._own(args, self._visible(asker.link.name))
+        node, uri = self._own(args, self.visible(asker.link.name))
         return await ping_node(node, uri, OWN_NODE)
 
     async def _kill(self, asker: PeerSession, args: dict[str, Any]) -> NodeEnd:
