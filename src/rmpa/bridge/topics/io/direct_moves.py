@@ -319,11 +319,12 @@ class SubscriberMoves:
         if links is None and endpoint is not None and standing(endpoint):
             return False  # the node is stopped: `_check` tries again
         await publisher_update(uri, topic, [one for one in self._core.publishers(topic).values() if one != proxy])
-        if publication.hang_up(key.subscriber):
-            await forgotten(uri, topic, proxy)
+        left = publication.hang_up(key.subscriber)
         if endpoint is not None and (problem := await end_links(endpoint, links or ())):
             self.stuck(key, endpoint, problem)
             return False
+        if left or route.path is not Path.RELAY:
+            await forgotten(uri, topic, proxy)
         self._routes.hung_up(key)
         self._on_left(key)
         return True
