@@ -35,8 +35,10 @@ pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 CLIENTS: Final = [("roscpp", "rospy"), ("rospy", "roscpp")]
 """Subscriber and publisher. What each library does at a fault depends on its own side alone."""
 RATE: Final = 100
-UNPRIVILEGED: Final = ("setpriv", "--bounding-set=-net_admin", "--inh-caps=-net_admin", "--")
-"""Runs an agent as root without the capability that ending connections of others takes."""
+UNPRIVILEGED: Final = ("setpriv", "--bounding-set=-net_admin,-sys_ptrace", "--inh-caps=-net_admin,-sys_ptrace", "--")
+"""Runs an agent as root without the capabilities by which it could end connections of nodes."""
+ORDINARY: Final = ("setpriv", "--bounding-set=-net_admin", "--inh-caps=-net_admin", "--")
+"""Runs an agent that may end those of processes that it may touch, as one of the nodes' own user."""
 
 
 def pair(modules: ModuleFactory, subscriber: str, publisher: str) -> tuple[Module, Module, Process, Process]:
@@ -137,9 +139,12 @@ def test_a_host_with_another_address_is_direct_again(modules: ModuleFactory, cli
     assert any(other.startswith("10.77.0.77:") for _, other in connections(listener))
 
 
-def test_a_publisher_without_a_queue_is_freed_from_a_vanished_subscriber(modules: ModuleFactory, lab: Lab) -> None:
+@pytest.mark.parametrize("prefix", [(), ORDINARY])
+def test_a_publisher_without_a_queue_is_freed_from_a_vanished_subscriber(
+    modules: ModuleFactory, lab: Lab, prefix: tuple[str, ...]
+) -> None:
     """rospy without ``queue_size`` sends to each subscriber in turn, and blocks where one takes nothing more."""
-    a, b = modules("a", "b", config=AUTO)
+    a, b = modules("a", "b", config=AUTO, prefix=prefix)
     on_the_network(a, b)
     talker = a.ros.rospy("talker", topic="/chatter", rate=50, size=100_000, queue=-1)
     abroad = b.ros.roscpp("listener", topic="/chatter")

@@ -6,10 +6,13 @@ import errno
 import os
 import select
 import socket
+import subprocess
+import sys
 import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 import pytest
@@ -267,10 +270,37 @@ def test_a_connection_to_a_host_that_does_not_answer_is_ended(stack: ExitStack) 
     assert first.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR) == 0
 
 
+WAITS = """
+import socket, sys
+sock = socket.create_connection(("127.0.0.1", int(sys.argv[1])))
+print(flush=True)
+try:
+    sock.sendall(bytes(256 << 20))
+except OSError as error:
+    print(type(error).__name__, flush=True)
+"""
+
+
 @ends
-def test_without_the_capability_nothing_is_ended(stack: ExitStack) -> None:
+def test_without_the_capability_those_of_the_same_user_are_ended(stack: ExitStack) -> None:
+    """A node that waits in ``send`` goes on, and what the kernel still had for it is not sent later."""
+    listener = listen(stack)
+    words = [sys.executable, "-c", WAITS, str(listener.getsockname()[1])]
+    node = stack.enter_context(subprocess.Popen(words, stdout=subprocess.PIPE, text=True))
+    assert node.stdout is not None
+    node.stdout.readline()
+    server = stack.enter_context(listener.accept()[0])
+    port = server.getpeername()[1]
+    found = seen(local_port=port)
+    assert without(NET_ADMIN, lambda: end_connections(found)) == 1
+    assert node.stdout.readline() in {"ConnectionResetError\n", "BrokenPipeError\n"}
+    assert seen(local_port=port) == []
+
+
+@ends
+def test_without_the_capability_those_of_others_are_not_ended(stack: ExitStack) -> None:
     client, server = pair(stack, listen(stack))
-    found = seen(remote=client.getsockname())
+    found = [replace(of, uid=of.uid + 1) for of in seen(remote=client.getsockname())]
     with pytest.raises(PermissionError):
         without(NET_ADMIN, lambda: end_connections(found))
     try_to_end.cache_clear()
@@ -279,7 +309,7 @@ def test_without_the_capability_nothing_is_ended(stack: ExitStack) -> None:
         assert may_end_connections().partition("; ")[0] == problem, "it is tried once"
     finally:
         try_to_end.cache_clear()
-    assert problem == "this process has no CAP_NET_ADMIN"
+    assert problem.startswith("this process has no CAP_NET_ADMIN")
     assert "AmbientCapabilities=CAP_NET_ADMIN" in remedy
     assert "setcap" in remedy
     assert may_end_connections() == ""

@@ -8,11 +8,14 @@ has IPv4 addresses here.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import functools
 import os
 import socket
+import struct
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from rmpa.runtime.sock_diag import InetSocket, SockDiag, read_carried
@@ -40,6 +43,12 @@ _PORTS: Final = range(1, 1 << 16)
 _GONE: Final = frozenset({errno.ENOENT, errno.ESTALE})
 _UNSUPPORTED: Final = frozenset({errno.EOPNOTSUPP, errno.EINVAL})
 """``EINVAL`` comes from kernels before 4.5, which do not know the message."""
+_libc: Final = ctypes.CDLL(None, use_errno=True)
+_PIDFD_GETFD: Final = 438
+"""The number of pidfd_getfd(2), the same on all machines, since Linux 5.6; Python has no function for it."""
+_DISCONNECT: Final = bytes(16)
+"""A socket address of the family AF_UNSPEC, which ends a connection (connect(2))."""
+_YAMA: Final = Path("/proc/sys/kernel/yama/ptrace_scope")
 REMEDY: Final = (
     "run the agent with CAP_NET_ADMIN: `AmbientCapabilities=CAP_NET_ADMIN` in its systemd unit, "
     "`--cap-add NET_ADMIN` for Docker, or `setcap cap_net_admin+ep PYTHON`"
@@ -245,26 +254,66 @@ def end_connections(found: Iterable[TcpConnection]) -> int:
     """End connections of any process (``SOCK_DESTROY``, what ``ss -K`` does), in some 0.02 ms each.
 
     Calls of the process that holds the socket fail with ``ECONNABORTED``, also those that wait already; the other end
-    gets a reset.
+    gets a reset. Without CAP_NET_ADMIN those of this user's processes are ended by a copy of their descriptor
+    (pidfd_getfd, where Yama does not forbid it), with ``ECONNRESET`` or ``EPIPE``; a search for them takes some
+    milliseconds.
 
     Returns:
         How many were ended. A connection that is gone already is not counted.
 
     Raises:
-        PermissionError: This process has no CAP_NET_ADMIN. Connections before the first one that is still there may
-            have been gone.
+        PermissionError: Some could not be ended: this process has no CAP_NET_ADMIN, and they are not of processes
+            that it may touch. The others were ended.
         OSError: ``EOPNOTSUPP``: the kernel lacks ``CONFIG_INET_DIAG_DESTROY``; or another error of netlink.
     """
-    ended = 0
+    ended = refused = 0
     with SockDiag() as kernel:
         for connection in found:
             number = kernel.destroy(_socket(connection))
+            if number == errno.EPERM:
+                done = _disconnect(connection)
+                ended, refused = ended + done, refused + (not done)
+                continue
             if number in _UNSUPPORTED:
                 raise OSError(errno.EOPNOTSUPP, "this kernel cannot end connections (CONFIG_INET_DIAG_DESTROY)")
             if number and number not in _GONE:
                 raise OSError(number, os.strerror(number))
             ended += not number
+    if refused:
+        raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
     return ended
+
+
+def _disconnect(connection: TcpConnection) -> bool:
+    """End a connection of a process of this user by a copy of its descriptor; return whether that was possible."""
+    if not connection.inode or connection.uid != os.geteuid():
+        return False
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            if process.stat().st_uid != os.geteuid():
+                continue
+            for entry in (process / "fd").iterdir():
+                if str(entry.readlink()) == f"socket:[{connection.inode}]":
+                    return _disconnect_copy(int(process.name), int(entry.name), connection)
+    return False
+
+
+def _disconnect_copy(process: int, descriptor: int, connection: TcpConnection) -> bool:
+    pidfd = os.pidfd_open(process)
+    try:
+        copy = _libc.syscall(_PIDFD_GETFD, pidfd, descriptor, 0)
+    finally:
+        os.close(pidfd)
+    if copy < 0:
+        return False
+    with socket.socket(fileno=copy) as sock:
+        if os.fstat(copy).st_ino != connection.inode:
+            return False  # the number is another socket's by now
+        if _libc.connect(copy, _DISCONNECT, len(_DISCONNECT)):
+            # Some kernels refuse it while the process waits in a call. That is released, and closing drops the rest.
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            sock.shutdown(socket.SHUT_RDWR)
+    return True
 
 
 def _socket(connection: TcpConnection) -> InetSocket:
@@ -318,6 +367,11 @@ def try_to_end() -> str:
         if problem.errno != errno.EOPNOTSUPP:
             raise
         return f"{problem.strerror}; use a kernel with that option"
+    if ended and error == errno.ECONNRESET:
+        with contextlib.suppress(OSError):
+            if _YAMA.read_text(encoding="ascii").strip() != "0":  # a process may touch itself and its children alone
+                return f"this process has no CAP_NET_ADMIN; {REMEDY}"
+        return f"this process has no CAP_NET_ADMIN, and ends those of its own user's nodes alone; {REMEDY}"
     if not ended or error != errno.ECONNABORTED:
         return "the kernel did not end a connection that it was told to end; use another kernel"
     return ""
