@@ -157,6 +157,9 @@ GHOST_QUIET: Final = 0.5
 """A link that was silent for this long (two keepalive intervals) does not prevent a link to a new run of its peer."""
 LINKS_MAX: Final = 4096
 """Peers that may be linked at one time; as many as the membership holds."""
+CONNECTIONS_PER_NAME: Final = 16
+"""Connections that one certified name may have here. A module has two, one for each lane; twice that while its agent
+starts anew or dials cross, and twice that after a cut. Each takes some 130 KB."""
 LINK_STABLE: Final = 5.0
 """After the loss of a link that was up for at least this long, the back-off begins at the shortest delay."""
 REFUSED_RETRY: Final = 5.0

@@ -432,3 +432,24 @@ async def test_a_handshake_that_has_not_begun_leaves_no_socket_when_the_mesh_end
         await asyncio.wait([task])
         assert task.cancelled()
         assert ours.fileno() == -1
+
+
+async def test_one_certificate_has_a_bounded_number_of_connections(
+    lab: Authority, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its two lanes, a run that begins before the other ends, and no hundreds of agents with one certificate."""
+    monkeypatch.setattr(limits, "CONNECTIONS_PER_NAME", 4)
+    names = ("arm", "arm", "arm", "base", "crane")
+    async with meshes(*(Member(lab, name) for name in names), names=names, found=False) as peers:
+        *arms, base, crane = peers
+        for arm in arms[:2]:
+            introduce([arm, base])
+            await until(lambda arm=arm: arm.both_lanes(base) and base.both_lanes(arm), "both lanes of both runs")  # type: ignore[misc]
+        introduce([arms[2], base])
+        await until(lambda: "arm has 4 connections here" in status(arms[2], base).last_error, "the refusal is told")
+        assert "rmpa trust revoke arm" in status(arms[2], base).last_error
+        await until(lambda: base.mesh.counters["link.refused.busy"] > 0, "the acceptor counts it")
+        introduce([crane, base])
+        await until(lambda: crane.both_lanes(base), "another module links")
+        await arms[0].mesh.close()
+        await until(lambda: arms[2].both_lanes(base), "there is room again")

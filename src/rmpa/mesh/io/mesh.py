@@ -256,7 +256,9 @@ class Mesh:
         if self._security is None or connection.certificate is None:
             return None
         linked = [(link.identity, self._alive(link.id)) for link in self.links()]
-        return prove(hello, connection.certificate, self._security, linked)
+        others = (each.remote for each in self.connections() if each.up and each is not connection)
+        named = sum(other is not None and other.name == hello.name for other in others)
+        return prove(hello, connection.certificate, self._security, linked, named)
 
     def connection_held(self, guid: Guid) -> bytes:
         """What this agent holds of a peer's offers."""

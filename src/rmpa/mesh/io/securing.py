@@ -22,7 +22,7 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.handshake import Refuse
+from rmpa.mesh.handshake import Refusal, Refuse
 from rmpa.runtime.record_layer import SecureSocket, TlsHandshake
 from rmpa.trust.io.contexts import ALPN_LINK
 from rmpa.trust.preface import PREFACE_BYTES, PrefaceError, Purpose, is_preface
@@ -147,9 +147,13 @@ def refusal(reason: TrustReason, problem: str) -> Refuse:
 
 
 def prove(
-    hello: Hello, certificate: Certificate, security: MeshSecurity, linked: Iterable[tuple[Identity, bool]]
+    hello: Hello,
+    certificate: Certificate,
+    security: MeshSecurity,
+    linked: Iterable[tuple[Identity, bool]],
+    others: int = 0,
 ) -> Refuse | None:
-    """Judge whether a hello is of the module that its certificate is of; ``None``: it is.
+    """Judge whether a hello is of the module that its certificate is of, and has not too many already; ``None``: yes.
 
     Args:
         hello: The remote side's hello or welcome.
@@ -157,6 +161,7 @@ def prove(
         security: This module's membership.
         linked: The peers with links, each with whether its link is alive. No other module may claim the run of one of
             them. Another module may have the address of one whose link is silent: it may have come after it.
+        others: The other connections that are up with this name.
     """
     try:
         security.judge_member(certificate, hello.name)
@@ -166,6 +171,9 @@ def prove(
         same_place = alive and peer.guid.place == hello.guid.place
         if peer.name != hello.name and (same_place or peer.instance == hello.instance):
             return refusal(TrustReason.NAME, f"{hello.name} says that it is the run of {peer}, which is linked")
+    if others >= limits.CONNECTIONS_PER_NAME:
+        text = f"{hello.name} has {others} connections here, a module needs two: is its certificate used elsewhere?"
+        return Refuse(Refusal.BUSY, f"{text} Then: rmpa trust revoke {hello.name}")
     return None
 
 
