@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import socket
+import time
 from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
 from typing import TYPE_CHECKING
@@ -373,3 +374,13 @@ async def test_a_proxy_that_could_not_be_made_is_made_later(
         await talker.advertise("/chatter", "std_msgs/String")
         await until(lambda: "/chatter" in b.core.state().publishers)
         assert len(refusals) == 2
+
+
+async def test_the_uptime_does_not_follow_a_clock_that_is_set(
+    settings: Callable[..., Settings], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A robot without a battery for its clock starts in 1970, and gets the time from the network."""
+    async with running(settings("a")) as (agent,):
+        real = time.time
+        monkeypatch.setattr(time, "time", lambda: real() + 1e9)
+        assert 0 <= agent.operations.snapshot({}).agent.uptime < 3600

@@ -86,6 +86,9 @@ def test_what_is_not_well_is_said(
     code, _, err = place.run("site", "list")
     assert said in err
     assert code == (0 if said.startswith("g of") else 1)
+    if not reports:
+        code, out, err = place.run("site", "list", "--json")
+        assert (code, out.strip(), said in err) == (1, "[]", True), "an empty list has a reason too"
 
 
 def test_a_site_is_shown_with_what_does_not_cross(place: Place, answers: Callable[[Handler], None]) -> None:

@@ -90,6 +90,9 @@ PARAM_TRANSFERS: Final = 4
 oldest be given up."""
 PARAM_TRANSFER_IDLE: Final = 30.0
 """Seconds without a further portion after which a parameter's transfer may be dropped."""
+PARAMS_SET_MAX: Final = 10_000
+"""Parameters in one value that a peer sets: each takes the core some 0.25 ms, between data; a large robot has some
+thousand in all."""
 PARAM_ASKERS_MAX: Final = 256
 """Modules of another site for which a gateway asks at once: as many as one mesh has."""
 PARAM_ASK_TIMEOUT: Final = 25.0

@@ -82,11 +82,11 @@ def list_(as_json: bool, agent: str | None, name: str | None) -> int:
     with _connect(agent, name) as client:
         reports = _ask(client, REPORT, tuple[SitesReport, ...])
         absent = "" if reports else _why_none(client)
+    if not reports:
+        warn(absent)
     if as_json:
         print_json(reports)
-    elif not reports:
-        warn(absent)
-    else:
+    elif reports:
         rows = [(report, site) for report in reports for site in report.sites]
         print_table(
             _COLUMNS,

@@ -317,3 +317,20 @@ def test_a_server_of_ros1_that_is_gone_aborts_its_goals() -> None:
     machine.take()
     machine.server_gone(STAMP, 1.0)
     assert answers(machine.take()) == {2: response(Ros2Status.ABORTED, 0)}
+
+
+def test_a_goal_that_vanishes_from_the_status_of_its_server_is_lost() -> None:
+    """As in actionlib: the server was started anew, or has forgotten the goal without a result."""
+    machine = GoalsToRos1(PAIR)
+    name = sent_to_ros1(machine)
+    machine.get_result(2, with_uuid(UUID, b"\0\1\0\0"))
+    machine.states(states_message("another", Ros1Status.ACTIVE), STAMP, 0.1)
+    assert machine.take() == [], "it has not come there yet"
+    machine.states(states_message(name, Ros1Status.ACTIVE), STAMP, 0.2)
+    machine.take()
+    machine.states(states_message("another", Ros1Status.ACTIVE), STAMP, 0.3)
+    events = machine.take()
+    assert answers(events) == {2: response(Ros2Status.ABORTED, 0)}
+    assert machine.active == 0
+    machine.states(states_message("another", Ros1Status.ACTIVE), STAMP, 0.4)
+    assert machine.take() == [], "once"

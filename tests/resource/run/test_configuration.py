@@ -52,6 +52,8 @@ class Lamp:
     def __init__(self, core: RosCore) -> None:
         self.core = core
         self.problem: Exception | threading.Event | None = None
+        self.jammed = ""
+        """The context whose function fails."""
         self.profile = self.place = ""
         self.entered: list[str] = []
         one = self.resource = Resource("lamp", role="acting")
@@ -91,6 +93,8 @@ class Lamp:
 
     def _enter(self, name: str) -> Callable[[], None]:
         def enter() -> None:
+            if name == self.jammed:
+                raise OSError("jammed")
             if isinstance(self.problem, threading.Event):
                 self.problem.wait(DEADLINE)
             elif self.problem is not None:
@@ -249,6 +253,18 @@ async def test_choice_by_hand_overrides_rules(lamp: Lamp, node: Node) -> None:
     assert (await ask(node, context=""))["context"] == ""
     await until(lambda: contexts[-1].data == "dark", "the rules do not decide again")
     assert lamp.entered == ["away", "dark"]
+
+
+async def test_a_choice_that_fails_takes_nothing_from_the_next_one(lamp: Lamp) -> None:
+    contexts = lamp.member.contexts
+    lamp.jammed = "away"
+    first = asyncio.ensure_future(contexts.choose("away"))
+    await asyncio.sleep(0)
+    second = asyncio.ensure_future(contexts.choose("docked"))
+    with pytest.raises(PeerRefused, match="jammed"):
+        await first
+    await second
+    assert (contexts.current, contexts.chosen) == ("docked", "docked")
 
 
 async def test_a_context_that_cannot_begin_changes_nothing(

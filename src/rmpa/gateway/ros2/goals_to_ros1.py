@@ -90,6 +90,8 @@ class _Goal:
     """Requests ``get_result`` that are not answered yet."""
     result: bytes | None = None
     """The result of ROS 1 once it has come."""
+    listed: bool = False
+    """Whether the server's status has named it."""
 
     @property
     def ended(self) -> bool:
@@ -184,16 +186,22 @@ class GoalsToRos1:
     # --- from the server of ROS 1 ---------------------------------------------------------------------------------
 
     def states(self, raw: Buffer, stamp: int, now: float) -> None:
-        """The server publishes its status.
+        """The server publishes its status. A goal that it named before, and names no more, is lost, as in actionlib.
 
         Raises:
             RemoteProtocolError: It is malformed.
         """
-        changed = False
+        changed, named = False, set()
         for state in parse_states(raw):
             changed |= self._state(state, stamp, now)
+            named.add(state.goal.id)
         if changed:
             self._tell_states()
+        for goal in list(self._goals.values()):
+            if goal.id.id in named:
+                goal.listed = True
+            elif goal.listed and not goal.ended:
+                self._end(goal, Ros1Status.LOST, self.pair.no_result, stamp, now)
 
     def feedback(self, raw: Buffer, stamp: int, now: float) -> None:
         """The server publishes feedback.

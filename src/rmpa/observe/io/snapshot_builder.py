@@ -87,7 +87,7 @@ class SnapshotBuilder:
         self._process = psutil.Process()
         self._process.cpu_percent()  # the first call only begins to count
         self._cpu: float | None = None
-        self._cpu_known = time.monotonic()
+        self._cpu_known = self._began = time.monotonic()
         self._peers = PeersSection(sources.bridge, sources.limit_reports)
         self.direct = DirectSection(sources.core, sources.bridge)
         """What is known of direct transport."""
@@ -201,7 +201,7 @@ class SnapshotBuilder:
             version=rmpa.__version__,
             pid=os.getpid(),
             started=self._sources.started,
-            uptime=time.time() - self._sources.started,
+            uptime=time.monotonic() - self._began,
             cpu=self._cpu_share(),
             rss=self._memory(),
             addresses=tuple(str(a) for a in (identity.guid.address, *identity.addresses)) if identity else (),

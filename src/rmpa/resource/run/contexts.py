@@ -77,6 +77,7 @@ class Contexts(RuntimePart):
         self._latest: dict[str, tuple[MessageType, bytes]] = {}
         self._current = ""
         self._retry = 0.0
+        self._choice_lock = asyncio.Lock()
         self._switch_lock = asyncio.Lock()
         self._work: set[asyncio.Task[None]] = set()
         self._switching: asyncio.Task[None] | None = None
@@ -146,17 +147,18 @@ class Contexts(RuntimePart):
             near = did_you_mean(name, self._known)
             remedy = f"did you mean {near}?" if near else f"it is one of {', '.join(self._known) or 'none'}"
             raise ConfigError(f"resource {self._runtime.resource.name}", f"no context {name[:80]!r}", remedy)
-        before, self._selector.chosen = self._selector.chosen, name
-        try:
-            if name:
-                await self._switch(name)
-        except RmpaError:
-            self._selector.chosen = before
-            raise
-        if not name:
-            self._selector.since = self._retry = 0.0
-            wanted = self._selector.select(self._current, self._values(), self._loop.time())
-            await self._switch(wanted)
+        async with self._choice_lock:  # one that fails must not put the one before in the place of the next
+            before, self._selector.chosen = self._selector.chosen, name
+            try:
+                if name:
+                    await self._switch(name)
+            except RmpaError:
+                self._selector.chosen = before
+                raise
+            if not name:
+                self._selector.since = self._retry = 0.0
+                wanted = self._selector.select(self._current, self._values(), self._loop.time())
+                await self._switch(wanted)
         self._publish()
 
     # --- values of rules ----------------------------------------------------------------------------------------

@@ -200,6 +200,23 @@ async def test_a_text_that_does_not_parse(text: str) -> None:
         await read_text(text)
 
 
+async def test_a_value_of_more_parameters_than_a_peer_may_set_sets_none(
+    sides: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "PARAMS_SET_MAX", 100)
+    base, pad = Side("base", ParamSettings(remote_get=("/**",), remote_set=("/**",))), Side("pad")
+    sides(base, pad)
+    join(base, pad)
+    for count in (101, 100):
+        text = await write_text("", {"deep": {f"p{number}": number for number in range(count)}})
+        if count > 100:
+            with pytest.raises(PeerRefused, match="/many has more than 100 parameters: set its parts one by one"):
+                await pad.drive(transfer.writing("/many", text, 7))
+            assert base.core.get("/many") is None
+        else:
+            assert await pad.drive(transfer.writing("/many", text, 7)) == 100
+
+
 async def test_get_set_list_delete(sides: Any) -> None:
     base = Side("base", ParamSettings(remote_get=("/open/**", "/big"), remote_set=("/open/**",)))
     pad = Side("pad")

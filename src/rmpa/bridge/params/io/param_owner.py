@@ -208,6 +208,10 @@ class ParamOwner:
         value = await read_text(self._of(session).written(args, self._now()))
         parameters: list[tuple[str, XmlRpcValue]] = []
         for given, one in yielding_to_data(leaves(key, value)):
+            if len(parameters) >= limits.PARAMS_SET_MAX:
+                raise RmpaError(f"{key} has more than {limits.PARAMS_SET_MAX} parameters: set its parts one by one")
+            if len(parameters) % limits.APPLIED_AT_ONCE == 0:
+                await asyncio.sleep(0)
             # A member may be named "" or "a/": the core drops the slash at the end, so the name is judged without it.
             name = given.rstrip("/") or "/"
             self._refuse(key_problem(given) or self.policy.why_not_set(name) or self._why_denied(asker, name))
