@@ -63,6 +63,7 @@ async def test_the_first_page_is_accessible_whatever_is_wrong(site: Site, scene:
     assert await violations(page) == []
     await page.look(360, 800, dark=False)
     assert await violations(page) == []
+    assert await page.run("document.documentElement.scrollWidth") == 360
 
 
 @pytest.mark.parametrize("address", PAGES)

@@ -93,6 +93,12 @@ def test_a_module_that_left_the_roster_is_away_since_nothing_came_of_it() -> Non
     assert left["modules"]["hand"]["since"] == FULL.taken - 1  # it had no link before
 
 
+def test_a_module_is_silent_since_it_was_heard_last() -> None:
+    mute = peer("arm", link=msgspec.structs.replace(LINK, heard_ago=4.0, up_ago=3600.0))
+    state = build(msgspec.structs.replace(FULL, peers=(mute,)))
+    assert (state["modules"]["arm"]["state"], state["modules"]["arm"]["since"]) == ("silent", FULL.taken - 4)
+
+
 def test_an_agent_that_has_just_started_has_lost_nothing() -> None:
     builder = StateBuilder(FULL.agent.name)
     builder.build(FULL)

@@ -269,9 +269,12 @@ class StateBuilder:
     def _module(self, peer: PeerInfo, taken: float) -> Tree:
         link, steady, name = peer.link, self._steady, peer.name
         rates = self._bytes.update(name, taken, link)
+        state, ago = module_state(peer), peer.since_ago
+        if state == "silent" and link is not None and link.heard_ago is not None:
+            ago = link.heard_ago
         entry = {
-            "state": module_state(peer),
-            "since": steady.moment(f"{name} since", taken - peer.since_ago),
+            "state": state,
+            "since": steady.moment(f"{name} since", taken - ago),
             "error": "; ".join(filter(None, ("" if link else peer.last_error, *peer.conflicts))),
             "guid": peer.guid,
             "source": peer.source,
