@@ -83,6 +83,14 @@ async def test_a_phone_shows_a_page_without_sideways_scrolling_and_with_large_ta
     assert small == []
 
 
+async def test_a_small_screen_shows_the_tables_of_the_first_page_whole(site: Site) -> None:
+    await site.page.look(1280, 900)
+    page = await site.open()
+    await page.wait("document.querySelector('.beside table').innerText.includes('kB/s')")
+    cut = "[...document.querySelectorAll('.scroll')].filter((each) => each.scrollWidth > each.clientWidth)"
+    assert await page.run(f"{cut}.map((each) => each.ariaLabel)") == []
+
+
 async def test_a_killed_module_shows_within_a_second_and_a_half_and_so_does_its_return(site: Site) -> None:
     page = await site.open()
     base = "document.querySelector('[data-module=base]')"

@@ -398,7 +398,10 @@ class FakeServer:
         }
 
     def _answer_describe(self, _args: dict[str, Any]) -> Any:
-        text = "bool data\n---\nbool success\nstring message"
+        text = (
+            "bool data # e.g. for hardware enabling / disabling\n---\n"
+            "bool success   # indicate successful run of triggered service\nstring message"
+        )
         return {"type": "std_srvs/SetBool", "request": {"data": False}, "text": text}
 
     def _answer_call(self, args: dict[str, Any]) -> Any:
