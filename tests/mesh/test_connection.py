@@ -236,6 +236,31 @@ def test_a_pause_of_our_own_is_no_silence_of_the_others() -> None:
     assert not is_up(dialler), "what was excused is over with the next word"
 
 
+@pytest.mark.parametrize("first", ["timer", "bytes"])
+def test_after_a_pause_beyond_the_lease_nothing_is_acted_on_until_the_peer_answers(first: str) -> None:
+    """The peer has ended the link then, and what it asked before comes from this side's buffers."""
+    time = Time()
+    dialler, acceptor = pair(time)
+    told: list[bool] = []
+    for one in (dialler, acceptor):
+        one.link.on_data = lambda *_, link=one.link: told.append(link.abandoned)
+    data = pack_data_header(3, 1, 1, 1) + b"abc"
+    pass_time(dialler.link, time, 0.3)
+    time.now += 0.9 * limits.EXPRESS_LEASE - 0.3
+    deliver(Frame(FrameKind.PING, stamp_ns=1).serialize() + data, dialler.link, time.now)
+    assert told == [False]
+    time.now += limits.EXPRESS_LEASE + 0.1
+    if first == "timer":
+        dialler.link.handle_timer(time.now)
+    deliver(Frame(FrameKind.PING, stamp_ns=2).serialize() + data, dialler.link, time.now)
+    assert told == [False, True]
+    pass_time(dialler.link, time, 0.5)
+    time.now += 0.001
+    exchange(dialler, acceptor, time)
+    deliver(data, dialler.link, time.now)
+    assert told == [False, True, False], "the peer was stopped as well, and its link stands"
+
+
 def test_reason_names_lease_and_pause() -> None:
     time = Time()
     dialler, _ = pair(time, lease=2.0)

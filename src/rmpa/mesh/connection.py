@@ -182,6 +182,10 @@ class ConnectionProtocol:
         """Bytes that are still missing of a data frame whose first bytes were handed on."""
         self._begun = (0, 0, 0, 0)
         """Route, sequence, stamp and LAST flag of that frame."""
+        self.abandoned = False
+        """Whether this process was stopped for longer than the lease that it promised: the remote side has ended the
+        connection then, and given up what it asked in it. True until a ping from after that is answered."""
+        self._proof: int | None = None
         self._expected = expected
         self._label = label
         self._state = ConnectionState.HANDSHAKING
@@ -230,7 +234,10 @@ class ConnectionProtocol:
         Raises:
             RemoteProtocolError: The remote side broke the protocol; the connection is ``CLOSED``.
         """
-        self._keepalive.heard = now
+        keepalive = self._keepalive
+        keepalive.heard = now
+        if now - keepalive.sent > keepalive.lease:
+            self.abandoned, self._proof = True, None
         size = len(view)
         offset = 0
         try:
@@ -395,6 +402,8 @@ class ConnectionProtocol:
         keepalive = self._keepalive
         if now - due > limits.PAUSE_NOTICED:
             keepalive.excuse(now - due, now)
+        if now - keepalive.sent > keepalive.lease:
+            self.abandoned, self._proof = True, None
         if self._state is ConnectionState.CLOSING:
             self._end(self._reason, orderly=True)
         elif self._state is ConnectionState.HANDSHAKING:
@@ -451,6 +460,8 @@ class ConnectionProtocol:
             self._keepalive.sent = now
         elif kind is FrameKind.PONG:
             t1, t2 = frames.parse_pong(payload)
+            if t1 == self._proof:
+                self.abandoned, self._proof = False, None
             sample = self.clock.ponged(t1, t2, stamp_ns, self._wall_ns(), now)
             if sample is not None:
                 self.on_event(PongReceived(t1, sample.rtt))
@@ -533,6 +544,8 @@ class ConnectionProtocol:
 
     def _ping(self, now: float) -> int:
         stamp = self._wall_ns()
+        if self.abandoned and self._proof is None:
+            self._proof = stamp
         self.clock.pinged(stamp, now)
         self._send(Frame(FrameKind.PING, stamp_ns=stamp))
         self._keepalive.pinged(now)

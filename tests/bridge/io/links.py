@@ -103,7 +103,7 @@ class LinkEnd:
         self.held: list[bytes] = []
         self.clock_offset: float | None = None
         self.clock_error: float | None = None
-        self.gone = False
+        self.gone = self.abandoned = False
         self.busy = False
         self.expects_the_worst = False
         self.aborted = ""

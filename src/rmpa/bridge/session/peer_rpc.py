@@ -43,7 +43,7 @@ class PeerRpc(Part):
     """Sends requests to the peers, and responds to theirs.
 
     Args:
-        counters: Counts ``ask.refused`` and ``ask.failed``.
+        counters: Counts ``ask.refused``, ``ask.failed`` and ``ask.late``.
     """
 
     def __init__(self, counters: Counters) -> None:
@@ -176,6 +176,11 @@ class PeerRpc(Part):
         await asyncio.gather(*tasks, return_exceptions=True)
 
     def _answer(self, session: PeerSession, ask: Request) -> None:
+        if session.link.abandoned:
+            self._counters.add("ask.late")
+            text = "this agent was stopped when the question came, and the asking one has given it up"
+            self._send(session, Response(ask.number, ok=False, error=text, remedy="ask again"))
+            return
         tasks = self._answering.setdefault(session.peer, set())
         if len(tasks) >= limits.ASKS_AT_ONCE:
             self._counters.add("ask.refused")

@@ -237,6 +237,11 @@ class Connection:
         return self._machine.state is ConnectionState.UP and not self._ended
 
     @property
+    def abandoned(self) -> bool:
+        """Whether the remote side has ended the connection while this process was stopped."""
+        return self._machine.abandoned
+
+    @property
     def lane(self) -> int:
         """The lane (``handshake.Lane``); for an accepted connection it is known after the remote side's hello."""
         remote = self._machine.remote

@@ -122,6 +122,12 @@ class PeerLink:
         return None if estimate is None else estimate[1]
 
     @property
+    def abandoned(self) -> bool:
+        """Whether the peer has given up what it asked over this link; see ``ConnectionProtocol.abandoned``."""
+        bulk = self.bulk_connection
+        return self.connection.abandoned or (bulk is not None and bulk.abandoned)
+
+    @property
     def resumed_at(self) -> float:
         """Monotonic seconds of the express lane's last poll without bytes before its last silence ended."""
         return self.connection.stream.resumed_at

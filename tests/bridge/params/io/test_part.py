@@ -104,7 +104,9 @@ class Side:
         attached = cast(
             "PeerSession",
             SimpleNamespace(
-                peer=number, linked=True, link=SimpleNamespace(name=other.name, send_control=send, parked=False)
+                peer=number,
+                linked=True,
+                link=SimpleNamespace(name=other.name, send_control=send, parked=False, abandoned=False),
             ),
         )
         self.links[number] = attached

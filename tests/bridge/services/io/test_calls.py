@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
 
@@ -11,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rmpa.bridge import limits
+from rmpa.bridge.data.io.link_time import LinkTime
 from rmpa.bridge.services.io.bodies import BodyReceiver, BodySender, Budget
 from rmpa.bridge.services.io.calls import Budgets, Caller, CallStats, Server
 from rmpa.core import limits as core_limits
@@ -84,6 +86,7 @@ class Wire:
         self.express, self.bulk = Lane(self), Lane(self)
         self.takers: dict[int, BodyReceiver] = {}
         self.closed: list[int] = []
+        self.abandoned = False
 
     def close_route(self, route: int) -> int:
         self.closed.append(route)
@@ -156,7 +159,10 @@ class Ends:
         self.stats, self.served = CallStats(), CallStats()
         self.budgets, self.budgets_there = Budgets(), Budgets()
         self.caller = Caller(self.there, 2, "service [/add] of base", self.budgets, self.stats, DESCRIPTION)
-        self.server = Server(self.back, 1, cast("ServicePool", self.pool), 7.0, self.budgets_there, self.served)
+        self.time = LinkTime()
+        self.server = Server(
+            self.back, 1, cast("ServicePool", self.pool), 7.0, self.budgets_there, self.served, self.time
+        )
         self.there.takers[2] = self.server
         self.back.takers[1] = self.caller
 
@@ -176,6 +182,33 @@ async def _answered(*calls: Call) -> None:
         while any(call.answer is None for call in calls):
             await asyncio.sleep(0)
     await asyncio.sleep(0)
+
+
+@pytest.mark.parametrize("whole", [True, False])
+async def test_a_request_whose_caller_has_given_it_up_is_not_passed_to_the_server(whole: bool) -> None:
+    ends, answers = Ends(), Kept()
+    ends.pool.waiting = []
+    ends.back.takers[1] = answers
+    ends.time.set(60.0, 0.5)  # the caller's clock is a minute ahead, half a second more or less
+
+    def come(age: float) -> None:
+        stamp_ns = time.time_ns() + int((60.0 - age) * 1e9)
+        framed = memoryview(len(SMALL).to_bytes(4, "little") + SMALL)
+        if whole:
+            ends.server.message(1, stamp_ns, framed)
+        else:
+            ends.server.part(1, stamp_ns, FIRST, framed[:50])
+            ends.server.part(1, stamp_ns, LAST, framed[50:])
+
+    come(1.0)
+    assert len(ends.pool.waiting) == 1
+    come(20.0)
+    assert b"s late; the caller waits for 7 s" in answers.bodies[-1][1]
+    ends.back.abandoned = True  # of a link that the caller has ended, whatever its clock says
+    come(0.0)
+    assert b"this agent was stopped" in answers.bodies[-1][1]
+    assert len(ends.pool.waiting) == 1
+    assert len(answers.bodies) == 2
 
 
 async def test_calls_of_every_size_at_once_by_the_lane_of_their_size() -> None:

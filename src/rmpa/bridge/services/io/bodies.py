@@ -64,6 +64,11 @@ class BodyLink(Protocol):
     """The methods of a link that bodies are sent by (``mesh.io.link.PeerLink``)."""
 
     @property
+    def abandoned(self) -> bool:
+        """Whether the peer has given up what it asked over this link."""
+        ...
+
+    @property
     def express(self) -> BodyLane:
         """The lane for small bodies."""
         ...
@@ -202,6 +207,8 @@ class BodyReceiver:
         self._sequence: int | None = None
         self._buffer: bytearray | None = None
         self._size = 0
+        self._stamp_ns = 0
+        """When the present body was sent, by the peer's clock."""
 
     def body(self, sequence: int, body: bytes | bytearray) -> None:
         """Handle a complete body, which belongs to the callee; it no longer counts in the budget."""
@@ -211,11 +218,12 @@ class BodyReceiver:
         """Handle the loss of a body whose first part had arrived."""
         raise NotImplementedError
 
-    def message(self, sequence: int, _stamp_ns: int, framed: memoryview) -> None:
+    def message(self, sequence: int, stamp_ns: int, framed: memoryview) -> None:
         """Handle a body that arrived in one frame."""
+        self._stamp_ns = stamp_ns
         self.body(sequence, bytes(framed[_LENGTH:]))
 
-    def part(self, sequence: int, _stamp_ns: int, flags: int, part: memoryview) -> None:
+    def part(self, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
         """Handle a part of a large body.
 
         Raises:
@@ -235,6 +243,7 @@ class BodyReceiver:
                 raise RemoteProtocolError(f"a service's message of {self._size} bytes has more than that")
             buffer += part
         if flags & LAST:
+            self._stamp_ns = stamp_ns
             self._sequence = self._buffer = None
             if buffer is not None:
                 self._budget.give(self._size)

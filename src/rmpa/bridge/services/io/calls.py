@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections import OrderedDict
 from functools import partial
 from typing import TYPE_CHECKING, Final
@@ -15,6 +16,7 @@ from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.wire.services import ServiceDescription
 
 if TYPE_CHECKING:
+    from rmpa.bridge.data.io.link_time import LinkTime
     from rmpa.bridge.services.actions import ServiceAbout
     from rmpa.bridge.services.io.bodies import BodyLink
     from rmpa.bridge.services.io.connection_pool import ServicePool
@@ -197,12 +199,22 @@ class Server(BodyReceiver):
         timeout: Seconds that the peer waits for a reply.
         budgets: The budgets of the peer's link.
         stats: The counts of the service.
+        link_time: The peer's clock.
     """
 
     def __init__(
-        self, link: BodyLink, route: int, pool: ServicePool, timeout: float, budgets: Budgets, stats: CallStats
+        self,
+        link: BodyLink,
+        route: int,
+        pool: ServicePool,
+        timeout: float,
+        budgets: Budgets,
+        stats: CallStats,
+        link_time: LinkTime,
     ) -> None:
         super().__init__(budgets.incoming)
+        self._link = link
+        self._time = link_time
         self._sender: BodySender | None = BodySender(link, route)
         self._pool = pool
         self._timeout = timeout
@@ -212,15 +224,28 @@ class Server(BodyReceiver):
         self._recent: OrderedDict[int, None] = OrderedDict()
 
     def body(self, sequence: int, body: bytes | bytearray) -> None:
-        """Pass a request to the server."""
+        """Pass a request to the server, unless its caller has given it up: it must not act then."""
         stats, size = self._stats, len(body)
         stats.calls += 1
+        if late := self._late():
+            self._reply_failed(sequence, late)
+            return
         if not self._budget.take(size):
             self._reply_failed(sequence, f"more than {self._budget.limit >> 20} MiB of requests are being served")
             return
         stats.active += 1
         timeout = self._timeout + limits.SERVICE_GRACE
         self._pool.call(body, timeout, partial(self._answered, sequence, size, self._loop.time()))
+
+    def _late(self) -> str:
+        """Why the caller waits no longer for the present request; empty while it may."""
+        if self._link.abandoned:
+            return "this agent was stopped when the request came, and the caller has given it up"
+        error = self._time.error_ns
+        age = time.time_ns() - self._stamp_ns + self._time.ahead_ns
+        if error is not None and age - error > self._timeout * 1e9:
+            return f"the request came {age / 1e9:.1f} s late; the caller waits for {self._timeout:g} s"
+        return ""
 
     def failed(self, sequence: int, reason: str) -> None:
         """Reply with an error to a request whose rest was lost."""

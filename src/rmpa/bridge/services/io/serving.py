@@ -166,6 +166,7 @@ class Serving:
             action.timeout,
             self._budgets[action.peer],
             self.stats.setdefault(action.service, CallStats()),
+            session.time,
         )
         self._servers[action.peer, action.requests] = server
         session.handlers[action.requests] = server
