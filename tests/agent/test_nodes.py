@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
-from rmpa.bridge.io.node_presence import NodePresence
+from rmpa.bridge.io.node_presence import NODES, NodePresence
 from rmpa.config.settings import NodeSettings, PeerRule, PolicySettings
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros import limits
@@ -212,6 +212,16 @@ async def test_a_node_that_only_subscribes_stands_in_the_other_graphs(settings: 
             await until(lambda: not loggers(a, "viewer"))
             assert "/rmpa/b/viewer" in a.core.state().nodes
         await until(lambda: not [name for name in a.core.state().nodes if name.startswith("/rmpa/b/")])
+
+
+@pytest.mark.parametrize("names", [None, "/viewer", [7], ["viewer"]])
+async def test_names_that_no_node_can_have_end_the_link(settings: Callable[..., Settings], names: object) -> None:
+    async with running(settings("a"), settings("b")) as (a, b):
+        (session,) = b.bridge.sessions.linked()
+        link = session.link
+        b.bridge.rpc.notify(session, NODES, {"nodes": names})
+        await until(lambda: link not in [one.link for one in b.bridge.sessions.linked()])
+        assert not [name for name in a.core.state().nodes if name.startswith("/rmpa/b/")]
 
 
 async def test_modules_that_ignore_each_other_do_not_show_their_nodes(settings: Callable[..., Settings]) -> None:

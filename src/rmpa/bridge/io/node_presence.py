@@ -154,10 +154,11 @@ class NodePresence(Part):
     # --- of the peers -------------------------------------------------------------------------------------------
 
     def _told_by_peer(self, session: PeerSession, args: dict[str, Any]) -> None:
-        names = args.get("nodes")
-        if not isinstance(names, list) or not all(isinstance(name, str) and is_crossing_name(name) for name in names):
+        told = args.get("nodes")
+        names: list[Any] = told[: self._max] if isinstance(told, list) else [None]
+        if not all(isinstance(name, str) and is_crossing_name(name) for name in names):
             raise RemoteProtocolError(f"{NODES} has no list of nodes' names")
-        wanted = {name for name in names[: self._max] if self._passes(session.link.name, name)}
+        wanted = {name for name in names if self._passes(session.link.name, name)}
         shown = self._shown.setdefault(session.peer, set())
         for node in sorted(shown - wanted):
             session.proxies.release(node, _HELD)
