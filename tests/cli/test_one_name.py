@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
 import json
 import os
@@ -72,7 +73,9 @@ class Machine:
 
     def up(self, *arguments: str, **environ: str) -> subprocess.Popen[str]:
         """Start an agent on loopback, and wait until it has a control socket."""
-        net = ("--multicast", f"239.255.117.117:{self._port}", "--interface", "lo", "--core-port", free_port())
+        net: tuple[str, ...] = ("--multicast", f"239.255.117.117:{self._port}", "--interface", "lo")
+        if "--core-port" not in arguments:
+            net = (*net, "--core-port", free_port())
         known = self.agents()
         process = self.start("up", *net, *arguments, **environ)
 
@@ -208,6 +211,26 @@ def test_the_web_server_is_as_secure_as_the_agent_whatever_their_names(machine: 
     for host in ("sec", "sec.local", "localhost", "127.0.0.1", *hosts):
         _until(functools.partial(_accepts, ca, port, host))
     assert not _accepts(ca, port, "other.local")
+
+
+def test_the_web_server_of_one_agent_does_not_show_a_secured_one_that_takes_over_its_core(machine: Machine) -> None:
+    pytest.importorskip("aiohttp")
+    core = ("--core-port", free_port())
+    agent = machine.up("--name", "open", *core)
+    port = free_port()
+    server = machine.start("web", "--json", "--agent", "open", "--port", port)
+    _until(lambda: machine.log("web").count("the agent open answers") or _ask(port))
+    machine.end(agent)
+    machine.run("trust", "init", "--name", "sec")
+    machine.up(*core)
+    assert server.wait(DEADLINE) == 1
+    assert "the module open: has no keys, and would start without trust, beside keys of sec" in machine.log("web")
+
+
+def _ask(port: str) -> None:
+    with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", int(port)), DEADLINE) as client:
+        client.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        client.recv(64)
 
 
 def _accepts(ca: Path, port: int, host: str) -> bool:

@@ -36,8 +36,8 @@ PUBLISHERS_MAX: Final = 2000
 NODE_RETRY: Final = 1.0
 """Pause between two attempts to reach the master, or to register."""
 TRUST_RETRY: Final = 0.1
-"""Pause before an agent that has ended is looked for again: one that comes back secured is not shown as an open one
-for longer."""
+"""Pause before an agent that has ended is looked for again, doubled up to ``NODE_RETRY``: one that comes back
+secured is not shown as an open one for longer."""
 LATCHED_BYTES: Final = 64 * MIB
 """Bytes of latched messages that the hub keeps for newcomers: maps and robot descriptions have some 10 MB. Beyond,
 the oldest is forgotten, and a newcomer gets none."""

@@ -261,6 +261,7 @@ class WebReload:
         self._asked = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
         self._known = _rights_in(setup)
+        self._trusted = setup.trusted
         self.roles = setup.roles
         """What clients may do now."""
 
@@ -288,6 +289,9 @@ class WebReload:
                 setup = await asyncio.to_thread(self._load)
             except RmpaError as error:
                 _log.error("! rmpa web keeps its tokens and rules: %s", error)
+                continue
+            if self._trusted and not setup.trusted:  # the agent is away, and another module was found meanwhile
+                _log.error("! rmpa web keeps its tokens and rules: the module with keys is not found now")
                 continue
             if _rights_in(setup) == self._known:
                 continue

@@ -12,13 +12,14 @@ import msgspec
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.control import ControlReply, ControlRequest
-from rmpa.observe.io.control_client import choose_agent
+from rmpa.observe.io.control_client import ControlClient, choose_agent, find_agents, same_core
 from rmpa.trust.status import TrustStatus
 from rmpa.web import limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from rmpa.observe.io.control_client import FoundAgent
     from rmpa.observe.snapshot import Snapshot
 
 _log = logging.getLogger(__name__)
@@ -27,7 +28,8 @@ _log = logging.getLogger(__name__)
 class TrustWatch:
     """Notices an agent that is secured in another way than this server: the server is then to be made anew.
 
-    It holds a connection to the agent's control socket, whose end tells that the agent may be another one now.
+    It holds a connection to the agent's control socket, whose end tells that the agent may be another one now: also
+    one of another name that took over the core, since the server's node stays registered there.
 
     Args:
         environ: Says where the sockets are.
@@ -40,6 +42,7 @@ class TrustWatch:
     ) -> None:
         self._environ = environ
         self._agent = agent
+        self._core = ""
         self._fits = fits
         self._loop = asyncio.get_running_loop()
         self._task: asyncio.Task[None] | None = None
@@ -68,16 +71,19 @@ class TrustWatch:
             raise PeerRefused(f"agent {snapshot.agent.name}", problem, "ask again")
 
     async def _run(self) -> None:
+        pause = limits.TRUST_RETRY
         while not self.misfit.is_set():
             try:
                 await self._follow()
+                pause = limits.TRUST_RETRY
             except (RmpaError, OSError, EOFError, TimeoutError, asyncio.LimitOverrunError) as error:
                 _log.debug("! whether the agent is secured is not known: %s", error)
-            await asyncio.sleep(limits.TRUST_RETRY)
+            await asyncio.sleep(pause)
+            pause = min(2 * pause, limits.NODE_RETRY)
 
     async def _follow(self) -> None:
         """Ask one run of an agent, and wait for its end."""
-        agent = await asyncio.to_thread(choose_agent, self._environ, self._agent)
+        agent = await asyncio.to_thread(self._find)
         reader, writer = await asyncio.open_unix_connection(agent.path, limit=observe_limits.CONTROL_REPLY_MAX)
         try:
             writer.write(ControlRequest("trust", {"what": "status"}).serialize())
@@ -86,11 +92,26 @@ class TrustWatch:
             if not self._fits(status if status.on else None):
                 self.misfit.set()
                 return
+            self._agent = self._agent or agent.name
             await reader.read()  # idle connections are ended, too: then it is asked again
         finally:
             writer.close()
             with contextlib.suppress(OSError):
                 await writer.wait_closed()
+
+    def _find(self) -> FoundAgent:
+        """The agent; where it does not run, one that has its core."""
+        agents = find_agents(self._environ)
+        found = next((agent for agent in agents if agent.name == self._agent), None)
+        for agent in agents if found is None and self._core else ():
+            with contextlib.suppress(RmpaError), ControlClient(agent.path) as client:
+                if same_core(client.agent().core_uri, self._core):
+                    return agent
+        if found is None:
+            found = choose_agent(self._environ, self._agent)
+        with ControlClient(found.path) as client:
+            self._core = client.agent().core_uri
+        return found
 
 
 def _status(line: bytes) -> TrustStatus:
