@@ -159,10 +159,10 @@ def test_what_has_joined_is_what_starts_next(machine: Machine) -> None:
     said = machine.run("trust", "init", "--name", "sec")
     assert "Next: rmpa up here" in said
     refused = machine.run("up", "--name", "trial", code=1)
-    assert f"beside keys of sec here in {machine.state}; start as it: --name sec" in refused
+    assert f"beside keys of sec here in {machine.state}; start as sec: --name sec" in refused
     assert "--insecure" in refused
     refused = machine.run("up", code=1, RMPA_STATE_DIR=str(machine.folder / "other"))
-    assert f"start with RMPA_STATE_DIR={machine.state} and --name sec" in refused
+    assert f"start with RMPA_STATE_DIR={machine.state} --name sec" in refused
     machine.up("--name", "trial", "--insecure")
     machine.up()
     assert machine.agents() == {"sec", "trial"}
@@ -173,7 +173,7 @@ def test_what_has_joined_is_what_starts_next(machine: Machine) -> None:
 def test_an_authority_in_a_state_directory_of_its_own_is_not_forgotten(machine: Machine) -> None:
     data = str(machine.folder / "data")
     machine.run("trust", "init", "--name", "sec", RMPA_STATE_DIR=data)
-    assert f"start with RMPA_STATE_DIR={data};" in machine.run("up", "--name", "sec", code=1)
+    assert f"start with RMPA_STATE_DIR={data} --name sec;" in machine.run("up", "--name", "sec", code=1)
 
 
 def test_a_gateway_is_no_less_secure_than_the_agent_beside_it(machine: Machine) -> None:

@@ -72,7 +72,7 @@ def test_keys_of_another_name_are_named_with_what_to_do(tmp_path: Path) -> None:
     text = str(error.value)
     assert "the module other: has no keys" in text
     assert f"beside keys of sec here in {tmp_path}" in text
-    for remedy in ("start as it: --name sec", "rmpa trust join TOKEN --name other", "--insecure"):
+    for remedy in ("start as sec: --name sec", "rmpa trust join TOKEN --name other", "--insecure"):
         assert remedy in text
 
 
@@ -82,9 +82,11 @@ def test_another_or_a_forgotten_state_directory_is_noticed(tmp_path: Path) -> No
     _keys(data)
     note_state_dir(home, data)
     for used in (usual, tmp_path / "third"):  # forgotten; and another one
-        with pytest.raises(StartError, match=f"keys of sec in {data}; start with RMPA_STATE_DIR={data}; or"):
+        with pytest.raises(
+            StartError, match=f"in {data}; start with RMPA_STATE_DIR={data} --name sec; or"
+        ):
             check_open_start(used, "sec", home)
-    with pytest.raises(StartError, match=f"RMPA_STATE_DIR={data} and --name sec"):
+    with pytest.raises(StartError, match=f"RMPA_STATE_DIR={data} --name sec"):
         check_open_start(usual, "other", home)
     _keys(usual)
     with pytest.raises(StartError, match=f"keys of sec in {usual}"):
@@ -94,3 +96,11 @@ def test_another_or_a_forgotten_state_directory_is_noticed(tmp_path: Path) -> No
 def test_a_directory_that_is_not_in_use_and_belongs_to_another_user_does_not_matter(tmp_path: Path) -> None:
     (tmp_path / "rmpa").write_text("")
     check_open_start(tmp_path / "own", "m", {"XDG_STATE_HOME": str(tmp_path)})
+
+
+def test_a_gateway_is_not_told_to_start_as_the_module(tmp_path: Path) -> None:
+    _keys(tmp_path)
+    with pytest.raises(StartError) as error:
+        check_open_start(tmp_path, "sec_gateway", {})
+    assert "; let sec_gateway join: rmpa trust join TOKEN --name sec_gateway; or" in str(error.value)
+    assert "--name sec;" not in str(error.value)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from rmpa.config.module_name import GATEWAY_SUFFIX
 from rmpa.config.state_dir import other_state_dirs
 from rmpa.core.errors import StartError
 from rmpa.trust.io.store import TrustStore, modules_with_keys
@@ -31,21 +32,26 @@ def check_open_start(state: Path | None, module: str, environ: Mapping[str, str]
     """
     here = modules_with_keys(state) if state is not None else []
     if here:
-        start = f"start as it: --name {here[0]}" if len(here) == 1 else "start as one of them with --name"
-        raise _refused(module, f"{_listed(here)} here in {state}", f"{start}; or let {module} join")
+        start = [f"start as {name}: --name {name}" for name in _startable(here, module)]
+        raise _refused(module, f"{_listed(here)} here in {state}", start)
     for place in other_state_dirs(environ, state):
         if there := _keys_in(place):
-            start = f"start with RMPA_STATE_DIR={place}"
-            name = "" if module in there else f" and --name {there[0]}"
-            raise _refused(module, f"{_listed(there)} in {place}", f"{start}{name}; or let {module} join")
+            names = [module] if module in there else _startable(there, module)
+            start = [f"start with RMPA_STATE_DIR={place} --name {name}" for name in names]
+            raise _refused(module, f"{_listed(there)} in {place}", start)
 
 
-def _refused(module: str, others: str, remedy: str) -> StartError:
+def _startable(names: list[str], module: str) -> list[str]:
+    """As which module to start instead: a gateway is none, and has a name of its own."""
+    modules = [name for name in names if not name.endswith(GATEWAY_SUFFIX)]
+    return modules[:1] if len(modules) == 1 and not module.endswith(GATEWAY_SUFFIX) else []
+
+
+def _refused(module: str, others: str, start: list[str]) -> StartError:
     problem = f"has no keys, and would start without trust, beside keys of {others}"
-    open_word = "or start it open: --insecure (insecure = true in [trust])"
-    return StartError(
-        f"the module {module}", problem, f"{remedy}: rmpa trust join TOKEN --name {module}; {open_word}"
-    )
+    join = f"let {module} join: rmpa trust join TOKEN --name {module}"
+    open_word = "start it open: --insecure (insecure = true in [trust])"
+    return StartError(f"the module {module}", problem, "; or ".join((*start, join, open_word)))
 
 
 def _keys_in(place: Path) -> list[str]:
