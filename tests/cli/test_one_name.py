@@ -219,7 +219,7 @@ def test_the_web_server_of_one_agent_does_not_show_a_secured_one_that_takes_over
     agent = machine.up("--name", "open", *core)
     port = free_port()
     server = machine.start("web", "--json", "--agent", "open", "--port", port)
-    _until(lambda: machine.log("web").count("the agent open answers") or _ask(port))
+    _until(lambda: _asked(port) and "the agent open answers" in machine.log("web"))
     machine.end(agent)
     machine.run("trust", "init", "--name", "sec")
     machine.up(*core)
@@ -227,10 +227,12 @@ def test_the_web_server_of_one_agent_does_not_show_a_secured_one_that_takes_over
     assert "the module open: has no keys, and would start without trust, beside keys of sec" in machine.log("web")
 
 
-def _ask(port: str) -> None:
+def _asked(port: str) -> bool:
+    """Whether the server was asked for the agent's state: it looks for it then."""
     with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", int(port)), DEADLINE) as client:
         client.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        client.recv(64)
+        return bool(client.recv(64))
+    return False
 
 
 def _accepts(ca: Path, port: int, host: str) -> bool:

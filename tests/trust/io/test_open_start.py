@@ -82,9 +82,7 @@ def test_another_or_a_forgotten_state_directory_is_noticed(tmp_path: Path) -> No
     _keys(data)
     note_state_dir(home, data)
     for used in (usual, tmp_path / "third"):  # forgotten; and another one
-        with pytest.raises(
-            StartError, match=f"in {data}; start with RMPA_STATE_DIR={data} --name sec; or"
-        ):
+        with pytest.raises(StartError, match=f"in {data}; start with RMPA_STATE_DIR={data} --name sec; or"):
             check_open_start(used, "sec", home)
     with pytest.raises(StartError, match=f"RMPA_STATE_DIR={data} --name sec"):
         check_open_start(usual, "other", home)
