@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 
+import msgspec
+
 from rmpa.bridge.direct import requests
 from rmpa.bridge.direct.conditions import Grant, read_reply, reply_of
 from rmpa.core.contract import Contract
@@ -29,8 +31,8 @@ SEEDS: list[bytes] = [
 def fuzz(data: bytes) -> None:
     """Valid values or a documented error; a port, a service and a text are always fit for use."""
     try:
-        value = json.loads(data)
-    except (ValueError, RecursionError):
+        value = msgspec.json.decode(data)  # as messages between agents are decoded
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return
     _response(value)
     if not isinstance(value, dict):

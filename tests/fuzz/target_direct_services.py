@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from typing import Any
+
+import msgspec
 
 from rmpa.bridge.direct.client_side import AnswerDirect, AskPeer, DirectServices, ProbeServer, ServiceKey
 from rmpa.bridge.direct.conditions import Condition, Unmet, read_reply, read_unmet
@@ -31,8 +32,8 @@ SEEDS: list[bytes] = [
 def fuzz(data: bytes) -> None:
     """Values or ``RemoteProtocolError``; lookups are never answered directly without a probe."""
     try:
-        value = json.loads(data)
-    except (ValueError, RecursionError):
+        value = msgspec.json.decode(data)  # as messages between agents are decoded
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return
     services = DirectServices()
     services.consider(_KEY, "/adder", Transport.AUTO, None, 0.0)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import msgspec
+
 from rmpa.bridge import limits
 from rmpa.bridge.params import transfer
 from rmpa.bridge.params.rules import key_problem
@@ -30,8 +32,8 @@ SEEDS: list[bytes] = [
 def fuzz(data: bytes) -> None:
     """Whatever comes, an ``RmpaError`` or a value of the size that was told; nothing grows beyond its limit."""
     try:
-        said: Any = json.loads(data)
-    except (ValueError, RecursionError):
+        said: Any = msgspec.json.decode(data)  # as messages between agents are decoded
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return
     answers = said if isinstance(said, list) else [said]
     _read(answers)

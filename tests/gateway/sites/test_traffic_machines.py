@@ -153,6 +153,7 @@ def test_golden_header() -> None:
         json.dumps({"type": "a/B", "md5sum": MD5, "run": -1}).encode(),
         json.dumps({"type": "a/B", "md5sum": MD5, "sequence": 2**64}).encode(),
         json.dumps({"type": "a/B", "md5sum": MD5, "definition": 1}).encode(),
+        json.dumps({"type": "a/B", "md5sum": MD5, "definition": "\ud83e"}).encode(),  # half of a surrogate pair
         b"[" * 100_000,
         b'{"type": "a/B", "more": "' + b"x" * limits.HEADER_MAX + b'"}',
     ],

@@ -16,6 +16,8 @@ import json
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
 
+import msgspec
+
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.names import is_type_name
 from rmpa.gateway import limits
@@ -75,8 +77,8 @@ class TopicHeader:
         if len(data) > limits.HEADER_MAX:
             raise LimitExceeded("the header of a publisher at another site", len(data), limits.HEADER_MAX)
         try:
-            fields = json.loads(bytes(data))
-        except (ValueError, RecursionError) as error:
+            fields = msgspec.json.decode(data)
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             raise RemoteProtocolError(f"the header of a publisher at another site is no JSON: {error}") from error
         if not isinstance(fields, dict):
             raise RemoteProtocolError("the header of a publisher at another site is no JSON object")
