@@ -119,7 +119,12 @@ def _add_questions(
 
     exports = SiteParamExports(own.site, session, ask_module, may_not)
     imports = SiteParamImports(
-        own.site, session, clock.wall_ns, agent.params, lambda: neighbour.catalogue.sites, may_not_here
+        own.site,
+        session,
+        clock.wall_ns,
+        agent.params,
+        lambda: neighbour.catalogue.sites,
+        may_not_here if gate.on else None,
     )
     params = SiteParams(exports, imports)
     neighbour.add(params)

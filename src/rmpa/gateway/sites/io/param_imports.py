@@ -57,7 +57,7 @@ class SiteParamImports:
         core: The gateway's own parameters, which hold followed ones as ``/<site>/<module>/<name>``.
         sites: Returns the names of the sites that are there.
         why_not: ``(asker, parameter, told)``: why a module of this site, which asks, may not have a parameter, by its
-            name at the other site; empty if it may. ``told`` is the name that it asked for.
+            name at the other site; empty if it may. ``told`` is the name that it asked for. ``None``: trust is off.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class SiteParamImports:
         stamp: Callable[[], int],
         core: FollowedCore,
         sites: Callable[[], Iterable[str]],
-        why_not: Callable[[str, str, str], str] = lambda _asker, _name, _told: "",
+        why_not: Callable[[str, str, str], str] | None = None,
     ) -> None:
         self._site = site
         self._session = session
@@ -126,7 +126,7 @@ class SiteParamImports:
                 return transfers.answer(await self._get(asker, site, module, question), now)
             case transfer.NAMES:
                 found = await self._names(asker, site, module)
-                names = [name for name in found if not self._why_not(asker, name, name)]
+                names = [name for name in found if not self._denial(asker, name, name)]
                 return transfers.answer(await write_text("the list of parameters", list(names)), now)
             case transfer.MORE:
                 return transfers.more(args, now)
@@ -166,12 +166,15 @@ class SiteParamImports:
 
     async def _judge_change(self, asker: str, site: str, module: str, key: str, written: list[str]) -> None:
         self._judge(asker, key, written)
-        if asker:
+        if asker and self._why_not is not None:
             self._judge(asker, key, lost_with(written, await self._names(asker, site, module)))
 
     def _judge(self, asker: str, key: str, names: list[str]) -> None:
-        if why := refused_one(names, lambda name: self._why_not(asker, name, key)):
+        if why := refused_one(names, lambda name: self._denial(asker, name, key)):
             raise PeerRefused(f"site {self._site}", why)
+
+    def _denial(self, asker: str, name: str, told: str) -> str:
+        return "" if self._why_not is None else self._why_not(asker, name, told)
 
     async def _question(self, site: str, module: str, question: ParamQuestion) -> ParamAnswer:
         origin = SiteAttachment(1, self._stamp(), NO_MD5, "/rmpa", (self._site,))
