@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.bridge.naming import Names, PeerNames
-from rmpa.config.settings import PeerRule, Remap
+from rmpa.config.settings import PeerRule, Remap, Settings
 
 ROBOT = PeerRule(
     "robot*",
@@ -19,6 +19,14 @@ ROBOT = PeerRule(
     (Remap("/goals/{peer}", "/goal"), Remap("/shared/**", "/**")),
 )
 NAMES = st.from_regex(r"(/[a-c]{1,2}){1,4}", fullmatch=True)
+
+
+def test_every_peer_may_have_its_names_below_its_own_but_those_that_a_rule_names() -> None:
+    names = Names(Settings(prefix_peers=True, peers=(PeerRule("pc", remap_in=(Remap("/**", "/**"),)), ROBOT)).naming)
+    assert names.local_name("arm", "/odom") == "/arm/odom"
+    assert names.wire_name("arm", "/arm/goal") == "/goal"
+    assert names.local_name("pc", "/cmd_vel") == "/cmd_vel"
+    assert names.local_name("robot1", "/tf") == "/tf"
 
 
 @pytest.mark.parametrize(

@@ -187,6 +187,7 @@ def test_every_flag(load: Load) -> None:
         "interface": ("lo", "eth0"),
         "seed": ("h:1",),
         "multicast": "off",
+        "prefix_peers": True,
         "log_level": "error",
         "log_json": True,
         "realtime": True,
@@ -218,6 +219,7 @@ def test_every_flag(load: Load) -> None:
         interfaces=("lo", "eth0"),
         seeds=(HostPort("h", 1),),
         multicast=Multicast(False),
+        prefix_peers=True,
         log_level="error",
         log_json=True,
         trust=TrustSettings(insecure=True),  # rmpa gateway --insecure means its connections and its start

@@ -182,6 +182,9 @@ async def test_the_demos_modules_are_smart_resources(tidy: dict[str, str]) -> No
                 profile("joystick", "steady"), profile("velocity", "direct"), profile("base", "full")
             )
             assert await period("/odom", "nav_msgs/Odometry") == pytest.approx(0.02, rel=0.2)
+        for name in ("joystick", "velocity", "base", "pc"):
+            with ControlClient(choose_agent({"RMPA_RUNTIME_DIR": str(agents)}, name).path) as agent:
+                assert [peer.conflicts for peer in agent.snapshot().peers] == [()] * 3, "they are of different kinds"
         assert await asyncio.to_thread(demo.interrupt) == 0, demo.output
 
 

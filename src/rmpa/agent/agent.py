@@ -23,6 +23,7 @@ from rmpa.bridge.io.bridge import Bridge
 from rmpa.bridge.io.limit_reports import LimitReports
 from rmpa.bridge.io.node_presence import NodePresence
 from rmpa.bridge.io.node_requests import NodeRequests
+from rmpa.bridge.io.twin_watch import TwinWatch
 from rmpa.bridge.naming import Names
 from rmpa.bridge.params.io.part import Params
 from rmpa.bridge.policy import Policy
@@ -87,7 +88,7 @@ class Agent:
         self._settings = settings
         clock = SystemClock()
         membership = open_membership(settings, clock)
-        policy, names = Policy(settings.policy, settings.peers, settings.time), Names(settings.peers)
+        policy, names = Policy(settings.policy, settings.peers, settings.time), Names(settings.naming)
         self.core: Core = make_core(settings)
         self.bridge = Bridge(
             self.core,
@@ -134,7 +135,8 @@ class Agent:
             settings,
             self._nodes.visible,
         )
-        for part in (self.params, self.services, reports, presence):
+        twins = TwinWatch(self.core, self.bridge, settings.peers)
+        for part in (self.params, self.services, reports, presence, twins):
             self.bridge.add(part)
         self.trust: AgentTrust | None = None
         """This module's part in a secured mesh; ``None``: trust is off."""
@@ -158,6 +160,7 @@ class Agent:
             clocks=self._clocks,
             services=self.services,
             limit_reports=reports,
+            twins=twins,
             endpoint=lambda: self.network.endpoint,
             counters=(counters,),
             notes=self._notes,

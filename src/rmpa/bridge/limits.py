@@ -125,6 +125,8 @@ NODES_PAUSE: Final = 1.0
 registers in several steps."""
 RECONCILE_INTERVAL: Final = 5.0
 """Seconds between two comparisons of the plan with what is really open, so that nothing stays stuck."""
+TWIN_NAMES_MAX: Final = 128
+"""Topics that a peer is told nodes here subscribe to, if it may be a twin: 30 KB at most, and a few are enough."""
 RECONCILE_SKIPS: Final = 11
 """Comparisons in a row that leave out names while the local graph has not changed: all are compared once a minute."""
 WATCH_RECENT: Final = 16

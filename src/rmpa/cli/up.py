@@ -34,6 +34,7 @@ Examples:
   rmpa up --seed 10.8.0.5:40001           greet an agent that multicast does not reach
   rmpa up --name b2 --core-port 11312     a second agent on this machine
   rmpa up --keep never                    forget what the core kept of the run before
+  rmpa up --prefix-peers                  beside robots of the same kind: their names stay apart
   rmpa up --core external                 join the graph of a roscore that runs already
   rmpa up --realtime                      punctual on a busy machine; the log says what was not granted
 """

@@ -13,7 +13,7 @@ from rmpa.config import limits
 from rmpa.config.contract_rules import CONTRACT_RULES
 from rmpa.config.gateway_rules import CrossingRule, GatewaySettings, Ros2Settings
 from rmpa.config.param_rules import PARAM_RULES, FollowRule
-from rmpa.config.peer_rules import PEER_RULES, PeerRule, Remap
+from rmpa.config.peer_rules import PEER, PEER_RULES, PeerRule, Remap
 from rmpa.config.permission_rules import (
     MODULE_GROUPS,
     PERMISSION_DEFAULT,
@@ -472,6 +472,16 @@ class Settings:
         env="RMPA_TRANSPORT",
         live=True,
     )
+    prefix_peers: bool = setting(
+        False,
+        BOOL,
+        "Whether every peer's names are below its own here (/arm/odom of arm), as by a [[peer]] with prefix = "
+        '"/{peer}"; for modules of one kind, which have the same names.',
+        key="bridge.prefix_peers",
+        env="RMPA_PREFIX_PEERS",
+        option="--prefix-peers",
+        live=True,
+    )
     peers: tuple[PeerRule, ...] = setting(
         (),
         PEER_RULES,
@@ -555,6 +565,11 @@ class Settings:
     def make_contracts(self) -> Contracts:
         """The contracts of this module's topics, by ``[[contract]]`` and ``[bridge] transport``."""
         return Contracts(self.contracts, self.transport)
+
+    @property
+    def naming(self) -> tuple[PeerRule, ...]:
+        """The rules for peers' names: ``[[peer]]``, and behind them the prefix that ``prefix_peers`` gives to all."""
+        return (*self.peers, PeerRule("*", f"/{PEER}")) if self.prefix_peers else self.peers
 
     @property
     def allows_direct(self) -> bool:

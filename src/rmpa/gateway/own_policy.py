@@ -23,7 +23,7 @@ class OwnPolicy:
 
     def __init__(self, settings: Settings) -> None:
         self._topics = Policy(settings.policy, settings.peers, settings.time)
-        self._services = ServiceRules(settings.services, self._topics, Names(settings.peers))
+        self._services = ServiceRules(settings.services, self._topics, Names(settings.naming))
 
     def judge(self, kind: SourceKind, name: str, type_name: str, node: str) -> PolicyDecision:
         """Decide whether a source may cross; ``type_name`` counts for topics alone."""

@@ -129,9 +129,9 @@ class Imports:
         """The sources that peers offer for a local topic, each with its peer."""
         return ((peer, source) for peer, known in self._peers.items() for source in known.topics.get(topic, ()))
 
-    def offered_by(self, peer: int) -> Collection[str]:
-        """The topics that a peer offers, by their local names."""
-        return known.topics.keys() if (known := self._peers.get(peer)) is not None else ()
+    def offered_by(self, peer: int) -> Mapping[str, Collection[Source]]:
+        """The topics that a peer offers, by their local names, each with its sources."""
+        return known.topics if (known := self._peers.get(peer)) is not None else {}
 
     def relayed_topics(self, instance: str) -> set[str]:
         """The shown topics of a module that is reached by relays, by their local names."""

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.catalogue.peer_limits import Beyond
     from rmpa.bridge.io.bridge import Bridge
     from rmpa.bridge.io.limit_reports import LimitReports
+    from rmpa.bridge.io.twin_watch import TwinWatch
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.core.identity import Identity
     from rmpa.discovery.events import PeerView
@@ -54,11 +55,13 @@ class PeersSection:
     Args:
         bridge: The agent's bridge.
         bounds: Its part for limits.
+        twins: Its part for peers of this module's kind.
     """
 
-    def __init__(self, bridge: Bridge, bounds: LimitReports) -> None:
+    def __init__(self, bridge: Bridge, bounds: LimitReports, twins: TwinWatch) -> None:
         self._bridge = bridge
         self._bounds = bounds
+        self._twins = twins
         self._clock = SystemClock()
 
     def infos(self, endpoint: EndpointView) -> tuple[PeerInfo, ...]:
@@ -88,6 +91,7 @@ class PeersSection:
                     info,
                     topics_in=theirs,
                     topics_out=ours,
+                    conflicts=(*info.conflicts, *filter(None, (self._twins.problem(session),))),
                     beyond=beyond,
                     direct_in=to_it,
                     direct_out=from_it,

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.io.bridge import Bridge
     from rmpa.bridge.io.limit_reports import LimitReports
+    from rmpa.bridge.io.twin_watch import TwinWatch
     from rmpa.bridge.services.io.part import Services
     from rmpa.config.settings import Settings
     from rmpa.core.counters import Counters
@@ -52,6 +53,7 @@ class SnapshotSources:
         clocks: The clocks of its peers.
         services: The bridge's part for services.
         limit_reports: The bridge's part for limits.
+        twins: The bridge's part for peers of this module's kind.
         endpoint: Its place in the network now; ``None`` while it has none.
         counters: The counters of parts that are not named here.
         notes: What else the user should know, each ready to read.
@@ -65,6 +67,7 @@ class SnapshotSources:
     clocks: PeerClocks
     services: Services
     limit_reports: LimitReports
+    twins: TwinWatch
     endpoint: Callable[[], EndpointView | None]
     counters: tuple[Counters, ...]
     notes: Callable[[], Iterable[str]]
@@ -88,7 +91,7 @@ class SnapshotBuilder:
         self._process.cpu_percent()  # the first call only begins to count
         self._cpu: float | None = None
         self._cpu_known = self._began = time.monotonic()
-        self._peers = PeersSection(sources.bridge, sources.limit_reports)
+        self._peers = PeersSection(sources.bridge, sources.limit_reports, sources.twins)
         self.direct = DirectSection(sources.core, sources.bridge)
         """What is known of direct transport."""
         self.sampler = self.direct.sampler

@@ -209,7 +209,7 @@ class Services(Part):
 
     def reload(self, settings: Settings) -> None:
         """Apply other settings."""
-        policy, names = Policy(settings.policy, settings.peers, settings.time), Names(settings.peers)
+        policy, names = Policy(settings.policy, settings.peers, settings.time), Names(settings.naming)
         self._limit_settings = settings.limits
         self.apply_rules(ServiceRules(settings.services, policy, names))
 

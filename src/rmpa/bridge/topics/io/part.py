@@ -221,7 +221,7 @@ class Topics(Part):
     def reload(self, settings: Settings) -> None:
         """Takes new settings; sources and routes that they do not change go on untouched."""
         policy, contracts = Policy(settings.policy, settings.peers, settings.time), settings.make_contracts()
-        self.names = Names(settings.peers)
+        self.names = Names(settings.naming)
         limit_settings, now = settings.limits, asyncio.get_running_loop().time()
         self._act(self.exports.apply_rules(policy, contracts, self.names, limit_settings))
         self._driver.rejudge(self.imports.apply_rules(policy, contracts, self.names, now, limit_settings))

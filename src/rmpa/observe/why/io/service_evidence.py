@@ -45,7 +45,7 @@ class ServiceEvidence:
 
     def reload(self, settings: Settings) -> None:
         """Use other settings from now on."""
-        policy, names = Policy(settings.policy, settings.peers, settings.time), Names(settings.peers)
+        policy, names = Policy(settings.policy, settings.peers, settings.time), Names(settings.naming)
         self._rules = ServiceRules(settings.services, policy, names)
 
     def known(self, service: str) -> bool:
