@@ -12,7 +12,8 @@ import psutil
 import pytest
 
 from lab.bed.processes import Process, eventually
-from rmpa.cli.run import prepared
+from rmpa.cli.run import _module_name, prepared
+from rmpa.config.state_dir import keep_name
 from rmpa.core.errors import ConfigError
 from tests.interop.ros import free_port
 
@@ -252,3 +253,17 @@ def test_it_can_be_ended_while_it_starts(ground: Ground) -> None:
     assert run.terminate() == 130
     assert not agent.is_running()
     assert "Traceback" not in run.output
+
+
+def test_without_a_name_the_module_is_that_of_rmpa_up_and_keeps_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RMPA_STATE_DIR", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    assert _module_name(()) == ""  # the first resource names it
+    keep_name(tmp_path, "arm")
+    assert _module_name(("--interface", "lo")) == "arm"
+    (tmp_path / "own.toml").write_text('name = "nose"\n')
+    assert _module_name(("--config", "own.toml")) == "nose"
+    monkeypatch.setenv("RMPA_NAME", "said")
+    assert _module_name(("--config", "own.toml")) == "said"

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import json
 import re
 import socket
 import sys
+import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -80,10 +82,12 @@ async def watch_and_drive(page: Page, demo: Process, env: dict[str, str]) -> Non
         assert await kill.ended() == 0, kill.output
     await page.until(lambda: page.modules()["velocity"] != "up")
     async with asyncio.timeout(DEADLINE):
+        numbers = itertools.count(1)
         while views(demo)[-1]["pose"]["speed"] != FULL_SPEED:
-            await page.send(op="drive", topic="/velocity_order", linear=1, angular=0)
+            made = {"hold": 1, "n": next(numbers), "at": time.monotonic()}  # one machine, one clock
+            await page.send(op="drive", topic="/velocity_order", linear=1, angular=0, **made)
             await asyncio.sleep(0.1)  # as a held joystick does
-    await page.send(op="release")
+    await page.send(op="release", hold=1)
     stopped = lambda view: view["pose"]["speed"] == 0  # noqa: E731
     await asyncio.to_thread(wait_for_view, demo, stopped, "a stop")
 
