@@ -178,6 +178,13 @@ TIME_STAMP_BYTES: Final = 12
 EXPRESS_UNSENT_BYTES: Final = 64 * KIB
 """Unsent bytes of one link that the kernel may hold (TCP_NOTSENT_LOWAT): control frames cannot overtake them, and the
 drop policy does not reach them. On 5 Mbit/s a pong was 1.2 s late without this bound, 0.3 s with it."""
+BULK_QUEUE: Final = 0.01
+"""Seconds of data that a bulk lane without BBR may have in the queues of the path. Behind 100 ms of queue at
+20 Mbit/s commands wait for 25 to 30 ms in place of 90, and no image is lost by it."""
+BULK_WINDOW_MIN: Final = 64 * KIB
+"""Bytes that such a lane may have on the way at the least."""
+BULK_WINDOW_MAX: Final = 16 * MIB
+"""And at the most: 1 Gbit/s at a round trip of 0.1 s."""
 EXPRESS_RTO_MIN_US: Final = 5000
 """Microseconds that TCP waits on the express lane for an acknowledgement, beyond the round trip and its variation,
 before it repeats a packet (TCP_RTO_MIN_US); its own value is 200 ms. At 5 % loss 95 % of commands at 50 Hz came

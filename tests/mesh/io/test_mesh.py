@@ -23,7 +23,7 @@ from rmpa.core.sizes import KIB, MIB
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Lane, Refusal, Refuse
-from rmpa.mesh.io.sockets import may_use_bbr, repeats_quickly, tune_bulk, tune_express
+from rmpa.mesh.io.sockets import bound_queue, may_use_bbr, repeats_quickly, tune_bulk, tune_express
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.descriptors import DESCRIPTORS
 from tests.mesh.io.meshes import DEADLINE, Peer, peers, raw, until
@@ -357,6 +357,22 @@ def test_lost_packets_are_repeated_sooner_on_the_express_lane_alone() -> None:
         assert found[_LINUX_TCP["rto_min_us"]][1] in range(5000, 12_000)
     assert bulk_control == (b"bbr" if may_use_bbr() else usual_control)
     assert counters.as_dict() == {}, "an option that this kernel lacks is no fault"
+
+
+def test_without_bbr_the_window_follows_the_rate() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as sock:
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, b"reno")
+        before = sock.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
+        bound_queue(sock)
+        assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF) == before, "no rate is known"
+        with server.accept()[0] as other:
+            for _ in range(64):
+                sock.sendall(bytes(16 * KIB))
+                other.recv(16 * KIB, socket.MSG_WAITALL)
+        bound_queue(sock)
+        bound = sock.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
+        assert bound != before
+        assert limits.BULK_WINDOW_MIN <= bound <= limits.BULK_WINDOW_MAX
 
 
 async def test_a_bye_says_why() -> None:

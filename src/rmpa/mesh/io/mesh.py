@@ -21,7 +21,7 @@ from rmpa.mesh.io.dialler import Dialler
 from rmpa.mesh.io.link import LinkHandlers, PeerLink
 from rmpa.mesh.io.redials import Redials, is_over
 from rmpa.mesh.io.securing import Securing, SecuringError, prove, secure_dialled
-from rmpa.mesh.io.sockets import tune_bulk, tune_express
+from rmpa.mesh.io.sockets import bound_queue, tune_bulk, tune_express
 from rmpa.mesh.keepalive import RestPace
 from rmpa.mesh.peering import Peering
 from rmpa.mesh.peering_events import (
@@ -333,8 +333,9 @@ class Mesh:
             self._redials.begin(link)
 
     def connection_tick(self, connection: Connection) -> None:
-        """Check whether a bulk lane is used."""
+        """Check whether a bulk lane is used, and how much it has on the way."""
         if connection.lane == Lane.BULK:
+            bound_queue(connection.sock)
             for each in self._links.values():
                 if each.bulk_connection is connection:
                     self._bulk_lanes.tick(each)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import socket
+import struct
 import sys
 import termios
 from typing import TYPE_CHECKING, Final
@@ -24,6 +25,9 @@ _REPETITION: Final = (
 """Options with their values on the express lane, and Linux's own; Python's ``socket`` lacks these numbers of
 linux/tcp.h."""
 _BBR: Final = b"bbr"
+_INFO_BYTES: Final = 256
+_MIN_RTT: Final = struct.Struct("=148xI")  # microseconds, in struct tcp_info of linux/tcp.h
+_DELIVERY_RATE: Final = struct.Struct("=160xQ")  # bytes a second, since Linux 4.9
 
 
 def tune_express(sock: socket.socket, lanes: LaneSettings, counters: Counters) -> None:
@@ -48,6 +52,25 @@ def tune_bulk(sock: socket.socket, lanes: LaneSettings, counters: Counters) -> N
     for name, _, usual in _REPETITION:  # the lane of an accepted connection is known late
         _try(sock, name, usual)
     _try(sock, socket.TCP_CONGESTION, _BBR)
+
+
+def bound_queue(sock: socket.socket) -> None:
+    """Bound what a bulk lane without BBR has on the way: two round trips and ``limits.BULK_QUEUE`` at its rate.
+
+    To be called from time to time while it sends: where the window itself was the bound, it grows.
+    """
+    try:
+        if sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, 16).rstrip(b"\0") == _BBR:
+            return
+        info = sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _INFO_BYTES)
+        rate: int = _DELIVERY_RATE.unpack_from(info)[0]
+        window = round(rate * (2e-6 * _MIN_RTT.unpack_from(info)[0] + limits.BULK_QUEUE))
+        if not rate:
+            return
+        window = max(limits.BULK_WINDOW_MIN, min(window, limits.BULK_WINDOW_MAX))
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, window // 2)  # the kernel doubles it
+    except (OSError, struct.error):
+        return
 
 
 def repeats_quickly() -> bool:

@@ -193,7 +193,7 @@ def judge_radio(radios: Iterable[Radio], *, quick: bool, bbr: bool) -> list[Chec
             text = "TCP waits 200 ms before it repeats a lost packet, and this kernel has no option for less"
             found.append(Check("radio", WARN, text, remedy, where=radio.name))
         if not bbr:
-            text = "BBR is not permitted: large messages fill the radio's queue, and commands wait behind them"
+            text = "BBR is not permitted: commands wait some 30 ms in the radio's queue behind large messages"
             permit = 'sudo modprobe tcp_bbr; sudo sysctl -w net.ipv4.tcp_allowed_congestion_control="reno cubic bbr"'
             found.append(Check("radio", WARN, text, permit, where=radio.name))
     return found or [Check("radio", SKIPPED, "no wireless interface is used")]
