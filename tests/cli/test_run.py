@@ -255,9 +255,7 @@ def test_it_can_be_ended_while_it_starts(ground: Ground) -> None:
     assert "Traceback" not in run.output
 
 
-def test_without_a_name_the_module_is_that_of_rmpa_up_and_keeps_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_name_the_module_is_that_of_rmpa_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RMPA_STATE_DIR", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     assert _module_name(()) == ""  # the first resource names it
