@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.names import NEVER_CROSSING, matches
-
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from collections.abc import Set as AbstractSet
@@ -22,9 +20,9 @@ OFFERED_MIN: Final = 2
 _NAMES_SHOWN: Final = 4
 _COMMON: Final = frozenset({
     "/tf", "/tf_static", "/diagnostics", "/diagnostics_agg", "/diagnostics_toplevel_state", "/statistics",
-    "/client_count", "/connected_clients",
+    "/client_count", "/connected_clients", "/clock", "/rosout", "/rosout_agg",
 })  # fmt: skip
-"""Names that modules of every kind may share: transforms, diagnostics, and those of tools that run everywhere."""
+"""Names that modules of every kind may share: transforms, diagnostics, time, logs, and those of common tools."""
 _COMMON_ENDINGS: Final = (
     "/parameter_updates", "/parameter_descriptions", "/bond",
     "/quality", "/requirements", "/responses", "/observed", "/alarms", "/profile", "/context", "/state", "/decision",
@@ -35,13 +33,7 @@ _COMMON_ENDINGS: Final = (
 
 def telling(names: Iterable[str]) -> frozenset[str]:
     """The names that tell something of the kind of a module: not those that all modules may share."""
-    return frozenset(
-        name
-        for name in names
-        if name not in _COMMON
-        and not name.endswith(_COMMON_ENDINGS)
-        and not any(matches(pattern, name) for pattern in NEVER_CROSSING)
-    )
+    return frozenset(name for name in names if name not in _COMMON and not name.endswith(_COMMON_ENDINGS))
 
 
 def twin_names(
