@@ -37,6 +37,7 @@ SEEDS: list[bytes] = [
     b'{"": "\\u0000", "a/b": -1e999}',
     param_key("hall", "arm", "/gains/p").encode(),
     param_key("hall", "arm", GATEWAYS).encode(),
+    b"rmpa/1/hall/arm/p/-/",
     b"/hall/arm/speed",
 ]
 

@@ -169,8 +169,8 @@ def parse_param_key(key: str) -> tuple[str, str]:
         raise RemoteProtocolError(f"{key[:120]!r} is not the key of a parameter")
     if any("*" in chunk for chunk in chunks):
         raise RemoteProtocolError(f"{key[:120]!r} names several; ask for one, or for a namespace")
-    name = "/".join(chunks[5:])
-    return chunks[3], GATEWAYS if name == GATEWAYS else plain_key("/" + name)
+    name = plain_key("/" + "/".join(chunks[5:]))
+    return chunks[3], GATEWAYS if name == "/" + GATEWAYS else name
 
 
 def plain_key(key: str) -> str:
