@@ -272,13 +272,13 @@ class AgentTrust(Part):
 
     async def _look_after(self) -> None:
         while True:
+            self._wake.clear()  # before the look: what changes meanwhile is looked at, too
             try:
                 await self._look()
             except asyncio.CancelledError:
                 raise
             except Exception:  # noqa: BLE001 - the task's top: the next look may succeed
                 _log.exception("! the certificate could not be renewed")
-            self._wake.clear()
             try:
                 async with asyncio.timeout(limits.RENEWAL_LOOK):
                     await self._wake.wait()
