@@ -98,7 +98,10 @@ async def test_a_topic_flows_while_both_sides_permit_it_and_no_longer(
         a.apply_settings(with_rules(a_settings, allow("b", subscribe="/tf")))
         await until(lambda: not odom.subscribers and not subscriber.publishers)
         name, text = stopped_at((await ask(b, "/odom", "a"))[:1])
-        assert (name, text) == ("permission there", "the permissions of a do not let b subscribe to /odom")
+        assert (name, text) == (
+            "permission there",
+            "the permissions of a do not let b subscribe to /odom, nor call it if it is a service",
+        )
         a.apply_settings(a_settings)
         await until(lambda: odom.subscribers and subscriber.publishers)
 
@@ -154,7 +157,7 @@ async def test_services_are_shown_and_called_only_as_both_sides_permit(
         a.apply_settings(with_rules(a_settings, allow("b", call="/other")))
         await until(lambda: not here("/add"))
         texts = [d.failed.text for d in await ask(b, "/add", "a") if d.failed is not None]
-        assert texts == ["the permissions of a do not let b subscribe to /add"], "not told what it would be"
+        assert texts == ["the permissions of a do not let b subscribe to /add, nor call it if it is a service"]
         peer = next(iter(b.bridge.sessions.linked())).peer
         await until(lambda: b.services.imports.get(peer, "/other"))
         assert not here("/other")

@@ -36,7 +36,7 @@ async def flowing(agent: Agent, name: str, peer: str | None = None) -> Diagnosis
     async with asyncio.timeout(DEADLINE):
         while True:
             found = await ask(agent, name, peer)
-            if len(found) == 1 and found[0].flows:
+            if len(found) == 1 and found[0].flows and not found[0].unasked:
                 return found[0]
             await asyncio.sleep(0.05)
 
@@ -61,8 +61,9 @@ async def test_each_stage_until_a_topic_flows(settings: Callable[..., Settings])
         assert stopped_at(await ask(b, "/chatter"))[0] == "publisher"
         publisher = await talker.advertise("/chatter", "std_msgs/String")
         await until(lambda: b.bridge.topics.imports.offered_by(next(iter(b.bridge.sessions.linked())).peer))
-        stage, text = stopped_at(await ask(b, "/chatter", "a"))
-        assert (stage, text) == ("subscriber", "no node here subscribes to /chatter, so nothing is sent")
+        (idle,) = await ask(b, "/chatter", "a")
+        assert (idle.unasked, idle.failed) == (True, None)
+        assert idle.stages[-1].text == "no node here subscribes to /chatter, so nothing is sent"
         (near,) = await ask(b, "/chater", "a")
         assert near.failed is not None
         assert near.failed.remedy == "did you mean /chatter?"

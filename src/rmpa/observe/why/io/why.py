@@ -142,9 +142,9 @@ class WhyService:
             calls = await self._service(name, wanted)
             if any(diagnosis.node for diagnosis in calls):
                 return calls
-            # A peer that denies both does not tell whether there is a topic or a service of this name: one is shown.
-            if not _is_denied(found[0]):
-                return (*found, *filter(_is_denied, calls))
+            denied = tuple(filter(_is_denied, calls))
+            # A peer that denies both does not tell whether there is a topic or a service of this name.
+            return tuple(map(_with_calls, found)) if _is_denied(found[0]) and denied else (*found, *denied)
         return found
 
     async def _module(self, name: str) -> Diagnosis:
@@ -345,6 +345,13 @@ class WhyService:
 def _is_denied(found: Diagnosis) -> bool:
     """Whether a peer tells nothing of a name, because its permissions do not let this module have it."""
     return found.failed is not None and found.failed.name == PERMISSION_THERE
+
+
+def _with_calls(found: Diagnosis) -> Diagnosis:
+    """A denied topic, where calls of a service of this name are denied too."""
+    *walked, last = found.stages
+    text = f"{last.text}, nor call it if it is a service"
+    return msgspec.structs.replace(found, stages=(*walked, msgspec.structs.replace(last, text=text)))
 
 
 def _no_link(peer: str) -> Check:
