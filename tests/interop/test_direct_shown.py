@@ -161,7 +161,7 @@ def test_tools_that_measure_are_relayed_and_leave_the_user_direct(modules: Modul
     code, text = b.agent.rmpa("topic", "echo", TOPIC, "-n", "3", "--json")
     assert (code, len(text.splitlines())) == (0, 3), text
     after = subscriber(b, "/viewer")
-    assert (after["transport"], after["missed"]) == ("direct", 0)
+    assert (after["transport"], after["interruptions"]) == ("direct", 0)
     assert after["since_ago"] > since, "it was not moved meanwhile"
     unbroken(flows(viewer))
     assert "direct.relayed" not in b.agent.snapshot().counters, "a tool is relayed on purpose: no warning"
