@@ -125,5 +125,5 @@ def clean_environment(monkeypatch: pytest.MonkeyPatch, state_home: Path) -> None
     """Take the user's ROS and rmpa settings away, so that no test depends on them; nothing is kept in his home."""
     monkeypatch.setenv("XDG_STATE_HOME", str(state_home / str(next(_numbers))))
     for name in list(os.environ):
-        if name.startswith(("ROS_", "RMPA_")) or name in ("CMAKE_PREFIX_PATH", "NOTIFY_SOCKET"):
+        if name.startswith(("ROS_", "RMPA_")) or name in ("CMAKE_PREFIX_PATH", "NOTIFY_SOCKET", "SUDO_UID"):
             monkeypatch.delenv(name)

@@ -12,6 +12,7 @@ import ssl
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -189,6 +190,28 @@ def test_a_gateway_is_no_less_secure_than_the_agent_beside_it(machine: Machine) 
     assert "beside the agent sec" in machine.run(*gateway, code=1, **other)
 
 
+def test_a_gateway_does_not_start_beside_an_agent_that_does_not_say_whether_it_is_secured(machine: Machine) -> None:
+    pytest.importorskip("zenoh")
+    (machine.folder / "run").mkdir(mode=0o700)
+    with socket.socket(socket.AF_UNIX) as mute:
+        mute.bind(str(machine.folder / "run" / "mute.sock"))
+        mute.listen()
+
+        def hang_up() -> None:
+            with contextlib.suppress(OSError):
+                while True:
+                    mute.accept()[0].close()
+
+        thread = threading.Thread(target=hang_up)
+        thread.start()
+        try:
+            said = machine.run("gateway", "--router", "--listen", f"tcp/127.0.0.1:{free_port()}", code=1)
+        finally:
+            mute.shutdown(socket.SHUT_RDWR)
+            thread.join()
+    assert "mute.sock" in said
+
+
 def test_the_web_server_is_as_secure_as_the_agent_whatever_their_names(machine: Machine) -> None:
     pytest.importorskip("aiohttp")
     (machine.folder / "agents.toml").write_text(RULES)
@@ -266,4 +289,5 @@ def test_the_web_server_without_an_agent_is_that_of_the_module_with_keys(machine
     machine.run("trust", "init", "--name", "sec")
     assert machine.web("--port", free_port()).startswith("https://")
     refused = machine.run("web", "--agent", "other", code=1)
+    assert "start as sec: --agent sec" in refused
     assert "the module other: has no keys, and would start without trust, beside keys of sec" in refused

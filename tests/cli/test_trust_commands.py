@@ -273,7 +273,7 @@ def test_a_join_by_files(machine: Callable[[str], Machine]) -> None:
     code, out, err = base.run("trust", "invite", "--sign", str(csr), stdin="y\n")
     assert code == 0, err
     assert f"arm asks with the key {shown[1]}" in err
-    ca = re.search(r"--ca ([0-9a-f]+)", out)
+    ca = re.search(r"--ca ([0-9a-f]+) --name arm$", out, re.MULTILINE)
     assert ca is not None
     answer = Path(f"{csr}.answer")
     assert answer.stat().st_mode & 0o077 == 0

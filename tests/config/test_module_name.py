@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING
 
 import pytest
@@ -14,7 +15,7 @@ from rmpa.config.state_dir import (
     kept_name,
     note_state_dir,
     other_state_dirs,
-    usual_state_dir,
+    usual_state_dirs,
 )
 from rmpa.core.errors import ConfigError, RmpaError
 
@@ -72,10 +73,28 @@ def test_a_broken_file_of_the_name_is_an_error_and_not_another_module(tmp_path: 
     assert "remove the file" in str(error.value)
 
 
+def test_a_pipe_in_place_of_the_name_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / NAME_FILE)
+    assert not kept_name(tmp_path)
+
+
+def test_a_name_that_root_keeps_belongs_to_the_user_of_the_agent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    owned: list[tuple[int, int]] = []
+    owner = tmp_path.stat().st_uid or 1000
+    os.chown(tmp_path, owner, -1)
+    group = tmp_path.stat().st_gid
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    monkeypatch.setattr(os, "chown", lambda _, user, group: owned.append((user, group)))
+    assert keep_name(tmp_path, "arm")
+    assert owned == [(owner, group)]
+
+
 def test_a_state_directory_of_its_own_is_noted_in_the_usual_one(tmp_path: Path) -> None:
     environ = {"HOME": str(tmp_path), "RMPA_STATE_DIR": str(tmp_path / "data")}
     usual = tmp_path / ".local/state/rmpa"
-    assert usual_state_dir(environ) == usual
+    assert usual_state_dirs(environ) == [usual]
     for _ in range(2):
         note_state_dir(environ, tmp_path / "data")
     assert other_state_dirs(environ, usual)[:1] == [tmp_path / "data"]

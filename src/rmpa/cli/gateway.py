@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import importlib.util
 import logging
@@ -20,7 +19,7 @@ from rmpa.cli.setting_options import config_option, setting_options
 from rmpa.config.module_name import GATEWAY_SUFFIX
 from rmpa.config.settings import WebSettings
 from rmpa.config.sources import load_settings
-from rmpa.core.errors import ConfigError, RmpaError, StartError
+from rmpa.core.errors import ConfigError, StartError
 from rmpa.core.identity import peer_name_from
 from rmpa.core.log import configure_logging
 from rmpa.observe.io.control_client import ControlClient, find_agents
@@ -150,6 +149,7 @@ def check_agents(settings: Settings, environ: Mapping[str, str]) -> None:
 
     Raises:
         StartError: One is a member of a secured mesh, the gateway is not, and ``trust.insecure`` is not set.
+        RmpaError: One does not answer whether it is.
     """
     from rmpa.agent.trust import trust_store
 
@@ -157,8 +157,7 @@ def check_agents(settings: Settings, environ: Mapping[str, str]) -> None:
     if settings.trust.insecure or (store is not None and store.exists):
         return
     for agent in find_agents(environ):
-        secured = False
-        with contextlib.suppress(RmpaError), ControlClient(agent.path) as client:
+        with ControlClient(agent.path) as client:
             secured = client.call("trust", TrustStatus, what="status").agent == "secured"
         if secured:
             problem = f"has no keys, beside the agent {agent.name} in a secured mesh"

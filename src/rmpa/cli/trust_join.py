@@ -200,7 +200,7 @@ def _sign(place: TrustPlace, request: Path, out: Path, module: str, *, yes: bool
         print_json({"module": wanted.name, "key": key, "file": str(out)})
     else:
         print_line(f"{out} is the answer, a secret: bring it to {wanted.name}, and delete it then")
-        print_line(f"there: rmpa trust join --accept {out.name} --ca {_ca_of(place)}")
+        print_line(f"there: rmpa trust join --accept {out.name} --ca {_ca_of(place)} --name {wanted.name}")
 
 
 def _ca_of(place: TrustPlace) -> str:

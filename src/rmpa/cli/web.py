@@ -152,7 +152,7 @@ def _setup(module: Module, settings: Settings) -> WebSetup:
     store = TrustStore(module.state, module.name) if module.state is not None else None
     trusted = module.secured or (store is not None and store.exists)
     if not trusted and module.socket is None and not settings.trust.insecure:
-        check_open_start(module.state, module.name, os.environ)
+        check_open_start(module.state, module.name, os.environ, "--agent")
     own_file = str(settings.config_file.absolute()) if settings.config_file is not None else ""
     if trusted and module.config_file not in ("", own_file):  # the permissions are those that its agent reads
         theirs = load_settings({"config": module.config_file}, os.environ, host_name=socket.gethostname())

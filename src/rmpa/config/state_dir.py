@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import pwd
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -96,6 +97,9 @@ def keep_name(directory: Path, name: str, *, instead: bool = False) -> bool:
     try:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         temporary.write_text(f"{name}\n", encoding="ascii")
+        owner = directory.stat()
+        if os.geteuid() == 0 and owner.st_uid != 0:  # the agent runs as that user, and is to read it
+            os.chown(temporary, owner.st_uid, owner.st_gid)
         try:
             if instead:
                 temporary.replace(path)
@@ -110,10 +114,25 @@ def keep_name(directory: Path, name: str, *, instead: bool = False) -> bool:
     return True
 
 
-def usual_state_dir(environ: Mapping[str, str]) -> Path | None:
-    """The state directory where nothing names one: no setting, RMPA_STATE_DIR or STATE_DIRECTORY."""
+def usual_state_dirs(environ: Mapping[str, str]) -> list[Path]:
+    """The state directories where nothing names one (no setting, RMPA_STATE_DIR or STATE_DIRECTORY), our own last.
+
+    Without HOME, as a unit of the system has none, it is that of the user's home directory all the same; under
+    ``sudo`` there is also that of the user who called it.
+    """
     said = ("RMPA_STATE_DIR", "STATE_DIRECTORY")
-    return state_dir({name: value for name, value in environ.items() if name not in said})
+    usual = state_dir({name: value for name, value in environ.items() if name not in said})
+    caller = environ.get("SUDO_UID", "")
+    homes = [_home_of(int(caller))] if caller.isdecimal() else []
+    homes.append(usual or _home_of(os.geteuid()))
+    return list(dict.fromkeys(place for place in homes if place is not None))
+
+
+def _home_of(user: int) -> Path | None:
+    try:
+        return Path(pwd.getpwuid(user).pw_dir) / ".local" / "state" / "rmpa"
+    except (KeyError, OverflowError):
+        return None
 
 
 def other_state_dirs(environ: Mapping[str, str], used: Path | None) -> list[Path]:
@@ -123,9 +142,9 @@ def other_state_dirs(environ: Mapping[str, str], used: Path | None) -> list[Path
         environ: As for ``state_dir``.
         used: The one in use.
     """
-    usual = usual_state_dir(environ)
-    listed = _read(usual / PLACES_FILE).splitlines() if usual is not None else []
-    places = [*([usual] if usual is not None else []), *map(Path, filter(None, listed)), _SYSTEM]
+    usual = usual_state_dirs(environ)
+    listed = [line for place in usual for line in _read(place / PLACES_FILE).splitlines() if line]
+    places = [*usual, *map(Path, listed), _SYSTEM]
     return [place for place in dict.fromkeys(places) if place != used]
 
 
@@ -134,17 +153,19 @@ def note_state_dir(environ: Mapping[str, str], used: Path) -> None:
 
     It is of use to the same user alone; where it cannot be written, nothing is noted.
     """
-    usual, used = usual_state_dir(environ), used.absolute()
-    if usual is None or usual == used or used in other_state_dirs(environ, usual):
+    usual, used = usual_state_dirs(environ)[-1:], used.absolute()
+    if not usual or usual[0] == used or used in map(Path, _read(usual[0] / PLACES_FILE).splitlines()):
         return
     with contextlib.suppress(OSError):
-        usual.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with (usual / PLACES_FILE).open("a", encoding="utf-8") as file:
+        usual[0].mkdir(mode=0o700, parents=True, exist_ok=True)
+        with (usual[0] / PLACES_FILE).open("a", encoding="utf-8") as file:
             file.write(f"{used}\n")
 
 
 def _read(path: Path) -> str:
     try:
+        if not path.is_file():  # a pipe would be waited for
+            return ""
         with path.open("rb") as file:
             return file.read(_READ_MAX).decode("utf-8", "replace")
     except OSError:

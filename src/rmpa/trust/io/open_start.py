@@ -19,26 +19,27 @@ if TYPE_CHECKING:
 _SHOWN = 5
 
 
-def check_open_start(state: Path | None, module: str, environ: Mapping[str, str]) -> None:
+def check_open_start(state: Path | None, module: str, environ: Mapping[str, str], option: str = "--name") -> None:
     """Check that an open module is what the user wants.
 
     Args:
         state: The state directory in use; ``None``: there is none.
         module: The module, which has no files of trust there.
         environ: Says where other state directories are.
+        option: The command's option for a name, for errors.
 
     Raises:
         StartError: Another module, or another state directory, has keys of a secured mesh; or it cannot be known.
     """
     here = modules_with_keys(state) if state is not None else []
     if here:
-        start = [f"start as {name}: --name {name}" for name in _startable(here, module)]
+        start = [f"start as {name}: {option} {name}" for name in _startable(here, module)]
         raise _refused(module, f"{_listed(here)} here in {state}", start)
-    for place in other_state_dirs(environ, state):
-        if there := _keys_in(place):
-            names = [module] if module in there else _startable(there, module)
-            start = [f"start with RMPA_STATE_DIR={place} --name {name}" for name in names]
-            raise _refused(module, f"{_listed(there)} in {place}", start)
+    others = [(place, there) for place in other_state_dirs(environ, state) if (there := _keys_in(place))]
+    for place, there in sorted(others, key=lambda each: module not in each[1]):  # first where its own keys are
+        names = [module] if module in there else _startable(there, module)
+        start = [f"start with RMPA_STATE_DIR={place} {option} {name}" for name in names]
+        raise _refused(module, f"{_listed(there)} in {place}", start)
 
 
 def _startable(names: list[str], module: str) -> list[str]:
