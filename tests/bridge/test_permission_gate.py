@@ -52,11 +52,13 @@ def test_each_refusal_is_counted_and_each_rule_is_logged_once(caplog: pytest.Log
     assert len(caplog.records) == 4, "other rules are worth another line"
 
 
-def test_what_is_remembered_of_the_log_is_bounded() -> None:
-    gate = PermissionGate(Permissions(TrustSettings()))
+def test_names_that_are_invented_do_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    counters = Counters()
+    gate = PermissionGate(Permissions(TrustSettings()), counters)
     for number in range(limits.REFUSALS_LOGGED + 10):
         assert not gate.admits(Access.PUBLISH, f"m{number}", "/t")
-    assert len(gate._logged) <= limits.REFUSALS_LOGGED
+    assert len(caplog.records) == limits.REFUSALS_LOGGED
+    assert counters["permission.publish"] == limits.REFUSALS_LOGGED + 10
 
 
 def test_a_relay_and_the_origin_are_judged_both(caplog: pytest.LogCaptureFixture) -> None:

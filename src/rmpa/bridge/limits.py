@@ -202,8 +202,9 @@ DIRECT_LOOK: Final = 0.02
 """Seconds between two looks while a move waits."""
 
 # --- permissions ----------------------------------------------------------------------------------------------
-REFUSALS_LOGGED: Final = 1024
-"""Refusals (module, kind of access and rule) that are known to be logged; then all are forgotten and logged again."""
+REFUSALS_LOGGED: Final = 128
+"""Modules and sites that are logged as refused by one rule for one kind of access; further ones, whose names may be
+invented, are only counted until the rules change."""
 
 # --- parked peers ---------------------------------------------------------------------------------------------
 UNSENT_MAX: Final = 64

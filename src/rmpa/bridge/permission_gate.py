@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -52,7 +53,7 @@ class PermissionGate:
     def __init__(self, permissions: Permissions | None = None, counters: Counters | None = None) -> None:
         self.permissions = permissions
         self._counters = counters if counters is not None else Counters()
-        self._logged: set[tuple[str, str, int | None]] = set()
+        self._logged: dict[tuple[str, int | None], set[str]] = defaultdict(set)
 
     @property
     def on(self) -> bool:
@@ -118,16 +119,17 @@ class PermissionGate:
     def refused(
         self, access: Access, module: str, name: str, decision: PermissionDecision, *, relay: str = ""
     ) -> None:
-        """Count a refusal; the first one of a module, a kind of access and a rule is logged."""
+        """Count a refusal; the first one of a module, a kind of access and a rule is logged.
+
+        Names of sites may be invented, so further modules and sites of one rule are only counted.
+        """
         by_relay = bool(relay) and not self.may_relay(relay)
         kind, whose = (_RELAY, relay) if by_relay else (str(access), module)
         self._counters.add(f"permission.{kind}")
-        known = (kind, whose, decision.number)
-        if known in self._logged:
+        logged = self._logged[kind, decision.number]
+        if whose in logged or len(logged) >= limits.REFUSALS_LOGGED:
             return
-        if len(self._logged) >= limits.REFUSALS_LOGGED:
-            self._logged.clear()
-        self._logged.add(known)
+        logged.add(whose)
         what = prohibition(access, module, name) + (f" by way of {relay}" if relay else "")
         _log.warning("! %s: %s (logged once, then counted)", what, decision.rule)
 

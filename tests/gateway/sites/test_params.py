@@ -331,3 +331,28 @@ async def test_the_own_sites_modules_are_asked_by_themselves(sites: ParamSites) 
     sites.sites.append("office")
     await sites.imports.look()
     assert sites.session.asked == []
+
+
+async def test_a_module_here_does_not_follow_what_this_gateways_permissions_deny_it(sites: ParamSites) -> None:
+    """Neither by its name nor within a namespace; what it may have is followed."""
+    sites.imports._why_not = lambda asker, name, told: (
+        f"{asker} may not have {told}" if asker == "desk" and name in ("/speed", "/gains/i") else ""
+    )
+    keys = ("/warehouse/arm/speed", "/warehouse/arm/gains", "/warehouse/arm/gains/p")
+    sites.arm.values["/gains/p"] = 1
+    sites.own.followed_by_peers = dict.fromkeys(keys, frozenset({"base", "desk"}))
+    await sites.imports.look()
+    assert sites.own.values == {"/warehouse/arm/gains/p": 1}
+    assert sites.imports.problems == {
+        "/warehouse/arm/speed": "desk may not have /speed",
+        "/warehouse/arm/gains": "desk may not have /gains",
+    }
+
+
+async def test_a_site_is_not_told_whether_a_parameter_is_there_that_a_rule_keeps_from_it(sites: ParamSites) -> None:
+    sites.denied = {"/speed", "/none"}
+    texts = []
+    for name in ("speed", "none"):
+        (reply,) = await sites.session.get(f"rmpa/1/warehouse/arm/p/{name}")
+        texts.append(reply.payload.decode().replace(name, "X"))
+    assert texts[0] == texts[1]

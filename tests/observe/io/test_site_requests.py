@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
-from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
+from rmpa.core.errors import ConfigError, PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.observe.io.site_requests import BODY, INFO, LAST, PARAM, REPORT, SiteRequests
 
 if TYPE_CHECKING:
@@ -103,5 +103,8 @@ async def test_a_gateway_answers_itself_and_is_told_which_module_asks() -> None:
         for who, topic in (("other", "/map"), ("desk", "/secret")):
             with pytest.raises(PeerRefused):
                 await ask(who, what, {"topic": topic})
+        for bad in ("/map\nforged", "/map/", "/" + "x" * 5000, None):
+            with pytest.raises(RemoteProtocolError, match="is not a topic"):  # it would come into the log
+                await ask("other", what, {"topic": bad})
     assert await ask("other", PARAM, {"asker": "desk"}) == "answer"
     assert gateway.answered == [(REPORT, ""), (LAST, "desk"), (BODY, "desk"), (PARAM, "other")]

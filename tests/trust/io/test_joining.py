@@ -371,6 +371,22 @@ async def test_the_name_of_an_absent_member_is_not_given_to_another(lab: Lab) ->
         await lab.join(lab.invite(unattended=True))  # its certificate has ended
 
 
+@pytest.mark.parametrize("away", [0, 8 * DAY])
+async def test_a_module_whose_name_another_one_has_by_now_renews_no_certificate(lab: Lab, away: float) -> None:
+    """Else two modules would have one name: its successor, and one that was in a drawer, or stolen."""
+    async with running(lab):
+        old = lab.member(await lab.join(lab.invite(unattended=True)))
+        lab.clock.wall_seconds += away
+        lab.authority.renew_own()
+        new = lab.member(await lab.join(lab.invite("arm", unattended=True)), "successor")
+        with pytest.raises(PeerRefused, match=r"another module has joined as arm.*\(revoked\); join again"):
+            await renew_at_authority(old, "127.0.0.1", lab.port)
+        again = MeshAuthority.load(lab.store, lab.base)
+        with pytest.raises(CertificateError, match="another module has joined as arm"):
+            again.issue(old.request(), "arm")
+        new.renewed((await renew_at_authority(new, "127.0.0.1", lab.port)).certificate)
+
+
 async def test_of_two_modules_that_join_under_one_name_at_a_time_one_becomes_a_member(lab: Lab) -> None:
     async with running(lab):
         first, second = lab.invite(), lab.invite("arm")

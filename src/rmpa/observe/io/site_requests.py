@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 from rmpa.bridge import limits
 from rmpa.bridge.permission_gate import OPEN_GATE, Needs, PermissionGate
 from rmpa.bridge.session.peer_rpc import UNKNOWN_QUESTION
+from rmpa.config import limits as config_limits
 from rmpa.config.permission_rules import Access
-from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
+from rmpa.core.errors import ConfigError, PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.core.names import is_global_name
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
@@ -149,8 +151,12 @@ class SiteRequests:
     ) -> Awaitable[object]:
         """Answer a linked module, which another site takes for this one's gateway: so it is judged here."""
         peer = asker.link.name
-        if what in (LAST, BODY) and (why := self._gate.why_not(Access.SUBSCRIBE, peer, str(args.get("topic", "")))):
-            raise PeerRefused(str(args.get("site", "")), why)
+        if what in (LAST, BODY):
+            topic = str(args.get("topic", ""))
+            if len(topic) > config_limits.CROSSING_NAME_MAX or not is_global_name(topic):
+                raise RemoteProtocolError(f"{topic[:80]!r} is not a topic")  # before it comes into a log
+            if why := self._gate.why_not(Access.SUBSCRIBE, peer, topic):
+                raise PeerRefused(str(args.get("site", "")), why)
         return gateway.answer(what, args, peer)
 
     async def _ask(

@@ -79,7 +79,7 @@ def found_mesh(store: TrustStore, name: str, label: str, wall: float) -> None:
     keys = KeyList.of(1, [GroupKey(1, os.urandom(limits.GROUP_KEY_BYTES))], name)
     store.write(files_of.CA_KEY, ca_pem)
     store.save(MemberFiles(key_pem, certificate, ca, sign(keys, ca_key)))
-    store.save_issued([_issued(name, wall)])
+    store.save_issued([_issued(name, wall, request.public_key)])
 
 
 class MeshAuthority:
@@ -180,9 +180,9 @@ class MeshAuthority:
         """A random number for a certificate."""
         return _serial()
 
-    def was_issued(self, name: str, hosts: tuple[str, ...] = ()) -> None:
-        """Remember that a module has a new certificate, with these hosts of its page."""
-        self._issued[name] = _issued(name, self.wall_for(name), hosts)
+    def was_issued(self, name: str, key: bytes, hosts: tuple[str, ...] = ()) -> None:
+        """Remember that a module has a new certificate, of this public key (DER) and with these hosts of its page."""
+        self._issued[name] = _issued(name, self.wall_for(name), key, hosts)
         while len(self._issued) > limits.ISSUED_MAX:
             del self._issued[min(self._issued, key=lambda each: self._issued[each].expires)]
         self._store.save_issued(self.issued)
@@ -192,19 +192,23 @@ class MeshAuthority:
 
         Args:
             request: PKCS #10.
-            name: The module that it must be of; empty for any.
+            name: The member that renews its certificate; empty for a module that joins.
 
         Raises:
-            CertificateError: The request is malformed or of another module.
+            CertificateError: The request is malformed or of another module, or a module with another key has joined
+                under this name since.
             StartError: The clock is not set, or a file cannot be written.
         """
         asked = certificates.read_request(request)
         if name and asked.name != name:
             raise CertificateError(TrustReason.NAME, f"{name} asks for a certificate of {asked.name}")
+        last = self._issued.get(asked.name)
+        if name and last is not None and last.key not in (b"", asked.public_key):
+            raise CertificateError(TrustReason.REVOKED, f"another module has joined as {name} since")
         secrets = self.secrets
         hosts, wall = self._granted(asked), self.wall_for(asked.name)
         certificate = certificates.issue(asked, secrets.ca, self._ca_key, _serial(), wall, hosts=hosts)
-        self.was_issued(asked.name, hosts)
+        self.was_issued(asked.name, asked.public_key, hosts)
         return asked, certificate
 
     def _granted(self, asked: CertificateRequest) -> tuple[str, ...]:
@@ -368,8 +372,8 @@ def _serial() -> int:
     return int.from_bytes(os.urandom(20), "big") >> (160 - _SERIAL_BITS) or 1
 
 
-def _issued(name: str, wall: float, hosts: tuple[str, ...] = ()) -> Issued:
-    return Issued(name, int(wall), int(wall) + limits.CERTIFICATE_LIFETIME, hosts)
+def _issued(name: str, wall: float, key: bytes, hosts: tuple[str, ...] = ()) -> Issued:
+    return Issued(name, int(wall), int(wall) + limits.CERTIFICATE_LIFETIME, hosts, key)
 
 
 def _check_clock(wall: float) -> None:

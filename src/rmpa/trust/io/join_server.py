@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.core.errors import LocalProtocolError, RmpaError
 from rmpa.trust import limits
-from rmpa.trust.certificates import CertificateError
+from rmpa.trust.certificates import CertificateError, verify
 from rmpa.trust.io import store as files_of
 from rmpa.trust.io.join_connection import JoinConnection, NotTlsError, join_server_context, renewal_context
 from rmpa.trust.io.joining import one_message
@@ -268,7 +268,7 @@ class JoinServer:
                 joining.side.agree(self._authority.wall_for(event.module))
                 joining.answered.set()
         elif isinstance(event, Joined):
-            self._authority.was_issued(event.module)
+            self._authority.was_issued(event.module, verify(event.certificate, event.ca, None).public_key)
             self._step(token_id, JoinState.JOINED, module=event.module)
             _log.info("+ %s at %s has joined", event.module, where)
         else:

@@ -76,12 +76,14 @@ class Issued(msgspec.Struct, frozen=True):
         issued: When, seconds since 1970.
         expires: When it ends.
         hosts: The names and addresses of its page that it has, besides those that follow from its name.
+        key: Its public key (SubjectPublicKeyInfo, DER).
     """
 
     name: str
     issued: int
     expires: int
     hosts: tuple[str, ...] = ()
+    key: bytes = b""
 
 
 class AuthorityPlace(msgspec.Struct, frozen=True):

@@ -81,3 +81,24 @@ async def test_an_error_does_not_name_a_parameter_that_the_permissions_hide() ->
         assert "secret" not in str(caught.value)
         text = await peer.drive(transfer.reading(transfer.GET, {"key": "/open"}))
         assert await read_text(text) == {"a": 1}
+
+
+async def test_a_peer_that_names_other_sites_is_refused_and_logged_by_its_own_name(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """What a member says of the sites that ask is not proved: it must not fill the log, nor put others in it."""
+    async with linked(ALL, denying("/door")) as (owner, peer):
+        for number in range(20):
+            with pytest.raises(PeerRefused, match="permissions there do not let"):
+                await peer.ask(transfer.GET, {"key": "/door", "site": f"site{number}", "askers": ["base"]})
+        assert owner.params._server._gate._counters["permission.param"] == 20
+    lines = [record.getMessage() for record in caplog.records if "may not" in record.getMessage()]
+    assert [line[: len("! pad may not")] for line in lines] == ["! pad may not"]
+
+
+@pytest.mark.parametrize("site", [0, False, [], {}, 0.0])
+async def test_what_is_no_name_of_a_site_is_refused(site: object) -> None:
+    async with linked(ALL, denying("/door")) as (owner, peer):
+        with pytest.raises(PeerRefused, match="is not the name of a site or a module"):
+            await peer.ask(transfer.GET, {"key": "/run_id", "site": site})
+        assert owner.counters["ask.failed"] == 0

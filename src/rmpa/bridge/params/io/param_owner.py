@@ -64,11 +64,11 @@ class _Asker:
         site, modules = args.get("site"), args.get("askers", [])
         if not isinstance(modules, list) or len(modules) > limits.PARAM_ASKERS_MAX:
             raise RmpaError(f"askers is not a list of at most {limits.PARAM_ASKERS_MAX} modules")
-        for name in [*([site] if site else []), *modules]:
+        for name in [*(() if site is None or site == "" else (site,)), *modules]:
             # Globs of permissions have the name put in for {peer}: it must be a name, and no glob.
             if not isinstance(name, str) or peer_name_problem(name) is not None:
                 raise RmpaError(f"{str(name)[:80]!r} is not the name of a site or a module")
-        return cls(session.link.name, site, tuple(modules))
+        return cls(session.link.name, site, tuple(dict.fromkeys(modules)))
 
     def __str__(self) -> str:
         return self.peer if self.site is None else self.site or "a program without a site"
@@ -199,7 +199,7 @@ class ParamOwner:
         names = [
             name
             for name in yielding_to_data(await self._core.names())
-            if not self.policy.why_not_get(name) and self._judge(asker, name).allowed
+            if not self.policy.why_not_get(name) and self._judge(asker, name)[0].allowed
         ]
         return self._of(session).answer(await write_text("the list of parameters", names), self._now())
 
@@ -273,12 +273,16 @@ class ParamOwner:
             (why for name, _ in yielding_to_data(leaves(key, value)) if (why := self.policy.why_not_get(name))), ""
         )
 
-    def _judge(self, asker: _Asker, name: str) -> PermissionDecision:
-        """Decide whether a parameter may be had: by the peer, and by the site for which it asks."""
+    def _judge(self, asker: _Asker, name: str) -> tuple[PermissionDecision, str]:
+        """Decide whether a parameter may be had: by the peer, and by the site for which it asks; and who is judged.
+
+        A peer that may not have it is judged by its own name alone: the site that it names may be invented.
+        """
         decision = self._gate.judge(Access.PARAM, asker.peer, name)
         if asker.site is None or not decision.allowed:
-            return decision
-        return self._gate.judge_site(Access.PARAM, asker.site, asker.modules, name)
+            return decision, asker.peer
+        by_site = self._gate.judge_site(Access.PARAM, asker.site, asker.modules, name)
+        return by_site, f"{asker} by way of {asker.peer}"
 
     def _why_denied(self, asker: _Asker, key: str, value: XmlRpcValue = None) -> str:
         """Why the permissions do not let a peer have a parameter, or all of a namespace; empty if they do."""
@@ -286,9 +290,9 @@ class ParamOwner:
             return ""
         names = [name for name, _ in leaves(key, value)] if isinstance(value, dict) and value else [key]
         for name in yielding_to_data(names):
-            decision = self._judge(asker, name)
+            decision, whose = self._judge(asker, name)
             if not decision.allowed:
-                self._gate.refused(Access.PARAM, str(asker), name, decision)
+                self._gate.refused(Access.PARAM, whose, name, decision)
                 return refusal(Access.PARAM, str(asker), key)  # not the name: it may be a secret
         return ""
 

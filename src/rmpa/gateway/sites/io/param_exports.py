@@ -146,7 +146,11 @@ class SiteParamExports:
                 return ParamAnswer(values=await self._values(asker, module, question.last))
 
     async def _get(self, asker: SiteAsker, module: str, key: str) -> str:
-        text: str = await self._drive(asker, module, transfer.reading(transfer.GET, {"key": key}))
+        try:
+            text: str = await self._drive(asker, module, transfer.reading(transfer.GET, {"key": key}))
+        except RmpaError:
+            self._judge(asker, module, key, [key])  # it is not told whether it is there
+            raise
         self._judge(asker, module, key, parameters_in(key, parse_response(text.encode())))
         return text
 

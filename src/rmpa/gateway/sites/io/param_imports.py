@@ -231,18 +231,20 @@ class SiteParamImports:
         except RmpaError as error:
             found = {name: ParamNews(problem=str(error)) for name in last}
         for key, name in names.items():
-            news = found.get(name)
-            if news is None:
-                self.problems.pop(key, None)
-            elif news.problem:
-                self.problems[key] = news.problem
-                text = f"{key} is not followed from {site}/{module}: {news.problem}"
+            news = found.get(name, ParamNews())
+            value = await read_text(news.text) if news.text is not None else None
+            denials = (self._denial(each, leaf, name) for leaf in parameters_in(name, value) for each in askers)
+            if problem := news.problem or next(filter(None, denials), ""):
+                self.problems[key] = problem
+                text = f"{key} is not followed from {site}/{module}: {problem}"
                 self._log.refuse(asyncio.get_running_loop().time(), "param.refused", key, text)
+            elif name in found:
+                await self._take(key, news.text, value)
             else:
-                await self._take(key, news.text)
+                self.problems.pop(key, None)
 
-    async def _take(self, key: str, text: str | None) -> None:
+    async def _take(self, key: str, text: str | None, value: XmlRpcValue) -> None:
         if text is not None or key in self._known:  # what was never there does not delete what is here
-            await self._core.provide(key, await read_text(text) if text is not None else None)
+            await self._core.provide(key, value)
         self._known[key] = digest(text)
         self.problems.pop(key, None)
