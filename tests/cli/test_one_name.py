@@ -190,6 +190,18 @@ def test_a_gateway_is_no_less_secure_than_the_agent_beside_it(machine: Machine) 
     assert "beside the agent sec" in machine.run(*gateway, code=1, **other)
 
 
+def test_a_gateway_without_keys_ends_when_a_secured_agent_starts_beside_it(machine: Machine) -> None:
+    pytest.importorskip("zenoh")
+    other = {"HOME": "/nonexistent", "RMPA_STATE_DIR": str(machine.folder / "gw")}
+    net = ("--interface", "lo", "--multicast", f"239.255.117.118:{free_port()}")
+    gateway = machine.start("gateway", "--router", "--listen", f"tcp/127.0.0.1:{free_port()}", *net, **other)
+    _until(machine.agents)
+    machine.run("trust", "init", "--name", "sec")
+    machine.up()
+    assert gateway.wait(DEADLINE) == 1
+    assert "has no keys, beside the agent sec in a secured mesh; let it join" in machine.log("gateway")
+
+
 def test_a_gateway_does_not_start_beside_an_agent_that_does_not_say_whether_it_is_secured(machine: Machine) -> None:
     pytest.importorskip("zenoh")
     (machine.folder / "run").mkdir(mode=0o700)

@@ -28,7 +28,10 @@ _log = logging.getLogger(__name__)
 
 
 async def serve(
-    start: Callable[[], Awaitable[None]], close: Callable[[], Awaitable[None]], reloader: Reloader
+    start: Callable[[], Awaitable[None]],
+    close: Callable[[], Awaitable[None]],
+    reloader: Reloader,
+    watch: Callable[[], Coroutine[None, None, None]] | None = None,
 ) -> None:
     """Start, run until SIGINT or SIGTERM, and close; systemd is notified.
 
@@ -36,6 +39,7 @@ async def serve(
         start: Starts everything; after an exception nothing is left running.
         close: Closes everything.
         reloader: Reads the settings again at SIGHUP.
+        watch: Runs meanwhile; its end ends everything, and an exception of it is raised.
     """
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
@@ -45,12 +49,20 @@ async def serve(
     sighup = SighupHandler(reloader, stop.set)
     await start()
     sighup.start()
+    watching = asyncio.create_task(watch(), name="watch") if watch is not None else None
+    if watching is not None:
+        watching.add_done_callback(lambda _: stop.set())
     try:
         notify_service_manager("READY=1")
         await stop.wait()
         notify_service_manager("STOPPING=1")
         _log.info("= ending")
+        if watching is not None and watching.done():
+            watching.result()
     finally:
+        if watching is not None:
+            watching.cancel()
+            await asyncio.wait([watching])
         await sighup.close()
         await close()
 

@@ -98,7 +98,7 @@ def gateway(context: click.Context, /, **options: object) -> int:
     from rmpa.gateway.gateway import run
 
     try:
-        return run(loaded.settings, load)
+        return run(loaded.settings, load, lambda: check_agents(loaded.settings, os.environ))
     finally:
         writer.close()
 

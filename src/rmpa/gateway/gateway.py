@@ -251,20 +251,42 @@ async def _discard(opening: asyncio.Future[OwnedSession]) -> None:
 
 
 async def _main(
-    settings: Settings, requests: tuple[SchedulingRequest, ...], load: Callable[[], Loaded] | None
+    settings: Settings,
+    requests: tuple[SchedulingRequest, ...],
+    load: Callable[[], Loaded] | None,
+    check: Callable[[], None],
 ) -> None:
     gateway = Gateway(settings, requests, load, open_session=open_gateway_session, make_neighbours=make_neighbours)
-    await serve(gateway.start, gateway.close, gateway.agent.reloader)
+    await serve(gateway.start, gateway.close, gateway.agent.reloader, lambda: _keep_checking(check))
 
 
-def run(settings: Settings, load: Callable[[], Loaded] | None = None) -> int:
+async def _keep_checking(check: Callable[[], None]) -> None:
+    """Check again and again whether this gateway may run: an agent may start after it.
+
+    Raises:
+        StartError: It may not.
+    """
+    while True:
+        await asyncio.sleep(limits.AGENTS_LOOK_PERIOD)
+        try:
+            await asyncio.to_thread(check)
+        except StartError:
+            raise
+        except RmpaError as error:  # an agent that ends just now, or hangs
+            _log.debug("! %s", error)
+
+
+def run(
+    settings: Settings, load: Callable[[], Loaded] | None = None, check: Callable[[], None] = lambda: None
+) -> int:
     """Run a gateway until SIGINT or SIGTERM; return the exit code.
 
     Args:
         settings: Complete: the name is filled in.
         load: Reads the settings again, at SIGHUP and ``rmpa reload``.
+        check: Raises ``StartError`` where it may not run, or not any more; called in a thread.
 
     Raises:
-        StartError: The gateway cannot start on this machine with these settings.
+        StartError: The gateway cannot start on this machine with these settings, or ``check`` has ended it.
     """
-    return run_process(settings, lambda requests, _: _main(settings, requests, load))
+    return run_process(settings, lambda requests, _: _main(settings, requests, load, check))

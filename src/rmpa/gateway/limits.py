@@ -6,6 +6,8 @@ from typing import Final
 
 from rmpa.core.sizes import KIB, MIB
 
+AGENTS_LOOK_PERIOD: Final = 5.0
+"""Seconds until a gateway without keys looks again whether an agent of a secured mesh runs beside it."""
 KEY_MAX: Final = 2048
 """Characters of a key expression or a liveliness token that another site or a ROS 2 node sent. Longer ones are not
 read; the longest that ROS names and types make is some 900."""
