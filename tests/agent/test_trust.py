@@ -407,3 +407,21 @@ async def test_the_certificate_is_for_the_hosts_of_the_page_and_for_no_other_mod
 def _hosts(agent: Agent) -> frozenset[str]:
     assert agent.trust is not None
     return agent.trust.membership.certificate.hosts
+
+
+async def test_a_member_does_not_fill_the_log_by_documents_and_claims(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with a_fleet(tmp_path) as fleet:
+        arm = await fleet.add("arm")
+        await fleet.add("leg")
+        await fleet.linked("base", "arm", "leg")
+        leg = fleet.agents["leg"]
+        [session] = [each for each in arm.bridge.sessions.linked() if each.link.name == "leg"]
+        for _ in range(50):
+            arm.bridge.rpc.notify(session, Notice.DENY, {"document": "{}"})
+            arm.bridge.rpc.notify(session, Notice.HAVE, {"deny": 0, "keys": 1, "authority": True})
+        await until(lambda: leg.bridge.counters["trust.no_authority"] == 50)
+        assert leg.bridge.counters["trust.document_refused"] == 50
+        lines = [text for text in caplog.messages if "does not hold" in text or "it is not" in text]
+        assert 2 <= len(lines) < 20

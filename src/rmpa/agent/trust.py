@@ -14,6 +14,7 @@ from rmpa.bridge.permission_gate import Needs
 from rmpa.bridge.session.part import Part
 from rmpa.config.state_dir import state_dir
 from rmpa.core.backoff import Backoff
+from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import RemoteProtocolError, RmpaError, StartError, UnreachableError
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.mesh.frames import Frame, FrameKind
@@ -127,6 +128,7 @@ class AgentTrust(Part):
         self.membership = membership
         self._bridge = bridge
         self._clock = clock
+        self._refusals = RefusalLog(_log, bridge.counters)
         self._hosts = hosts
         self._hosts_asked: tuple[str, ...] = ()
         self._kinds: dict[Notice, DocumentKind] = {Notice.DENY: DocumentKind.DENY, Notice.KEYS: DocumentKind.KEYS}
@@ -138,7 +140,7 @@ class AgentTrust(Part):
         """The joins at the authority."""
         if membership.store.is_authority:
             self.authority = MeshAuthority.load(membership.store, membership)
-            self.joins = JoinServer(self.authority, membership, clock, self._is_linked)
+            self.joins = JoinServer(self.authority, membership, clock, self._is_linked, bridge.counters)
         self._backoff = Backoff(limits.RENEWAL_RETRY_FIRST, limits.RENEWAL_RETRY_CAP, rng)
         self._retry_at = 0.0
         self._renewals: dict[str, TokenBucket] = {}
@@ -220,7 +222,8 @@ class AgentTrust(Part):
             if session.link.name == self.membership.authority:
                 self._authority_found(session)
             else:
-                _log.warning("! %s says that it is the authority, which it is not", session.link.name)
+                name = session.link.name
+                self._refuse("trust.no_authority", name, f"{name} says that it is the authority, which it is not")
         self._send(session, self._spreading.have(session.peer, numbers))
 
     def _document(self, session: PeerSession, kind: Notice, args: dict[str, Any]) -> None:
@@ -228,13 +231,16 @@ class AgentTrust(Part):
         try:
             newer = self.membership.accept_document(self._kinds[kind], data)
         except RemoteProtocolError as error:
-            self._bridge.counters.add("trust.document_refused")
-            _log.warning("! %s sent a document that does not hold: %s", session.link.name, error)
+            name = session.link.name
+            self._refuse("trust.document_refused", name, f"{name} sent a document that does not hold: {error}")
             return
         if newer:
             self._spreading.received(session.peer, kind, self._number(kind))
             _log.info("= %s %d by %s", kind.removeprefix("trust."), self._number(kind), session.link.name)
             self.spread()
+
+    def _refuse(self, counter: str, name: str, text: str) -> None:
+        self._refusals.refuse(self._clock.now(), counter, name, text)
 
     def spread(self) -> None:
         """Send newer documents to all that lack them; some of the parked peers are linked, which do the same."""

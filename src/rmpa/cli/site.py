@@ -107,7 +107,8 @@ def _why_none(client: ControlClient) -> str:
     with contextlib.suppress(RmpaError):  # no gateway: it has no such operation
         problem = str(client.call(GATEWAY_REPORT, dict[str, object]).get("problem", ""))
         return f"{client.name} joins no site: {problem or 'it is a gateway without --site'}"
-    return f"{client.name} is no gateway, and is linked to none: start one with `rmpa gateway --site NAME`"
+    start = "start one with `rmpa gateway --site NAME`; in a secured mesh `relays` of [trust] names it"
+    return f"{client.name} is no gateway, and is linked to none: {start}"
 
 
 def _where(report: SitesReport) -> str:

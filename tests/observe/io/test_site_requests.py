@@ -50,6 +50,9 @@ class Gate:
     def why_not(self, access: Access, module: str, name: str) -> str:
         return "" if module == "desk" and (access.value, name) in self.allowed else f"no {name} for {module}"
 
+    def may_relay(self, relay: str) -> bool:
+        return relay == "gate"
+
 
 class Gateway:
     def __init__(self) -> None:
@@ -76,6 +79,17 @@ async def test_the_peer_that_is_a_gateway_answers_and_is_asked_first_the_next_ti
     assert await asks.answer(args) == {"x": 1}
     assert rpc.asked == ["arm", "gate", "gate"]
     assert await asks.answer({"what": REPORT, "args": {}}) == [{"x": 1}]
+
+
+async def test_no_member_but_the_relays_is_believed_about_other_sites() -> None:
+    """It would answer for every site and module, and take what is set there."""
+    rpc = Rpc({"eve": {"x": 666}, "gate": {"x": 1}})
+    asks = requests(rpc, "eve", "gate", gate=Gate())
+    assert await asks.one(PARAM, {"site": "hall"}) == {"x": 1}
+    assert await asks.all(REPORT, {}) == [{"x": 1}]
+    assert rpc.asked == ["gate", "gate"]
+    with pytest.raises(UnreachableError, match=r"`relays` of \[trust\]"):
+        await requests(rpc, "eve", gate=Gate()).one(PARAM, {"site": "hall"})
 
 
 async def test_the_error_of_a_gateway_goes_before_that_of_others() -> None:

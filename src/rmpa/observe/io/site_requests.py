@@ -69,7 +69,8 @@ class SiteRequests:
     Args:
         rpc: Carries requests between the modules.
         linked: Returns the sessions of the peers that are linked now.
-        gate: Decides which peers may read and set parameters of other sites by this gateway, and read last values.
+        gate: Decides which peers may read and set parameters of other sites by this gateway, and read last values;
+            and which ones are believed about other sites.
     """
 
     def __init__(
@@ -112,7 +113,7 @@ class SiteRequests:
         """The answers of all gateways; those that fail are left out."""
         if self._gateway is not None:
             return [await self._gateway.answer(what, args)]
-        sessions = list(self._linked())
+        sessions = self._believed()
         # Twice the time: the gateway itself asks the other site for so long.
         wait = 2 * limits.ASK_TIMEOUT
         found = await asyncio.gather(*(self._ask(session, what, args, wait) for session in sessions))
@@ -128,7 +129,7 @@ class SiteRequests:
         if self._gateway is not None:
             return await self._gateway.answer(what, args)
         site = str(args.get("site", ""))
-        sessions = sorted(self._linked(), key=lambda each: str(each.link.guid) != self._liked.get(site))
+        sessions = sorted(self._believed(), key=lambda each: str(each.link.guid) != self._liked.get(site))
         problem: RmpaError | None = None
         for session in sessions:
             value, error = await self._ask(session, what, args, limits.PARAM_ASK_TIMEOUT)
@@ -143,8 +144,15 @@ class SiteRequests:
         if problem is not None:
             raise problem
         raise UnreachableError(
-            "gateway", "any linked peer", "start one with `rmpa gateway`; `rmpa peer list` shows who is linked"
+            "gateway",
+            "any linked peer",
+            "start one with `rmpa gateway`; `rmpa peer list` shows who is linked. In a secured mesh "
+            "`relays` of [trust] names the gateways that are believed",
         )
+
+    def _believed(self) -> list[PeerSession]:
+        """The linked peers whose word about other sites counts: any member could answer as a gateway."""
+        return [session for session in self._linked() if self._gate.may_relay(session.link.name)]
 
     def _answer_peer(
         self, gateway: SiteAnswerer, what: str, asker: PeerSession, args: dict[str, Any]

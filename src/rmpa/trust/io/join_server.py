@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
+from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import LocalProtocolError, RmpaError
 from rmpa.trust import limits
 from rmpa.trust.certificates import CertificateError, verify
@@ -82,14 +83,21 @@ class JoinServer:
         membership: This module's.
         clock: Monotonic seconds.
         is_taken: Whether a member that is linked has a name.
+        counters: Counts what is refused: ``trust.join_full``, ``trust.join_failed``, ``trust.renewal_refused``.
     """
 
     def __init__(
-        self, authority: MeshAuthority, membership: Membership, clock: Clock, is_taken: Callable[[str], bool]
+        self,
+        authority: MeshAuthority,
+        membership: Membership,
+        clock: Clock,
+        is_taken: Callable[[str], bool],
+        counters: Counters | None = None,
     ) -> None:
         self._authority = authority
         self._membership = membership
         self._clock = clock
+        self._refusals = RefusalLog(_log, counters if counters is not None else Counters())
         self._is_taken = is_taken
         self._tasks: dict[asyncio.Task[None], tuple[Purpose, str]] = {}
         """Each with what it is for, and the address of the other end."""
@@ -104,7 +112,8 @@ class JoinServer:
         alike = [there for what, there in self._tasks.values() if what is purpose]
         full = len(alike) >= limits.JOINS_AT_ONCE or alike.count(host) >= limits.JOINS_PER_ADDRESS
         if full or preface.token_id in self._reserved:
-            _log.warning("! a join or renewal is refused: too many at once, or its token is being used just now")
+            text = "a join or renewal is refused: too many at once, or its token is being used just now"
+            self._refuse("trust.join_full", host, text)
             sock.close()
             return
         task = asyncio.get_running_loop().create_task(self._run(sock, preface), name=str(preface))
@@ -166,6 +175,10 @@ class JoinServer:
         changed, progress.changed = progress.changed, asyncio.Event()
         changed.set()
 
+    def _refuse(self, counter: str, host: str, text: str) -> None:
+        """Log what can be repeated by each connection, within limits: a module that was revoked may do it."""
+        self._refusals.refuse(self._clock.now(), counter, host, text)
+
     # --- connections ------------------------------------------------------------------------------------------
 
     async def _run(self, sock: socket.socket, preface: Preface) -> None:
@@ -177,7 +190,8 @@ class JoinServer:
             else:
                 await self._renew(sock, where)
         except (OSError, NotTlsError, RmpaError) as error:
-            _log.warning("! %s by %s failed: %s", preface.purpose.name.lower(), where, error)
+            text = f"{preface.purpose.name.lower()} by {where} failed: {error}"
+            self._refuse("trust.join_failed", _host(sock), text)
         except Exception:  # noqa: BLE001 - the task's top
             _log.exception("! %s by %s failed", preface.purpose.name.lower(), where)
 
@@ -295,7 +309,8 @@ class JoinServer:
             before = self._authority.judge_renewal(presented)
             _, certificate = self._authority.issue(message.request, before.name)
         except CertificateError as error:
-            _log.warning("! a renewal by %s is refused (%s): %s", where, error.reason.label, error)
+            text = f"a renewal by {where} is refused ({error.reason.label}): {error}"
+            self._refuse("trust.renewal_refused", where.partition(":")[0], text)
             return RenewalRefused(error.reason.label, str(error))
         except RmpaError as error:
             return RenewalRefused("clock", str(error))
