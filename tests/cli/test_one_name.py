@@ -298,6 +298,7 @@ async def _statuses(ca: Path, port: int, token: str) -> list[str]:
 
 def test_the_web_server_without_an_agent_is_that_of_the_module_with_keys(machine: Machine) -> None:
     pytest.importorskip("aiohttp")
+    assert "has joined no secured mesh" in machine.run("web", code=1, RMPA_TRUST_REQUIRE="1")
     machine.run("trust", "init", "--name", "sec")
     assert machine.web("--port", free_port()).startswith("https://")
     refused = machine.run("web", "--agent", "other", code=1)

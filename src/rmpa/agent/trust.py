@@ -20,7 +20,7 @@ from rmpa.core.token_bucket import TokenBucket
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Refuse
 from rmpa.trust import limits
-from rmpa.trust.io.open_start import check_open_start
+from rmpa.trust.io.open_start import check_open
 from rmpa.trust.io.store import AuthorityPlace, TrustStore
 from rmpa.trust.reasons import TrustReason
 from rmpa.trust.spreading import DocumentSpreading, Notice, have_args, read_document, read_have
@@ -62,14 +62,7 @@ def open_membership(settings: Settings, clock: Clock) -> Membership | None:
     """
     store = trust_store(settings)
     if store is None or not store.exists:
-        if settings.trust.require:
-            raise StartError(
-                "trust.require",
-                f"the module {settings.name} has joined no secured mesh",
-                "join one: rmpa trust join TOKEN, with a token of rmpa trust invite at the authority",
-            )
-        if not settings.trust.insecure:
-            check_open_start(state_dir(os.environ, settings.state_dir), settings.name, os.environ)
+        check_open(settings.trust, state_dir(os.environ, settings.state_dir), settings.name, os.environ)
         return None
     try:
         from rmpa.trust.io.membership import Membership  # noqa: PLC0415 - its library takes memory: only when needed

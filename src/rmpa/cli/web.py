@@ -144,15 +144,15 @@ def _setup(module: Module, settings: Settings) -> WebSetup:
     Raises:
         RmpaError: A file cannot be used; or no agent runs, the module has no keys, and others have some.
     """
-    from rmpa.trust.io.open_start import check_open_start
+    from rmpa.trust.io.open_start import check_open
     from rmpa.trust.io.store import TrustStore
     from rmpa.web.server.process import WebSetup, access_of
     from rmpa.web.server.tls import certificate_files
 
     store = TrustStore(module.state, module.name) if module.state is not None else None
     trusted = module.secured or (store is not None and store.exists)
-    if not trusted and module.socket is None and not settings.trust.insecure:
-        check_open_start(module.state, module.name, os.environ, "--agent")
+    if not trusted and module.socket is None:
+        check_open(settings.trust, module.state, module.name, os.environ, "--agent")
     own_file = str(settings.config_file.absolute()) if settings.config_file is not None else ""
     if trusted and module.config_file not in ("", own_file):  # the permissions are those that its agent reads
         theirs = load_settings({"config": module.config_file}, os.environ, host_name=socket.gethostname())

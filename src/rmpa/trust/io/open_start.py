@@ -16,7 +16,32 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
+    from rmpa.config.settings import TrustSettings
+
 _SHOWN = 5
+
+
+def check_open(
+    trust: TrustSettings, state: Path | None, module: str, environ: Mapping[str, str], option: str = "--name"
+) -> None:
+    """Check that a module without files of trust may start by its settings.
+
+    Args:
+        trust: The settings: ``require`` forbids it, ``insecure`` permits it also beside other modules' keys.
+        state: As for ``check_open_start``, like those that follow.
+        module: Likewise.
+        environ: Likewise.
+        option: Likewise.
+
+    Raises:
+        StartError: It may not.
+    """
+    if trust.require:
+        problem = f"the module {module} has joined no secured mesh"
+        remedy = "join one: rmpa trust join TOKEN, with a token of rmpa trust invite at the authority"
+        raise StartError("trust.require", problem, remedy)
+    if not trust.insecure:
+        check_open_start(state, module, environ, option)
 
 
 def check_open_start(state: Path | None, module: str, environ: Mapping[str, str], option: str = "--name") -> None:
