@@ -8,6 +8,7 @@ import logging
 import os
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import partial
 from typing import TYPE_CHECKING
 
 from rmpa.core.counters import Counters, RefusalLog
@@ -102,29 +103,43 @@ class JoinServer:
         self._tasks: dict[asyncio.Task[None], tuple[Purpose, str]] = {}
         """Each with what it is for, and the address of the other end."""
         self._joining: dict[bytes, _Joining] = {}
-        self._reserved: set[bytes] = set()  # ids of tokens, from the moment in which a connection is taken
+        self._reserved: dict[bytes, asyncio.Task[None]] = {}
+        """By the ids of tokens, from the moment in which a connection is taken."""
         self._progress: dict[bytes, JoinProgress] = {}
         authority.on_revoked.append(self._revoked)
 
     def accept(self, sock: socket.socket, preface: Preface) -> None:
-        """Take a connection whose preface asks for a join or a renewal; the socket is owned from here on."""
+        """Take a connection whose preface asks for a join or a renewal; the socket is owned from here on.
+
+        A connection that has not shown the token yet gives way to the next one with it: a preface of a join has no
+        time, and may be one that was recorded.
+        """
         purpose, host = preface.purpose, _host(sock)
-        alike = [there for what, there in self._tasks.values() if what is purpose]
-        full = len(alike) >= limits.JOINS_AT_ONCE or alike.count(host) >= limits.JOINS_PER_ADDRESS
-        if full or preface.token_id in self._reserved:
+        before = self._reserved.get(preface.token_id) if purpose is Purpose.JOIN else None
+        joining = self._joining.get(preface.token_id)
+        in_use = before is not None and joining is not None and bool(joining.side.module)
+        others = (each for task, each in self._tasks.items() if task is not before)
+        alike = [there for what, there in others if what is purpose]
+        if in_use or len(alike) >= limits.JOINS_AT_ONCE or alike.count(host) >= limits.JOINS_PER_ADDRESS:
             text = "a join or renewal is refused: too many at once, or its token is being used just now"
             self._refuse("trust.join_full", host, text)
             sock.close()
             return
+        if before is not None:
+            before.cancel()
         task = asyncio.get_running_loop().create_task(self._run(sock, preface), name=str(preface))
         self._tasks[task] = (purpose, host)
         if purpose is Purpose.JOIN:
-            self._reserved.add(preface.token_id)
-            task.add_done_callback(lambda _: self._reserved.discard(preface.token_id))
+            self._reserved[preface.token_id] = task
+            task.add_done_callback(partial(self._ended, preface.token_id))
         task.add_done_callback(self._tasks.pop)
         task.add_done_callback(
             lambda _: sock.close()
         )  # a task that is cancelled before it begins runs no ``finally``
+
+    def _ended(self, token_id: bytes, task: asyncio.Task[None]) -> None:
+        if self._reserved.get(token_id) is task:
+            del self._reserved[token_id]
 
     async def close(self) -> None:
         """End all of them."""
@@ -220,7 +235,8 @@ class JoinServer:
             connection = await self._handshake(sock, context)
             await self._converse(connection, joining, token_id, where)
         finally:
-            del self._joining[token_id]
+            if self._joining.get(token_id) is joining:
+                del self._joining[token_id]
 
     def _taken(self, token_id: bytes, name: str) -> bool:
         """Whether a member, or another module that joins just now, has a name.
