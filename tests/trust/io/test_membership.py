@@ -122,6 +122,8 @@ def test_a_newer_deny_list_holds_at_once_and_after_a_restart(mesh: SecuredMesh) 
     base.judge_member(mesh.authority.module("arm", WALL + 60), "arm")  # it was invited again
     again = Membership.load(base.store, mesh.clock, mesh.clock.wall)
     assert reason_of(again, certificate, "arm") is TrustReason.REVOKED
+    mesh.clock.wall_seconds = 0.0
+    assert reason_of(again, certificate, "arm") is TrustReason.REVOKED, "a clock that is set back lets none in again"
 
 
 def test_a_document_of_another_authority_changes_nothing(mesh: SecuredMesh, tmp_path: Path) -> None:
