@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from lab.bed.processes import CommandFailed, eventually
+from rmpa.mesh.limits import SILENT_GRACE
 from tests.interop.modules import Module, flows
 from tests.interop.ros import PYTHON
 
@@ -96,7 +97,7 @@ def test_a_bad_link_keeps_the_peer_and_a_lost_one_comes_back(modules: ModuleFact
     assert b.agent.peers()["a"]["state"] == "linked"
     assert "= - publisher /chatter" not in b.agent.process.output, "it came and went"
     for _ in range(2):
-        b.host.outage(3.0)
+        b.host.outage(SILENT_GRACE + 3.0)
         flows(heard, 30)  # by the same listener: nothing was restarted
     assert "= - publisher /chatter" in b.agent.process.output
     assert list(b.agent.peers()) == ["a"]

@@ -150,9 +150,9 @@ def test_root_without_capabilities_gets_a_warning(agent: AgentFactory) -> None:
 def test_any_user_is_told_and_the_agent_runs_on(agent: AgentFactory, home_of_nobody: Path) -> None:
     if not runs(AS_NOBODY):
         pytest.skip("only root can run this rmpa")
-    made = agent(
-        Prefixed("user", "", prefix=AS_NOBODY), ready=False, flags=["--realtime"], runtime_dir=home_of_nobody
-    )
+    places = (f"{name}={home_of_nobody}/state" for name in ("RMPA_STATE_DIR", "XDG_STATE_HOME"))
+    user = Prefixed("user", "", prefix=["env", *places, *AS_NOBODY])  # it may not search the folders of this test
+    made = agent(user, ready=False, flags=["--realtime"], runtime_dir=home_of_nobody)
     made.process.wait_for("ROS_MASTER_URI=")  # systemd's socket of this test is root's
     told_what_to_do(made, "nobody")
     peer = agent()
