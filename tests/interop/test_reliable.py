@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from lab.bed.processes import eventually
-from rmpa.mesh.limits import EXPRESS_LEASE, KEEPALIVE_INTERVAL
 from tests.interop.recordings import recorded, wait_last
 
 if TYPE_CHECKING:
@@ -23,8 +22,6 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
 KINDS = ("roscpp", "rospy")
-ATTEMPTS = 5
-"""Outages until one is short enough."""
 COUNT = 10_000
 """At 1 kHz."""
 
@@ -202,24 +199,19 @@ def test_best_effort_is_fresh_after_a_cut(modules: ModuleFactory, tmp_path: Path
         assert len(stale) <= 5
 
 
-@pytest.mark.parametrize("outage", [0.3, 0.6])
-def test_the_last_word_before_a_cut_still_counts(modules: ModuleFactory, tmp_path: Path, outage: float) -> None:
-    for _ in range(ATTEMPTS):
-        a, b = modules("a", "b")
-        heard = recorders(b)
-        teller = a.ros.roscpp("teller", topic="/chatter", nodelay=True, wait=1, commands=True)
-        last = connected(teller, heard) + 1
-        began = time.monotonic()
-        b.host.cut()
-        teller.tell("64 1 0")
-        time.sleep(max(0.0, began + outage - time.monotonic()))
-        b.host.restore()
-        # On a busy machine cut and restore take their time, and a longer silence ends the link.
-        if time.monotonic() - began < EXPRESS_LEASE - KEEPALIVE_INTERVAL:
-            break
-        a.agent.terminate()
-        b.agent.terminate()
-    else:
-        pytest.fail(f"each of {ATTEMPTS} outages lasted longer than a link may be silent: is the machine too busy?")
+def test_the_last_word_before_a_cut_still_counts(modules: ModuleFactory) -> None:
+    """TCP repeats it at once when the cable is in again, if the link is still the same.
+
+    After more than half a second TCP repeats so rarely that the silence may end the link first. A topic whose last
+    message counts then is reliable or latched.
+    """
+    a, b = modules("a", "b")
+    heard = recorders(b)
+    teller = a.ros.roscpp("teller", topic="/chatter", nodelay=True, wait=1, commands=True)
+    last = connected(teller, heard) + 1
+    b.host.cut()
+    teller.tell("64 1 0")
+    time.sleep(0.3)
+    b.host.restore()
     for listener in heard:
         wait_last(listener, last)
