@@ -338,7 +338,7 @@ class AgentTrust(Part):
 
         place = self.membership.store.load_authority()
         if place is None:
-            raise UnreachableError("authority", "any link", "start its agent; rmpa peer list shows who is linked")
+            raise UnreachableError("authority", "any link", "start its agent; rmpa peer list shows the links")
         grant = await renew_at_authority(self.membership, place.address, place.port, read_refusal)
         self.membership.renewed(grant.certificate)
         for kind, data in ((Notice.DENY, grant.deny), (Notice.KEYS, grant.keys)):

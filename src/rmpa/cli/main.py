@@ -122,7 +122,7 @@ def _run(arguments: Sequence[str] | None) -> int:
         code = cli.main(args=arguments, prog_name="rmpa", standalone_mode=False)
     except click.ClickException as error:
         if isinstance(error, click.NoSuchOption):
-            from rmpa.config.settings import REMOVED
+            from rmpa.config.schema import REMOVED
 
             if remedy := REMOVED.get(error.option_name):
                 error = click.UsageError(f"No such option: {error.option_name}; {remedy}", error.ctx)

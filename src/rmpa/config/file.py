@@ -7,7 +7,8 @@ import tomllib
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.config import limits
-from rmpa.config.settings import REMOVED, SETTINGS
+from rmpa.config.schema import REMOVED
+from rmpa.config.settings import SETTINGS
 from rmpa.config.toml_lines import line_of, value_at
 from rmpa.config.values import JsonSchema, Place, did_you_mean, shown
 from rmpa.core.errors import ConfigError

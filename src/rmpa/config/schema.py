@@ -183,3 +183,11 @@ def settings_of(
                 live or it.live,
                 it.command,
             )
+
+
+REMOVED: Final = {
+    "core.fresh": 'write keep = "never" in place of true',
+    "RMPA_FRESH": "set RMPA_KEEP=never in its place",
+    "--fresh": "write --keep never",
+}
+"""What to use in place of a key, variable or option that is gone."""

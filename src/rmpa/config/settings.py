@@ -351,8 +351,7 @@ class TrustSettings:
     insecure: bool = setting(
         False,
         BOOL,
-        "Start without trust although other modules of this user have keys of a secured mesh; a module with keys of "
-        "its own is secured all the same.",
+        "Start without trust beside keys of other modules; a module with keys of its own is secured all the same.",
         env="RMPA_TRUST_INSECURE",
         option="--insecure",
     )
@@ -475,8 +474,7 @@ class Settings:
     prefix_peers: bool = setting(
         False,
         BOOL,
-        "Whether every peer's names are below its own here (/arm/odom of arm), as by a [[peer]] with prefix = "
-        '"/{peer}"; for modules of one kind, which have the same names.',
+        "Whether every peer's names are below its own here (/arm/odom of arm): for modules that have the same names.",
         key="bridge.prefix_peers",
         env="RMPA_PREFIX_PEERS",
         option="--prefix-peers",
@@ -485,7 +483,7 @@ class Settings:
     peers: tuple[PeerRule, ...] = setting(
         (),
         PEER_RULES,
-        "Names and policy for single peers; all that fit a peer apply, in order.",
+        "Names and policy for single peers; all that fit apply, in order.",
         key="peer",
         live=True,
     )
@@ -578,12 +576,6 @@ class Settings:
         return any(word in (Transport.DIRECT, Transport.AUTO) for word in words)
 
 
-REMOVED: Final = {
-    "core.fresh": 'write keep = "never" in place of true',
-    "RMPA_FRESH": "set RMPA_KEEP=never in its place",
-    "--fresh": "write --keep never",
-}
-"""What to use in place of a key, variable or option that is gone."""
 SETTINGS: Final = tuple(settings_of(Settings))
 """Every setting, in the order of the documentation."""
 TABLES: Final = {

@@ -23,7 +23,8 @@ from rmpa.config.module_name import NameFacts, choose_name
 from rmpa.config.param_rules import follow_problems
 from rmpa.config.peer_rules import peer_warnings
 from rmpa.config.permission_rules import permission_problems
-from rmpa.config.settings import REMOVED, SETTINGS, Settings
+from rmpa.config.schema import REMOVED
+from rmpa.config.settings import SETTINGS, Settings
 from rmpa.config.state_dir import NAME_FILE, kept_name, state_dir
 from rmpa.config.toml_lines import line_of
 from rmpa.config.values import BadValue, did_you_mean

@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Literal
 
 from rmpa.core import limits as core_limits
 from rmpa.core.backoff import Backoff
@@ -23,6 +23,9 @@ from rmpa.core.token_bucket import TokenBucket
 from rmpa.mesh import limits
 from rmpa.mesh.handshake import Hello, KnownLink, Lane, Refusal, Refuse, judge
 from rmpa.mesh.peering_events import (
+    OTHER_PEER,
+    SELDOM_MENDED,
+    UNPROVEN,
     CloseLink,
     Dial,
     LinkDown,
@@ -42,27 +45,6 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
 
 _log = logging.getLogger(__name__)
-
-_SELDOM_MENDED: Final = frozenset(
-    {
-        Refusal.VERSION,
-        Refusal.DOMAIN,
-        Refusal.DUPLICATE,
-        Refusal.MALFORMED,
-        Refusal.LANE,
-        TrustReason.PLAIN,
-        TrustReason.FOREIGN,
-        TrustReason.EXPIRED,
-        TrustReason.REVOKED,
-        TrustReason.NAME,
-        TrustReason.DOWNGRADE,
-    }
-)
-"""Refusals for reasons that seldom pass by themselves."""
-_UNPROVEN: Final = frozenset({TrustReason.UNSECURED, TrustReason.KEY, TrustReason.CLOCK})
-"""Refusals that a secured agent receives without proof of the sender: they are shown, and change no pause."""
-_OTHER_PEER: Final = frozenset({Refusal.MYSELF, Refusal.WRONG_PEER})
-"""Refusals that concern one endpoint only, because another agent, or this agent itself, answered there."""
 
 
 @dataclass(slots=True)
@@ -340,15 +322,15 @@ class Peering:
             if peer.link is None:
                 self._dial_at(peer, now + max(limits.EXPRESS_LEASE, self._pause(peer, now)))
             return
-        if refuse.code in _UNPROVEN or not proved:
+        if refuse.code in UNPROVEN or not proved:
             peer.refused = refuse
-        if not proved or refuse.code in _OTHER_PEER or refuse.code not in _SELDOM_MENDED:
+        if not proved or refuse.code in OTHER_PEER or refuse.code not in SELDOM_MENDED:
             self._retry(peer, now)
         elif peer.link is None:
             peer.refused = refuse
             pause = max(limits.REFUSED_RETRY, self._cap(peer))
             self._dial_at(peer, now + pause * (1 + 0.5 * self._rng()))
-        if refuse.code not in _OTHER_PEER and refuse.code not in peer.reported:
+        if refuse.code not in OTHER_PEER and refuse.code not in peer.reported:
             peer.reported.add(refuse.code)
             self._outputs.append(LinkRefused(peer.identity, refuse))
 

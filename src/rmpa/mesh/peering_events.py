@@ -4,15 +4,37 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Final, Literal
+
+from rmpa.mesh.handshake import Refusal, Refuse
+from rmpa.trust.reasons import TrustReason
 
 if TYPE_CHECKING:
     from rmpa.core.guid import Guid
     from rmpa.core.identity import Identity
-    from rmpa.mesh.handshake import Refuse
-    from rmpa.trust.reasons import TrustReason
 
 SocketAddress = tuple[str, int]
+
+SELDOM_MENDED: Final = frozenset(
+    {
+        Refusal.VERSION,
+        Refusal.DOMAIN,
+        Refusal.DUPLICATE,
+        Refusal.MALFORMED,
+        Refusal.LANE,
+        TrustReason.PLAIN,
+        TrustReason.FOREIGN,
+        TrustReason.EXPIRED,
+        TrustReason.REVOKED,
+        TrustReason.NAME,
+        TrustReason.DOWNGRADE,
+    }
+)
+"""Refusals for reasons that seldom pass by themselves."""
+UNPROVEN: Final = frozenset({TrustReason.UNSECURED, TrustReason.KEY, TrustReason.CLOCK})
+"""Refusals that a secured agent receives without proof of the sender: they are shown, and change no pause."""
+OTHER_PEER: Final = frozenset({Refusal.MYSELF, Refusal.WRONG_PEER})
+"""Refusals that concern one endpoint only, because another agent, or this agent itself, answered there."""
 
 
 @dataclass(frozen=True, slots=True)

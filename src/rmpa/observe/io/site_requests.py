@@ -146,7 +146,7 @@ class SiteRequests:
         raise UnreachableError(
             "gateway",
             "any linked peer",
-            "start one with `rmpa gateway`; `rmpa peer list` shows who is linked. In a secured mesh "
+            "start one with `rmpa gateway`; `rmpa peer list` shows the links. In a secured mesh "
             "`relays` of [trust] names the gateways that are believed",
         )
 

@@ -274,7 +274,7 @@ class ParamOwner:
         )
 
     def _judge(self, asker: _Asker, name: str) -> tuple[PermissionDecision, str]:
-        """Decide whether a parameter may be had: by the peer, and by the site for which it asks; and who is judged.
+        """Decide whether a parameter may be had by the peer and by the site for which it asks, and name those judged.
 
         A peer that may not have it is judged by its own name alone: the site that it names may be invented.
         """
