@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import socket
 import subprocess
 import sys
 import tempfile
 import threading
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,6 +28,29 @@ if TYPE_CHECKING:
     from types import TracebackType
 
 DEADLINE = 30.0
+
+
+def free_port() -> int:
+    """A TCP port that is free at present."""
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        port: int = sock.getsockname()[1]
+        return port
+
+
+def end(process: subprocess.Popen[str]) -> None:
+    """Kill a process that still runs, and read what it said."""
+    if process.poll() is None:
+        process.kill()
+    process.communicate()
+
+
+def until(condition: Callable[[], object]) -> None:
+    """Wait until something holds."""
+    deadline = time.monotonic() + DEADLINE
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
 
 
 class Command(subprocess.Popen[str]):

@@ -13,7 +13,6 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,10 +24,10 @@ pytest.importorskip("cryptography")
 
 from rmpa.discovery.io.interfaces import list_interfaces
 from rmpa.trust.page_names import host_names, page_hosts
-from tests.cli.conftest import DEADLINE
+from tests.cli.conftest import DEADLINE, end, free_port, until
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
 RULES = """
 [[permission]]
@@ -60,7 +59,7 @@ class Machine:
                 cwd=self.folder,
                 start_new_session=True,
             )
-        self._stack.callback(_end, process)
+        self._stack.callback(end, process)
         return process
 
     def run(self, *arguments: str, code: int = 0, **environ: str) -> str:
@@ -76,7 +75,7 @@ class Machine:
         """Start an agent on loopback, and wait until it has a control socket."""
         net: tuple[str, ...] = ("--multicast", f"239.255.117.117:{self._port}", "--interface", "lo")
         if "--core-port" not in arguments:
-            net = (*net, "--core-port", free_port())
+            net = (*net, "--core-port", str(free_port()))
         known = self.agents()
         process = self.start("up", *net, *arguments, **environ)
 
@@ -84,7 +83,7 @@ class Machine:
             assert process.poll() is None, self.log("up")
             return self.agents() != known
 
-        _until(answers)
+        until(answers)
         return process
 
     def agents(self) -> set[str]:
@@ -93,37 +92,18 @@ class Machine:
     def end(self, process: subprocess.Popen[str]) -> None:
         process.terminate()
         process.wait(DEADLINE)
-        _until(lambda: not self.agents())
+        until(lambda: not self.agents())
 
     def web(self, *arguments: str) -> str:
         """Start ``rmpa web``, and wait until it says where it is."""
         self.start("web", "--json", *arguments)
-        _until(lambda: self.log("web").count('"url"'))
+        until(lambda: self.log("web").count('"url"'))
         return self.url()
 
     def url(self) -> str:
         """Where ``rmpa web`` said last that it is."""
         lines = [line for line in self.log("web").splitlines() if line.startswith('{"url"')]
         return str(json.loads(lines[-1])["url"])
-
-
-def free_port() -> str:
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        return str(sock.getsockname()[1])
-
-
-def _end(process: subprocess.Popen[str]) -> None:
-    if process.poll() is None:
-        process.kill()
-    process.communicate()
-
-
-def _until(condition: Callable[[], object]) -> None:
-    deadline = time.monotonic() + DEADLINE
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 @pytest.fixture
@@ -195,7 +175,7 @@ def test_a_gateway_without_keys_ends_when_a_secured_agent_starts_beside_it(machi
     other = {"HOME": "/nonexistent", "RMPA_STATE_DIR": str(machine.folder / "gw")}
     net = ("--interface", "lo", "--multicast", f"239.255.117.118:{free_port()}")
     gateway = machine.start("gateway", "--router", "--listen", f"tcp/127.0.0.1:{free_port()}", *net, **other)
-    _until(machine.agents)
+    until(machine.agents)
     machine.run("trust", "init", "--name", "sec")
     machine.up()
     assert gateway.wait(DEADLINE) == 1
@@ -228,13 +208,13 @@ def test_the_web_server_is_as_secure_as_the_agent_whatever_their_names(machine: 
     pytest.importorskip("aiohttp")
     (machine.folder / "agents.toml").write_text(RULES)
     agent = machine.up("--name", "sec", "--config", "agents.toml")
-    url = machine.web("--control", "--listen", "127.0.0.1", "--port", free_port())
+    url = machine.web("--control", "--listen", "127.0.0.1", "--port", str(free_port()))
     assert url.startswith("http://")
     # The agent comes back secured: the server is made anew, with its certificate and its permissions.
     machine.run("trust", "init")
     machine.end(agent)
     machine.up("--config", "agents.toml")
-    _until(lambda: machine.url().startswith("https://"))
+    until(lambda: machine.url().startswith("https://"))
     ca = machine.state / "sec/trust/ca.crt"
     token = (machine.state / "sec/web-token").read_text().strip()
     statuses = asyncio.run(_statuses(ca, urlsplit(machine.url()).port or 0, token))
@@ -244,17 +224,17 @@ def test_the_web_server_is_as_secure_as_the_agent_whatever_their_names(machine: 
     hosts = page_hosts((*host_names(socket.gethostname()), *sorted(addresses)))
     port = urlsplit(machine.url()).port or 0
     for host in ("sec", "sec.local", "localhost", "127.0.0.1", *hosts):
-        _until(functools.partial(_accepts, ca, port, host))
+        until(functools.partial(_accepts, ca, port, host))
     assert not _accepts(ca, port, "other.local")
 
 
 def test_the_web_server_of_one_agent_does_not_show_a_secured_one_that_takes_over_its_core(machine: Machine) -> None:
     pytest.importorskip("aiohttp")
-    core = ("--core-port", free_port())
+    core = ("--core-port", str(free_port()))
     agent = machine.up("--name", "open", *core)
-    port = free_port()
+    port = str(free_port())
     server = machine.start("web", "--json", "--agent", "open", "--port", port)
-    _until(lambda: _asked(port) and "the agent open answers" in machine.log("web"))
+    until(lambda: _asked(port) and "the agent open answers" in machine.log("web"))
     machine.end(agent)
     machine.run("trust", "init", "--name", "sec")
     machine.up(*core)
@@ -300,7 +280,7 @@ def test_the_web_server_without_an_agent_is_that_of_the_module_with_keys(machine
     pytest.importorskip("aiohttp")
     assert "has joined no secured mesh" in machine.run("web", code=1, RMPA_TRUST_REQUIRE="1")
     machine.run("trust", "init", "--name", "sec")
-    assert machine.web("--port", free_port()).startswith("https://")
+    assert machine.web("--port", str(free_port())).startswith("https://")
     refused = machine.run("web", "--agent", "other", code=1)
     assert "start as sec: --agent sec" in refused
     assert "the module other: has no keys, and would start without trust, beside keys of sec" in refused

@@ -5,11 +5,9 @@ from __future__ import annotations
 import json
 import os
 import re
-import socket
 import subprocess
 import sys
 import tempfile
-import time
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,7 +16,7 @@ import pytest
 
 pytest.importorskip("cryptography")
 
-from tests.cli.conftest import DEADLINE, Place
+from tests.cli.conftest import DEADLINE, Place, end, free_port, until
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -40,7 +38,7 @@ class Machine:
             "--multicast",
             f"239.255.116.116:{port}",
             "--core-port",
-            str(_free_port()),
+            str(free_port()),
             "--interface",
             "lo",
         )
@@ -62,7 +60,7 @@ class Machine:
             cwd=self.folder,
             start_new_session=True,  # without a terminal of the test's own, whose /dev/tty would be asked
         )
-        self._stack.callback(_end, process)
+        self._stack.callback(end, process)
         return process
 
     def trust(self, *arguments: str, stdin: str = "") -> str:
@@ -90,7 +88,7 @@ class Machine:
         )
         log.close()
         self._stack.callback(self.down)
-        _until(self._answers)
+        until(self._answers)
 
     def _answers(self) -> bool:
         assert self.agent is not None
@@ -113,26 +111,6 @@ class Machine:
 
     def peers(self) -> dict[str, str]:
         return {peer["name"]: peer["state"] for peer in json.loads(self.run("peer", "list", "--json")[1])}
-
-
-def _free_port() -> int:
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        port: int = sock.getsockname()[1]
-        return port
-
-
-def _end(process: subprocess.Popen[str]) -> None:
-    if process.poll() is None:
-        process.kill()
-    process.communicate()
-
-
-def _until(condition: Callable[[], object]) -> None:
-    deadline = time.monotonic() + DEADLINE
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 @pytest.fixture
@@ -184,7 +162,7 @@ def test_from_init_to_a_linked_mesh_and_to_a_revocation(machine: Callable[[str],
     assert "arm has joined; its certificate ends" in out
 
     arm.up()
-    _until(lambda: arm.peers().get("base") == "linked" and base.peers().get("arm") == "linked")
+    until(lambda: arm.peers().get("base") == "linked" and base.peers().get("arm") == "linked")
     shown = base.status()
     assert (shown["is_authority"], shown["agent"], shown["problems"]) == (True, "secured", [])
     assert [(m["name"], m["linked"]) for m in shown["members"]] == [("arm", True), ("base", True)]  # type: ignore[attr-defined]
@@ -195,7 +173,7 @@ def test_from_init_to_a_linked_mesh_and_to_a_revocation(machine: Callable[[str],
     assert "is not the authority of its mesh; do it at base" in arm.refused("revoke", "base")
     assert "did you mean arm?" in base.refused("revoke", "amr")
     assert "arm is revoked (deny list 1); there is a new group key" in base.trust("revoke", "arm")
-    _until(lambda: base.peers().get("arm") != "linked")
+    until(lambda: base.peers().get("arm") != "linked")
     assert base.status()["revoked"] == ["arm"]
     # It comes back: leave, join with a token from standard input, start again.
     arm.down()
@@ -203,7 +181,7 @@ def test_from_init_to_a_linked_mesh_and_to_a_revocation(machine: Callable[[str],
     token = base.trust("invite", "--no-wait").strip()
     arm.trust("join", "--yes", "-", stdin=token + "\n")
     arm.up()
-    _until(lambda: arm.peers().get("base") == "linked")
+    until(lambda: arm.peers().get("base") == "linked")
     for secret in (token, token.removeprefix("rmpa1-")):
         assert secret not in base.log + arm.log
 
@@ -289,7 +267,7 @@ def test_a_join_by_files(machine: Callable[[str], Machine]) -> None:
     assert "is no request" in base.refused("invite", "--sign", str(answer), code=2)
     base.up()
     arm.up()
-    _until(lambda: arm.peers().get("base") == "linked")
+    until(lambda: arm.peers().get("base") == "linked")
 
 
 def test_an_agent_without_trust_warns_and_says_that_it_must_be_started_again(
@@ -297,7 +275,7 @@ def test_an_agent_without_trust_warns_and_says_that_it_must_be_started_again(
 ) -> None:
     base = machine("base")
     base.up()
-    _until(lambda: "is on the air" in base.log and "trust is off" in base.log)
+    until(lambda: "is on the air" in base.log and "trust is off" in base.log)
     assert base.log.count("trust is off: every program that reaches port") == 1
     out = base.run("trust", "init")
     assert "the agent base runs without trust until it is started again" in out[2]

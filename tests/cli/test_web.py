@@ -8,7 +8,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 import urllib.error
 import urllib.request
 from contextlib import contextmanager
@@ -16,21 +15,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rmpa.agent.agent import Agent
+from tests.cli.conftest import DEADLINE, free_port, until
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
     from tests.cli.conftest import Place
 
-DEADLINE = 60.0
 WEB = ("aiohttp", "prometheus_client", "rmpa.web")
-
-
-def free_port() -> int:
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        port: int = sock.getsockname()[1]
-        return port
 
 
 def get(port: int, path: str, token: str = "") -> tuple[int, str]:
@@ -45,13 +37,6 @@ def get(port: int, path: str, token: str = "") -> tuple[int, str]:
             return error.code, error.read().decode()
     except OSError:
         return 0, ""
-
-
-def until(condition: Callable[[], object]) -> None:
-    deadline = time.monotonic() + DEADLINE
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
 
 
 @contextmanager

@@ -481,11 +481,7 @@ class Settings:
         live=True,
     )
     peers: tuple[PeerRule, ...] = setting(
-        (),
-        PEER_RULES,
-        "Names and policy for single peers; all that fit apply, in order.",
-        key="peer",
-        live=True,
+        (), PEER_RULES, "Names and policy for single peers; all that fit apply, in order.", key="peer", live=True
     )
     contracts: tuple[ContractRule, ...] = setting(
         (),

@@ -277,7 +277,7 @@ class TrustStore:
         return data
 
     def _owners(self) -> set[int]:
-        """The users to whom files may belong: this one and root; for root the owner of the state directory, too."""
+        """The users that may own the files: this one and root; for root the owner of the state directory, too."""
         us = os.geteuid()
         return {us, 0} if us else {0, self.folder.parents[1].stat().st_uid}
 

@@ -220,7 +220,7 @@ class SiteParamImports:
         for table in (self._known, self.problems):
             for key in [key for key in table if key not in keys]:
                 del table[key]
-        await asyncio.gather(*(self._look_at(*whom, names) for whom, names in wanted.items()))
+        await asyncio.gather(*(self._look_at(*owner, names) for owner, names in wanted.items()))
 
     async def _look_at(self, site: str, module: str, askers: frozenset[str], names: dict[str, str]) -> None:
         """Ask for what modules here follow at one module; all of them must be allowed to have it."""
