@@ -36,8 +36,6 @@ def test_a_file_says_it_all(tmp_path: Path) -> None:
         router = true
         insecure = true
         uplink = "1 Mbit/s"
-        ros1_bridge = true
-        ros1_bridge_namespace = "hall_2"
         store = "/var/lib/last.db"
         [gateway.ros2]
         enabled = true
@@ -66,8 +64,6 @@ def test_a_file_says_it_all(tmp_path: Path) -> None:
         True,
         True,
         125_000,
-        True,
-        "hall_2",
         "/var/lib/last.db",
         Ros2Settings(True, 4, "humble", ("a.yaml", "b.yaml")),
         (
@@ -110,7 +106,6 @@ def test_a_size_has_the_units_of_files_and_of_links(tmp_path: Path, size: str, e
         ("[gateway]\nsite = 'hall-2'", 2, "gateway.site: 'hall-2' is not a ROS base name"),
         ("[gateway]\nsite = 'hall-2'", 2, 'did you mean "hall_2"?'),
         ("[gateway]\nsite = 'ros2'", 2, "ros2 is reserved"),
-        ("[gateway]\nsite = 'ros1_bridge'", 2, "choose another name"),
         (f"[gateway]\nsite = '{'a' * 64}'", 2, "a site's name has at most 63 characters"),
         ("[gateway]\nrank = 1000", 2, "a rank is between 0 and 999"),
         ("[gateway]\nconnect = ['fleet.example:7447']", 2, 'did you mean "tls/fleet.example:7447"?'),
@@ -120,7 +115,7 @@ def test_a_size_has_the_units_of_files_and_of_links(tmp_path: Path, size: str, e
         ("[gateway]\nlisten = ['tcp/a:70000']", 2, "no port between 1 and 65535"),
         ("[gateway]\nlisten = ['tcp/a:1', 'tcp/a b:1']", 2, "is not an endpoint of Zenoh"),
         ("[gateway]\nconnect = 'tcp/a:1'", 2, 'did you mean ["tcp/a:1"]?'),
-        ("[gateway]\nros1_bridge_namespace = 'a/b'", 2, "is not a bridge namespace"),
+        ("[gateway]\nros1_bridge = true", 2, "an unknown key; let a gateway with a site name join those robots"),
         ("[gateway]\nsites = 'a'", 2, "did you mean gateway.site?"),
         ("[gateway]\nenabled = true", 2, "unknown key"),
         ("[gateway]\nros2 = true", 2, "gateway.ros2: true is not a table"),

@@ -199,7 +199,6 @@ def test_every_flag(load: Load) -> None:
         "router": True,
         "insecure": True,
         "uplink": "1 Mbit/s",
-        "ros1_bridge": True,
         "ros2": True,
         "ros2_domain": "3",
         "ros2_distribution": "kilted",
@@ -233,7 +232,6 @@ def test_every_flag(load: Load) -> None:
             True,
             True,
             125_000,
-            True,
             ros2=Ros2Settings(True, 3, "kilted", ("a.yaml",)),
         ),
     )

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.gateway import ros1_bridge
 from rmpa.gateway.ros2 import tokens as ros2_tokens
 from rmpa.gateway.ros2.graph import Ros2Graph
 from rmpa.gateway.ros2.tokens import Ros2Endpoint
@@ -36,8 +35,6 @@ SEEDS: list[bytes] = [
     _ENDPOINT.format(1, "MP", "std_msgs::msg::dds_::String_").encode(),
     _ENDPOINT.format(2, "SS", "std_srvs::srv::dds_::Trigger_").replace("::,10:", "2:1:2,1:3,4:").encode(),
     b"@ros2_lv/3/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/talker",
-    b"ros1_discovery_info/*/pub/7374645f6d7367732f537472696e67/992ce8a1687cec8c8bd883ec73ca41d1/*/chatter",
-    b"7374645f6d7367732f537472696e67/992ce8a1687cec8c8bd883ec73ca41d1/*/chatter",
 ]
 
 
@@ -52,11 +49,8 @@ def fuzz(data: bytes) -> None:
         raise AssertionError(f"{entity} does not survive its token")
     if isinstance(entity, Ros2Endpoint) and not entity.key():
         raise AssertionError("an endpoint has no key")
-    for parse in (ros1_bridge.parse_presence, ros1_bridge.parse_key, parse_value_key, asked_type):
+    for parse in (parse_value_key, asked_type):
         _read(parse, key)
-    topic = _read(ros1_bridge.parse_key, key)
-    if topic is not None and ros1_bridge.parse_key(topic.key()) != topic:
-        raise AssertionError(f"{topic} does not survive its key")
     graph = Ros2Graph(0, "own")
     shown = graph.change(key, alive=True)
     if graph.change(key, alive=False) != shown or len(graph) or graph.nodes:

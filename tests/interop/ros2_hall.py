@@ -28,7 +28,6 @@ site = "hall"
 router = true
 listen = ["tcp/0.0.0.0:{ROUTER_PORT}"]
 insecure = true
-ros1_bridge = true
 
 [gateway.ros2]
 enabled = true

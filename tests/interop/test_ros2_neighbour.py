@@ -1,4 +1,4 @@
-"""ROS 1 nodes beside those of other worlds, by one gateway: ROS 2 of rmw_zenoh, Zenoh programs, zenoh-bridge-ros1.
+"""ROS 1 nodes beside those of other worlds, by one gateway: ROS 2 of rmw_zenoh and Zenoh programs.
 
 The other ends are ``zenoh-ros2-sdk`` and plain eclipse-zenoh: they have no code of ours.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -22,9 +22,6 @@ if TYPE_CHECKING:
 pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 needs_sdk = pytest.mark.skipif(find_spec("zenoh_ros2_sdk") is None, reason="zenoh-ros2-sdk is not installed")
-
-STRING: Final = b"std_msgs/String".hex() + "/992ce8a1687cec8c8bd883ec73ca41d1"
-SET_BOOL: Final = b"std_srvs/SetBool".hex() + "/09fb03525b03e7ea1fd3992bafd87e16"
 
 
 @pytest.fixture(scope="module")
@@ -153,36 +150,3 @@ def test_a_zenoh_program_calls_a_service(hall: Hall, plain: OtherEnd) -> None:
             return replies["ok"] == ["01" + text_of("on")]
 
         eventually(answered, what="the service's answer", every=0.3)
-
-
-def test_zenoh_bridge_ros1_hears_and_is_heard(hall: Hall, plain: OtherEnd) -> None:
-    """Presence once a second, and data under hexadecimal types, as that bridge has them."""
-    plain.do("put", key=f"ros1_discovery_info/*/pub/{STRING}/*/bridged", period=1.0)
-    hall.robot.wait_topic("/bridged", LONG)
-    with hall.robot.ros.rospy("listener", topic="/bridged", type="String", name="bridged_listener") as listener:
-        plain.do("put", key=f"{STRING}/*/bridged", payload=text_of("over the bridge"), period=0.1, times=100)
-        assert listener.wait_event("text", LONG)["data"] == "over the bridge"
-    with hall.robot.ros.rospy("talker", topic="/to_bridge", type="String", rate=20, wait=1):
-        plain.do("subscribe", key="ros1_discovery_info/**")
-        present = f"/pub/{STRING}/*/to_bridge"
-        plain.process.wait_event("sample", LONG, where=lambda e: str(e["key"]).endswith(present))
-        plain.do("put", key=f"ros1_discovery_info/*/sub/{STRING}/*/to_bridge", period=1.0)
-        plain.do("subscribe", key=f"{STRING}/*/to_bridge")
-        sample = plain.process.wait_event("sample", LONG, where=lambda e: str(e["key"]).startswith(STRING))
-        assert bytes.fromhex(str(sample["payload"]))[4:].startswith(b"message ")
-
-
-def test_zenoh_bridge_ros1_serves_and_calls(hall: Hall, plain: OtherEnd) -> None:
-    plain.do("put", key=f"ros1_discovery_info/*/srv/{SET_BOOL}/*/bridge_lamp", period=1.0)
-    plain.do("serve", key=f"{SET_BOOL}/*/bridge_lamp", payload="01" + text_of("bridged"))
-    eventually(lambda: "/bridge_lamp" in hall.robot.ros.tool("rosservice", "list").split(), LONG, what="/bridge_lamp")
-    assert "bridged" in hall.robot.ros.tool("rosservice", "call", "/bridge_lamp", "true")
-    with hall.robot.ros.rospy("switch", service="/our_lamp") as switch:
-        switch.wait_event("up")
-        plain.do("put", key=f"ros1_discovery_info/*/cl/{SET_BOOL}/*/our_lamp", period=1.0)
-
-        def answered() -> bool:
-            replies = plain.ask("get", "replies", key=f"{SET_BOOL}/*/our_lamp", payload="01")
-            return replies["ok"] == ["01" + text_of("on")]
-
-        eventually(answered, LONG, what="the service's answer", every=0.3)

@@ -54,7 +54,6 @@ Examples:
   rmpa gateway --router --listen tls/0.0.0.0:7447                    the router that they meet at
   rmpa gateway --site b --rank 200 --connect tls/fleet.example:7447  stands by for the one with rank 100
   rmpa gateway --ros2 --connect tcp/localhost:7447                   ROS 2 nodes beside rmw_zenohd
-  rmpa gateway --ros1-bridge --connect tcp/localhost:7447            robots with zenoh-bridge-ros1
   rmpa gateway zenoh-config --listen tls/0.0.0.0:7447 > zenohd.json5 a router with zenohd instead
 """
 _options = setting_options(
@@ -176,10 +175,8 @@ def check_settings(settings: Settings) -> None:
         ConfigError: There is not.
     """
     it = settings.gateway
-    if not (it.site or it.ros2.enabled or it.ros1_bridge or it.router):
-        raise ConfigError(
-            "rmpa gateway", "there is nothing to join", "say --site NAME for other sites, --ros2 or --ros1-bridge"
-        )
+    if not (it.site or it.ros2.enabled or it.router):
+        raise ConfigError("rmpa gateway", "there is nothing to join", "say --site NAME for other sites, or --ros2")
     if it.router and not it.listen:
         raise ConfigError("gateway.router", "a router that listens nowhere", "add --listen tls/0.0.0.0:7447")
     if not (it.connect or it.listen):

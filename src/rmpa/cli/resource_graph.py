@@ -15,7 +15,7 @@ from rmpa.bridge.relay import OUTSIDE_GUID
 from rmpa.cli.graph import GraphName, read_graph, read_name
 from rmpa.cli.output import printable
 from rmpa.cli.stream import with_node
-from rmpa.config.gateway_rules import RESERVED_SITES
+from rmpa.config.gateway_rules import ROS2
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.resource.run.descriptor import TOPIC, Descriptor
@@ -174,7 +174,7 @@ def _sites(master: Master) -> frozenset[str]:
     """The names of the other sites that a gateway joins, as the master's agent knows them."""
     snapshot = master.snapshot(topics=())
     peers = snapshot.peers if snapshot is not None else ()
-    return frozenset(peer.name for peer in peers if peer.guid == OUTSIDE_GUID) - frozenset(RESERVED_SITES)
+    return frozenset(peer.name for peer in peers if peer.guid == OUTSIDE_GUID) - {ROS2}
 
 
 async def find_resources(node: Node, graph: Graph, sites: frozenset[str] = frozenset()) -> tuple[SeenResource, ...]:

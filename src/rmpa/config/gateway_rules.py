@@ -35,8 +35,8 @@ from rmpa.core.names import is_global_name
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-RESERVED_SITES: Final = ("ros2", "ros1_bridge")
-"""Names of neighbours that are not sites: they stand in the place of a site in names and rules."""
+ROS2: Final = "ros2"
+"""Stands in the place of a site in names and rules, for a ROS 2 graph; no site may have it."""
 PROTOCOLS: Final = ("tls", "tcp", "quic", "udp", "ws")
 """The protocols of Zenoh's endpoints that are accepted."""
 _COMMAND: Final = "gateway"
@@ -47,7 +47,6 @@ _ENDPOINT: Final = re.compile(
 _LOOKS: Final = "one looks like tls/fleet.example:7447"
 _PLACEHOLDERS: Final = {"{site}": "site", "{module}": "module", "{name}": "/name"}
 """What a rule's ``name`` may have in it, each with an example of what it becomes."""
-_NAMESPACE: Final = re.compile(r"\*|[A-Za-z0-9_][A-Za-z0-9_.-]{0,62}")
 
 
 class Crossing(StrEnum):
@@ -65,7 +64,7 @@ class CrossingRule:
 
     Args:
         names: Globs over topics, services and parameters, by the names that they have in their module.
-        sites: Globs over the other site's name; ``ros2`` and ``ros1_bridge`` are names too.
+        sites: Globs over the other site's name; ``ros2`` is a name too.
         modules: Globs over the module that has the source.
         crossing: Which way it may cross.
         name: The name here of what comes in; ``{site}``, ``{module}`` and ``{name}`` are replaced. ``{name}`` begins
@@ -97,8 +96,8 @@ def _read_site(raw: object) -> str:
         raise BadValue(error.problem.replace("peer's", "site's"), error.remedy, error.better) from None
     if len(name) > limits.SITE_NAME_MAX:
         raise BadValue(f"a site's name has at most {limits.SITE_NAME_MAX} characters")
-    if name in RESERVED_SITES:
-        raise BadValue(f"{name} is reserved: rules and names mean another neighbour by it", "choose another name")
+    if name == ROS2:
+        raise BadValue("ros2 is reserved: rules and names mean the ROS 2 graph by it", "choose another name")
     return name
 
 
@@ -120,13 +119,6 @@ def _read_endpoint(raw: object) -> str:
         )
     if not 1 <= int(match["port"]) <= 65535:
         raise BadValue(f"{text!r} has no port between 1 and 65535", _LOOKS)
-    return text
-
-
-def _read_namespace(raw: object) -> str:
-    text = read_text(raw).strip()
-    if not _NAMESPACE.fullmatch(text):
-        raise BadValue(f"{text!r} is not a bridge namespace", "one is letters, digits, _ and -, or * for any")
     return text
 
 
@@ -161,7 +153,6 @@ _DISTRIBUTION: Final = word_of(
     "there are humble, iron, jazzy, kilted and lyrical",
     "NAME",
 )
-_BRIDGE_NAMESPACE: Final = ValueType(_read_namespace, {"type": "string", "examples": ["*"]}, "NAME")
 _TEMPLATE: Final = ValueType(_read_template, {"type": "string", "examples": ["/{site}{name}"]})
 _KEYS: Final = (
     RuleKey(
@@ -172,7 +163,7 @@ _KEYS: Final = (
     RuleKey(
         "sites",
         list_of(PEER_GLOB, if_empty="leave sites out, or name some"),
-        "Globs over the other site's name; ros2 and ros1_bridge are names too. Without it all.",
+        "Globs over the other site's name; ros2 is a name too. Without it all.",
     ),
     RuleKey(
         "modules",
@@ -322,20 +313,6 @@ class GatewaySettings:
         option="--uplink",
         command=_COMMAND,
         shown_default="unlimited",
-    )
-    ros1_bridge: bool = setting(
-        False,
-        BOOL,
-        "Speak the format of zenoh-bridge-ros1 too.",
-        env="RMPA_GATEWAY_ROS1_BRIDGE",
-        option="--ros1-bridge/--no-ros1-bridge",
-        command=_COMMAND,
-    )
-    ros1_bridge_namespace: str = setting(
-        "*",
-        _BRIDGE_NAMESPACE,
-        "The bridge namespace in the keys of zenoh-bridge-ros1; * is that bridge's default.",
-        env="RMPA_GATEWAY_ROS1_BRIDGE_NAMESPACE",
     )
     store: str = setting(
         "",

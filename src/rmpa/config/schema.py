@@ -189,5 +189,16 @@ REMOVED: Final = {
     "core.fresh": 'write keep = "never" in place of true',
     "RMPA_FRESH": "set RMPA_KEEP=never in its place",
     "--fresh": "write --keep never",
+    **dict.fromkeys(
+        (
+            "gateway.ros1_bridge",
+            "gateway.ros1_bridge_namespace",
+            "RMPA_GATEWAY_ROS1_BRIDGE",
+            "RMPA_GATEWAY_ROS1_BRIDGE_NAMESPACE",
+            "--ros1-bridge",
+            "--no-ros1-bridge",
+        ),
+        "let a gateway with a site name join those robots, or run zenoh-bridge-ros1 beside rmpa",
+    ),
 }
 """What to use in place of a key, variable or option that is gone."""

@@ -38,8 +38,4 @@ def make_neighbours(graph: AgentGraph, session: OwnedSession, settings: Settings
         from rmpa.gateway.ros2.io.joining import make_ros2_neighbour  # noqa: PLC0415 - it reads all types of ROS
 
         neighbours["ros2"] = make_ros2_neighbour(graph, session, settings)
-    if gateway.ros1_bridge:
-        from rmpa.gateway.ros1_bridge.io.joining import make_ros1_bridge_neighbour  # noqa: PLC0415 - likewise
-
-        neighbours["ros1_bridge"] = make_ros1_bridge_neighbour(graph, session, settings, graph.agent)
     return neighbours

@@ -1,4 +1,4 @@
-"""What a neighbour of the gateway (other sites, ROS 2, zenoh-bridge-ros1) needs of the gateway's own graph.
+"""What a neighbour of the gateway (other sites, ROS 2) needs of the gateway's own graph.
 
 The gateway is a peer of the mesh that relays. Its core has the proxies of the modules at its site, which are *mesh
 sources*; a neighbour carries those out. What a neighbour brings in are *foreign sources*; they become proxies in the
@@ -56,7 +56,7 @@ class ForeignSource:
 
     Args:
         kind: What it is.
-        site: The site's name, ``ros2`` or ``ros1_bridge``: its proxies are ``/rmpa/<site>/…``.
+        site: The site's name, or ``ros2``: its proxies are ``/rmpa/<site>/…``.
         module: The module at that site; empty where the neighbour has none.
         node: The node in the module's graph.
         name: The topic or service in the gateway's graph, after the rules for names.

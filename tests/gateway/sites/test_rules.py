@@ -74,7 +74,7 @@ def test_a_source_is_for_all_sites_unless_a_rule_treats_one_of_them_otherwise() 
     assert not out(CrossingRules(), "/scan").addressed
     for rule, addressed in (
         (CrossingRule(sites=("yard*",), crossing=Crossing.BOTH), False),
-        (CrossingRule(sites=("ros2", "ros1_bridge"), crossing=Crossing.NONE), False),
+        (CrossingRule(sites=("ros2",), crossing=Crossing.NONE), False),
         (CrossingRule(sites=("ros2", "yard"), crossing=Crossing.NONE), True),
         (CrossingRule(sites=("yard",), rate=2.0), True),
         (CrossingRule(names=("/other",), sites=("yard",), crossing=Crossing.NONE), False),

@@ -3,10 +3,7 @@
 Runs with RMPA's interpreter: ``zenoh_end.py ENDPOINT``. Reads lines of JSON; payloads are hexadecimal:
 
 * ``{"do": "subscribe", "key"}``: then ``sample`` with ``key``, ``payload`` and ``attachment``;
-* ``{"do": "put", "key", "payload", "times", "period"}``: in a thread of its own, ``times`` times (0: for ever);
 * ``{"do": "get", "key", "payload"}``: then ``replies`` with ``ok`` (payloads) and ``errors`` (texts);
-* ``{"do": "serve", "key", "payload"}``: a complete queryable that answers each query so, and says ``query`` with the
-  payload that came;
 * ``{"do": "tokens", "key"}``: then ``tokens`` with those that are alive.
 
 Events beside: ``up``; ``done`` after each line.
@@ -16,8 +13,6 @@ from __future__ import annotations
 
 import json
 import sys
-import threading
-import time
 from typing import Any
 
 import zenoh
@@ -38,17 +33,6 @@ def _subscribe(session: zenoh.Session, told: dict[str, Any]) -> None:
     _kept.append(session.declare_subscriber(told["key"], take))
 
 
-def _put(session: zenoh.Session, told: dict[str, Any]) -> None:
-    def work() -> None:
-        number = 0
-        while not told.get("times") or number < told["times"]:
-            number += 1
-            session.put(told["key"], bytes.fromhex(told.get("payload", "")))
-            time.sleep(told.get("period", 0.0))
-
-    threading.Thread(target=work, daemon=True).start()
-
-
 def _get(session: zenoh.Session, told: dict[str, Any]) -> None:
     ok, errors = [], []
     payload = bytes.fromhex(told["payload"]) if "payload" in told else None
@@ -60,20 +44,12 @@ def _get(session: zenoh.Session, told: dict[str, Any]) -> None:
     say("replies", ok=ok, errors=errors)
 
 
-def _serve(session: zenoh.Session, told: dict[str, Any]) -> None:
-    def answer(query: zenoh.Query) -> None:
-        say("query", payload=_hex(query.payload))
-        query.reply(query.key_expr, bytes.fromhex(told["payload"]))
-
-    _kept.append(session.declare_queryable(told["key"], answer, complete=True))
-
-
 def _tokens(session: zenoh.Session, told: dict[str, Any]) -> None:
     replies = session.liveliness().get(told["key"], timeout=2.0)
     say("tokens", keys=sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None))
 
 
-DO = {"subscribe": _subscribe, "put": _put, "get": _get, "serve": _serve, "tokens": _tokens}
+DO = {"subscribe": _subscribe, "get": _get, "tokens": _tokens}
 
 
 def main() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rmpa.config.gateway_rules import RESERVED_SITES, Crossing
+from rmpa.config.gateway_rules import ROS2, Crossing
 from rmpa.config.permission_rules import Access
 from rmpa.core.names import is_global_name, matches
 from rmpa.gateway.neighbour import SourceKind
@@ -82,8 +82,8 @@ class CrossingRules:
             return decision
         found = []
         for number, rule in self._fitting(module, name):
-            if all(site in RESERVED_SITES for site in rule.sites):
-                continue  # it is about other neighbours
+            if all(site == ROS2 for site in rule.sites):
+                continue  # it is about no site
             found.append(_outgoing(number, rule))
             if any(glob in _EVERY_SITE for glob in rule.sites):
                 break

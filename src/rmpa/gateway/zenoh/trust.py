@@ -137,12 +137,4 @@ def revoked_modules(settings: Settings) -> tuple[str, ...]:
 
 def foreign_keys(settings: GatewaySettings) -> tuple[str, ...]:
     """Key expressions of neighbours that are no sites: each certificate of the mesh may use them."""
-    keys: list[str] = []
-    if settings.ros2.enabled:
-        keys += ["@ros2_lv/**", f"{settings.ros2.domain}/**"]
-    if settings.ros1_bridge:
-        namespace = settings.ros1_bridge_namespace
-        keys.append("ros1_discovery_info/**")
-        if namespace != "*":
-            keys.append(f"*/*/{namespace}/**")
-    return tuple(keys)
+    return ("@ros2_lv/**", f"{settings.ros2.domain}/**") if settings.ros2.enabled else ()

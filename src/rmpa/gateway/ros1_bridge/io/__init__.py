@@ -1,1 +1,0 @@
-"""The parts of the neighbour zenoh-bridge-ros1 that do I/O."""

@@ -1,7 +1,0 @@
-"""Gateways run on the loop that agents have in life."""
-
-from __future__ import annotations
-
-from tests.agent.conftest import pytest_asyncio_loop_factories
-
-__all__ = ["pytest_asyncio_loop_factories"]
