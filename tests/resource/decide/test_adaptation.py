@@ -286,7 +286,7 @@ def test_request_while_applying_counts_afterwards() -> None:
 
 
 @pytest.mark.parametrize("seed", range(200))
-def test_one_allowed_profile_is_applied_at_a_time(seed: int) -> None:  # noqa: C901
+def test_one_allowed_profile_is_applied_at_a_time(seed: int) -> None:
     chance = random.Random(seed)
     one = loop(FAST, MIDDLE, SLOW, LIMP)
     now, outstanding = 0.0, ""
