@@ -17,7 +17,7 @@ from click.testing import CliRunner
 
 from rmpa import __version__
 from rmpa.cli import completion
-from rmpa.cli.lazy_group import LazyGroup
+from rmpa.cli.lazy_group import REMOVED_VERBS, LazyGroup
 from rmpa.cli.main import MEANT, cli, main
 from tests.cli.conftest import DEADLINE, with_core
 
@@ -122,9 +122,10 @@ def test_version() -> None:
     assert CliRunner().invoke(cli, ["--version"]).output == f"rmpa {__version__}\n"
 
 
-def test_a_command_that_moved_says_where_it_is(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["experiment", "run", "--short"]) == 2
-    assert "make experiment" in capsys.readouterr().err
+@pytest.mark.parametrize(("words", "remedy"), REMOVED_VERBS.items())
+def test_a_command_that_is_gone_says_what_to_use(words: str, remedy: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*words.split(), "an-argument", "--an-option"]) == 2
+    assert f"rmpa {words}: is not a command any more; {remedy}" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_misspelt_command_is_told_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:

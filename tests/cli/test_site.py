@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from rmpa.core.errors import PeerRefused
 from rmpa.observe.io.control_server import ControlServer, Handler
-from rmpa.observe.sites import LastValueInfo, SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport, ValuePortion
-from rmpa.ros.types.messages import MessageType
+from rmpa.observe.sites import SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport
 from tests.observe.samples import SNAPSHOT
 
 if TYPE_CHECKING:
@@ -114,58 +112,12 @@ def test_an_unknown_site_offers_the_nearest(place: Place, answers: Callable[[Han
     assert (code, err) == (1, "rmpa: gate knows no site 'warehuose'; did you mean warehouse?\n")
 
 
-@pytest.mark.parametrize("portion", [1000, 3])
-def test_a_last_value_is_read_in_portions_and_printed(
-    place: Place, answers: Callable[[Handler], None], portion: int
-) -> None:
-    kind = MessageType("std_msgs/String")
-    body = kind.serialize(kind.make({"data": "docked"}))
-    value = LastValueInfo(
-        module="arm",
-        topic="/state",
-        node="/n",
-        type=kind.name,
-        md5sum=kind.md5sum,
-        definition=kind.definition,
-        latching=True,
-        stamp=time.time() - 65,
-        size=len(body),
-    )
-
-    def answer(args: dict[str, Any]) -> object:
-        inner = args["args"]
-        assert (inner["site"], inner["module"], inner["topic"]) == ("warehouse", "arm", "/state")
-        if args["what"] == "site.last":
-            return [value]
-        return ValuePortion(size=len(body), data=body[inner["offset"] : inner["offset"] + portion])
-
-    answers(answer)
-    code, out, err = place.run("site", "last", "warehouse/arm", "state")
-    assert (code, err) == (0, "")
-    head, *rest = out.splitlines()
-    assert head.startswith("# /state of /n of warehouse/arm: std_msgs/String, latched, 10 B, 1 min ")
-    assert rest == ['data: "docked"', "---"]
-    (line,) = place.json("site", "last", "warehouse/arm", "/state", "--field", "data", "--json")
-    assert (line["message"], line["module"], "definition" in line) == ("docked", "arm", False)
-    code, out, _ = place.run("site", "last", "warehouse/arm", "/state", "--header")
-    assert (code, len(out.splitlines())) == (0, 1)
-
-
-def test_errors_of_gateways_and_of_arguments(place: Place, answers: Callable[[Handler], None]) -> None:
+def test_errors_of_gateways_are_told(place: Place, answers: Callable[[Handler], None]) -> None:
     def refuse(_: dict[str, object]) -> object:
         raise PeerRefused("gate", "site warehouse is unreachable since 6 s")
 
     answers(refuse)
-    code, out, err = place.run("site", "last", "warehouse/arm", "/x", "--json")
+    code, out, err = place.run("site", "info", "warehouse", "--json")
     assert code == 1
     assert json.loads(out) == {"error": "gate refused: site warehouse is unreachable since 6 s"}
     assert err.startswith("rmpa: gate refused: site warehouse is unreachable")
-    assert place.run("site", "last", "warehouse", "/x")[0] == 2
-    assert place.run("site", "last", "warehouse/arm", "~x")[0] == 2
-
-
-def test_nothing_kept_is_said(place: Place, answers: Callable[[Handler], None]) -> None:
-    answers(lambda _: [])
-    code, _, err = place.run("site", "last", "warehouse/arm", "/x")
-    assert code == 1
-    assert "keeps no value of /x of arm" in err

@@ -36,7 +36,6 @@ def test_a_file_says_it_all(tmp_path: Path) -> None:
         router = true
         insecure = true
         uplink = "1 Mbit/s"
-        store = "/var/lib/last.db"
         [gateway.ros2]
         enabled = true
         domain = 4
@@ -64,7 +63,6 @@ def test_a_file_says_it_all(tmp_path: Path) -> None:
         True,
         True,
         125_000,
-        "/var/lib/last.db",
         Ros2Settings(True, 4, "humble", ("a.yaml", "b.yaml")),
         (
             CrossingRule(("/camera/**",), ("ros2", "hall*"), ("arm",), Crossing.OUT, "{name}", 2.0, 125_000),
@@ -115,6 +113,8 @@ def test_a_size_has_the_units_of_files_and_of_links(tmp_path: Path, size: str, e
         ("[gateway]\nlisten = ['tcp/a:70000']", 2, "no port between 1 and 65535"),
         ("[gateway]\nlisten = ['tcp/a:1', 'tcp/a b:1']", 2, "is not an endpoint of Zenoh"),
         ("[gateway]\nconnect = 'tcp/a:1'", 2, 'did you mean ["tcp/a:1"]?'),
+        ("[gateway]\nstore = 'last.db'", 2, "an unknown key; no gateway keeps values"),
+        ("[[gateway.rule]]\nrate = 1\nkeep = true", 3, "gateway.rule.keep: an unknown key; no gateway keeps values"),
         ("[gateway]\nros1_bridge = true", 2, "an unknown key; let a gateway with a site name join those robots"),
         ("[gateway]\nsites = 'a'", 2, "did you mean gateway.site?"),
         ("[gateway]\nenabled = true", 2, "unknown key"),

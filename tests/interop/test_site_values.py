@@ -1,4 +1,4 @@
-"""What crosses between two sites beside topics: parameters, last values, Smart Resources; and what the tools tell.
+"""What crosses between two sites beside topics: parameters, Smart Resources; and what the tools tell.
 
 The sites are those of ``test_sites``. The tests share one set of processes; each leaves it as it was.
 """
@@ -105,57 +105,6 @@ def test_a_module_follows_a_parameter_of_another_site_by_its_gateway(joined: Joi
         base.wait_peer(joined.yard.gateway.name)
 
 
-def test_a_last_value_is_there_when_its_module_is_off(joined: JoinedModules) -> None:
-    arm, base = joined.arm.agent, joined.base.agent
-    last = ("site", "last", "warehouse/arm", "/gripper")
-    with joined.arm.ros.rospy("stranger", topic="/gripper", name="stranger") as stranger:
-        stranger.wait_event("up")
-        eventually(lambda: base.rmpa(*last, "--header", timeout=LONG)[0] == 0, LONG, what="a value", every=0.5)
-    arm.kill()
-    try:
-        value: dict[str, Any] = json.loads(does(base, *last, "--json"))
-        assert (value["type"], value["node"], value["latching"]) == ("strange_msgs/Gripper", "/stranger", True)
-        assert 0 <= value["age"] < LONG
-        assert '"force":1.5' in json.dumps(value["message"], separators=(",", ":"))
-        assert "force: 1.5" in does(base, *last)
-        (kept,) = (
-            each
-            for each in json.loads(does(joined.warehouse.gateway, "site", "info", "warehouse", "--json"))["sites"][0][
-                "values"
-            ]
-            if each["topic"] == "/gripper"
-        )
-        assert kept["module"] == "arm"
-        assert "keeps no value of /none" in fails(base, "site", "last", "warehouse/arm", "/none")
-    finally:
-        arm.restart()
-        arm.wait_peer(joined.warehouse.gateway.name)
-
-
-def test_a_last_value_of_a_site_that_is_off_as_a_whole_is_what_came_of_it(joined: JoinedModules) -> None:
-    base, gateway = joined.base.agent, joined.warehouse.gateway
-    with joined.arm.ros.rospy("stranger", topic="/seen_gripper", name="seen_stranger") as stranger:
-        stranger.wait_event("up")
-        eventually(lambda: "/seen_gripper" in does(base, "topic", "list"), LONG, what="the topic", every=0.5)
-        assert "force: 1.5" in does(base, "topic", "echo", "/seen_gripper", "-n", "1")
-    gateway.kill()
-    try:
-        eventually(lambda: "unreachable" in fails(base, "site", "info", "warehouse"), LONG, what="its end", every=0.5)
-        value: dict[str, Any] = json.loads(does(base, "site", "last", "warehouse/arm", "/seen_gripper", "--json"))
-        assert (value["node"], value["seen_at"]) == ("/seen_stranger", "yard")
-        assert '"force":1.5' in json.dumps(value["message"], separators=(",", ":"))
-        assert "this is what site yard saw of it last" in does(
-            base, "site", "last", "warehouse/arm", "/seen_gripper", "--header"
-        )
-        assert "/seen_gripper" in fails(base, "site", "info", "warehouse")
-        assert "unreachable since" in fails(base, "site", "last", "warehouse/arm", "/none")
-    finally:
-        gateway.restart()
-        eventually(
-            lambda: "joined" in base.rmpa("site", "info", "warehouse")[1], LONG, what="the site again", every=0.5
-        )
-
-
 def test_smart_resources_of_another_site_are_listed_and_set(joined: JoinedModules) -> None:
     arm, base = joined.arm.agent, joined.base.agent
     arm.kill()
@@ -209,7 +158,6 @@ def test_a_site_that_is_cut_off_is_told_of_as_unreachable(joined: JoinedModules)
         eventually(lambda: "unreachable" in base.rmpa("site", "list")[1], LONG, what="unreachable", every=0.5)
         assert "site warehouse is unreachable since" in fails(base, "why", "warehouse/arm:/told")
         assert "site warehouse is unreachable since" in fails(base, "why", "/told"), "whose it was need not be known"
-        assert "site warehouse is unreachable since" in fails(base, "site", "last", "warehouse/arm", "/told")
         fails(base, "site", "info", "warehouse")
     finally:
         joined.warehouse.network.restore()

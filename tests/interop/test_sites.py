@@ -120,8 +120,7 @@ def test_an_action_runs_at_the_other_site(joined: JoinedModules) -> None:
         assert client.wait_event("done", LONG, since=since)["state"] == "PREEMPTED"
 
 
-def test_parameters_resources_and_last_values_of_the_other_site(joined: JoinedModules) -> None:
-    """A last value is there also while its module is off: only the gateway of its site keeps it."""
+def test_parameters_and_resources_of_the_other_site(joined: JoinedModules) -> None:
     arm, base = joined.arm, joined.base
 
     def asked(*words: str) -> str:
@@ -132,18 +131,9 @@ def test_parameters_resources_and_last_values_of_the_other_site(joined: JoinedMo
     with Process(lamp, env=arm.agent.env, name="lamp"):
         eventually(lambda: "/lamp " in asked("resource", "list"), LONG, what="/lamp among the resources", every=0.5)
     arm.ros.tool("rosparam", "set", "/speed", "1.5")
-    with arm.ros.rospy("stranger", topic="/held", name="stranger") as stranger:
-        stranger.wait_event("up")
-        eventually(lambda: "1.5" in asked("param", "get", "--peer", "warehouse/arm", "/speed"), what="/speed of arm")
-        assert base.agent.rmpa("param", "set", "--peer", "warehouse/arm", "/speed", "2.5")[0] == 0
-        assert "2.5" in arm.ros.tool("rosparam", "get", "/speed")
-        value = ("site", "last", "warehouse/arm", "/held")
-        eventually(lambda: "force: 1.5" in asked(*value), LONG, what="the last value", every=0.5)
-        arm.agent.terminate()
-        joined.base.wait_no_topic("/held")
-        assert "force: 1.5" in asked(*value)
-    arm.agent.restart()
-    arm.agent.wait_peer(joined.warehouse.gateway.name)
+    eventually(lambda: "1.5" in asked("param", "get", "--peer", "warehouse/arm", "/speed"), what="/speed of arm")
+    assert base.agent.rmpa("param", "set", "--peer", "warehouse/arm", "/speed", "2.5")[0] == 0
+    assert "2.5" in arm.ros.tool("rosparam", "get", "/speed")
 
 
 def test_nothing_crosses_without_a_subscriber(joined: JoinedModules) -> None:

@@ -149,12 +149,11 @@ alarm: Final = _group(
     _RESOURCE,
 )
 site: Final = _group(
-    "See other sites that gateways join, and values of modules that are off.",
+    "See other sites that gateways join.",
     {
         "site": {
             "list": "List this site and the others, and how they are.",
             "info": "Show the modules of a site and what they offer.",
-            "last": "Print the last value of a topic that a site's gateway keeps, also if its module is off.",
         }
     },
     """\

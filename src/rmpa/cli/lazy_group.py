@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import click
 
@@ -12,6 +12,12 @@ from rmpa.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
+REMOVED_VERBS: Final = {
+    "experiment": "in a clone of the repository: make experiment, or python -m lab experiment (docs/experiments.md)",
+    "site last": "record the topic with rosbag where it is needed, or keep its key by a storage of Zenoh",
+}
+"""What to use in place of a command that is gone, by its words behind ``rmpa``."""
 
 
 class PipeClosed(Exception):  # noqa: N818 - not an error: the program that reads our output has closed the pipe
@@ -27,7 +33,6 @@ class LazyGroup(click.Group):
     Args:
         commands_at: By name: the module, which has the command under that name (or with ``_`` behind it, where the
             name is a builtin's), and the line that the group's help shows.
-        moved: By name: where a command of an earlier release is now, for the error.
         meant: By a word that is no command: what a user who writes it wants, a command line without the program.
         arguments: For ``click.Group``.
     """
@@ -36,13 +41,11 @@ class LazyGroup(click.Group):
         self,
         *,
         commands_at: Mapping[str, tuple[str, str]],
-        moved: Mapping[str, str] | None = None,
         meant: Mapping[str, Sequence[str]] | None = None,
         **arguments: object,
     ) -> None:
         super().__init__(**arguments)  # type: ignore[arg-type] # handed through as they came
         self.commands_at = commands_at
-        self.moved = moved or {}
         self.meant = meant or {}
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
@@ -95,8 +98,10 @@ class LazyGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Find a command; for a misspelt one the error names the nearest."""
-        if args and args[0] in self.moved:
-            raise ConfigError(args[0], self.moved[args[0]])
+        if args:
+            words = " ".join((*ctx.command_path.split()[1:], args[0]))
+            if remedy := REMOVED_VERBS.get(words):
+                raise ConfigError(f"rmpa {words}", "is not a command any more", remedy)
         if args and args[0] not in self.commands_at and not args[0].startswith("-"):
             near = did_you_mean(args[0], self.commands_at)
             others = self.meant.get(args[0]) or ([near] if near else [])

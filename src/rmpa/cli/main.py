@@ -48,11 +48,6 @@ COMMANDS = {
     "reload": ("rmpa.cli.reload", "Let the agent read its settings again."),
     "completion": ("rmpa.cli.completion", "Print the script that completes rmpa's commands in a shell."),
 }
-MOVED = {
-    "experiment": "is not part of rmpa any more; in a clone of its repository: make experiment, "
-    "or python -m lab experiment (docs/experiments.md)",
-}
-"""Commands of releases before this one, and where they are now; to be dropped after one release."""
 MEANT = {
     "help": ("--help",),
     "version": ("--version",),
@@ -89,7 +84,6 @@ Examples:
 @click.group(
     cls=LazyGroup,
     commands_at=COMMANDS,
-    moved=MOVED,
     meant=MEANT,
     epilog=EPILOG,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},

@@ -1,29 +1,26 @@
-"""``rmpa site list|info|last``: other sites that gateways join."""
+"""``rmpa site list|info``: other sites that gateways join."""
 
 from __future__ import annotations
 
 import contextlib
 import os
-import time
 from typing import TYPE_CHECKING, Final, TypeVar
 
 import click
 import msgspec
 
 from rmpa.cli.options import agent_option, json_option
-from rmpa.cli.output import Column, duration, print_json, print_line, print_table, printable, size, warn
+from rmpa.cli.output import Column, duration, print_json, print_line, print_table, printable, warn
 from rmpa.config.values import did_you_mean
-from rmpa.core.errors import ConfigError, PeerRefused, RemoteProtocolError, RmpaError
-from rmpa.core.names import is_legal_name
+from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.observe import limits
 from rmpa.observe.control import GATEWAY_REPORT
 from rmpa.observe.io.control_client import ControlClient, choose_agent
-from rmpa.observe.io.site_requests import BODY, INFO, LAST, REPORT
-from rmpa.observe.sites import LastValueInfo, SitesReport, ValuePortion, read_site_module
+from rmpa.observe.io.site_requests import INFO, REPORT
+from rmpa.observe.sites import SitesReport
 
 if TYPE_CHECKING:
     from rmpa.observe.sites import SiteInfo
-    from rmpa.ros.types.messages import Plain
 
 _T = TypeVar("_T")
 _COLOURS: Final = {"this site": "green", "joined": "green", "no gateway": "yellow", "unreachable": "red"}
@@ -34,10 +31,6 @@ _COLUMNS: Final = (
 )
 _MODULES: Final = (Column("  MODULE"), *(Column(title, right=True) for title in ("TOPICS", "SERVICES", "SHOWN")))
 _SOURCES: Final = tuple(map(Column, ("  NAME", "KIND", "TYPE", "MODULE", "NODE", "HERE")))
-_VALUES: Final = (
-    *map(Column, ("  TOPIC", "TYPE", "MODULE", "NODE")),
-    *(Column(t, right=True) for t in ("SIZE", "AGE")),
-)
 
 name_option = click.option("--name", metavar="GATEWAY", help="Ask this gateway of this machine, not --agent's.")
 
@@ -148,11 +141,7 @@ Examples:
 @agent_option
 @name_option
 def info(site: str, as_json: bool, agent: str | None, name: str | None) -> int:
-    """Show the modules of SITE, what they offer, its name here, and why something does not cross.
-
-    Of this module's own site the last values that its gateway keeps are shown too, and of a site that is unreachable
-    those that came of it.
-    """
+    """Show the modules of SITE, what they offer, its name here, and why something does not cross."""
     with _connect(agent, name) as client:
         report = _ask(client, INFO, SitesReport, site=site)
     found = next((each for each in report.sites if each.name == site), None)
@@ -197,121 +186,6 @@ def _show(report: SitesReport, site: SiteInfo) -> None:
         print_table(
             _SOURCES, [[f"  {s.name}", s.kind, s.type, s.module, s.node, s.here or "-"] for s in site.sources]
         )
-    if site.values:
-        click.echo("\nLast values:")
-        print_table(_VALUES, [_value_row(value) for value in site.values])
     for source in site.sources:
         if source.problem:
             warn(f"{source.name} of {source.module}: {source.problem}")
-
-
-def _value_row(value: LastValueInfo) -> list[str]:
-    return [f"  {value.topic}", value.type, value.module, value.node, size(value.size), duration(_age(value))]
-
-
-def _age(value: LastValueInfo) -> float:
-    return max(0.0, time.time() - value.stamp)
-
-
-@click.command(
-    epilog="""\
-\b
-Exit codes: 0 printed; 1 no value is kept, or it cannot be read.
-
-\b
-Examples:
-  rmpa site last warehouse/arm /map
-  rmpa site last warehouse/arm /sonar/descriptor --field data
-  rmpa site last warehouse/arm /map --header          type and age only
-  rmpa site last warehouse/arm /map --json | jq .message.info
-"""
-)
-@click.argument("module", metavar="SITE/MODULE")
-@click.argument("topic")
-@click.option("--header", is_flag=True, help="Its type, size and age, and not the message.")
-@click.option("--field", metavar="FIELD", help="This field of the message, such as pose/position.")
-@click.option("--noarr", is_flag=True, help="Leave arrays out.")
-@json_option
-@agent_option
-@name_option
-def last(
-    module: str,
-    topic: str,
-    header: bool,
-    field: str | None,
-    noarr: bool,
-    as_json: bool,
-    agent: str | None,
-    name: str | None,
-) -> None:
-    """Print the last value of TOPIC that the gateway of SITE keeps, of each publisher: MODULE may be off.
-
-    Latched topics and descriptors of Smart Resources are kept, and those that a [[gateway.rule]] says. The age is
-    the time since the gateway received it, by both machines' clocks. If the whole site is off, this one's gateway
-    answers with what came of its latched topics.
-    """
-    site, of = read_site_module(module)
-    if not is_legal_name(topic) or topic.startswith("~"):
-        raise ConfigError("TOPIC", f"{topic!r} is not a topic", "write /name")
-    topic = "/" + topic.strip("/")
-    with _connect(agent, name) as client:
-        found = _ask(client, LAST, tuple[LastValueInfo, ...], site=site, module=of, topic=topic)
-        if not found:
-            raise RmpaError(
-                f"site {site} keeps no value of {topic} of {of}: it is not latched, or was never seen by the gateway"
-            )
-        bodies = [None if header else _body(client, site, value) for value in found]
-    for value, body in zip(found, bodies, strict=True):
-        _print_value(site, value, body, field, noarr=noarr, as_json=as_json)
-
-
-def _body(client: ControlClient, site: str, value: LastValueInfo) -> bytes:
-    data = bytearray()
-    while len(data) < value.size:
-        portion = _ask(
-            client,
-            BODY,
-            ValuePortion,
-            site=site,
-            module=value.module,
-            topic=value.topic,
-            node=value.node,
-            offset=len(data),
-        )
-        if portion.size != value.size or not portion.data:
-            raise RmpaError(f"the value of {value.topic} has changed meanwhile; ask again")
-        data += portion.data
-    return bytes(data)
-
-
-def _print_value(
-    site: str, value: LastValueInfo, body: bytes | None, field: str | None, *, noarr: bool, as_json: bool
-) -> None:
-    from rmpa.cli.message_text import pick, shorten, to_text
-
-    plain: Plain = None
-    if body is not None:
-        path = field.strip("/").split("/") if field else []
-        plain = shorten(pick(_plain(value, body), path), arrays=noarr, strings=False)
-    if as_json:
-        facts = msgspec.to_builtins(value) | {"site": site, "age": _age(value)}
-        del facts["definition"]
-        print_json(facts | ({"message": plain} if body is not None else {}))
-        return
-    latched = ", latched" if value.latching else ""
-    if value.seen_at:
-        warn(f"site {site} does not give it now: this is what site {value.seen_at} saw of it last")
-    print_line(
-        f"# {value.topic} of {value.node} of {site}/{value.module}: {value.type}{latched}, "
-        f"{size(value.size)}, {duration(_age(value))} old"
-    )
-    if body is not None:
-        click.echo(to_text(plain) + "\n---")
-
-
-def _plain(value: LastValueInfo, body: bytes) -> dict[str, Plain]:
-    """The message as plain values, by the publisher's own definition."""
-    from rmpa.ros.types.messages import MessageType
-
-    kind = MessageType.learn(value.type, value.definition, value.md5sum)
-    return kind.to_plain(kind.deserialize(body))

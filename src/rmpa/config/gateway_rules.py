@@ -71,7 +71,6 @@ class CrossingRule:
             with a slash.
         rate: Messages a second of each topic that goes out; ``None``: no limit. Others are dropped, and counted.
         size: Bytes a second of each topic that goes out; ``None``: no limit.
-        keep: Whether the gateway keeps the last value of each topic of this site, also if it is not latched.
     """
 
     names: tuple[str, ...] = ("/**",)
@@ -81,7 +80,6 @@ class CrossingRule:
     name: str = "{name}"
     rate: float | None = None
     size: int | None = None
-    keep: bool = False
 
 
 # --- values ---------------------------------------------------------------------------------------------------------
@@ -174,7 +172,6 @@ _KEYS: Final = (
     RuleKey("name", _TEMPLATE, "The name here of what comes in; {site}, {module} and {name} are replaced."),
     RuleKey("rate", RATE, "Messages a second of each topic that goes out; others are dropped, and counted."),
     RuleKey("size", BYTES_A_SECOND, "Bytes a second of each topic that goes out; others are dropped, and counted."),
-    RuleKey("keep", BOOL, "Keep the last value of each topic of this site, also of those that are not latched."),
 )
 _EXAMPLE: Final = 'one has names = ["/camera/**"] and rate = 2, or crossing = "none"'
 _SELECTORS: Final = {"names", "sites", "modules"}
@@ -313,13 +310,6 @@ class GatewaySettings:
         option="--uplink",
         command=_COMMAND,
         shown_default="unlimited",
-    )
-    store: str = setting(
-        "",
-        TEXT,
-        "The file of last values (SQLite); those of other sites are in one beside it, which ends in .seen.sqlite.",
-        env="RMPA_GATEWAY_STORE",
-        shown_default="in the state directory",
     )
     ros2: Ros2Settings = table(Ros2Settings, "gateway.ros2")
     rules: tuple[CrossingRule, ...] = setting(

@@ -200,5 +200,9 @@ REMOVED: Final = {
         ),
         "let a gateway with a site name join those robots, or run zenoh-bridge-ros1 beside rmpa",
     ),
+    **dict.fromkeys(
+        ("gateway.store", "RMPA_GATEWAY_STORE", "gateway.rule.keep"),
+        "no gateway keeps values: record the topic with rosbag, or keep its key by a storage of Zenoh",
+    ),
 }
 """What to use in place of a key, variable or option that is gone."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.core.sizes import KIB, MIB
+from rmpa.core.sizes import MIB
 
 AGENTS_LOOK_PERIOD: Final = 5.0
 """Seconds until a gateway without keys looks again whether an agent of a secured mesh runs beside it."""
@@ -33,45 +33,18 @@ SITE_CALL_GRACE: Final = 1.0
 """Seconds that the calling site waits longer than the serving one, whose error text tells more."""
 DESCRIBE_TIMEOUT: Final = 10.0
 """Seconds for the description of another site's service; its server may be probed for it over two meshes."""
-LAST_VALUE_MAX: Final = 32 * MIB
-"""Bytes of a message that is kept as a last value: a map of 5,000 by 5,000 cells. Larger ones are not kept."""
-LAST_VALUE_DEFINITION_MAX: Final = 64 * KIB
-"""Characters of the definition that is kept with a last value, also in memory; a longer one is left out. The longest
-of ROS 1 has some 30 KB."""
-LAST_VALUES_ASKED_MAX: Final = 64
-"""Questions for last values that are answered at once; further ones are refused. Each may read 64 MiB."""
-LAST_VALUES_MAX: Final = 4096
-"""Last values that are kept; the oldest go first. A module has some 20 latched topics."""
-LAST_VALUES_BYTES_MAX: Final = 256 * MIB
-"""Bytes of all last values in the file; the oldest go first."""
-LAST_VALUES_PENDING_MAX: Final = 64 * MIB
-"""Bytes of last values that wait while the disk takes none; above it the oldest are not written."""
-LAST_VALUES_INTERVAL: Final = 0.5
-"""Seconds between writes: a topic that publishes quickly is written once in each."""
-LAST_VALUES_OPEN_TIMEOUT: Final = 5.0
-"""Seconds for the file of last values to open; a disk that hangs must not stop the gateway."""
-LAST_VALUES_CLOSE_TIMEOUT: Final = 3.0
-"""Seconds for the last write; a disk that hangs must not keep the gateway from ending."""
-LAST_VALUES_READ_TIMEOUT: Final = 4.0
-"""Seconds for one query of last values: less than the session waits for its answer."""
-LAST_VALUES_ANSWER_MAX: Final = 64 * MIB
-"""Bytes of all answers to one query of last values; the newest are given first."""
 LATCH_LOOK_AFTER: Final = 5.0
 """Seconds that a topic is there before the gateway asks its publisher whether it is latched."""
 LATCH_LOOK_TIMEOUT: Final = 10.0
 """Seconds for the publisher's answer to that."""
 LATCH_LOOKS_AT_ONCE: Final = 2
 """Publishers that are asked that at once: each opens a route in the mesh for a moment."""
-VALUE_HEADER_MAX: Final = 1 * MIB
-"""Bytes of the header of another site's last value: most of it is the definition of its type."""
+SITE_WHY_MAX: Final = 1 * MIB
+"""Bytes of what another site's gateway tells of a topic for ``rmpa why``."""
 SITES_REMEMBERED_MAX: Final = 256
 """Sites that are remembered as unreachable; those that left first are forgotten first."""
 SITE_REPORT_SOURCES_MAX: Final = 5000
 """Topics and services of one site in ``rmpa site info``: some 2 MB of JSON."""
-VALUE_PORTION: Final = 256 * KIB
-"""Bytes of a last value in one message to a module that asks for it: 20 ms on a 100 Mbit/s link."""
-VALUE_READING_IDLE: Final = 60.0
-"""Seconds for which a last value that is read in portions is kept without another question for it."""
 SITE_ACTIONS_MAX: Final = 1024
 """Connections under the names of other sites' action servers: two for each pair of a client and a server."""
 SITE_ASK_TIMEOUT: Final = 5.0
@@ -87,8 +60,6 @@ SITE_FOLLOW_INTERVAL: Final = 1.0
 """Seconds between questions for followed parameters of other sites: one question for each module."""
 SITE_PARAM_TIMEOUT: Final = 20.0
 """Seconds for a question about a parameter to another site: less than the module that asks waits for this gateway."""
-LAST_VALUES_RETRY_MAX: Final = 30.0
-"""Seconds between attempts to write to a disk that takes nothing."""
 SITE_NAME_MAX: Final = 63
 """Characters of a site's name, as for a module's name and for a label of DNS."""
 NODE_NAME_MAX: Final = 255

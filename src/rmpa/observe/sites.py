@@ -48,34 +48,6 @@ class SiteSourceInfo(msgspec.Struct, frozen=True, kw_only=True):
     problem: str = ""
 
 
-class LastValueInfo(msgspec.Struct, frozen=True, kw_only=True):
-    """A value that a site's gateway keeps.
-
-    Attributes:
-        module: The module.
-        topic: The topic there.
-        node: Its publisher there.
-        type: ``package/Name``.
-        md5sum: Of the type.
-        definition: The publisher's; may be empty.
-        latching: Whether the publisher is latched.
-        stamp: When the gateway received it, seconds since 1970.
-        size: Bytes.
-        seen_at: The site whose gateway kept what came of it, where its own was not asked, being off; else empty.
-    """
-
-    module: str
-    topic: str
-    node: str
-    type: str
-    md5sum: str = ""
-    definition: str = ""
-    latching: bool = False
-    stamp: float = 0.0
-    size: int = 0
-    seen_at: str = ""
-
-
 class SiteInfo(msgspec.Struct, frozen=True, kw_only=True):
     """A site.
 
@@ -89,8 +61,6 @@ class SiteInfo(msgspec.Struct, frozen=True, kw_only=True):
         sources: What it offers, in ``rmpa site info`` alone.
         not_shown: How many sources a rule or a conflict of names keeps out.
         beyond: Sources that were left out because there are too many.
-        values: Last values that this site's gateway keeps: of this site, without definitions; of another one that is
-            unreachable, what came of it.
     """
 
     name: str
@@ -101,7 +71,6 @@ class SiteInfo(msgspec.Struct, frozen=True, kw_only=True):
     sources: tuple[SiteSourceInfo, ...] = ()
     not_shown: int = 0
     beyond: int = 0
-    values: tuple[LastValueInfo, ...] = ()
 
 
 class SitesReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -124,18 +93,6 @@ class SitesReport(msgspec.Struct, frozen=True, kw_only=True):
     problem: str = ""
     endpoints: tuple[str, ...] = ()
     sites: tuple[SiteInfo, ...] = ()
-
-
-class ValuePortion(msgspec.Struct, frozen=True, kw_only=True):
-    """A part of the message of a last value.
-
-    Attributes:
-        size: Bytes of the whole message.
-        data: These bytes of it.
-    """
-
-    size: int
-    data: bytes
 
 
 def read_site_module(text: str) -> tuple[str, str]:

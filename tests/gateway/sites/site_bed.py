@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.core.contract import Contracts
 from rmpa.gateway.neighbour import MeshSource, SourceKind
-from rmpa.gateway.sites.io.last_value_store import LastValueStore
 from rmpa.gateway.sites.io.neighbour import SiteNeighbour
-from rmpa.gateway.sites.io.seen_values import SiteSeenValues
 from rmpa.gateway.sites.io.topic_part import SiteTopics
 from rmpa.gateway.sites.keys import SiteGateway
 from rmpa.gateway.sites.rules import CrossingRules
@@ -22,7 +20,6 @@ from tests.gateway.zenoh_bed import ZenohBed, bed, until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
-    from pathlib import Path
 
     from rmpa.config.gateway_rules import CrossingRule
     from rmpa.core.contract import ContractRule
@@ -109,7 +106,6 @@ class Site:
     graph: SiteGraph
     session: OpenSession
     topic_part: SiteTopics
-    seen: SiteSeenValues
 
     def topic(self, name: str, node: str = "/talker") -> MemoryTopic:
         """A topic that is shown here."""
@@ -150,16 +146,14 @@ class SiteBed:
         graph: SiteGraph | None = None,
         rules: tuple[CrossingRule, ...] = (),
         contracts: tuple[ContractRule, ...] = (),
-        seen: Path | None = None,
     ) -> Site:
         """Open one more gateway, and start it."""
         session = await self.zenoh.session()
         graph = graph if graph is not None else SiteGraph()
         own = SiteGateway(name, rank, f"{len(self.opened) + 1:032x}")
         crossing = CrossingRules(rules)
-        kept = SiteSeenValues(LastValueStore(seen))
-        topics = SiteTopics(name, graph, session, crossing, Contracts(contracts), SystemClock(), kept.keep)
-        site = Site(SiteNeighbour(graph, session, own, crossing, [kept, topics]), graph, session, topics, kept)
+        topics = SiteTopics(name, graph, session, crossing, Contracts(contracts), SystemClock())
+        site = Site(SiteNeighbour(graph, session, own, crossing, [topics]), graph, session, topics)
         self.opened.append(site)
         site.neighbour.start()
         return site

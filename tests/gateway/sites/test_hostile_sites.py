@@ -20,7 +20,6 @@ from rmpa.gateway.sites.catalogue import SiteCatalogue
 from rmpa.gateway.sites.history import SiteHistory
 from rmpa.gateway.sites.imports import SiteImports
 from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource, parse_token
-from rmpa.gateway.sites.last_values import ValueHeader
 from rmpa.gateway.sites.params import ParamAnswer, ParamQuestion, from_json, to_json
 from rmpa.gateway.sites.rules import CrossingRules
 from rmpa.gateway.sites.topic_header import TopicHeader
@@ -158,7 +157,6 @@ BOMBS = [
         ParamAnswer.parse,
         TopicHeader.parse,
         WhyAnswer.parse,
-        ValueHeader.parse,
         lambda d: to_json(from_json(d)),
     ],
 )

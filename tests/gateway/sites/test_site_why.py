@@ -12,7 +12,7 @@ from rmpa.bridge.permission_gate import PermissionGate
 from rmpa.config.gateway_rules import Crossing, CrossingRule
 from rmpa.config.permission_rules import Access, PermissionRule
 from rmpa.config.settings import TrustSettings
-from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.site_permissions import SitePermissions
 from rmpa.gateway.sites.history import SiteHistory
@@ -30,15 +30,13 @@ from rmpa.gateway.sites.why import (
     there_stages,
 )
 from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN
-from rmpa.observe.io.site_requests import BODY, INFO, LAST, PARAM, REPORT, WHY
+from rmpa.observe.io.site_requests import INFO, PARAM, REPORT, WHY
 from rmpa.ros.wire.tcpros import TopicDescription
 from rmpa.trust.permissions import Permissions
 from tests.gateway.memory_zenoh import eventually as until
 from tests.gateway.sites.site_bed import site_bed
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from rmpa.observe.sites import SitesReport
     from rmpa.observe.why.diagnosis import Diagnosis
     from tests.gateway.sites.site_bed import Site, SiteBed
@@ -71,7 +69,6 @@ async def asked(
     bed: SiteBed,
     name: str,
     rules: tuple[CrossingRule, ...] = (),
-    seen: Path | None = None,
     permissions: tuple[PermissionRule, ...] | None = None,
 ) -> Asked:
     gate = PermissionGate(None if permissions is None else Permissions(TrustSettings(rules=permissions)))
@@ -79,7 +76,7 @@ async def asked(
     def may(asker: str, access: Access, name: str) -> bool:
         return not asker or gate.judge(access, asker, name).allowed
 
-    site = await bed.site(name, rules=rules, seen=seen)
+    site = await bed.site(name, rules=rules)
     history = SiteHistory(time.monotonic)
     site.neighbour.on_sites = history.seen
     site.neighbour.on_site_source = lambda source, there: history.source(source, there=there)
@@ -94,14 +91,11 @@ async def asked(
     answers = SiteAnswers(
         f"{name}_gateway",
         SiteGateway(name, 100, "0" * 32),
-        site.session,
         site.neighbour,
         history,
-        site.seen,
         lambda: ("tcp/x:1",),
         ask_param,
         why,
-        lambda: 1,
         may if gate.on else None,
     )
     site.neighbour.add(answers)
@@ -192,10 +186,6 @@ async def test_a_module_and_a_site_are_told_only_of_what_they_may_have() -> None
             said.append(str(refused.failed).replace(name, "NAME"))
         assert said[0] == said[1]
         assert "the permissions there do not let hall subscribe to NAME" in said[0]
-        args = {"site": "hall", "module": "press", "topic": "/home/open", "offset": 0}
-        for what in (LAST, BODY):
-            with pytest.raises(PeerRefused, match="of this very site: subscribe to it"):
-                await hall.answers.answer(what, args, "desk")
 
 
 async def test_a_site_that_left_is_unreachable_since_then_and_one_that_never_was_is_no_site() -> None:
@@ -225,46 +215,9 @@ async def test_a_site_that_left_is_unreachable_since_then_and_one_that_never_was
         assert moon.failed is not None
         assert "no gateway of a site moon" in moon.failed.text
         with pytest.raises(RmpaError, match="site yard is unreachable since"):
-            await hall.answers.answer(LAST, {"site": "yard", "module": "arm", "topic": "/chatter"})
+            await hall.answers.answer(PARAM, {"site": "yard", "module": "arm"})
         with pytest.raises(UnreachableError, match="known are: none"):
-            await hall.answers.answer(LAST, {"site": "moon", "module": "arm", "topic": "/chatter"})
-
-
-async def test_last_values_of_a_site_that_is_off_are_those_that_came_from_it_also_after_a_restart(
-    tmp_path: Path,
-) -> None:
-    path, question = tmp_path / "seen.sqlite", {"site": "yard", "module": "arm", "topic": "/map"}
-    latched = TopicDescription(TEXT.type, TEXT.md5sum, TEXT.definition, True)
-    async with site_bed() as bed:
-        yard, hall = await asked(bed, "yard"), await asked(bed, "hall", seen=path)
-        source, chat = yard.site.graph.add("/map", latched), yard.site.graph.add("/chatter", TEXT)
-        topic, other = await hall.site.subscribed("/map"), await hall.site.subscribed("/chatter")
-        for body in (b"old walls", b"walls"):
-            yard.site.graph.send(source, body)
-        yard.site.graph.send(chat, b"hello")
-        await until(lambda: b"walls" in topic.messages and other.messages)
-        await yard.site.neighbour.close()
-        await until(lambda: hall.history.away == ("yard",))
-        (value,) = await hall.answers.answer(LAST, question)
-        assert (value.node, value.type, value.latching, value.seen_at) == ("/talker", TEXT.type, True, "hall")
-        assert value.definition == TEXT.definition
-        assert abs(value.stamp - time.time()) < 60
-        with pytest.raises(RmpaError, match="site yard is unreachable since"):
-            await hall.answers.answer(LAST, {**question, "topic": "/chatter"})
-    async with site_bed() as bed:
-        hall = await asked(bed, "hall", seen=path)
-        (value,) = await hall.answers.answer(LAST, question)
-        portion = await hall.answers.answer(BODY, {**question, "node": value.node, "offset": 0})
-        assert (portion.size, portion.data) == (5, b"walls")
-        (site,) = (await hall.report(INFO, site="yard")).sites
-        assert (site.state, [(each.module, each.topic) for each in site.values]) == ("unreachable", [("arm", "/map")])
-        assert [site.name for site in (await hall.report()).sites] == ["hall"], "it may never come again"
-        yard = await asked(bed, "yard")
-        yard.site.graph.add("/other", TEXT)
-        await until(lambda: hall.site.shows("/other"))
-        assert (await hall.report(INFO, site="yard")).sites[0].values == ()
-        (value,) = await hall.answers.answer(LAST, question)
-        assert value.seen_at == "hall", "its own gateway keeps none"
+            await hall.answers.answer(PARAM, {"site": "moon", "module": "arm"})
 
 
 async def test_questions_are_checked_before_they_are_passed_on() -> None:
@@ -272,10 +225,8 @@ async def test_questions_are_checked_before_they_are_passed_on() -> None:
         hall = await asked(bed, "hall")
         for what, args in (
             ("site.shout", {"site": "hall", "module": "arm"}),
-            (LAST, {"site": "ha ll", "module": "arm", "topic": "/x"}),
-            (LAST, {"site": "hall", "module": "*", "topic": "/x"}),
-            (LAST, {"site": "hall", "module": "arm", "topic": "x y"}),
-            (BODY, {"site": "hall", "module": "arm", "topic": "/x", "offset": -1}),
+            (PARAM, {"site": "ha ll", "module": "arm", "what": "param.get", "args": {}}),
+            (PARAM, {"site": "hall", "module": "*", "what": "param.get", "args": {}}),
             (PARAM, {"site": "hall", "module": "arm", "what": "param.get"}),
         ):
             with pytest.raises(RmpaError):

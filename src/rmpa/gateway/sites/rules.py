@@ -143,10 +143,6 @@ class CrossingRules:
         """Why the permissions, without the rules, do not let another site have a name; empty if they do."""
         return "" if self._permissions is None else self._permissions.why_not(access, site, name, askers, told)
 
-    def kept(self, module: str, name: str) -> bool:
-        """Whether the first rule that fits a topic of this site has its last value kept."""
-        return next((rule.keep for _, rule in self._fitting(module, name)), False)
-
     def incoming(
         self, kind: SourceKind, site: str, module: str, name: str, type_name: str, node: str
     ) -> CrossingDecision:

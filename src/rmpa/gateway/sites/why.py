@@ -115,7 +115,7 @@ class WhyAnswer(msgspec.Struct, kw_only=True, frozen=True):
         Raises:
             RemoteProtocolError: It is none.
         """
-        if len(data) > limits.VALUE_HEADER_MAX:
+        if len(data) > limits.SITE_WHY_MAX:
             raise RemoteProtocolError(f"an answer of rmpa why has {len(data)} bytes")
         try:
             return msgspec.json.decode(data, type=cls)

@@ -34,7 +34,6 @@ _ADDRESSED: Final = f"{_MODULE}/to/*"
 _TOPIC: Final = (
     *(f"{head}/t/*/{{}}{end}" for head in (_MODULE, _ADDRESSED) for end in ("", "/@batch", "/@adv/**")),
     f"{_MODULE}/d/t/{{}}",
-    f"{_MODULE}/v/{{}}",
 )
 _SERVICE: Final = (f"{_MODULE}/s/*/{{}}", f"{_ADDRESSED}/s/*/{{}}")
 _PARAM: Final = (f"{_MODULE}/p/{{}}",)

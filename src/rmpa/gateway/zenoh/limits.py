@@ -74,10 +74,10 @@ some 900. Longer ones are dropped, and counted as ``zenoh.key.long``."""
 ARRIVED_TOKEN_BYTES: Final = 64 * 1024 * 1024
 """Characters of the tokens that wait for the event loop."""
 REPLIES_MAX: Final = 20_000
-"""Answers to one query; further ones are dropped, and counted as ``zenoh.reply.limit``. The most that a gateway asks
-for are the last values of a site, of which it keeps 4,096."""
+"""Answers to one query; further ones are dropped, and counted as ``zenoh.reply.limit``. A gateway
+asks for one answer of each gateway of a site."""
 REPLY_BYTES_MAX: Final = 256 * 1024 * 1024
-"""Bytes of all answers to one query; one answer always fits. A gateway gives last values of 64 MiB at most."""
+"""Bytes of all answers to one query; one answer always fits."""
 ANSWER_BYTES_MAX: Final = 256 * 1024 * 1024
 """Bytes of answers that wait for Zenoh in all; one always fits. Above it a query ends without the answer, which is
 counted as ``zenoh.answer.limit``: a client that asks and does not read must not fill the memory."""

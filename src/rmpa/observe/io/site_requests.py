@@ -9,10 +9,8 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 from rmpa.bridge import limits
 from rmpa.bridge.permission_gate import OPEN_GATE, Needs, PermissionGate
 from rmpa.bridge.session.peer_rpc import UNKNOWN_QUESTION
-from rmpa.config import limits as config_limits
 from rmpa.config.permission_rules import Access
-from rmpa.core.errors import ConfigError, PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
-from rmpa.core.names import is_global_name
+from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
@@ -24,22 +22,17 @@ REPORT: Final = "site.report"
 """The request for a ``SitesReport`` without sources."""
 INFO: Final = "site.info"
 """The request for a ``SitesReport`` of one site with its sources: ``{site}``."""
-LAST: Final = "site.last"
-"""The request for the last values of a topic, ``LastValueInfo`` each: ``{site, module, topic}``."""
-BODY: Final = "site.last.body"
-"""The request for a ``ValuePortion``: ``{site, module, topic, node, offset}``."""
 PARAM: Final = "site.param"
 """A request about parameters (``bridge.params.transfer``) to a module: ``{site, module, what, args}``."""
 WHY: Final = "site.why"
 """The request for the ways of a topic or a service through gateways: ``{name, site, module, service}``."""
 _ALL: Final = (REPORT, WHY)
 """Those that every gateway answers for itself."""
-QUESTIONS: Final = (REPORT, INFO, LAST, BODY, PARAM, WHY)
+QUESTIONS: Final = (REPORT, INFO, PARAM, WHY)
 _SOURCES: Final = Needs(
     (Access.SUBSCRIBE, Access.CALL),
     "each topic and service; of this site the asking module's own alone. Sites and modules are named to all",
 )
-_VALUE: Final = Needs((Access.SUBSCRIBE,), "the topic; of this site the asking module's own alone")
 _PARAM: Final = Needs(
     (Access.PARAM,),
     "as `param.get` and its like, by this gateway, the other site's and the owner. None of this site",
@@ -69,8 +62,7 @@ class SiteRequests:
     Args:
         rpc: Carries requests between the modules.
         linked: Returns the sessions of the peers that are linked now.
-        gate: Decides which peers may read and set parameters of other sites by this gateway, and read last values;
-            and which ones are believed about other sites.
+        gate: Decides which peers are believed about other sites.
     """
 
     def __init__(
@@ -94,8 +86,6 @@ class SiteRequests:
         rpc = self._rpc
         rpc.on_request(REPORT, partial(self._answer_peer, gateway, REPORT), _SOURCES)
         rpc.on_request(INFO, partial(self._answer_peer, gateway, INFO), _SOURCES)
-        rpc.on_request(LAST, partial(self._answer_peer, gateway, LAST), _VALUE)
-        rpc.on_request(BODY, partial(self._answer_peer, gateway, BODY), _VALUE)
         rpc.on_request(PARAM, partial(self._answer_peer, gateway, PARAM), _PARAM)
         rpc.on_request(WHY, partial(self._answer_peer, gateway, WHY), _WAYS)
 
@@ -154,18 +144,9 @@ class SiteRequests:
         """The linked peers whose word about other sites counts: any member could answer as a gateway."""
         return [session for session in self._linked() if self._gate.may_relay(session.link.name)]
 
-    def _answer_peer(
-        self, gateway: SiteAnswerer, what: str, asker: PeerSession, args: dict[str, Any]
-    ) -> Awaitable[object]:
-        """Answer a linked module, which another site takes for this one's gateway: so it is judged here."""
-        peer = asker.link.name
-        if what in (LAST, BODY):
-            topic = str(args.get("topic", ""))
-            if len(topic) > config_limits.CROSSING_NAME_MAX or not is_global_name(topic):
-                raise RemoteProtocolError(f"{topic[:80]!r} is not a topic")  # before it comes into a log
-            if why := self._gate.why_not(Access.SUBSCRIBE, peer, topic):
-                raise PeerRefused(str(args.get("site", "")), why)
-        return gateway.answer(what, args, peer)
+    @staticmethod
+    def _answer_peer(gateway: SiteAnswerer, what: str, asker: PeerSession, args: dict[str, Any]) -> Awaitable[object]:
+        return gateway.answer(what, args, asker.link.name)
 
     async def _ask(
         self, session: PeerSession, what: str, args: dict[str, Any], wait: float

@@ -8,7 +8,7 @@ import pytest
 
 from rmpa.core.errors import UnreachableError
 from rmpa.gateway.ros2.io.answers import Ros2Answers
-from rmpa.observe.io.site_requests import INFO, LAST, REPORT, WHY
+from rmpa.observe.io.site_requests import INFO, PARAM, REPORT, WHY
 from rmpa.observe.sites import SiteInfo, SitesReport
 from tests.gateway.memory_zenoh import eventually
 from tests.gateway.ros2.io.ros2_bed import STRING, topic_bed
@@ -40,7 +40,7 @@ async def test_ros2_is_listed_with_its_topics_and_what_is_wrong_with_them() -> N
         ways = await alone.answer(WHY, {"name": "/chatter", "site": "ros2"})
         assert [(way.peer, way.node) for way in ways] == [("ros2", "/bot")]
         with pytest.raises(UnreachableError):
-            await alone.answer(LAST, {"site": "hall"})
+            await alone.answer(PARAM, {"site": "hall"})
 
 
 async def test_questions_about_sites_go_to_what_answers_for_them() -> None:
@@ -48,5 +48,5 @@ async def test_questions_about_sites_go_to_what_answers_for_them() -> None:
         both = Ros2Answers("gate", bed.neighbour, lambda: (), OtherSites())
         report: SitesReport = await both.answer(REPORT, {})
         assert [site.name for site in report.sites] == ["hall", "ros2"]
-        assert await both.answer(LAST, {"site": "hall"}) == ["of a site"]
+        assert await both.answer(PARAM, {"site": "hall"}) == ["of a site"]
         assert await both.answer(WHY, {"name": "/nothing"}) == ["of a site"]

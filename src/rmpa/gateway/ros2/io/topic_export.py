@@ -13,7 +13,6 @@ from rmpa.gateway.ros2.attachment import Ros2Attachment
 from rmpa.gateway.ros2.contract_qos import ros2_qos, zenoh_qos
 from rmpa.gateway.ros2.conversion import Conversion, ConversionError, NoConversion
 from rmpa.gateway.ros2.tokens import EntityKind
-from rmpa.gateway.sites.last_values import is_descriptor, may_be_latched
 from rmpa.gateway.sites.topic_limits import TopicLimits
 from rmpa.ros.types.header_types import type_of_header
 
@@ -30,6 +29,17 @@ if TYPE_CHECKING:
 
 _STATIC_TF: Final = "/tf_static"
 """Its publishers latch, in ROS 1 and ROS 2 (tf2_ros)."""
+_STREAMS: Final = frozenset(
+    (
+        "sensor_msgs/Image",
+        "sensor_msgs/CompressedImage",
+        "sensor_msgs/PointCloud",
+        "sensor_msgs/PointCloud2",
+        "sensor_msgs/LaserScan",
+        "stereo_msgs/DisparityImage",
+    )
+)
+"""Types of streams: their publishers are not asked whether they latch, since a driver may start by being asked."""
 
 
 class Ros2TopicExport:
@@ -65,7 +75,9 @@ class Ros2TopicExport:
         self.source: Final = source
         self._why = decision.why
         self._limit = TopicLimits(decision.rate, decision.size)
-        self._latching = source.name == _STATIC_TF or is_descriptor(source.name, source.type)
+        self._latching = source.name == _STATIC_TF or (
+            source.name.endswith("/descriptor") and source.type == "std_msgs/String"  # of a Smart Resource
+        )
         self._looks = looks
         self._was_described = asyncio.Event()
         self._tap: Tap | None = None
@@ -199,7 +211,7 @@ class Ros2TopicExport:
 
     async def _look(self) -> None:
         """Ask the publisher once for its header, unless a subscriber has it asked before."""
-        if not may_be_latched(self.source.type):
+        if self.source.type in _STREAMS:
             return
         await asyncio.sleep(limits.LATCH_LOOK_AFTER)
         async with self._looks:

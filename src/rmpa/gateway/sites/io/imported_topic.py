@@ -24,13 +24,9 @@ if TYPE_CHECKING:
     from rmpa.core.clock import Clock
     from rmpa.gateway.neighbour import OwnGraph
     from rmpa.gateway.sites.attachment import MessageSource
-    from rmpa.gateway.sites.keys import SiteModule
     from rmpa.gateway.sites.part import SiteImport
     from rmpa.gateway.zenoh_api import ZenohSession
     from rmpa.ros.wire.tcpros import TopicDescription
-
-    OnLatched = Callable[[SiteModule, str, str, TopicDescription, int, bytes], None]
-    """Module, topic and node there, the publisher's header, the stamp in nanoseconds since 1970, the message."""
 
 _log = logging.getLogger(__name__)
 
@@ -63,7 +59,6 @@ class ImportedTopic:
         on_demand: ``(topic, wanted)``: its key is to be subscribed to, or no longer.
         on_batches: ``(topic, offered)``: its gateway has said whether the topic can be had in batches, which were
             asked for, or it has to be asked anew.
-        on_latched: Called with each message of a latched topic that is understood here.
         interrupted: What ``close`` returned before, if the same topic was there and went.
     """
 
@@ -76,7 +71,6 @@ class ImportedTopic:
         clock: Clock,
         on_demand: Callable[[ImportedTopic, bool], None],
         on_batches: Callable[[ImportedTopic, bool], None],
-        on_latched: OnLatched,
         interrupted: InterruptedTopic | None = None,
     ) -> None:
         self.entry = entry
@@ -87,7 +81,6 @@ class ImportedTopic:
         self._on_batches = on_batches
         self._wants_batches = False
         self._judged_at, self._judged_messages, self._judged_bytes = clock.now(), 0, 0
-        self._on_latched = on_latched
         self.wanted = False
         """Whether its key is subscribed to for it."""
         self._description: TopicDescription | None = None
@@ -106,7 +99,6 @@ class ImportedTopic:
         self._fresh = False
         self._run = 0
         self._last_latched: bytes | None = None
-        self._latched_stamp = 0
         self._held_dropped = self._mismatched = self._dropped = 0
         self._task: asyncio.Task[None] | None = None
         self._linger: asyncio.TimerHandle | None = None
@@ -136,13 +128,11 @@ class ImportedTopic:
             renewed, self._run = source.run != self._run, source.run
             if renewed and payload == self._last_latched:
                 return  # another gateway of that site has taken over, and had it from the publisher again
-            self._last_latched, self._latched_stamp = payload, stamp
+            self._last_latched = payload
         if self._description is None or source.md5 != self._description.md5sum:
             self._hold(payload, source.md5)
         else:
             self._dropped += self._topic.publish(payload)
-            if source.latched:
-                self._keep(self._description)
 
     def take_batch(self, messages: list[memoryview], first: int, stamp: int, source: MessageSource) -> None:
         """Take messages that came together, each with its length in front; the first one has the number ``first``."""
@@ -357,15 +347,6 @@ class ImportedTopic:
                 self._dropped += self._topic.publish(payload)
             else:
                 self._mismatched += 1
-        if held and held[-1][1] == header.description.md5sum and header.description.latching:
-            self._keep(header.description)
-
-    def _keep(self, description: TopicDescription) -> None:
-        """Tell of the last message of a latched topic."""
-        announced = self.entry.announced
-        if self._last_latched is not None:
-            place = announced.module, announced.name, announced.node
-            self._on_latched(*place, description, self._latched_stamp, self._last_latched)
 
     def _hold(self, payload: bytes, md5: str) -> None:
         """Keep a message until the header is known, or known anew: its publisher has another definition."""

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import secrets
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rmpa.config.permission_rules import Access
-from rmpa.config.state_dir import module_dir, state_dir
 from rmpa.core.errors import UnreachableError
 from rmpa.gateway import limits
 from rmpa.gateway.graph.own_graph import AgentGraph
@@ -16,13 +13,10 @@ from rmpa.gateway.own_policy import OwnPolicy
 from rmpa.gateway.site_permissions import SitePermissions
 from rmpa.gateway.sites.history import SiteHistory
 from rmpa.gateway.sites.io.action_part import SiteActions
-from rmpa.gateway.sites.io.last_value_store import LastValueStore
-from rmpa.gateway.sites.io.last_values_part import SiteLastValues
 from rmpa.gateway.sites.io.neighbour import SiteNeighbour
 from rmpa.gateway.sites.io.param_exports import SiteParamExports
 from rmpa.gateway.sites.io.param_imports import SiteParamImports
 from rmpa.gateway.sites.io.param_part import SiteParams
-from rmpa.gateway.sites.io.seen_values import SiteSeenValues
 from rmpa.gateway.sites.io.service_part import SiteServices
 from rmpa.gateway.sites.io.site_answers import SiteAnswers
 from rmpa.gateway.sites.io.site_why import SiteWhy
@@ -57,20 +51,13 @@ def make_site_neighbour(
     permissions = None if agent is None else SitePermissions(agent.bridge.gate)
     rules = CrossingRules(gateway.rules, policy.judge, permissions)
 
-    def refusal(site: str, module: str, name: str) -> str:
-        return rules.refusal(site, module, name)
-
     def why_not(site: str, source: MeshSource) -> str:
         return rules.refusal(site, source.module, source.name, Access.CALL)
 
     counters = None if agent is None else agent.bridge.counters
     history = SiteHistory(clock.now)
-    store = _store_file(settings)
-    seen = SiteSeenValues(LastValueStore(store.with_suffix(".seen.sqlite") if store is not None else None))
     parts: list[SitePart] = [
-        SiteLastValues(gateway.site, session, graph, LastValueStore(store), rules.kept, refusal, clock.wall_ns),
-        seen,
-        SiteTopics(gateway.site, graph, session, rules, settings.make_contracts(), clock, seen.keep, counters),
+        SiteTopics(gateway.site, graph, session, rules, settings.make_contracts(), clock, counters),
         SiteServices(gateway.site, session, graph, policy.timeout, why_not, clock.wall_ns),
     ]
     own = SiteGateway(gateway.site, gateway.rank, secrets.token_hex(16))
@@ -80,7 +67,7 @@ def make_site_neighbour(
     if isinstance(graph, AgentGraph):
         neighbour.add(SiteActions(graph.attend))
     if agent is not None:
-        _add_questions(neighbour, agent, session, own, rules, history, seen, clock, settings.name)
+        _add_questions(neighbour, agent, session, own, rules, history, clock, settings.name)
     return neighbour
 
 
@@ -91,7 +78,6 @@ def _add_questions(
     own: SiteGateway,
     rules: CrossingRules,
     history: SiteHistory,
-    seen: SiteSeenValues,
     clock: SystemClock,
     name: str,
 ) -> None:
@@ -133,23 +119,12 @@ def _add_questions(
     answers = SiteAnswers(
         name,
         own,
-        session,
         neighbour,
         history,
-        seen,
         lambda: session.endpoints,
         imports.ask,
         why,
-        clock.wall_ns,
         may if gate.on else None,
     )
     neighbour.add(answers)
     agent.sites.serve(answers)
-
-
-def _store_file(settings: Settings) -> Path | None:
-    """The file of last values; ``None``: there is no state directory."""
-    if settings.gateway.store:
-        return Path(settings.gateway.store)
-    directory = state_dir(os.environ, settings.state_dir or None)
-    return module_dir(directory, settings.name) / "last-values.sqlite" if directory is not None else None

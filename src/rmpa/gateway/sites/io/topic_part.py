@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from rmpa.core.clock import Clock
     from rmpa.core.contract import Contracts
     from rmpa.gateway.neighbour import OwnGraph
-    from rmpa.gateway.sites.io.imported_topic import OnLatched
     from rmpa.gateway.sites.keys import SiteModule
     from rmpa.gateway.sites.part import SiteExport, SiteImport
     from rmpa.gateway.sites.rules import CrossingRules
@@ -42,7 +41,6 @@ class SiteTopics:
         rules: Tell which site may have which topic.
         contracts: The contracts of topics, which become Zenoh's QoS.
         clock: Both clocks.
-        on_latched: Called with each message of a latched topic of another site.
         counters: ``site.message.malformed``, ``site.message.looped``, ``site.message.unwanted_node``, and
             ``site.message.unkept``: a latched message of a node that no node here wants, and that found no room.
     """
@@ -57,10 +55,8 @@ class SiteTopics:
         rules: CrossingRules,
         contracts: Contracts,
         clock: Clock,
-        on_latched: OnLatched = lambda *_: None,
         counters: Counters | None = None,
     ) -> None:
-        self._on_latched = on_latched
         self._site = site
         self._graph = graph
         self._session = session
@@ -120,7 +116,6 @@ class SiteTopics:
                 self._clock,
                 self._on_demand,
                 self._on_batches,
-                self._on_latched,
                 interrupted,
             )
 
