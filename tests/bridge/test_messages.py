@@ -109,14 +109,6 @@ GOLDEN: list[tuple[Message, bytes]] = [
         b'{"op":"advertise","added":[],"removed":[{"topic":"/cmd","node":"/joy"}],"full":false,"more":false}',
     ),
     (
-        Advertise(unchanged=True),
-        b'{"op":"advertise","added":[],"removed":[],"full":false,"more":false,"unchanged":true}',
-    ),
-    (
-        AdvertiseServices(unchanged=True),
-        b'{"op":"services","added":[],"removed":[],"full":false,"more":false,"unchanged":true}',
-    ),
-    (
         OpenRoute(7, "/cmd", "/joy"),
         b'{"op":"open","route":7,"topic":"/cmd","node":"/joy",' + DEFAULT + b',"epoch":0,"after":0}',
     ),

@@ -19,7 +19,6 @@ from rmpa.bridge.actions import (
     Retract,
     Send,
 )
-from rmpa.bridge.catalogue.digest import digest_of
 from rmpa.bridge.messages import (
     Advertise,
     CloseRoute,
@@ -215,54 +214,3 @@ def test_after_it_settles_exactly_what_is_published_and_wanted_flows(steps: list
 
 topics = st.sampled_from(["/a", "/b", "/c"])
 nodes = st.sampled_from(["/n", "/m"])
-changes = st.lists(
-    st.tuples(topics, nodes, st.sampled_from(["a/B", "a/C", None]), st.sampled_from(["deliver", "lose", "wait"])),
-    max_size=20,
-)
-
-
-@settings(deadline=None)
-@given(changes)
-def test_equal_digests_are_equal_tables_and_a_copy_that_differs_is_mended(
-    made: list[tuple[str, str, str | None, str]],
-) -> None:
-    """Advertisements are lost on purpose; the digests say so, and sending all of it again mends it."""
-    world = World()
-    for topic, node, kind, what in made:
-        source = Source(topic, node)
-        if kind is None:
-            world.local.pop(source, None)
-        else:
-            world.local[source] = LocalSource(kind, "http://x/")
-        world.graph_changed(topic)
-        world.act(world.exports.advertise())
-        if what == "lose":
-            world.to_importer.clear()
-        elif what == "deliver":
-            while world.deliver():
-                pass
-    while world.deliver():
-        pass
-    offered = {(s.topic, s.node, local.type) for s, local in world.local.items()}
-
-    def held() -> set[tuple[str, str, str]]:
-        return {(offer.topic, offer.node, offer.type) for offer in world.imports.held(1) or ()}
-
-    def same() -> bool:
-        return digest_of(world.imports.held(1) or ()) == world.exports.digest(1)
-
-    assert same() == (held() == offered)
-    world.act(world.exports.again(1))
-    while world.deliver():
-        pass
-    assert same()
-    assert held() == offered
-    digest = world.exports.digest(1)
-    world.act([*world.exports.link_away(1)[0], *world.imports.link_away(1, briefly=True)[0]])
-    world.to_importer.clear()
-    world.act([*world.imports.link_up(1), *world.exports.link_up(1, held=digest)])
-    assert [decode(payload) for payload in world.to_importer] == [Advertise(unchanged=True)]
-    while world.deliver():
-        pass
-    assert held() == offered
-    assert world.exports.digest(1) == digest

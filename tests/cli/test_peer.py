@@ -11,7 +11,7 @@ import msgspec
 import pytest
 
 from rmpa.core.errors import RmpaError
-from rmpa.observe.peer_info import OffersInfo, PeerInfo
+from rmpa.observe.peer_info import PeerInfo
 from rmpa.observe.snapshot import PingReply
 from tests.observe.samples import SNAPSHOT
 
@@ -64,31 +64,6 @@ def test_list_as_json(place: Place, agent: Agent) -> None:
 def test_no_peers_says_where_it_looks(place: Place, agent: Agent) -> None:
     agent(snapshot=msgspec.structs.replace(SNAPSHOT, peers=(), notes=()))
     assert place.run("peer", "list") == (0, "base knows no peers yet (domain 3, looking on wlan0)\n", "")
-
-
-@pytest.mark.parametrize(
-    ("offers", "text"),
-    [
-        (OffersInfo(version=3, right=True), "version 3 is here as the peer told it\n"),
-        (OffersInfo(version=3), "version 3 is here, not compared\n"),
-        (OffersInfo(), "no version is held yet (a peer of an earlier release tells none)\n"),
-        (
-            OffersInfo(version=3, right=True, differed=2),
-            "version 3 is here as the peer told it; differed and was fetched again so far: 2\n",
-        ),
-        (
-            OffersInfo(version=3, right=False, differed=1),
-            "version 3 differs here from what the peer told; differed and was fetched again so far: 1\n",
-        ),
-    ],
-)
-def test_info_of_the_copy_of_a_peers_offers(place: Place, agent: Agent, offers: OffersInfo, text: str) -> None:
-    joystick, *others = SNAPSHOT.peers
-    agent(
-        snapshot=msgspec.structs.replace(SNAPSHOT, peers=(msgspec.structs.replace(joystick, offers=offers), *others))
-    )
-    _, out, _ = place.run("peer", "info", "joystick")
-    assert f"Offers:       {text}" in out
 
 
 def test_info(place: Place, agent: Agent) -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.guid import Guid
-from rmpa.mesh.handshake import Feature, HandshakeError, Hello, KnownLink, Lane, Refusal, Refuse, judge, judge_welcome
+from rmpa.mesh.handshake import HandshakeError, Hello, KnownLink, Lane, Refusal, Refuse, judge, judge_welcome
 from tests.mesh.worlds import HIGH, LOW
 
 if TYPE_CHECKING:
@@ -32,31 +32,6 @@ def test_golden_bytes() -> None:
     assert Refuse(2, "no").serialize() == b"\x00\x02no"
     assert Refuse.parse(b"\x00\x02no") == Refuse(2, "no")
     assert str(Refuse.parse(b"\x01\x00?")) == "code 256: ?"
-
-
-HELD = replace(HELLO, features=Feature.OFFERS, held=b"held")
-HELD_WIRE = WIRE[:44] + bytes.fromhex("00000010") + WIRE[48:] + b"\x04held"
-
-
-def test_golden_bytes_of_what_is_held() -> None:
-    assert HELD.serialize() == HELD_WIRE
-    assert Hello.parse(HELD_WIRE) == HELD
-    assert Hello.parse(HELD_WIRE + b"later") == HELD
-    nothing = replace(HELD, held=b"")
-    assert nothing.serialize() == HELD_WIRE[:-5] + b"\0"
-    assert Hello.parse(nothing.serialize()) == nothing
-
-
-def test_a_release_without_digests_says_nothing_of_them_and_reads_them_as_bytes_of_a_later_one() -> None:
-    assert replace(HELD, features=15).serialize() == WIRE[:44] + bytes.fromhex("0000000f") + WIRE[48:]
-    assert Hello.parse(HELD_WIRE[:44] + bytes.fromhex("0000000f") + HELD_WIRE[48:]).held == b""
-
-
-@pytest.mark.parametrize("cut", range(len(WIRE), len(HELD_WIRE)))
-def test_every_shorter_hello_that_holds_something_is_malformed(cut: int) -> None:
-    with pytest.raises(HandshakeError, match="the receiver's offers") as caught:
-        Hello.parse(HELD_WIRE[:cut])
-    assert caught.value.refuse.code == Refusal.MALFORMED
 
 
 @pytest.mark.parametrize("cut", range(len(WIRE)))
@@ -179,11 +154,9 @@ def test_unreachable_guid_is_malformed(place: str) -> None:
     lease=st.integers(1, 2**32 - 1),
     expected=st.integers(1, 2**64 - 1),
     lane=st.integers(0, 255),
-    held=st.binary(max_size=255),
 )
 def test_any_hello_survives(
-    guid: Guid, instance: bytes, name: str, domain: int, lease: int, expected: int, lane: int, held: bytes
+    guid: Guid, instance: bytes, name: str, domain: int, lease: int, expected: int, lane: int
 ) -> None:
-    features = Feature.OFFERS if held else 0
-    hello = Hello(guid, instance, name, domain, lease, Guid(expected), lane, features, held)
+    hello = Hello(guid, instance, name, domain, lease, Guid(expected), lane)
     assert Hello.parse(hello.serialize()) == hello

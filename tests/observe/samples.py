@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rmpa.observe.peer_info import BoundInfo, LinkInfo, OffersInfo, PeerInfo, ProbesInfo
+from rmpa.observe.peer_info import BoundInfo, LinkInfo, PeerInfo, ProbesInfo
 from rmpa.observe.snapshot import (
     AgentInfo,
     DetectorInfo,
@@ -55,7 +55,6 @@ SNAPSHOT = Snapshot(
             found_ago=62.0,
             beacon_ago=1.25,
             source="multicast",
-            offers=OffersInfo(version=3, right=True, differed=1),
             link=LinkInfo(
                 remote="10.0.0.2:40002",
                 dialled=True,

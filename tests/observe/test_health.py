@@ -9,7 +9,6 @@ import pytest
 
 from rmpa.observe import limits
 from rmpa.observe.health import HERE, Health, diagnostic_status
-from rmpa.observe.peer_info import OffersInfo
 from rmpa.observe.snapshot import EventInfo, FilesInfo, RouteInfo, ServiceInfo, Snapshot, UnreachableInfo
 from rmpa.ros.types.diagnostic_array import DiagnosticLevel, DiagnosticStatus
 from tests.observe.samples import DIRECT, SNAPSHOT, VIEWER
@@ -20,10 +19,7 @@ if TYPE_CHECKING:
 CMD = "rmpa: joystick: /cmd"
 JOYSTICK, PC = SNAPSHOT.peers
 (ROUTE,) = SNAPSHOT.topics[0].routes
-DIFFERS = (
-    "its topics and services differ here from what it told, and are fetched again; if that lasts, restart this agent "
-    "and report it with both releases"
-)
+
 HEALTHY = msgspec.structs.replace(ROUTE, events={}, recent=(), contract={}, oversized=0, oversized_bytes=270_000_000)
 
 
@@ -227,13 +223,6 @@ def test_sources_of_one_topic_have_unique_names() -> None:
         ),
         ({"state": "refused", "link": None, "last_error": "another domain"}, DiagnosticLevel.ERROR, "another domain"),
         ({"state": "conflict", "link": None, "conflicts": ("one GUID",)}, DiagnosticLevel.ERROR, "one GUID"),
-        ({"offers": OffersInfo(version=3, right=True)}, DiagnosticLevel.OK, "linked, round trip 0.43 ms"),
-        ({"offers": OffersInfo(version=3, right=False)}, DiagnosticLevel.WARN, DIFFERS),
-        (
-            {"state": "parked", "link": None, "offers": OffersInfo(version=3, right=False)},
-            DiagnosticLevel.WARN,
-            DIFFERS,
-        ),
     ],
 )
 def test_levels_of_a_peer(change: dict[str, object], expected: DiagnosticLevel, text: str) -> None:

@@ -107,7 +107,6 @@ class NetworkEndpoint:
             clock=clock,
             security=trust.membership if trust is not None else None,
             on_join=trust.on_join if trust is not None else None,
-            held=sessions.offers.held,
         )
         self.discovery = Discovery(
             self.identity,
@@ -224,8 +223,7 @@ class NetworkEndpoint:
             (link.remote_endpoint[0], link.identity.guid.port),
             answers_probes=bool(features & Feature.SWIM),
         )
-        held = remote.held if remote is not None else b""
-        self._bridge.sessions.link_up(link, compares=bool(features & Feature.OFFERS), held=held)
+        self._bridge.sessions.link_up(link)
 
     def _link_down(self, link: PeerLink, down: LinkDown) -> None:
         self._bridge.sessions.link_down(link)

@@ -17,9 +17,6 @@ ROUTE_LINGER: Final = 1.0
 ADVERTISED_AT_ONCE: Final = 64
 """Entries that one advertisement of this module takes from the pending changes; the rest follows in later turns of
 the event loop."""
-COMPARED_AT_ONCE: Final = 256
-"""Entries that are examined in one turn of the event loop, 2 microseconds each, for a peer that holds the catalogue
-already, so that nothing is sent."""
 TELL_PAUSE: Final = 0.005
 """Seconds until the next attempt to advertise, while the portions sent before still wait on the lane."""
 TELL_PATIENCE: Final = 0.1
@@ -213,15 +210,3 @@ REFRESH_RATE: Final = 100.0
 """Links a second that all modules together make to a parked peer that offers something new."""
 REFRESH_MAX: Final = 5.0
 """The longest delay of such a link, whatever the number of modules."""
-
-# --- digests of catalogues --------------------------------------------------------------------------------------
-REFETCH_PAUSE: Final = 5.0
-"""Seconds after which a catalogue that differs although it was fetched again is fetched once more; then twice as long
-each time. A peer is sent its copy no more often, whatever it asks for."""
-REFETCH_PAUSE_MAX: Final = 600.0
-"""The longest of these pauses: a difference that a fetch does not mend is an error of one side."""
-REFETCHED_AT_ONCE: Final = 16
-"""Peers of which the copies are fetched again each RECONCILE_INTERVAL, so that many differences make no storm."""
-AUDITED_AT_ONCE: Final = 64
-"""Entries of catalogues without a change that are compared again each RECONCILE_INTERVAL, at least those of one peer:
-less than 0.1 ms. The 20,000 topics of 1,000 modules take half an hour."""

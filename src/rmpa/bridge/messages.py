@@ -114,15 +114,12 @@ class Advertise(msgspec.Struct, frozen=True, tag_field="op", tag="advertise"):
         removed: Sources that are no longer offered.
         full: Whether this begins a full advertisement: sources that it does not contain are no longer offered.
         more: Whether the full advertisement continues in further messages.
-        unchanged: In place of the full advertisement: the sender offers what the receiver's hello says that it holds;
-            left out: no.
     """
 
     added: tuple[TopicOffer, ...] = ()
     removed: tuple[Source, ...] = ()
     full: bool = False
     more: bool = False
-    unchanged: bool | msgspec.UnsetType = msgspec.UNSET
 
 
 class OpenRoute(msgspec.Struct, frozen=True, tag_field="op", tag="open"):
@@ -238,7 +235,6 @@ class AdvertiseServices(msgspec.Struct, frozen=True, tag_field="op", tag="servic
     removed: tuple[str, ...] = ()
     full: bool = False
     more: bool = False
-    unchanged: bool | msgspec.UnsetType = msgspec.UNSET
 
 
 class OpenService(msgspec.Struct, frozen=True, tag_field="op", tag="service_open"):

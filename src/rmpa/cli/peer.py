@@ -23,7 +23,7 @@ from rmpa.observe.snapshot import PingReply
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rmpa.observe.peer_info import LaneInfo, LinkInfo, OffersInfo, PeerInfo, ProbesInfo
+    from rmpa.observe.peer_info import LaneInfo, LinkInfo, PeerInfo, ProbesInfo
     from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo
 
 _COLOURS: Final = {
@@ -232,8 +232,6 @@ def _facts(info: PeerInfo) -> list[tuple[str, str]]:
     ]
     if info.probes is not None:
         facts.append(("Probes", _probes_text(info.probes)))
-    if info.offers is not None:
-        facts.append(("Offers", offers_text(info.offers)))
     link = info.link
     if link is not None:
         who = "dialled by us" if link.dialled else "dialled by it"
@@ -258,19 +256,6 @@ def _facts(info: PeerInfo) -> list[tuple[str, str]]:
         facts.append(("Next attempt", f"in {duration(info.next_attempt)}"))
     facts += [("Limit", bound.text) for bound in info.beyond]
     return facts + [("Conflict", conflict) for conflict in info.conflicts]
-
-
-def offers_text(offers: OffersInfo) -> str:
-    """``version 3 is here as the peer told it``, and how often it was not; or that none is held."""
-    if offers.version is None:
-        return "no version is held yet (a peer of an earlier release tells none)"
-    state = {
-        True: "is here as the peer told it",
-        False: "differs here from what the peer told",
-        None: "is here, not compared",
-    }[offers.right]
-    times = f"; differed and was fetched again so far: {offers.differed}" if offers.differed else ""
-    return f"version {offers.version} {state}{times}"
 
 
 def _probes_text(probes: ProbesInfo) -> str:

@@ -146,7 +146,6 @@ class ConnectionProtocol:
         rest: The pace of all resting links of this agent.
         label: For log lines, until the remote side's name is known.
         prove: Judges whether the remote side is the module that its hello or welcome says; ``None`` accepts it.
-        held: ``(guid)``: what this side holds of a peer's offers, for the hello or welcome of an express lane.
     """
 
     def __init__(
@@ -165,7 +164,6 @@ class ConnectionProtocol:
         rest: RestPace | None = None,
         label: str = "?",
         prove: Callable[[Hello], Refuse | None] | None = None,
-        held: Callable[[Guid], bytes] = lambda _: b"",
     ) -> None:
         self.role = role
         self.clock = RemoteClock()
@@ -176,7 +174,6 @@ class ConnectionProtocol:
         self.on_data = on_data
         self.on_part = on_part if on_part is not None else _no_parts
         self._ours = ours
-        self._held = held
         self._wall_ns = wall_ns
         self._missing = 0
         """Bytes that are still missing of a data frame whose first bytes were handed on."""
@@ -196,8 +193,7 @@ class ConnectionProtocol:
         self._reason = ""
         self._output = bytearray()
         if role is ConnectionRole.DIALLER:
-            held_now = held(expected) if expected is not None and lane is Lane.EXPRESS else b""
-            hello = Hello.of(ours, lease=lease, expected=expected, lane=lane, held=held_now)
+            hello = Hello.of(ours, lease=lease, expected=expected, lane=lane)
             self._send(Frame(FrameKind.HELLO, hello.serialize()))
 
     @property
@@ -285,9 +281,8 @@ class ConnectionProtocol:
         hello = self._unanswered()
         if hello.lane == Lane.BULK:
             self._keepalive.promise(limits.BULK_LEASE)
-        held = self._held(hello.guid) if hello.lane == Lane.EXPRESS else b""
         lease = self._keepalive.lease
-        welcome = Hello.of(self._ours, lease=lease, expected=hello.guid, lane=hello.lane, held=held)
+        welcome = Hello.of(self._ours, lease=lease, expected=hello.guid, lane=hello.lane)
         self._send(Frame(FrameKind.WELCOME, welcome.serialize()))
         self._open(hello, now)
 

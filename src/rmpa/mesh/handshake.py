@@ -51,11 +51,9 @@ class Feature(IntFlag):
     """It answers the probes of failure detectors."""
     LANES = 8
     """It takes lane frames: the bulk lane is dialled when it is first wanted, and ends when it is not used."""
-    OFFERS = 16
-    """It compares catalogues by their digests; its hello says what it holds of the receiver's one."""
 
 
-FEATURES: Final = Feature.PACE | Feature.PARK | Feature.SWIM | Feature.LANES | Feature.OFFERS
+FEATURES: Final = Feature.PACE | Feature.PARK | Feature.SWIM | Feature.LANES
 """The features of this version."""
 
 
@@ -141,8 +139,6 @@ class Hello:
             hello's GUID.
         lane: What the connection is for; an ``int``, because a later version may know more lanes.
         features: What the sender can do, as bits of ``Feature``; a later version may have more.
-        held: With the feature ``OFFERS``: what the sender holds of the receiver's offers, at most 255 bytes, which
-            the mesh does not read; empty if it holds nothing that is known to be right.
     """
 
     guid: Guid
@@ -153,12 +149,9 @@ class Hello:
     expected: Guid | None = None
     lane: int = Lane.EXPRESS
     features: int = 0
-    held: bytes = b""
 
     @classmethod
-    def of(
-        cls, identity: Identity, *, lease: float, expected: Guid | None, lane: int = Lane.EXPRESS, held: bytes = b""
-    ) -> Hello:
+    def of(cls, identity: Identity, *, lease: float, expected: Guid | None, lane: int = Lane.EXPRESS) -> Hello:
         """The hello of this identity; ``lease`` in seconds."""
         return cls(
             identity.guid,
@@ -169,7 +162,6 @@ class Hello:
             expected,
             lane,
             FEATURES,
-            held,
         )
 
     @classmethod
@@ -201,9 +193,8 @@ class Hello:
         if not Guid(guid).dialable:
             # Discovery would gossip about this GUID, and no beacon may carry such a one.
             raise _malformed(f"no peer can be reached at {Guid(guid)}")
-        held = _parse_held(payload, _HELLO.size + size) if features & Feature.OFFERS else b""
         dialled = Guid(expected) if expected else None
-        return cls(Guid(guid), instance, name, domain, lease_ms, dialled, lane, features, held)
+        return cls(Guid(guid), instance, name, domain, lease_ms, dialled, lane, features)
 
     def serialize(self) -> bytes:
         """The bytes on the wire."""
@@ -221,8 +212,7 @@ class Hello:
             self.features,
             len(name),
         )
-        held = bytes((len(self.held),)) + self.held if self.features & Feature.OFFERS else b""
-        return head + name + held
+        return head + name
 
     @property
     def lease(self) -> float:
@@ -237,15 +227,6 @@ class Hello:
     def __str__(self) -> str:
         """``base (10.0.0.1:40001#7) domain 0``."""
         return f"{self.name} ({self.guid}) domain {self.domain}"
-
-
-def _parse_held(payload: Buffer, offset: int) -> bytes:
-    """What the sender holds of the receiver's offers: one byte of length, then that many bytes."""
-    size = payload[offset] if len(payload) > offset else 0
-    held = bytes(payload[offset + 1 : offset + 1 + size])
-    if len(payload) <= offset or len(held) != size:
-        raise _malformed("it is shorter than what it says of the receiver's offers")
-    return held
 
 
 def same_place(one: Guid, other: Guid) -> bool:

@@ -206,12 +206,6 @@ def _missing(route: RouteInfo) -> Counter[str]:
     )
 
 
-_OFFERS_DIFFER: Final = (
-    "its topics and services differ here from what it told, and are fetched again; if that lasts, restart this agent "
-    "and report it with both releases"
-)
-
-
 def _agent(snapshot: Snapshot) -> Check:
     linked = sum(info.state == _LINKED for info in snapshot.peers)
     notes, files = list(snapshot.notes), snapshot.agent.files
@@ -236,13 +230,9 @@ def _judge_peer(info: PeerInfo, dropped: int, *, was_linked: bool) -> tuple[Chec
         if dropped:
             return WARN, f"{dropped} messages dropped: the link takes them too slowly"
         troubles = [*info.conflicts, *(bound.text for bound in info.beyond)]
-        if info.offers is not None and info.offers.right is False:
-            troubles.append(_OFFERS_DIFFER)
         if troubles:
             return WARN, "; ".join(troubles)
         return OK, "linked" + (f", round trip {link.rtt * 1e3:.2f} ms" if link.rtt is not None else "")
-    if info.state == "parked" and info.offers is not None and info.offers.right is False:
-        return WARN, _OFFERS_DIFFER
     if info.state == "parked":
         return OK, "parked: nothing needs it now; it is linked again when something does"
     if info.state == "relayed":

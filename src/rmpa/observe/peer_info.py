@@ -108,21 +108,6 @@ class ProbesInfo(msgspec.Struct, kw_only=True, frozen=True):
     version: int | None = None
 
 
-class OffersInfo(msgspec.Struct, kw_only=True, frozen=True):
-    """This module's copy of what a peer offers.
-
-    Attributes:
-        version: The version that it has completely; ``None`` while it has none.
-        right: Whether its digests are those that the peer said; ``None`` while that is not known, as with a peer of
-            an earlier release.
-        differed: How often they were not, and the peer's topics and services were fetched again.
-    """
-
-    version: int | None = None
-    right: bool | None = None
-    differed: int = 0
-
-
 class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
     """One peer of the roster.
 
@@ -151,7 +136,6 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
         direct_in: Subscribers here that are connected to its nodes directly.
         direct_out: Its subscribers that may connect to nodes here directly.
         probes: What the failure detector holds of it, while it probes.
-        offers: This module's copy of what it offers.
     """
 
     name: str
@@ -174,4 +158,3 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
     direct_in: int = 0
     direct_out: int = 0
     probes: ProbesInfo | None = None
-    offers: OffersInfo | None = None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from rmpa.bridge import limits
-from rmpa.bridge.catalogue.digest import digest_of
 from rmpa.bridge.catalogue.offers import CataloguePeer, OfferCatalogue
 
 Peer = CataloguePeer[str, int, str, str]
@@ -114,80 +113,3 @@ def test_a_peer_without_a_link_is_told_nothing() -> None:
     changed(made, a=1)
     assert told(made) == {}
     assert (made.told(1, "a"), made.beginning(1), made.peer(1)) == (None, False, None)
-
-
-# --- digests ---------------------------------------------------------------------------------------------------
-
-
-def test_the_digest_is_that_of_what_a_peer_was_told() -> None:
-    made = catalogue()
-    changed(made, a=1, b=1)
-    made.link_up(1, "shouts", "", judged=True)
-    assert made.digest(1) == digest_of(["A", "B"])
-    changed(made, c=1, a=-1)
-    assert made.digest(1) is None, "it was not told all"
-    told(made)
-    assert made.digest(1) == digest_of(["B", "C"])
-    changed(made, b=2)
-    assert told(made) == {1: (["B"], [])}, "renewed, and the same offer"
-    assert made.digest(1) == digest_of(["B", "C"])
-    assert made.digest(2) is None
-
-
-def test_a_peer_that_holds_the_catalogue_is_sent_one_word() -> None:
-    made = catalogue()
-    changed(made, **{f"e{number:03}": 1 for number in range(limits.COMPARED_AT_ONCE + 1)})
-    held = digest_of(made.offered)
-    first = made.link_up(1, "far", "", judged=False, held=held)
-    assert not first.is_news
-    assert made.beginning(1)
-    [(_, last)] = made.portions(lambda _: True)
-    assert (last.unchanged, last.is_news, last.added, last.removed, last.full) == (True, True, [], [], False)
-    assert (made.beginning(1), made.pending, made.digest(1)) == (False, False, held)
-    changed(made, e000=-1, new=1)
-    assert told(made) == {1: (["new"], ["e000"])}
-
-
-def test_a_peer_that_holds_something_else_is_sent_everything() -> None:
-    made = catalogue()
-    changed(made, a=1, b=1)
-    first = made.link_up(1, "far", "", judged=False, held=digest_of(["a"]))
-    assert (first.added, first.full, first.complete, first.unchanged) == (["a", "b"], True, True, False)
-    assert made.digest(1) == digest_of(["a", "b"])
-
-
-def test_what_changes_while_a_held_catalogue_is_examined_is_not_lost() -> None:
-    made = catalogue()
-    changed(made, **{f"e{number:03}": 1 for number in range(limits.COMPARED_AT_ONCE + 1)})
-    made.link_up(1, "far", "", judged=False, held=digest_of(made.offered))
-    changed(made, e000=-1, new=1)
-    sent: set[str] = set()
-    while made.pending:
-        for _, portion in made.portions(lambda _: True):
-            assert portion.full == (not sent)
-            sent |= set(portion.added)
-    assert sent == {*made.offered} - {"e000"}
-    assert made.digest(1) == digest_of(sent)
-
-
-def test_the_catalogue_is_sent_again_in_portions_while_it_changes() -> None:
-    made = catalogue()
-    changed(made, **{f"e{number:03}": 1 for number in range(limits.ADVERTISED_AT_ONCE + 1)})
-    made.link_up(1, "far", "", judged=False)
-    assert made.again(1) is None, "it is being sent"
-    told(made)
-    changed(made, e000=-1)
-    first = made.again(1)
-    assert first is not None
-    assert (first.full, first.more, first.removed) == (True, True, ["e000"])
-    assert made.again(1) is None
-    [(_, rest)] = made.portions(lambda _: True)
-    assert (rest.full, rest.complete) == (False, True)
-    assert {*first.added, *rest.added} == {*made.offered} - {"e000"}
-    assert not made.pending
-    assert made.again(2) is None
-    empty = catalogue()
-    empty.link_up(1, "far", "", judged=False)
-    portion = empty.again(1)
-    assert portion is not None
-    assert (portion.full, portion.complete, portion.is_news) == (True, True, True)

@@ -12,7 +12,6 @@ from rmpa.bridge.io.bridge import Bridge
 from rmpa.bridge.messages import Advertise, AdvertiseServices, TopicOffer, encode, op_of
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.session.part import Part
-from rmpa.bridge.session.peer_session import OfferCopy
 from rmpa.config import limits as config_limits
 from rmpa.config.settings import PolicySettings
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
@@ -34,7 +33,7 @@ class Core:
 @pytest.fixture
 async def bridge(monkeypatch: pytest.MonkeyPatch) -> Bridge:
     made = Bridge(cast("RosCore", Core()), Policy(PolicySettings()), rng=lambda: 0.5)
-    session = SimpleNamespace(peer=1, copy=OfferCopy())
+    session = SimpleNamespace(peer=1)
     monkeypatch.setattr(made.sessions, "of", lambda link: session if link is LINK else None)
     return made
 

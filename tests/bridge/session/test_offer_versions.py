@@ -29,7 +29,7 @@ class Scene:
         self.versions = OfferVersions(lambda: [self.session], self._want, lambda: 1.0)
         handlers: dict[str, Callable[[PeerSession, dict[str, Any]], None]] = {}
         rpc = SimpleNamespace(on_notification=lambda what, told, _needs: handlers.__setitem__(what, told))
-        self.versions.listen(cast("Any", rpc), cast("Any", None))
+        self.versions.listen(cast("Any", rpc))
         self._told = handlers[OFFERS]
 
     def hear(self, version: int) -> None:

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 
 from rmpa.bridge import limits
 from rmpa.bridge.actions import Warn
-from rmpa.bridge.catalogue.digest import with_entry, without_entry
 from rmpa.bridge.catalogue.peer_limits import Beyond
 
 if TYPE_CHECKING:
@@ -40,11 +39,6 @@ class CataloguePeer(Generic[KeyT, LocalT, OfferT, WireT]):
         by_wire: The keys of ``told``, by name on the wire.
         behind: By name on the wire: keys of entries that are not sent because an entry in ``by_wire`` has that name.
         beginning: Whether the peer has not been sent the complete catalogue yet.
-        digest: The digest of ``told``.
-        held: The digest of the catalogue that the peer holds from its last link. Until all entries are examined it is
-            sent nothing; then one word if this is the digest of ``told``, else the complete catalogue. ``None``: the
-            peer is sent each portion.
-        again: Keys of ``told`` that are sent once more, although nothing has changed.
         fresh: Whether the next portion is the first one of a complete catalogue.
     """
 
@@ -56,9 +50,6 @@ class CataloguePeer(Generic[KeyT, LocalT, OfferT, WireT]):
     by_wire: dict[WireT, KeyT] = field(default_factory=dict)
     behind: dict[WireT, list[KeyT]] = field(default_factory=dict)
     beginning: bool = True
-    digest: int = 0
-    held: int | None = None
-    again: set[KeyT] = field(default_factory=set)
     fresh: bool = True
 
 
@@ -67,12 +58,11 @@ class Portion(Generic[KeyT, OfferT, WireT]):
     """What one peer is to be sent now.
 
     Args:
-        added: New or changed offers, and offers that are repeated.
+        added: New or changed offers.
         removed: Names on the wire that are no longer offered.
         full: Whether the complete catalogue begins with this portion.
         more: Whether the complete catalogue goes on with the next portion.
         complete: Whether the complete catalogue ends with this portion.
-        unchanged: Whether the peer holds the complete catalogue already, from its last link.
         ended: Keys of entries that the peer may no longer have, or now has under another name.
         taken: Entries that are not sent because another entry has their name on the wire: key, offer, key of the
             other.
@@ -83,14 +73,13 @@ class Portion(Generic[KeyT, OfferT, WireT]):
     full: bool = False
     more: bool = False
     complete: bool = False
-    unchanged: bool = False
     ended: list[KeyT] = field(default_factory=list)
     taken: list[tuple[KeyT, OfferT, KeyT]] = field(default_factory=list)
 
     @property
     def is_news(self) -> bool:
         """Whether there is anything to send."""
-        return bool(self.added or self.removed or self.full or self.complete or self.unchanged)
+        return bool(self.added or self.removed or self.full or self.complete)
 
 
 class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
@@ -181,9 +170,7 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
 
     # --- peers -------------------------------------------------------------------------------------------------
 
-    def link_up(
-        self, peer: int, name: str, instance: str, *, judged: bool, held: int | None = None
-    ) -> Portion[KeyT, OfferT, WireT]:
+    def link_up(self, peer: int, name: str, instance: str, *, judged: bool) -> Portion[KeyT, OfferT, WireT]:
         """Add a linked peer; return the first portion of the complete catalogue. ``portions`` yields the rest.
 
         Args:
@@ -191,36 +178,10 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
             name: The peer's name.
             instance: The peer's run, as 32 hexadecimal digits.
             judged: Whether each entry is judged or renamed for this peer.
-            held: The digest of what the peer holds of the catalogue, of the present version; ``None``: nothing.
         """
-        self._peers[peer] = CataloguePeer(name, instance, judged, dict.fromkeys(self._offered), held=held)
+        self._peers[peer] = CataloguePeer(name, instance, judged, dict.fromkeys(self._offered))
         self._with_news[peer] = None
         return self._portion(self._peers[peer])
-
-    def again(self, peer: int) -> Portion[KeyT, OfferT, WireT] | None:
-        """Send a linked peer the complete catalogue once more; ``None`` while the complete one is being sent.
-
-        Returns:
-            The first portion; ``portions`` yields the rest.
-        """
-        known = self._peers.get(peer)
-        if known is None or known.beginning:
-            return None
-        self._begin_again(known)
-        self._with_news[peer] = None
-        return self._portion(known)
-
-    @staticmethod
-    def _begin_again(known: CataloguePeer[KeyT, LocalT, OfferT, WireT]) -> None:
-        known.beginning = known.fresh = True
-        known.held = None
-        known.again = set(known.told)
-        known.news.update(dict.fromkeys(known.told))
-
-    def digest(self, peer: int) -> int | None:
-        """The digest of what a linked peer was sent; ``None`` while that is not the complete catalogue."""
-        known = self._peers.get(peer)
-        return known.digest if known is not None and not known.beginning and not known.news else None
 
     def link_down(self, peer: int) -> None:
         """Forget a peer and what it has been sent."""
@@ -285,65 +246,37 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
             yield number, self._portion(known)
 
     def _portion(self, known: CataloguePeer[KeyT, LocalT, OfferT, WireT]) -> Portion[KeyT, OfferT, WireT]:
-        if known.held is not None:
-            return self._held_portion(known, known.held)
-        portion = self._examined(known, limits.ADVERTISED_AT_ONCE)
+        portion = self._examined(known)
         portion.full, known.fresh = known.fresh, False
         portion.more = known.beginning and bool(known.news)
         portion.complete = known.beginning and not portion.more
         known.beginning = portion.more
         return portion
 
-    def _held_portion(
-        self, known: CataloguePeer[KeyT, LocalT, OfferT, WireT], held: int
-    ) -> Portion[KeyT, OfferT, WireT]:
-        """Examines entries of which nothing is sent, because the peer holds the catalogue in all likelihood."""
-        examined = self._examined(known, limits.COMPARED_AT_ONCE)
-        quiet: Portion[KeyT, OfferT, WireT] = Portion(ended=examined.ended, taken=examined.taken)
-        if known.news:
-            return quiet
-        if known.digest != held:
-            self._begin_again(known)
-            portion = self._portion(known)
-            portion.ended, portion.taken = quiet.ended + portion.ended, quiet.taken + portion.taken
-            return portion
-        known.held, known.beginning, known.fresh = None, False, False
-        quiet.unchanged = True
-        return quiet
-
-    def _examined(
-        self, known: CataloguePeer[KeyT, LocalT, OfferT, WireT], at_once: int
-    ) -> Portion[KeyT, OfferT, WireT]:
+    def _examined(self, known: CataloguePeer[KeyT, LocalT, OfferT, WireT]) -> Portion[KeyT, OfferT, WireT]:
         """Examines entries for a peer; the portion has what it is to be sent of them."""
         portion: Portion[KeyT, OfferT, WireT] = Portion()
-        for key in tuple(islice(known.news, at_once)):
+        for key in tuple(islice(known.news, limits.ADVERTISED_AT_ONCE)):
             del known.news[key]
-            again = key in known.again
-            known.again.discard(key)
             local = self._offered.get(key)
             offer = self._offer(known, key, local) if local is not None else None
             before = known.told.get(key)
             if before is not None and (offer is None or self._wire(offer) != self._wire(before[0])):
                 wire = self._wire(before[0])
                 del known.told[key], known.by_wire[wire]
-                known.digest = without_entry(known.digest, before[0])
                 portion.removed.append(wire)
                 portion.ended.append(key)
                 known.news.update(dict.fromkeys(known.behind.pop(wire, ())))
                 before = None
             if local is None or offer is None:
                 continue
-            if before is not None and offer == before[0] and not again and not self._renewed(before[1], local):
+            if before is not None and offer == before[0] and not self._renewed(before[1], local):
                 continue
             holder = known.by_wire.setdefault(self._wire(offer), key)
             if holder != key:
                 known.behind.setdefault(self._wire(offer), []).append(key)
                 portion.taken.append((key, offer, holder))
                 continue
-            if before is None or offer != before[0]:
-                known.digest = with_entry(known.digest, offer)
-                if before is not None:
-                    known.digest = without_entry(known.digest, before[0])
             known.told[key] = (offer, local)
             portion.added.append(offer)
         return portion

@@ -171,11 +171,6 @@ class Surplus(Generic[_Thing]):
     def __contains__(self, key: object) -> bool:
         return key in self._known
 
-    @property
-    def forgotten(self) -> int:
-        """The number of offers that are only counted."""
-        return self._forgotten
-
     def __iter__(self) -> Iterator[_Thing]:
         return iter(self._known.values())
 

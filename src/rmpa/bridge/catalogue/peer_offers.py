@@ -82,25 +82,6 @@ class PeerOffers(Generic[WireT, EntryT, OfferT]):
         for begin in range(0, len(added), step):
             yield Change(added=added[begin : begin + step])
 
-    def confirm_all(self, offers: Callable[[], list[OfferT]]) -> Iterator[Change[OfferT, WireT]]:
-        """Split what is held into portions, as if the peer had advertised it again; nothing is removed.
-
-        Args:
-            offers: Returns the offers that ``entries`` was made of.
-        """
-        self.doubtful = set()
-        held, step = offers(), limits.APPLIED_AT_ONCE
-        for begin in range(0, len(held), step):
-            yield Change(added=tuple(held[begin : begin + step]))
-
-    def held(self, offers: Callable[[], list[OfferT]]) -> list[OfferT] | None:
-        """All offers of the peer, those beyond the limit too; ``None`` if some were only counted.
-
-        Args:
-            offers: Returns the offers that ``entries`` was made of.
-        """
-        return None if self.surplus.forgotten else [*offers(), *self.surplus]
-
     def admitted(self, limit: int) -> OfferT | None:
         """Take the offer in surplus that has waited longest.
 

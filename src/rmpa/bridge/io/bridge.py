@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from rmpa.bridge import limits
 from rmpa.bridge.data.io.receiver import DataReceiver
 from rmpa.bridge.io.proxy_kills import ProxyKills
-from rmpa.bridge.messages import Advertise, AdvertiseServices, decode, op_of
+from rmpa.bridge.messages import decode, op_of
 from rmpa.bridge.naming import Names
 from rmpa.bridge.permission_gate import PermissionGate
 from rmpa.bridge.policy import OWN_NODE, Policy
@@ -20,7 +20,7 @@ from rmpa.bridge.session.proxy_nodes import ProxyNodes
 from rmpa.bridge.topics.io.part import Topics
 from rmpa.config.settings import LimitSettings
 from rmpa.core.contract import Contracts
-from rmpa.core.counters import Counters, RefusalLog
+from rmpa.core.counters import Counters
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.runtime.coarse_timer import call_at_tick
@@ -114,7 +114,7 @@ class Bridge:
             find=self.proxy_nodes.publication,
         )
         self.add(self.topics)
-        self.sessions.offers.listen(self.rpc, RefusalLog(_log, self.counters))
+        self.sessions.offers.listen(self.rpc)
         self._reconciler: asyncio.TimerHandle | None = None
 
     def add(self, part: Part) -> None:
@@ -126,7 +126,6 @@ class Bridge:
     def place(self, identity: Identity) -> None:
         """Set this agent's identity, before the first link; its own sources that a relay brings back are hidden."""
         self.relay.instance = identity.instance.hex()
-        self.sessions.offers.instance = identity.instance
 
     def reload(self, settings: Settings) -> None:
         """Take new settings; unchanged sources and routes go on, changes follow in later turns of the loop."""
@@ -170,12 +169,9 @@ class Bridge:
         part = self._by_op.get(op_of(payload))
         if part is not None:
             # Parsing takes long, and this is called from a reader of data: so it is done later.
-            self.sessions.offers.advertised(session)
             part.advertised(session, bytes(payload))
             return
         message = decode(payload)
-        if isinstance(message, Advertise | AdvertiseServices):
-            self.sessions.offers.advertised(session)
         if not any(part.message(session, message) for part in self._parts):
             raise RemoteProtocolError(f"a message of kind {type(message).__name__} that no part here takes")
 

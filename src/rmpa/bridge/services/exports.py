@@ -241,7 +241,7 @@ class ServiceExports:
 
     # --- advertising -------------------------------------------------------------------------------------------
 
-    def link_up(self, peer: int, name: str, instance: str = "", held: int | None = None) -> list[ExportAction]:
+    def link_up(self, peer: int, name: str, instance: str = "") -> list[ExportAction]:
         """Begin the advertisement to a peer; ``advertise`` goes on with it.
 
         What came from this very run of the peer is not offered to it.
@@ -250,19 +250,9 @@ class ServiceExports:
             peer: The peer's number.
             name: The peer's name.
             instance: The peer's run, as 32 hexadecimal digits.
-            held: The digest of what the peer holds of the present version; ``None``: nothing.
         """
         self._peers[peer] = _Callers()
-        return _told_portion(peer, self._catalogue.link_up(peer, name, instance, judged=False, held=held))
-
-    def again(self, peer: int) -> list[ExportAction]:
-        """Begin the advertisement to a linked peer once more; ``advertise`` goes on with it."""
-        first = self._catalogue.again(peer)
-        return _told_portion(peer, first) if first is not None else []
-
-    def digest(self, peer: int) -> int | None:
-        """The digest of what a linked peer was told; ``None`` while it was not told all."""
-        return self._catalogue.digest(peer)
+        return _told_portion(peer, self._catalogue.link_up(peer, name, instance, judged=False))
 
     def link_down(self, peer: int) -> list[ExportAction]:
         """End all routes of a peer whose link is gone."""
@@ -388,8 +378,6 @@ class ServiceExports:
 
 def _told_portion(peer: int, portion: _Portion) -> list[ExportAction]:
     """Makes the message of a portion, if there is one."""
-    if portion.unchanged:
-        return [Send(peer, AdvertiseServices(unchanged=True))]
     if not portion.is_news:
         return []
     message = AdvertiseServices(tuple(portion.added), tuple(portion.removed), portion.full, portion.more)

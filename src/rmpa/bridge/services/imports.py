@@ -239,14 +239,7 @@ class ServiceImports:
         known, full, more = self._peers.get(peer), message.full, message.more
         if known is None:
             return iter(())
-        if message.unchanged is True:
-            return iter(())  # also what the servers said of them: the peer's version counts each change of a server
         return known.changes(message.added, message.removed, lambda offer: offer.service, full=full, more=more)
-
-    def held(self, peer: int) -> list[ServiceOffer] | None:
-        """All that a peer offers, as it was received; ``None`` if some offers were only counted."""
-        known = self._peers.get(peer)
-        return known.held(lambda: _offers(known)) if known is not None else []
 
     def take_in(self, peer: int, change: Change[ServiceOffer, str]) -> list[ImportAction]:
         """Apply a portion of a peer's advertisement."""
@@ -561,7 +554,3 @@ class ServiceImports:
         if state not in TRANSITIONS[remote.state]:
             raise LocalProtocolError(f"{remote.wire}: {remote.state.name} does not lead to {state.name}")
         remote.state = state
-
-
-def _offers(known: _ServiceImportPeer) -> list[ServiceOffer]:
-    return [ServiceOffer(wire, remote.node, remote.origin) for wire, remote in known.entries.items()]

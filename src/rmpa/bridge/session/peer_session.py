@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import TYPE_CHECKING
@@ -10,7 +9,6 @@ from typing import TYPE_CHECKING
 from rmpa.bridge.data.io.link_time import LinkTime
 
 if TYPE_CHECKING:
-    from rmpa.bridge.catalogue.digest import HeldOffers
     from rmpa.bridge.data.io.receiver import DataHandler
     from rmpa.bridge.session.peer_proxies import PeerProxies
     from rmpa.mesh.io.link import PeerLink
@@ -40,27 +38,6 @@ class PeerState(Enum):
     """It has no link, and a part of the bridge keeps something for it."""
 
 
-@dataclass(slots=True)
-class OfferCopy:
-    """This module's copy of a peer's offers, and whether it is what the peer told (``session.offer_copies``).
-
-    Args:
-        said: The digests of topics and services that the peer said; ``None`` while it has told more since.
-        right: Whether the copy has these digests; ``None`` while it was not compared.
-        differed: How often it did not, and was fetched again.
-        in_a_row: How often it differed since it was last right.
-        due: Monotonic seconds before which it is not fetched again.
-        sent_again: Monotonic seconds at which this module last sent the peer its own offers again.
-    """
-
-    said: tuple[int, int] | None = None
-    right: bool | None = None
-    differed: int = 0
-    in_a_row: int = 0
-    due: float = 0.0
-    sent_again: float = -math.inf
-
-
 @dataclass(slots=True, eq=False)
 class PeerSession:
     """One run of a peer.
@@ -78,10 +55,6 @@ class PeerSession:
         offers_held: The version of the peer's offers that this module has completely.
         offers_heard: The highest version of the peer's offers that this module heard of.
         unparked: Whether its link is the one after it was parked: nothing was interrupted.
-        copy: This module's copy of the peer's offers, and whether it is right.
-        compares: Whether the peer compares catalogues by their digests, which it is told.
-        held_there: What the peer's hello says that it holds of this module's offers, if that is of the present
-            version.
     """
 
     peer: int
@@ -96,9 +69,6 @@ class PeerSession:
     offers_told: int | None = None
     offers_held: int | None = None
     offers_heard: int = 0
-    copy: OfferCopy = field(default_factory=OfferCopy)
-    compares: bool = False
-    held_there: HeldOffers | None = None
 
     @property
     def reachable(self) -> bool:

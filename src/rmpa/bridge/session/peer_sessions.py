@@ -101,14 +101,8 @@ class PeerSessions:
 
     # --- links ---------------------------------------------------------------------------------------------------
 
-    def link_up(self, link: PeerLink, *, compares: bool = False, held: bytes = b"") -> None:
-        """Attach a link to the session that waits for it, or begin a session.
-
-        Args:
-            link: The link.
-            compares: Whether the peer compares catalogues by their digests.
-            held: What the peer's hello says that it holds of this module's offers.
-        """
+    def link_up(self, link: PeerLink) -> None:
+        """Attach a link to the session that waits for it, or begin a session."""
         session = self._waiting_for(link)
         if session is not None:
             session.unparked = session.state in (PeerState.PARKED, PeerState.WANTED)
@@ -118,7 +112,7 @@ class PeerSessions:
             session = self._begin(link)
         session.time.resumed_at = lambda: link.resumed_at
         self._by_link[link] = session
-        self.offers.link_up(session, compares=compares, held=held)
+        self.offers.link_up(session)
         self._receiver.link_up(link, session.peer, session.handlers)
         for part in self._parts:
             with guarded(part):

@@ -348,9 +348,7 @@ class Exports:
             name = known.name if known is not None else ""
             text = f"{source} would be {offer.topic} at {name}, as {holder.topic} is already: rename one"
             actions.append(Warn("names.taken", f"{peer} {source}", text))
-        if portion.unchanged:
-            actions.append(Send(peer, Advertise(unchanged=True)))
-        elif portion.is_news:
+        if portion.is_news:
             message = Advertise(tuple(portion.added), tuple(portion.removed), portion.full, portion.more)
             actions.append(Send(peer, message))
         return actions
@@ -370,27 +368,17 @@ class Exports:
             return None
         return TopicOffer(wire, source.node, local.type, local.origin)
 
-    def link_up(self, peer: int, name: str = "", instance: str = "", held: int | None = None) -> list[Action]:
+    def link_up(self, peer: int, name: str = "", instance: str = "") -> list[Action]:
         """Begins the full advertisement on a new link; ``advertise`` continues it.
 
         Args:
             peer: The peer's number.
             name: The peer's name, which selects the rules for it.
             instance: The peer's run, as 32 hexadecimal digits; its own sources are not relayed back to it.
-            held: The digest of what the peer holds of the present version; ``None``: nothing.
         """
         self._routes[peer] = {}
-        first = self._catalogue.link_up(peer, name, instance, judged=self._is_judged(name), held=held)
+        first = self._catalogue.link_up(peer, name, instance, judged=self._is_judged(name))
         return self._told_portion(peer, first)
-
-    def again(self, peer: int) -> list[Action]:
-        """Begins the full advertisement once more, on a link that stays; ``advertise`` continues it."""
-        first = self._catalogue.again(peer)
-        return self._told_portion(peer, first) if first is not None else []
-
-    def digest(self, peer: int) -> int | None:
-        """The digest of what a linked peer was told; ``None`` while it was not told all."""
-        return self._catalogue.digest(peer)
 
     def _is_judged(self, name: str) -> bool:
         return self._gate.on or not self._names.of(name).plain or self._policy.has_rules_for(name)

@@ -340,14 +340,7 @@ class Imports:
     def portions(self, peer: int, message: Advertise) -> Iterator[Change[TopicOffer, Source]]:
         """Split an advertisement into portions, each small enough for one call of ``take_in``."""
         known, full, more = self._peers[peer], message.full, message.more
-        if message.unchanged is True:
-            return known.confirm_all(lambda: _offers(known))
         return known.changes(message.added, message.removed, lambda offer: offer.source, full=full, more=more)
-
-    def held(self, peer: int) -> list[TopicOffer] | None:
-        """All that a peer offers, as it was received; ``None`` if some offers were only counted."""
-        known = self._peers.get(peer)
-        return known.held(lambda: _offers(known)) if known is not None else []
 
     def take_in(self, peer: int, change: Change[TopicOffer, Source], now: float) -> list[Action]:
         """Applies a portion of an advertisement: sources that the peer has added or removed."""
@@ -577,10 +570,6 @@ class Imports:
             if self.ways.remove(peer, entry.origin):
                 actions += self._ways_changed({instance})
         return actions
-
-
-def _offers(known: _ImportPeer) -> list[TopicOffer]:
-    return [TopicOffer(s.topic, s.node, entry.type, entry.origin) for s, entry in known.entries.items()]
 
 
 def _gone(peer: int, sources: dict[Source, RemoteTopic]) -> Iterator[Action]:

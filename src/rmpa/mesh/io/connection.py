@@ -68,10 +68,6 @@ class ConnectionOwner(Protocol):
         """Compare the hello or welcome of a secured connection with its certificate; ``None`` accepts it."""
         ...
 
-    def connection_held(self, guid: Guid) -> bytes:
-        """What this agent holds of a peer's offers, for the hello or welcome to it."""
-        ...
-
     def connection_opened(self, connection: Connection) -> None:
         """The handshake succeeded."""
         ...
@@ -197,7 +193,6 @@ class Connection:
             lease=limits.BULK_LEASE if lane is Lane.BULK else limits.EXPRESS_LEASE,
             label=f"{endpoint[0]}:{endpoint[1]}",
             prove=None if secured is None else partial(owner.connection_prove, self),
-            held=owner.connection_held,
             rest=rest,
         )
         self._timer = MachineTimer(self._machine.next_timer, self._due, now=clock.now)

@@ -84,7 +84,6 @@ class Mesh:
         dialler: Opens the connections; by default real ones.
         security: This module's membership of a secured mesh: all links use TLS then; ``None``: none does.
         on_join: Takes accepted connections for a join or a renewal, with their prefaces.
-        held: ``(guid)``: what this agent holds of a peer's offers, at most 255 bytes, for its hello to that peer.
     """
 
     def __init__(
@@ -103,10 +102,8 @@ class Mesh:
         dialler: Dialler | None = None,
         security: MeshSecurity | None = None,
         on_join: OnJoin | None = None,
-        held: Callable[[Guid], bytes] = lambda _: b"",
     ) -> None:
         self.identity = identity
-        self._held = held
         self.counters = counters if counters is not None else Counters()
         self.handlers: Final = handlers
         self._acceptor = Acceptor(listen_socket, self._accepted, name="links to peers", use=Use.LINK)
@@ -259,10 +256,6 @@ class Mesh:
         others = (each.remote for each in self.connections() if each.up and each is not connection)
         named = sum(other is not None and other.name == hello.name for other in others)
         return prove(hello, connection.certificate, self._security, linked, named)
-
-    def connection_held(self, guid: Guid) -> bytes:
-        """What this agent holds of a peer's offers."""
-        return self._held(guid)
 
     def connection_opened(self, connection: Connection) -> None:
         """A handshake succeeded."""

@@ -9,7 +9,7 @@ import msgspec
 from rmpa.bridge.session.peer_session import PeerState
 from rmpa.mesh.lane_demand import LaneState
 from rmpa.observe.io.direct_section import direct_counts
-from rmpa.observe.peer_info import FOREIGN, BoundInfo, LaneInfo, LinkInfo, OffersInfo, PeerInfo, ProbesInfo
+from rmpa.observe.peer_info import FOREIGN, BoundInfo, LaneInfo, LinkInfo, PeerInfo, ProbesInfo
 from rmpa.observe.shared_address import mark_shared_addresses
 from rmpa.observe.snapshot import DetectorInfo
 from rmpa.runtime.event_loop import yield_to_data
@@ -86,7 +86,6 @@ class PeersSection:
                 yield_to_data()
                 beyond = self._beyond(session)
                 to_it, from_it = direct_counts(self._bridge, session.peer)
-                copy = session.copy
                 info = msgspec.structs.replace(
                     info,
                     topics_in=theirs,
@@ -95,7 +94,6 @@ class PeersSection:
                     beyond=beyond,
                     direct_in=to_it,
                     direct_out=from_it,
-                    offers=OffersInfo(version=session.offers_held, right=copy.right, differed=copy.differed),
                 )
             probed = endpoint.discovery.member(guid, bytes.fromhex(info.instance)) if detecting else None
             if probed is not None:

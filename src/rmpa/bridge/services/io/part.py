@@ -48,7 +48,6 @@ from rmpa.bridge.services.remote_service import ServiceRouteState
 from rmpa.bridge.services.rules import ServiceRules
 from rmpa.bridge.session.graph_driver import GraphDriver
 from rmpa.bridge.session.part import Part
-from rmpa.bridge.session.part_catalogue import PartCatalogue
 from rmpa.bridge.session.peer_proxies import ProxyCallbacks
 from rmpa.bridge.session.peer_session import PeerState
 from rmpa.bridge.session.unchanged_graph import UnchangedGraph
@@ -182,7 +181,7 @@ class Services(Part):
             gate=gate,
         )
         """Direct calls of local nodes to peers' servers."""
-        sessions.offers.add(PartCatalogue(self.exports, self.imports, self._driver))
+        sessions.offers.add(self.exports)
         rpc.on_notification(_MISMATCH, self._told_of_mismatch, Needs((), "a text for the log"))
 
     def __iter__(self) -> Iterator[ShownService]:
@@ -253,8 +252,7 @@ class Services(Part):
         instance = link.identity.instance.hex()
         self.imports.ways.instance = self._relay.instance
         self._act(self.imports.link_up(peer, link.name, link.guid.value, instance))
-        held = session.held_there.services if session.held_there is not None else None
-        self._act(self.exports.link_up(peer, link.name, instance, held))
+        self._act(self.exports.link_up(peer, link.name, instance))
         for shown in [one for one in self._shown.values() if one.peer == peer and (one.waiting or one.asking)]:
             self._want(shown)
         self.direct_imports.link_up(session)

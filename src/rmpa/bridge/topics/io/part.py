@@ -31,7 +31,6 @@ from rmpa.bridge.policy import Policy, is_own
 from rmpa.bridge.relay import LinkedPeer
 from rmpa.bridge.session.graph_driver import GraphDriver
 from rmpa.bridge.session.part import Part
-from rmpa.bridge.session.part_catalogue import PartCatalogue
 from rmpa.bridge.session.unchanged_graph import UnchangedGraph
 from rmpa.bridge.topics.claims import ClaimDeadlines
 from rmpa.bridge.topics.exports import Exports
@@ -153,7 +152,7 @@ class Topics(Part):
             on_idle=self._settled,
         )
         self._act = self._driver.act
-        sessions.offers.add(PartCatalogue(self.exports, self.imports, self._driver))
+        sessions.offers.add(self.exports)
         self._absent = AbsentPeers(lambda peer: self._act(self.exports.unclaimed(peer)), self.outbound.forget, gate)
         self._claims = ClaimDeadlines()
         self._unchanged = UnchangedGraph()
@@ -246,8 +245,7 @@ class Topics(Part):
         self.imports.ways.instance = self._relay.instance
         linked = LinkedPeer(identity.name, identity.instance.hex(), identity.guid)
         self._act(self.imports.link_up(peer, identity.name, linked))
-        held = session.held_there.topics if session.held_there is not None else None
-        self._act(self.exports.link_up(peer, identity.name, linked.instance, held))
+        self._act(self.exports.link_up(peer, identity.name, linked.instance))
         self.direct_imports.link_up(session)
         self.direct_exports.link_up(session)
         self._told()
