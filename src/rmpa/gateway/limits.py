@@ -213,11 +213,3 @@ ROS2_LAST_RESULTS: Final = 1.0
 """Seconds for which an action's topics stay in ROS 1's graph once its server is gone: its last results leave."""
 ROS2_ACTION_READY: Final = 5.0
 """Seconds for an action server of ROS 1 to connect to the gateway's topics; then a goal is refused."""
-ROS2_PARAM_NODES_MAX: Final = 500
-"""Nodes of ROS 2 whose parameters are in the gateway's tree; those of the others are reported as missing."""
-ROS2_PARAMS_MAX: Final = 2000
-"""Parameters of one node of ROS 2 that are read; the others are left out."""
-ROS2_PARAM_TIMEOUT: Final = 5.0
-"""Seconds for a node of ROS 2, or a module, to answer a question about parameters."""
-ROS2_PARAM_LOOK: Final = 1.0
-"""Seconds between two looks at the gateway's tree, for values that were set there for nodes of ROS 2."""

@@ -17,14 +17,13 @@ if TYPE_CHECKING:
     from rmpa.ros.types.service_types import ServiceType
 
 _LOGGERS: Final = "loggers of ROS 1 nodes have no counterpart in ROS 2"
-_PARAMETERS: Final = "the parameters of ROS 2 nodes are served by the gateway itself"
 _ROS1_WITHOUT_USE: Final = {
     "roscpp/GetLoggers": _LOGGERS,
     "roscpp/SetLoggerLevel": _LOGGERS,
-    "dynamic_reconfigure/Reconfigure": "ROS 2 has parameters instead, which the gateway serves",
+    "dynamic_reconfigure/Reconfigure": "ROS 2 has parameters of nodes instead",
 }
 _ROS2_WITHOUT_USE: Final = {
-    "rcl_interfaces": _PARAMETERS,
+    "rcl_interfaces": "ROS 1 has no parameters of nodes",
     "type_description_interfaces": "ROS 1 has definitions in the headers of its connections",
     "lifecycle_msgs": "ROS 1 has no managed nodes",
 }

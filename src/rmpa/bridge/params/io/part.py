@@ -75,15 +75,6 @@ class Params(Part):
         """The keys of this module that linked peers follow, each with their names."""
         return self._server.followers()
 
-    async def read(self, key: str) -> XmlRpcValue:
-        """The value of a parameter or namespace of this module's core; ``None`` if there is none.
-
-        Raises:
-            RmpaError: The core does not answer.
-        """
-        found, value = await self._core.get(key)
-        return value if found else None
-
     async def provide(self, key: str, value: XmlRpcValue) -> None:
         """Set a parameter of this module's core for the peers that follow it; ``None`` deletes it.
 

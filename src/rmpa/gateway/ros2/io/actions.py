@@ -72,9 +72,6 @@ class Ros2Actions:
                 self._show_other(name)
         return True
 
-    def rival(self, node: str) -> None:
-        """Nothing is to be done: the neighbour takes back the sources of a node that another gateway shows."""
-
     def close(self) -> None:
         """Take back all actions of both sides."""
         for offered in self._offered.values():

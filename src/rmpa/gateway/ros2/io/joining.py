@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from rmpa.core.errors import UnreachableError
-from rmpa.gateway import limits
-from rmpa.gateway.ros2.crossing import SITE
 from rmpa.gateway.ros2.io.actions import Ros2Actions
 from rmpa.gateway.ros2.io.answers import Ros2Answers
 from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour
-from rmpa.gateway.ros2.io.params import Ros2Params
 from rmpa.gateway.ros2.io.services import Ros2Services
 from rmpa.gateway.ros2.io.topics import Ros2Topics
-from rmpa.gateway.sites.params import SiteAsker
 
 if TYPE_CHECKING:
     from rmpa.config.permission_rules import Access
@@ -29,15 +24,7 @@ def make_ros2_neighbour(graph: AgentGraph, session: OwnedSession, settings: Sett
         ConfigError: A setting of it is wrong.
     """
     agent = graph.agent
-
-    async def ask_module(module: str, what: str, args: dict[str, Any]) -> object:
-        for peer in agent.bridge.sessions.linked():
-            if peer.link.name == module:
-                asked = SiteAsker(SITE).args(args)
-                return await agent.bridge.rpc.request(peer, what, asked, limits.ROS2_PARAM_TIMEOUT)
-        raise UnreachableError("module", repr(module), "it is not linked to this gateway")
-
-    parts = (Ros2Params(ask_module, agent.params), Ros2Actions(), Ros2Services(), Ros2Topics())
+    parts = (Ros2Actions(), Ros2Services(), Ros2Topics())
     neighbour = Ros2Neighbour(graph, session, settings.gateway, parts, settings.make_contracts())
     sites = agent.sites.answerer if settings.gateway.site else None
     gate = agent.bridge.gate

@@ -41,7 +41,7 @@ class Ros2Neighbour:
         graph: The gateway's own graph.
         session: The Zenoh session.
         settings: The table ``[gateway]``.
-        parts: What joins services, actions, parameters and topics, in the order in which they are asked.
+        parts: What joins actions, services and topics, in the order in which they are asked.
         contracts: The contracts of topics; by default those without any rule.
 
     Raises:
@@ -144,8 +144,6 @@ class Ros2Neighbour:
             return
         if rival := self.context.ros2.rival(key, alive=alive):
             self._judge_again(rival)
-            for part in self._parts:
-                part.rival(rival)
         entity = self.context.ros2.change(key, alive=alive)
         if isinstance(entity, Ros2Endpoint):
             _log.debug("%s %s", "+" if alive else "-", entity.token())

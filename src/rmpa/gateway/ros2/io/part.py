@@ -1,4 +1,4 @@
-"""The parts of the neighbour ROS 2: each joins topics, services, actions or parameters, both ways."""
+"""The parts of the neighbour ROS 2: each joins topics, services or actions, both ways."""
 
 from __future__ import annotations
 
@@ -86,12 +86,6 @@ class Ros2Part(Protocol):
 
         Returns:
             Whether this part takes it: then no other part is told.
-        """
-
-    def rival(self, node: str) -> None:
-        """Another gateway shows a node below ``/rmpa/``, or does not any more.
-
-        ``Ros2Graph.led_by`` tells which of them leads. The node's sources were taken back or offered again already.
         """
 
     def close(self) -> None:

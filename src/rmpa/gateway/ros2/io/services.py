@@ -56,9 +56,6 @@ class Ros2Services:
             self._replace(endpoint)
         return True
 
-    def rival(self, node: str) -> None:
-        """Nothing is to be done: the neighbour takes back the sources of a node that another gateway shows."""
-
     def close(self) -> None:
         """Take back all services of both sides."""
         for services in self._offered.values():

@@ -50,9 +50,6 @@ class Ros2Topics:
         self._context = context
         self._pairs = Ros2Pairs(context.types, context.mapping, self._find)
 
-    def rival(self, node: str) -> None:
-        """Nothing is to be done: the neighbour takes back the sources of a node that another gateway shows."""
-
     def close(self) -> None:
         """Take back all topics of both sides."""
         for exported in self._exports.values():
