@@ -74,6 +74,7 @@ BASE = '[[param]]\nkey = "/a"\nfrom = "base"\n'
         (BASE.replace("/a", "/a b"), "2: param.key: '/a b' is not a parameter's name"),
         (BASE.replace("/a", "/" + "a" * 2000), "2: param.key: a name of 2001 characters"),
         (BASE.replace("base", "robot-1"), "3: param.from: 'robot-1' is not a ROS base name"),
+        (BASE.replace("base", "hall/arm"), "3: param.from: 'hall/arm' is a module of another site"),
         (BASE.replace("base", "pad"), "3: param.from: pad is this module itself"),
         (BASE + 'to = "/run_id"', "4: param.to: /run_id cannot be followed: it names the run"),
         (BASE + 'to = "/roslaunch"', "4: param.to: /roslaunch cannot be followed"),

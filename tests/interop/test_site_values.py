@@ -31,7 +31,6 @@ LONG: Final = 40.0
 LAMP: Final = Path(__file__).parent / "resources" / "lamp.py"
 RULES: Final = '[[gateway.rule]]\nnames = ["/secret/**"]\ncrossing = "none"\n'
 """Of both gateways."""
-FOLLOW: Final = '[[param]]\nkey = "/warehouse/arm/speed"\nfrom = "yard_gateway"\nto = "/speed_of_arm"\n'
 
 
 @pytest.fixture(scope="module")
@@ -81,28 +80,6 @@ def test_parameters_of_another_site_are_read_set_and_refused_by_rules(joined: Jo
     )
     does(base, "param", "delete", *there, "/gains")
     fails(arm, "param", "get", "/gains")
-
-
-def test_a_module_follows_a_parameter_of_another_site_by_its_gateway(joined: JoinedModules) -> None:
-    arm, base = joined.arm.agent, joined.base.agent
-    does(arm, "param", "set", "/speed", "1.5")
-    base.config = FOLLOW
-    base.kill()
-    base.restart()
-    try:
-        for value in ("1.5", "2.5"):
-            does(arm, "param", "set", "/speed", value)
-            eventually(
-                lambda value=value: base.rmpa("param", "get", "/speed_of_arm")[1].strip() == value,  # type: ignore[misc]
-                LONG,
-                what=f"{value} at base",
-                every=0.3,
-            )
-    finally:
-        base.config = ""
-        base.kill()
-        base.restart()
-        base.wait_peer(joined.yard.gateway.name)
 
 
 def test_smart_resources_of_another_site_are_listed_and_set(joined: JoinedModules) -> None:

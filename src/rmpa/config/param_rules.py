@@ -75,10 +75,20 @@ def read_key(raw: object) -> str:
     return key.rstrip("/")
 
 
+def _read_owner(raw: object) -> str:
+    if re.fullmatch(r"\w+/\w+", read_text(raw)):
+        raise BadValue(
+            f"{raw!r} is a module of another site, whose parameters are not followed",
+            f"read one by `rmpa param get --peer {raw} NAME`",
+        )
+    return NAME.read(raw)
+
+
+_OWNER: Final = ValueType(_read_owner, NAME.json_schema)
 _PARAM: Final = ValueType(read_key, {"type": "string", "examples": ["/robot_description"]})
 _KEYS: Final = (
     RuleKey("key", _PARAM, "The parameter's name at its owner; a namespace is followed as a whole.", required=True),
-    RuleKey("from", NAME, "The peer that owns it.", required=True),
+    RuleKey("from", _OWNER, "The peer that owns it.", required=True),
     RuleKey("to", _PARAM, "Its name here; without it: the same."),
 )
 

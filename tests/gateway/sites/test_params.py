@@ -1,4 +1,4 @@
-"""Parameters between sites: read, written and followed, as policy and rules let them."""
+"""Parameters between sites: read and written, as policy and rules let them."""
 
 from __future__ import annotations
 
@@ -15,13 +15,10 @@ from rmpa.bridge.params import transfer
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.gateway.sites.io.param_exports import SiteParamExports
 from rmpa.gateway.sites.io.param_imports import SiteParamImports
-from rmpa.gateway.sites.io.param_part import SiteParams
 from rmpa.gateway.sites.params import (
     ParamAnswer,
     ParamQuestion,
     SiteAsker,
-    digest,
-    followed_of,
     from_json,
     param_key,
     parse_param_key,
@@ -68,33 +65,15 @@ class ArmParams:
         return self.values[key]
 
 
-class OwnParams:
-    """The gateway's own parameters."""
-
-    def __init__(self) -> None:
-        self.followed_by_peers: dict[str, frozenset[str]] = {}
-        self.values: dict[str, Any] = {}
-        self.provided = 0
-
-    async def provide(self, key: str, value: Any) -> None:
-        self.provided += 1
-        if value is None:
-            self.values.pop(key, None)
-        else:
-            self.values[key] = value
-
-
 class ParamSites:
     """Two sites, of which the second asks."""
 
     def __init__(self) -> None:
-        self.session, self.arm, self.own = LoopbackSession(), ArmParams(), OwnParams()
+        self.session, self.arm = LoopbackSession(), ArmParams()
         self.denied: set[str] = set()
-        self.sites = ["warehouse"]
         self.exports = SiteParamExports("warehouse", cast("Any", self.session), self.arm.ask, self._why_not)
-        self.imports = SiteParamImports("office", cast("Any", self.session), lambda: 1, self.own, lambda: self.sites)
-        self.part = SiteParams(self.exports, self.imports)
-        self.part.lead(leads=True)
+        self.imports = SiteParamImports("office", cast("Any", self.session), lambda: 1)
+        self.exports.lead(leads=True)
 
     def _why_not(self, asker: SiteAsker, module: str, name: str, told: str) -> str:
         return f"a rule keeps {told} of {module} from {asker.site}" if name in self.denied else ""
@@ -118,7 +97,7 @@ class ParamSites:
 async def sites() -> AsyncIterator[ParamSites]:
     found = ParamSites()
     yield found
-    await found.part.close()
+    await found.exports.close()
 
 
 async def test_parameters_of_another_site_are_read_and_written_also_large_ones(sites: ParamSites) -> None:
@@ -174,34 +153,9 @@ async def test_a_program_reads_and_sets_them_as_json(sites: ParamSites) -> None:
 
 
 async def test_a_gateway_that_stands_by_does_not_answer(sites: ParamSites) -> None:
-    sites.part.lead(leads=False)
+    sites.exports.lead(leads=False)
     with pytest.raises(UnreachableError, match="site warehouse for its module arm"):
         await sites.get("/speed")
-
-
-async def test_followed_parameters_are_kept_equal_in_the_gateways_core(sites: ParamSites) -> None:
-    keys = ("/warehouse/arm/speed", "/warehouse/arm/gains", "/own", "/elsewhere/arm/speed")
-    sites.own.followed_by_peers = dict.fromkeys(keys, frozenset({"desk"}))
-    await sites.imports.look()
-    assert sites.own.values == {"/warehouse/arm/speed": 1.5, "/warehouse/arm/gains": {"p": 1, "i": 2}}
-    await sites.imports.look()
-    assert sites.own.provided == 2  # what is equal is not set again
-    sites.arm.values["/speed"] = 3.5
-    del sites.arm.values["/gains"]
-    await sites.imports.look()
-    assert sites.own.values == {"/warehouse/arm/speed": 3.5}
-    sites.arm.there = False
-    await sites.imports.look()
-    assert sites.own.values == {"/warehouse/arm/speed": 3.5}
-    assert "no linked peer" in sites.imports.problems["/warehouse/arm/speed"]
-    sites.arm.there = True
-    sites.denied = {"/speed"}
-    await sites.imports.look()
-    assert "a rule keeps" in sites.imports.problems["/warehouse/arm/speed"]
-    sites.own.followed_by_peers = {}
-    await sites.imports.look()
-    assert sites.imports.problems == {}
-    assert sites.imports.followed == 0
 
 
 async def test_questions_under_way_end_with_the_gateway(sites: ParamSites) -> None:
@@ -246,12 +200,11 @@ def test_questions_are_checked() -> None:
         {"op": "get", "key": "a"},
         {"op": "get"},
         {"op": "set", "key": "/a//b"},
-        {"op": "values", "last": {"a": ""}},
-        {"op": "values", "last": {f"/a{n}": "" for n in range(300)}},
+        {"op": "get", "key": "/a", "askers": ["a b"]},
     ):
         with pytest.raises(RemoteProtocolError):
             ParamQuestion.parse(msgspec.json.encode(bad))
-    question = ParamQuestion(op="values", last={"/a": digest(None)})
+    question = ParamQuestion(op="set", key="/a", text="1", askers=("arm",))
     assert ParamQuestion.parse(question.serialize()) == question
 
 
@@ -262,8 +215,6 @@ def test_keys() -> None:
     for key in ("rmpa/1/home/arm/p", "rmpa/1/home/arm/t/x", "rmpa/1/home/*/p/x", "rmpa/1/home/arm/p/" + "x" * 3000):
         with pytest.raises(RemoteProtocolError):
             parse_param_key(key)
-    assert followed_of("/warehouse/arm/gains/p") == ("warehouse", "arm", "/gains/p")
-    assert followed_of("/warehouse/arm") is None
 
 
 async def test_a_module_here_gets_what_it_may_have_by_this_gateways_permissions_too(sites: ParamSites) -> None:
@@ -299,10 +250,7 @@ async def test_questions_carry_the_modules_that_ask_to_the_owner(sites: ParamSit
     await sites.set("/speed", 2)
     await sites.drive(transfer.reading(transfer.NAMES, {}))
     await sites.imports.ask("desk", "warehouse", "arm", transfer.DELETE, {"key": "/speed"})
-    sites.own.followed_by_peers = {"/warehouse/arm/gains": frozenset({"base", "desk"})}
-    await sites.imports.look()
-    assert {(site, tuple(askers)) for _, site, askers in asked[:-1]} == {("office", ("desk",))}
-    assert asked[-1] == (transfer.GET, "office", ["base", "desk"])
+    assert {(site, tuple(askers)) for _, site, askers in asked} == {("office", ("desk",))}
     await sites.session.get("rmpa/1/warehouse/arm/p/gains")
     assert asked[-1] == (transfer.GET, "", [])
 
@@ -327,26 +275,7 @@ async def test_the_own_sites_modules_are_asked_by_themselves(sites: ParamSites) 
     for asker in ("desk", ""):
         with pytest.raises(PeerRefused, match="of this very site: ask it itself, by --peer base"):
             await sites.imports.ask(asker, "office", "base", transfer.GET, {"key": "/"})
-    sites.own.followed_by_peers = {"/office/base/x": frozenset({"desk"})}
-    sites.sites.append("office")
-    await sites.imports.look()
     assert sites.session.asked == []
-
-
-async def test_a_module_here_does_not_follow_what_this_gateways_permissions_deny_it(sites: ParamSites) -> None:
-    """Neither by its name nor within a namespace; what it may have is followed."""
-    sites.imports._why_not = lambda asker, name, told: (
-        f"{asker} may not have {told}" if asker == "desk" and name in ("/speed", "/gains/i") else ""
-    )
-    keys = ("/warehouse/arm/speed", "/warehouse/arm/gains", "/warehouse/arm/gains/p")
-    sites.arm.values["/gains/p"] = 1
-    sites.own.followed_by_peers = dict.fromkeys(keys, frozenset({"base", "desk"}))
-    await sites.imports.look()
-    assert sites.own.values == {"/warehouse/arm/gains/p": 1}
-    assert sites.imports.problems == {
-        "/warehouse/arm/speed": "desk may not have /speed",
-        "/warehouse/arm/gains": "desk may not have /gains",
-    }
 
 
 async def test_a_site_is_not_told_whether_a_parameter_is_there_that_a_rule_keeps_from_it(sites: ParamSites) -> None:

@@ -8,16 +8,13 @@ payload it sets it to that JSON. JSON has neither binary data nor dates, so gate
     {"op": "names"}                                         {"names": ["/gains/p", …]}
     {"op": "set", "key": "/gains/p", "text": "<?xml …"}     {"count": 1}
     {"op": "delete", "key": "/gains/p"}                     {}
-    {"op": "values", "last": {"/gains": "<digest>"}}        {"values": {"/gains": {"text": …} or {"problem": …}}}
 
-Each question has ``"askers": ["arm"]``, the modules of the other site that ask. ``values`` brings those whose digest
-is another one; its ``text`` is missing where there is no such parameter.
+Each question has ``"askers": ["arm"]``, the modules of the other site that ask.
 """
 
 from __future__ import annotations
 
 import base64
-import hashlib
 from dataclasses import dataclass
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, Final
@@ -41,7 +38,7 @@ if TYPE_CHECKING:
 
 GATEWAYS: Final = "-"
 """The last chunk of the key at which gateways ask."""
-OPERATIONS: Final = ("get", "names", "set", "delete", "values")
+OPERATIONS: Final = ("get", "names", "set", "delete")
 
 
 class ParamQuestion(msgspec.Struct, omit_defaults=True, kw_only=True):
@@ -51,14 +48,12 @@ class ParamQuestion(msgspec.Struct, omit_defaults=True, kw_only=True):
         op: One of ``OPERATIONS``.
         key: The parameter's global name in its module.
         text: The value as XML-RPC text.
-        last: The digest of what is known, by key; empty for nothing.
         askers: The modules for which the gateway asks.
     """
 
     op: str
     key: str = ""
     text: str = ""
-    last: dict[str, str] = {}
     askers: tuple[str, ...] = ()
 
     def serialize(self) -> bytes:
@@ -75,14 +70,10 @@ class ParamQuestion(msgspec.Struct, omit_defaults=True, kw_only=True):
         found: ParamQuestion = _decode(data, cls)
         if found.op not in OPERATIONS:
             raise RemoteProtocolError(f"{found.op[:40]!r} is no question about parameters")
-        keys = {"names": (), "values": tuple(found.last)}.get(found.op, (found.key,))
-        if len(keys) > limits.SITE_PARAMS_AT_ONCE:
-            raise RemoteProtocolError(f"{len(keys)} parameters at once; at most {limits.SITE_PARAMS_AT_ONCE}")
         if len(found.askers) > bridge_limits.PARAM_ASKERS_MAX or any(map(peer_name_problem, found.askers)):
             raise RemoteProtocolError("askers are not the names of modules, or too many")
-        for key in keys:
-            if problem := key_problem(key):
-                raise RemoteProtocolError(problem)
+        if found.op != "names" and (problem := key_problem(found.key)):
+            raise RemoteProtocolError(problem)
         found.key = plain_key(found.key)
         return found
 
@@ -104,25 +95,12 @@ class SiteAsker:
         return {**args, "site": self.site, "askers": list(self.modules)}
 
 
-class ParamNews(msgspec.Struct, omit_defaults=True, kw_only=True):
-    """The present value of a followed parameter.
-
-    Attributes:
-        text: As XML-RPC text; ``None``: there is no such parameter.
-        problem: Why it is not told; empty for nothing.
-    """
-
-    text: str | None = None
-    problem: str = ""
-
-
 class ParamAnswer(msgspec.Struct, omit_defaults=True, kw_only=True):
     """The answer to a ``ParamQuestion``; the fields are those that its text names."""
 
     text: str = ""
     names: list[str] = []
     count: int = 0
-    values: dict[str, ParamNews] = {}
 
     def serialize(self) -> bytes:
         """As JSON."""
@@ -146,11 +124,6 @@ def _decode(data: Buffer, kind: type[Any]) -> Any:
         return msgspec.json.decode(data, type=kind)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise RemoteProtocolError(f"not a text about parameters: {error}") from None
-
-
-def digest(text: str | None) -> str:
-    """What ``values`` compares: of a value's text, or of no value (``None``)."""
-    return "-" if text is None else hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
 def param_key(site: str, module: str, name: str) -> str:
@@ -241,9 +214,3 @@ def _check_members(value: object, depth: int = 0) -> None:
         raise RemoteProtocolError(f"the value is nested deeper than {PARAM_DEPTH_MAX} levels")
     for member in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
         _check_members(member, depth + 1)
-
-
-def followed_of(key: str) -> tuple[str, str, str] | None:
-    """Site, module and parameter that a key of the gateway's own core stands for: ``/<site>/<module>/<name>``."""
-    parts = key.split("/", 3)
-    return (parts[1], parts[2], f"/{parts[3]}") if len(parts) == 4 and all(parts[1:]) else None

@@ -175,14 +175,6 @@ class ParamOwner:
         """The keys that at least one peer follows."""
         return iter(self._last)
 
-    def followers(self) -> dict[str, frozenset[str]]:
-        """The names of the peers that follow each key."""
-        names: dict[str, set[str]] = {}
-        for session, keys in self._followers.values():
-            for key in keys:
-                names.setdefault(key, set()).add(session.link.name)
-        return {key: frozenset(found) for key, found in names.items()}
-
     # --- requests -----------------------------------------------------------------------------------------------
 
     async def _get(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:

@@ -8,7 +8,7 @@ import logging
 from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
-from rmpa.bridge.params.io.core import PEERS, ParamCore
+from rmpa.bridge.params.io.core import ParamCore
 from rmpa.bridge.params.io.follower import ParamFollower
 from rmpa.bridge.params.io.param_owner import ParamOwner
 from rmpa.bridge.params.rules import ParamPolicy, follow_rules
@@ -69,22 +69,6 @@ class Params(Part):
     def followed(self) -> Iterable[Followed]:
         """The parameters that this module follows, with the state of each."""
         return self._follower.following
-
-    @property
-    def followed_by_peers(self) -> dict[str, frozenset[str]]:
-        """The keys of this module that linked peers follow, each with their names."""
-        return self._server.followers()
-
-    async def provide(self, key: str, value: XmlRpcValue) -> None:
-        """Set a parameter of this module's core for the peers that follow it; ``None`` deletes it.
-
-        Raises:
-            RmpaError: The core does not answer, or refuses the value.
-        """
-        if value is None:
-            await self._core.delete(key, PEERS)
-        else:
-            await self._core.set(key, value, PEERS)
 
     def notes(self) -> tuple[str, ...]:
         """Messages to the user about parameters that are not followed although their owner is linked."""

@@ -16,7 +16,6 @@ from rmpa.gateway.sites.io.action_part import SiteActions
 from rmpa.gateway.sites.io.neighbour import SiteNeighbour
 from rmpa.gateway.sites.io.param_exports import SiteParamExports
 from rmpa.gateway.sites.io.param_imports import SiteParamImports
-from rmpa.gateway.sites.io.param_part import SiteParams
 from rmpa.gateway.sites.io.service_part import SiteServices
 from rmpa.gateway.sites.io.site_answers import SiteAnswers
 from rmpa.gateway.sites.io.site_why import SiteWhy
@@ -108,13 +107,10 @@ def _add_questions(
         own.site,
         session,
         clock.wall_ns,
-        agent.params,
-        lambda: neighbour.catalogue.sites,
         may_not_here if gate.on else None,
     )
-    params = SiteParams(exports, imports)
-    neighbour.add(params)
-    neighbour.on_leads = params.lead
+    neighbour.add(exports)
+    neighbour.on_leads = exports.lead
     why = SiteWhy(own.site, name, session, neighbour, history, rules, may)
     answers = SiteAnswers(
         name,

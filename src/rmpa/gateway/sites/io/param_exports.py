@@ -17,18 +17,16 @@ from rmpa.gateway.sites.keys import ROOT
 from rmpa.gateway.sites.params import (
     GATEWAYS,
     ParamAnswer,
-    ParamNews,
     ParamQuestion,
     SiteAsker,
-    digest,
     from_json,
     lost_with,
     parameters_in,
     parse_param_key,
-    plain_key,
     refused_one,
     to_json,
 )
+from rmpa.gateway.sites.part import PassivePart
 from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
 
 if TYPE_CHECKING:
@@ -37,7 +35,6 @@ if TYPE_CHECKING:
     from rmpa.gateway.zenoh_api import Declared, ZenohQuery, ZenohSession
 
 _log = logging.getLogger(__name__)
-_MISSING = "there is no parameter"
 _NEEDS = Needs(
     (Access.PARAM,),
     "each parameter, of the site and of the modules that ask; also by the module that has it",
@@ -45,8 +42,8 @@ _NEEDS = Needs(
 )
 
 
-class SiteParamExports:
-    """The parameters of this site's modules, as queryables.
+class SiteParamExports(PassivePart):
+    """The parameters of this site's modules, as queryables: a ``SitePart``.
 
     Args:
         site: This site's name.
@@ -55,6 +52,8 @@ class SiteParamExports:
         why_not: ``(asker, module, parameter, told)``: why a site may not have a parameter; empty if it may. ``told``
             is what it asked for: a parameter that was found in that may be a secret.
     """
+
+    name = "params"
 
     def __init__(
         self,
@@ -69,10 +68,7 @@ class SiteParamExports:
         self._why_not = why_not
         self._queryable: Declared | None = None
         self._tasks: set[asyncio.Task[None]] = set()
-        self.asked = 0
-        """Questions that came."""
-        self.refused = 0
-        """Questions that got an error."""
+        self._asked = self._refused = 0
 
     def lead(self, leads: bool) -> None:
         """Answer while this gateway leads its site."""
@@ -81,6 +77,10 @@ class SiteParamExports:
         elif not leads and self._queryable is not None:
             self._queryable.close()
             self._queryable = None
+
+    def report(self) -> dict[str, object]:
+        """Questions of other sites, and how many got an error."""
+        return {"asked": self._asked, "refused": self._refused}
 
     async def close(self) -> None:
         """Answer no more; questions under way get an error."""
@@ -92,9 +92,9 @@ class SiteParamExports:
     # --- inside ---------------------------------------------------------------------------------------------------
 
     def _take(self, query: ZenohQuery) -> None:
-        self.asked += 1
+        self._asked += 1
         if len(self._tasks) >= limits.SITE_PARAMS_AT_ONCE:
-            self.refused += 1
+            self._refused += 1
             query.reply_error("too many questions about parameters at once; try again later")
             return
         task = asyncio.get_running_loop().create_task(self._answer(query), name="parameter for a site")
@@ -128,7 +128,7 @@ class SiteParamExports:
             self._fail(query, f"the gateway of site {self._site} failed at the parameter; its log says why")
 
     def _fail(self, query: ZenohQuery, text: str) -> None:
-        self.refused += 1
+        self._refused += 1
         query.reply_error(text)
 
     async def _for_gateway(self, asker: SiteAsker, module: str, question: ParamQuestion) -> ParamAnswer:
@@ -139,11 +139,9 @@ class SiteParamExports:
                 return ParamAnswer(names=await self._names(asker, module))
             case "set":
                 return ParamAnswer(count=await self._set(asker, module, question.key, question.text))
-            case "delete":
+            case _:
                 await self._delete(asker, module, question.key)
                 return ParamAnswer()
-            case _:
-                return ParamAnswer(values=await self._values(asker, module, question.last))
 
     async def _get(self, asker: SiteAsker, module: str, key: str) -> str:
         try:
@@ -174,21 +172,6 @@ class SiteParamExports:
         self._judge(asker, module, key, [key])
         self._judge(asker, module, key, lost_with([key], await self._present(asker, module)))
         await self._ask(module, transfer.DELETE, asker.args({"key": key}))
-
-    async def _values(self, asker: SiteAsker, module: str, last: dict[str, str]) -> dict[str, ParamNews]:
-        found = {}
-        for key, known in last.items():
-            text: str | None = None
-            try:
-                text = await self._get(asker, module, plain_key(key))
-            except RmpaError as error:
-                reason = error.reason if isinstance(error, PeerRefused) else str(error)
-                if not reason.startswith(_MISSING):
-                    found[key] = ParamNews(problem=reason)
-                    continue
-            if digest(text) != known:
-                found[key] = ParamNews(text=text)
-        return found
 
     def _judge(self, asker: SiteAsker, module: str, key: str, names: list[str]) -> None:
         if why := refused_one(names, lambda name: self._why_not(asker, module, name, key)):

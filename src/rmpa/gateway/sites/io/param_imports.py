@@ -1,24 +1,19 @@
-"""Asks other sites about parameters of their modules, and keeps those equal that modules here follow."""
+"""Asks other sites about parameters of their modules."""
 
 from __future__ import annotations
 
 import asyncio
-import logging
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge.params import transfer
 from rmpa.bridge.params.io.core import read_text, write_text
-from rmpa.core.counters import Counters, RefusalLog
-from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.core.errors import PeerRefused, RemoteProtocolError, UnreachableError
 from rmpa.gateway import limits
 from rmpa.gateway.sites.attachment import SiteAttachment
 from rmpa.gateway.sites.params import (
     GATEWAYS,
     ParamAnswer,
-    ParamNews,
     ParamQuestion,
-    digest,
-    followed_of,
     lost_with,
     param_key,
     parameters_in,
@@ -28,23 +23,9 @@ from rmpa.gateway.sites.params import (
 from rmpa.gateway.sites.services import NO_MD5
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable
 
     from rmpa.gateway.zenoh_api import ZenohSession
-    from rmpa.ros.wire.xmlrpc import XmlRpcValue
-
-_log = logging.getLogger(__name__)
-
-
-class FollowedCore(Protocol):
-    """The gateway's own parameters: ``bridge.params.io.part.Params``."""
-
-    @property
-    def followed_by_peers(self) -> Mapping[str, frozenset[str]]:
-        """The keys that linked modules follow, each with the names of these modules."""
-
-    async def provide(self, key: str, value: XmlRpcValue) -> None:
-        """Set a parameter, of which the linked modules are notified; ``None`` deletes it."""
 
 
 class SiteParamImports:
@@ -54,8 +35,6 @@ class SiteParamImports:
         site: This site's name.
         session: The Zenoh session.
         stamp: The wall clock, nanoseconds since 1970.
-        core: The gateway's own parameters, which hold followed ones as ``/<site>/<module>/<name>``.
-        sites: Returns the names of the sites that are there.
         why_not: ``(asker, parameter, told)``: why a module of this site, which asks, may not have a parameter, by its
             name at the other site; empty if it may. ``told`` is the name that it asked for. ``None``: trust is off.
     """
@@ -65,42 +44,14 @@ class SiteParamImports:
         site: str,
         session: ZenohSession,
         stamp: Callable[[], int],
-        core: FollowedCore,
-        sites: Callable[[], Iterable[str]],
         why_not: Callable[[str, str, str], str] | None = None,
     ) -> None:
         self._site = site
         self._session = session
         self._stamp = stamp
-        self._core = core
-        self._sites = sites
         self._why_not = why_not
         self._transfers: dict[str, transfer.Transfers] = {}
         """What each module here reads or writes in portions, by its name; empty: this machine's user."""
-        self._known: dict[str, str] = {}
-        """The digest of each followed parameter, by its key here."""
-        self.problems: dict[str, str] = {}
-        """Why a followed parameter is not as at its module, by its key here."""
-        self._counters = Counters()
-        self._log = RefusalLog(_log, self._counters)
-        self._following: asyncio.Task[None] | None = None
-
-    def start(self) -> None:
-        """Begin to follow."""
-        if self._following is None:
-            self._following = asyncio.get_running_loop().create_task(self._follow(), name="follow other sites")
-
-    async def close(self) -> None:
-        """Stop following; the values stay."""
-        if self._following is not None:
-            self._following.cancel()
-            await asyncio.gather(self._following, return_exceptions=True)
-            self._following = None
-
-    @property
-    def followed(self) -> int:
-        """The number of parameters that are followed from other sites."""
-        return len(self._known)
 
     async def ask(self, asker: str, site: str, module: str, what: str, args: dict[str, Any]) -> object:
         """Answer a request of ``bridge.params.transfer`` for a module of another site.
@@ -191,60 +142,3 @@ class SiteParamImports:
         raise UnreachableError(
             "gateway", f"site {site} for its module {module}", "`rmpa site info` shows who is there"
         )
-
-    # --- following --------------------------------------------------------------------------------------------------
-
-    async def _follow(self) -> None:
-        while True:
-            await asyncio.sleep(limits.SITE_FOLLOW_INTERVAL)
-            try:
-                await self.look()
-            except RmpaError as error:
-                self._log.refuse(asyncio.get_running_loop().time(), "param.failed", "", f"following: {error}")
-            except Exception:  # noqa: BLE001 - a task's top
-                _log.exception("! following parameters of other sites failed")
-
-    async def look(self) -> None:
-        """Ask once for all that modules here follow, and set what has changed; values of absent sites stay."""
-        wanted: dict[tuple[str, str, frozenset[str]], dict[str, str]] = {}
-        there = {*self._sites()} - {self._site}
-        for key, askers in self._core.followed_by_peers.items():
-            found = followed_of(key)
-            if (
-                found is not None
-                and found[0] in there
-                and sum(map(len, wanted.values())) < limits.SITE_PARAMS_AT_ONCE
-            ):
-                wanted.setdefault((*found[:2], askers), {})[key] = found[2]
-        keys = {key for names in wanted.values() for key in names}
-        for table in (self._known, self.problems):
-            for key in [key for key in table if key not in keys]:
-                del table[key]
-        await asyncio.gather(*(self._look_at(*owner, names) for owner, names in wanted.items()))
-
-    async def _look_at(self, site: str, module: str, askers: frozenset[str], names: dict[str, str]) -> None:
-        """Ask for what modules here follow at one module; all of them must be allowed to have it."""
-        last = {name: self._known.get(key, "") for key, name in names.items()}
-        try:
-            question = ParamQuestion(op="values", last=last, askers=tuple(sorted(askers)))
-            found = (await self._question(site, module, question)).values
-        except RmpaError as error:
-            found = {name: ParamNews(problem=str(error)) for name in last}
-        for key, name in names.items():
-            news = found.get(name, ParamNews())
-            value = await read_text(news.text) if news.text is not None else None
-            denials = (self._denial(each, leaf, name) for leaf in parameters_in(name, value) for each in askers)
-            if problem := news.problem or next(filter(None, denials), ""):
-                self.problems[key] = problem
-                text = f"{key} is not followed from {site}/{module}: {problem}"
-                self._log.refuse(asyncio.get_running_loop().time(), "param.refused", key, text)
-            elif name in found:
-                await self._take(key, news.text, value)
-            else:
-                self.problems.pop(key, None)
-
-    async def _take(self, key: str, text: str | None, value: XmlRpcValue) -> None:
-        if text is not None or key in self._known:  # what was never there does not delete what is here
-            await self._core.provide(key, value)
-        self._known[key] = digest(text)
-        self.problems.pop(key, None)
