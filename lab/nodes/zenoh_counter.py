@@ -1,7 +1,4 @@
-"""Count what comes of a key, as a client of a router: ``zenoh_counter.py ENDPOINT KEY [HEADER]``.
-
-With ``HEADER``, the key of a topic's header at a gateway, it asks for batches as a gateway does, and counts their
-messages.
+"""Count what comes of a key, as a client of a router: ``zenoh_counter.py ENDPOINT KEY``.
 
 Events, as of ``counter``: ``up``; ``window`` each 0.5 s: messages and bytes so far, nanoseconds of the steady clock.
 """
@@ -18,7 +15,7 @@ from zenoh_router import settings_of
 
 
 def main() -> None:
-    endpoint, key, *header = sys.argv[1:]
+    endpoint, key = sys.argv[1:]
     count = size = 0
 
     def take(sample: zenoh.Sample) -> None:
@@ -26,20 +23,9 @@ def main() -> None:
         count += 1
         size += len(sample.payload)
 
-    def take_batch(sample: zenoh.Sample) -> None:
-        nonlocal count, size
-        payload = sample.payload.to_bytes()
-        at = 0
-        while at < len(payload):
-            at += 4 + int.from_bytes(payload[at : at + 4], "little")
-            count += 1
-        size += len(payload)
-
     session = zenoh.open(settings_of("client", {"connect/endpoints": [endpoint]}))
-    session.declare_subscriber(f"{key}/@batch" if header else key, take_batch if header else take)
+    session.declare_subscriber(key, take)
     say("up")
-    while header and not any(reply.ok for reply in session.get(f"{header[0]}?site=reader;batches")):
-        time.sleep(0.1)
     while True:
         time.sleep(0.5)
         say("window", count=count, bytes=size, ns=time.monotonic_ns())

@@ -5,7 +5,6 @@ from __future__ import annotations
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway.ros2.attachment import Ros2Attachment
 from rmpa.gateway.sites.attachment import SiteAttachment
-from rmpa.gateway.sites.batch import join_batch, split_batch
 from rmpa.gateway.sites.services import read_description, write_description
 from rmpa.ros.wire.services import ServiceDescription
 
@@ -16,8 +15,7 @@ SEEDS: list[bytes] = [
     Ros2Attachment(-1, 0, bytes(24)).serialize() + b"later",
     SiteAttachment(1, 2**40, _MD5, "/talker", ("warehouse",), latched=True).serialize(),
     SiteAttachment(2**63, 0, _MD5, "/ns/node", ("a", "b", "c")).serialize(),
-    SiteAttachment(5, 0, _MD5, "/talker", ("yard",), run=7, batch=True).serialize(),
-    join_batch([b"one", b"", b"three"]),
+    SiteAttachment(5, 0, _MD5, "/talker", ("yard",), run=7).serialize(),
     write_description(ServiceDescription("std_srvs/Trigger", _MD5)),
     b"{}",
 ]
@@ -33,11 +31,6 @@ def fuzz(data: bytes) -> None:
             continue
         if kind.parse(read.serialize()) != read:
             raise AssertionError(f"{read} does not survive its bytes")
-    try:
-        if b"".join(split_batch(data)) != data:
-            raise AssertionError("a batch loses bytes")
-    except RemoteProtocolError as error:
-        _check_text(error)
     try:
         read_description(data)
     except RemoteProtocolError as error:

@@ -9,7 +9,7 @@ from rmpa.core.errors import PeerRefused
 from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping, Sequence
+    from collections.abc import Awaitable, Callable, Mapping
 
     from rmpa.ros.types.messages import MessageType
     from rmpa.ros.types.service_types import ServiceType
@@ -43,7 +43,6 @@ class MemoryTopic:
     problem: str = ""
     description: TopicDescription | None = None
     messages: list[bytes] = field(default_factory=list)
-    batches: list[int] = field(default_factory=list)
 
     def describe(self, description: TopicDescription) -> None:
         self.description = description
@@ -51,10 +50,6 @@ class MemoryTopic:
     def publish(self, body: Buffer) -> int:
         self.messages.append(bytes(body))
         return 0
-
-    def publish_all(self, framed: Sequence[memoryview]) -> int:
-        self.batches.append(len(framed))
-        return sum(self.publish(each[4:]) for each in framed)
 
     def forget_latched(self) -> None:
         self.messages.append(b"forgotten")

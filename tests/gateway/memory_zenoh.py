@@ -11,7 +11,7 @@ from rmpa.gateway.zenoh_api import ZenohReply, ZenohSample
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rmpa.gateway.zenoh_api import Declared, NumberedWriter, ZenohPriority, ZenohQos, ZenohQuery
+    from rmpa.gateway.zenoh_api import ZenohPriority, ZenohQos, ZenohQuery
     from rmpa.ros.wire.tcpros import Buffer
 
 
@@ -98,11 +98,8 @@ class MemoryPublisher:
             self._network.soon(self._network.subscribers, each, sample)
         return 0
 
-    def put_all(self, messages: Sequence[bytes], first: int, stamp: int, writer: NumberedWriter) -> int:
-        return sum(self.put(each, writer.write(number, stamp)) for number, each in enumerate(messages, first))
-
-    def batch(self, key: str, on_matching: Callable[[bool], None]) -> None:
-        """Declare nothing: this network has no batches."""
+    def put_all(self, messages: Sequence[tuple[bytes, bytes]]) -> int:
+        return sum(self.put(*each) for each in messages)
 
     def close(self) -> None:
         self._declared.close()
@@ -160,19 +157,13 @@ class MemorySession:
         self.network.match()
         return made
 
-    def numbered_publisher(self, key: str, qos: ZenohQos, on_matching: Callable[[bool], None]) -> MemoryPublisher:
-        return self.publisher(key, qos, on_matching)
-
     def subscribe(
         self,
         key: str,
         on_sample: Callable[[ZenohSample], None],
         *,
         history: bool = False,
-        beside: Declared | None = None,
-        batches: bool = False,
     ) -> MemoryDeclared:
-        del beside, batches
         network, entry = self.network, Entry(self, key, on_sample)
         declared = MemoryDeclared(network.subscribers, entry, network.match)
         for publisher in network.publishers if history else ():

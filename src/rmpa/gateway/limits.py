@@ -142,15 +142,6 @@ LARGE_MESSAGE: Final = 8 * 1024
 1 Mbit/s one such message takes 65 ms, for which all others of its priority wait."""
 COLLECTED_MESSAGES: Final = 256
 """Messages of one read that are collected before they are queued for other sites; the read may go on for longer."""
-BATCH_READ_MAX: Final = 1024
-"""Messages in a batch of another gateway; ours have at most 64. A larger one would hold the event loop for longer."""
-BATCH_RATE: Final = 500.0
-"""Messages a second of one publisher of another site from which on they are wanted in batches."""
-BATCH_MESSAGE_BYTES: Final = 4096
-"""Bytes of a message on average, up to which they are wanted in batches: a larger one costs more by its size."""
-BATCH_SETTLE: Final = 1.0
-"""Seconds after the first batch during which single messages are still subscribed to: by then all publishers of the
-topic send batches."""
 IDLE_CHECK: Final = 1.0
 """Seconds without a message after which a receiver asks for the last sequence number: losses at the end of a burst
 leave no gap."""

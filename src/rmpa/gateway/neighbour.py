@@ -12,7 +12,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping, Sequence
+    from collections.abc import Awaitable, Callable, Mapping
 
     from rmpa.ros.wire.services import ServiceDescription
     from rmpa.ros.wire.tcpros import Buffer, TopicDescription
@@ -98,9 +98,6 @@ class ForeignTopic(Protocol):
 
     def publish(self, body: Buffer) -> int:
         """Send one message (the TCPROS body without its length); return the messages dropped for slow subscribers."""
-
-    def publish_all(self, framed: Sequence[memoryview]) -> int:
-        """Send messages in order, each with its length in front; return the messages dropped for slow subscribers."""
 
     def forget_latched(self) -> None:
         """Drop the latched message: its publisher is gone."""

@@ -123,35 +123,8 @@ class ZenohPublisher(Protocol):
     def put(self, payload: Buffer, attachment: bytes = b"") -> int:
         """Queue one message; the payload is copied if it is not ``bytes``. Returns the messages dropped for it."""
 
-    def close(self) -> None:
-        """Undeclare it, after the queue is empty or a second has passed."""
-
-
-class NumberedWriter(Protocol):
-    """Writes the attachments of the messages of one source, by their numbers and stamps."""
-
-    def write(self, sequence: int, stamp: int) -> bytes:
-        """The attachment of one message."""
-
-    def batch(self, messages: Sequence[bytes], first: int, stamp: int) -> tuple[bytes, bytes]:
-        """Payload and attachment of messages together; ``first`` is the number of the first one."""
-
-
-class ZenohNumberedPublisher(Protocol):
-    """A declared publisher behind a bounded queue, for messages that are numbered; see ``gateway.zenoh.sending``."""
-
-    dropped: int
-    """Messages that the queue dropped."""
-
-    @property
-    def waiting(self) -> int:
-        """Messages in the queue."""
-
-    def put_all(self, messages: Sequence[bytes], first: int, stamp: int, writer: NumberedWriter) -> int:
-        """Queue messages with the numbers from ``first`` on; returns the messages dropped for them."""
-
-    def batch(self, key: str, on_matching: Callable[[bool], None]) -> None:
-        """Put what waits together as batches under a second key too, once there is a subscriber of it."""
+    def put_all(self, messages: Sequence[tuple[bytes, bytes]]) -> int:
+        """Queue messages, each with its attachment, in order; returns the messages dropped for them."""
 
     def close(self) -> None:
         """Undeclare it, after the queue is empty or a second has passed."""
@@ -166,29 +139,14 @@ class ZenohSession(Protocol):
     def publisher(self, key: str, qos: ZenohQos, on_matching: Callable[[bool], None]) -> ZenohPublisher:
         """Declare a publisher; ``on_matching(there)`` tells whether there is a subscriber, also at the beginning."""
 
-    def numbered_publisher(
-        self, key: str, qos: ZenohQos, on_matching: Callable[[bool], None]
-    ) -> ZenohNumberedPublisher:
-        """Declare a publisher of messages that are numbered; the rest is as of ``publisher``."""
-
     def subscribe(
         self,
         key: str,
         on_sample: Callable[[ZenohSample], None],
         *,
         history: bool = False,
-        beside: Declared | None = None,
-        batches: bool = False,
     ) -> Declared:
-        """Subscribe to a key expression.
-
-        Args:
-            key: The expression.
-            on_sample: ``(sample)``.
-            history: Ask publishers with a cache for what they keep.
-            beside: Another subscription: the samples of both come in one order, to the other's ``on_sample``.
-            batches: Each sample has many small messages.
-        """
+        """Subscribe to a key expression; ``history``: ask publishers with a cache for what they keep."""
 
     def token(self, key: str) -> Declared:
         """Declare a liveliness token."""

@@ -10,7 +10,7 @@ from rmpa.config.gateway_rules import Crossing, CrossingRule
 from rmpa.core.contract import ContractRule
 from rmpa.gateway import limits
 from rmpa.gateway.sites.keys import token_keys
-from rmpa.gateway.zenoh.sending import NumberedPublisher
+from rmpa.gateway.zenoh.sending import QueuedPublisher
 from tests.gateway.sites.site_bed import MD5, SiteBed, described, site_bed
 from tests.gateway.zenoh_bed import until
 
@@ -145,7 +145,7 @@ async def test_a_loss_at_the_end_is_counted_although_no_message_follows(monkeypa
         topic = await hall.subscribed("/burst")
         await until(lambda: yard.graph.send(source, b"first"))
         await until(lambda: topic.messages)
-        monkeypatch.setattr(NumberedPublisher, "put_all", lambda *_: 0)
+        monkeypatch.setattr(QueuedPublisher, "put_all", lambda *_: 0)
         for _ in range(3):
             yard.graph.send(source, b"swallowed by the network")
         await until(lambda: hall.topics("in")[0]["lost"] == 3)

@@ -9,11 +9,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.gateway.sites.attachment import AttachmentWriter, SiteAttachment
-from rmpa.gateway.sites.batch import split_batch
-from rmpa.gateway.zenoh import limits
 from rmpa.gateway.zenoh.arrivals import ArrivalQueue, Arrivals
-from rmpa.gateway.zenoh.sending import NumberedPublisher, QueuedPublisher, SendingLane
+from rmpa.gateway.zenoh.sending import QueuedPublisher, SendingLane
 from rmpa.gateway.zenoh_api import ZenohQos
 from tests.gateway.zenoh_bed import until
 
@@ -199,88 +196,3 @@ async def test_each_of_a_steady_stream_arrives_soon_at_any_rate() -> None:
     await until(lambda: len(got) == 3000)
     thread.join()
     assert (got, queue.dropped) == (list(range(3000)), 0)
-
-
-class Keys(Handle):
-    """A publisher of Zenoh that keeps the attachments too."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.attached: list[SiteAttachment] = []
-
-    def put(self, payload: bytes, *, attachment: bytes | None = None) -> None:
-        super().put(payload, attachment=attachment)
-        self.attached.append(SiteAttachment.parse(attachment or b""))
-
-    @property
-    def batches(self) -> list[tuple[int, list[bytes]]]:
-        """The number of the first message of each batch, and the messages."""
-        return [
-            (each.sequence, [bytes(one[4:]) for one in split_batch(payload)])
-            for each, payload in zip(self.attached, self.got, strict=True)
-        ]
-
-
-WRITER = AttachmentWriter("0" * 32, "/talker", ("yard",), run=7)
-
-
-def numbered(lane: SendingLane, singles: Keys, batches: Keys, qos: ZenohQos) -> NumberedPublisher:
-    made = NumberedPublisher(lane, "key", qos, lambda: None, lambda *_: pytest.fail("no second key is declared here"))
-    made.wanted, made.batches_wanted, made.batch_handle = False, True, batches
-    made.declared(singles)
-    return made
-
-
-async def test_what_waits_goes_together_and_the_oldest_are_dropped_one_by_one(lane: SendingLane) -> None:
-    singles, batches = Keys(), Keys()
-    batches.free.clear()
-    made = numbered(lane, singles, batches, ZenohQos(messages=50))
-    assert made.put_all([b"0"], 1, 5, WRITER) == 0
-    await until(lambda: made.waiting == 1 and not made._queue)
-    assert made.put_all([b"%d" % number for number in range(1, 60)], 2, 5, WRITER) == 10
-    batches.free.set()
-    await until(lambda: not made.waiting)
-    assert batches.batches == [(1, [b"0"]), (12, [b"%d" % number for number in range(11, 60)])]
-    assert (made.sent, made.dropped, singles.got) == (50, 10, [])
-
-
-async def test_a_batch_is_of_one_source_in_sequence_of_about_one_time_and_bounded(lane: SendingLane) -> None:
-    singles, batches = Keys(), Keys()
-    batches.free.clear()
-    made = numbered(lane, singles, batches, ZenohQos())
-    made.put_all([b"first"], 1, 0, WRITER)
-    await until(lambda: made.waiting == 1 and not made._queue)
-    late = limits.BATCH_STAMPS + 1
-    made.put_all([b"a", b"b"], 2, 0, WRITER)
-    made.put_all([b"later"], 4, late, WRITER)
-    made.put_all([b"after a gap"], 6, late, WRITER)
-    made.put_all([b"other source"], 7, late, AttachmentWriter("0" * 32, "/other", ("yard",), run=7))
-    made.put_all([bytes(limits.BATCH_BYTES), b"small"], 8, late, WRITER)
-    batches.free.set()
-    await until(lambda: not made.waiting)
-    assert [number for number, _ in batches.batches] == [1, 2, 4, 6, 7, 8, 9]
-    assert batches.batches[1] == (2, [b"a", b"b"])
-    assert batches.attached[2].stamp == late
-
-
-async def test_while_both_keys_are_wanted_each_has_all_and_each_message_counts_once(lane: SendingLane) -> None:
-    singles, batches = Keys(), Keys()
-    made = numbered(lane, singles, batches, ZenohQos())
-    made.wanted = True
-    messages = [b"%d" % number for number in range(300)]
-    made.put_all(messages, 1, 0, WRITER)
-    await until(lambda: not made.waiting)
-    assert singles.got == messages == [one for _, batch in batches.batches for one in batch]
-    assert [each.sequence for each in singles.attached] == list(range(1, 301))
-    assert (made.sent, made.dropped) == (300, 0)
-
-
-async def test_a_batch_that_zenoh_refuses_counts_each_of_its_messages_as_dropped(lane: SendingLane) -> None:
-    class Closed(Keys):
-        def put(self, payload: bytes, *, attachment: bytes | None = None) -> None:
-            raise TimeoutError
-
-    made = numbered(lane, Keys(), Closed(), ZenohQos())
-    made.put_all([b"x"] * 30, 1, 0, WRITER)
-    await until(lambda: made.dropped == 30)
-    assert made.sent == 0

@@ -13,7 +13,7 @@ from rmpa.ros.node.publication import Publication
 from rmpa.ros.wire.tcpros import LENGTH, printable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Mapping
 
     from rmpa.bridge.messages import Origin
     from rmpa.bridge.relay import Relay
@@ -79,16 +79,6 @@ class ProxiedTopic(ProxiedSource):
         self.publication.extend(LENGTH.pack(size))
         self.publication.extend(body)
         return self.publication.dropped - before
-
-    def publish_all(self, framed: Sequence[memoryview]) -> int:
-        """Send messages in order, each with its length in front; return the messages dropped for slow subscribers."""
-        dropped = 0
-        publish = self.publication.publish_framed
-        for each in framed:
-            dropped += (
-                publish(each) if len(each) <= core_limits.CUT_THROUGH_BYTES else self.publish(each[LENGTH.size :])
-            )
-        return dropped
 
     def forget_latched(self) -> None:
         """Drop the latched message: its publisher is gone."""

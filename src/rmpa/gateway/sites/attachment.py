@@ -3,7 +3,7 @@
 Little-endian::
 
      0 version    1 byte    1
-     1 flags      1 byte    bit 0: latched; bit 1: a batch, and this is its first message's attachment (``batch.py``)
+     1 flags      1 byte    bit 0: latched
      2 sequence   8 bytes   counts the messages of a source, from 1: a gap is a loss
     10 stamp      8 bytes   when its gateway received it, nanoseconds since 1970; signed
     18 md5       16 bytes   the md5 sum of the message type
@@ -24,16 +24,12 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import peer_name_problem
 from rmpa.core.names import is_global_name
 from rmpa.gateway import limits
-from rmpa.gateway.sites.batch import join_batch
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from rmpa.ros.wire.tcpros import Buffer
 
 VERSION: Final = 1
 _LATCHED: Final = 1
-_BATCH: Final = 2
 _HEAD: Final = struct.Struct("<BBQq16s")
 _RUN: Final = struct.Struct("<Q")
 _NUMBERS: Final = struct.Struct("<Qq")
@@ -55,7 +51,6 @@ class SiteAttachment:
         path: The sites that it passed, its origin first; at most ``limits.PATH_MAX``.
         latched: Whether its publisher is latched.
         run: The run of its exporter, by which sequence numbers are told apart; 0: not told.
-        batch: Whether the payload is a batch, of which this is the first message's.
     """
 
     sequence: int
@@ -65,12 +60,11 @@ class SiteAttachment:
     path: tuple[str, ...]
     latched: bool = False
     run: int = 0
-    batch: bool = False
 
     def serialize(self) -> bytes:
         """The bytes of the attachment."""
         writer = AttachmentWriter(self.md5, self.node, self.path, latched=self.latched, run=self.run)
-        return writer.write(self.sequence, self.stamp, batch=self.batch)
+        return writer.write(self.sequence, self.stamp)
 
     @classmethod
     def parse(cls, data: Buffer) -> SiteAttachment:
@@ -80,7 +74,7 @@ class SiteAttachment:
             RemoteProtocolError: It is shorter than it says, of another version, or has a name that is none in ROS.
         """
         sequence, stamp, source = AttachmentReader().read(bytes(data))
-        return cls(sequence, stamp, source.md5, source.node, source.path, source.latched, source.run, source.batch)
+        return cls(sequence, stamp, source.md5, source.node, source.path, source.latched, source.run)
 
 
 class AttachmentWriter:
@@ -100,14 +94,9 @@ class AttachmentWriter:
         told = _RUN.pack(run) if run else b""
         self._tail = b"".join((_text(node), bytes([len(path)]), *map(_text, path), told))
 
-    def write(self, sequence: int, stamp: int, *, batch: bool = False) -> bytes:
-        """The attachment of one message, or of a batch that begins with it."""
-        flags = self._flags | _BATCH if batch else self._flags
-        return _HEAD.pack(VERSION, flags, sequence, stamp, self._md5) + self._tail
-
-    def batch(self, messages: Sequence[bytes], first: int, stamp: int) -> tuple[bytes, bytes]:
-        """Payload and attachment of messages together; ``first`` is the number of the first one."""
-        return join_batch(messages), self.write(first, stamp, batch=True)
+    def write(self, sequence: int, stamp: int) -> bytes:
+        """The attachment of one message."""
+        return _HEAD.pack(VERSION, self._flags, sequence, stamp, self._md5) + self._tail
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +108,6 @@ class MessageSource:
     path: tuple[str, ...]
     latched: bool
     run: int
-    batch: bool = False
 
 
 class AttachmentReader:
@@ -157,7 +145,7 @@ def _read_source(data: bytes) -> MessageSource:
     if version != VERSION:
         raise RemoteProtocolError(f"an attachment of a site is of version {version}; this gateway reads {VERSION}")
     node, path, run = _read_tail(data[_HEAD.size :])
-    return MessageSource(md5.hex(), node, path, bool(flags & _LATCHED), run, bool(flags & _BATCH))
+    return MessageSource(md5.hex(), node, path, bool(flags & _LATCHED), run)
 
 
 def _read_tail(tail: bytes) -> tuple[str, tuple[str, ...], int]:

@@ -3,7 +3,6 @@
 ::
 
     rmpa/1/<site>/<module>/t/<package>%<Type>/<topic>          messages
-    rmpa/1/<site>/<module>/t/<package>%<Type>/<topic>/@batch   messages together; no wildcard but its own fits it
     rmpa/1/<site>/<module>/s/<package>%<Type>/<service>        calls (queryable)
     rmpa/1/<site>/<module>/up/<instance>                       token: the module
     rmpa/1/<site>/<module>/up/<instance>/<t or s>/<package>%<Type>/<%node>/<%name>      token: a source
@@ -39,8 +38,6 @@ TO: Final = "to"
 """The chunk before the one other site that a source is for."""
 GATEWAY: Final = "-gateway"
 """Stands in the place of the module in the tokens of gateways."""
-BATCH: Final = "@batch"
-"""The last chunk of a topic's key for batches. Zenoh lets no ``*`` and no ``**`` match a chunk that begins so."""
 UNKNOWN_TYPE: Final = "*"
 """The type of a service whose server was not asked."""
 _UNKNOWN: Final = "-"
@@ -97,10 +94,6 @@ class SiteSource:
     def key(self) -> str:
         """The key of its messages or calls: sources of one topic share it, and the attachment says which it is."""
         return data_key(self.module.site, self.module.name, self.kind, self.type, self.name, self.to)
-
-    def batch_key(self) -> str:
-        """The key of its messages in batches, for gateways."""
-        return f"{self.key()}/{BATCH}"
 
 
 @dataclass(frozen=True, slots=True)

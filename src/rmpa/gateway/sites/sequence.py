@@ -49,27 +49,6 @@ class SequenceCounter:
         self.received += 1
         return True
 
-    def take_batch(self, run: int, first: int, count: int) -> int:
-        """Count messages that came together, as ``take`` does for each one.
-
-        Args:
-            run: The exporter's run.
-            first: The number of the first one.
-            count: How many there are, at least 1.
-
-        Returns:
-            How many of them, at the beginning, are not new.
-        """
-        old = 0
-        if run == self._run and not self._expects_first and first <= self._last:
-            old = min(count, self._last - first + 1)
-            self.old += old
-        if old < count:
-            self.take(run, first + old)
-            self._last += count - old - 1
-            self.received += count - old - 1
-        return old
-
     def announced(self, run: int, sequence: int) -> None:
         """The exporter says how many messages it has sent; if none has come yet, what it sends later is expected."""
         if self._run is None:

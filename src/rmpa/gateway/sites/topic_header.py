@@ -4,10 +4,9 @@ r"""The answer of a gateway to the question for a publisher's header (``…/d/t/
 
     {"type": "std_msgs/String", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1", "latching": false,
      "definition": "string data\n", "node": "/talker", "run": 17, "sequence": 42, "waiting": 0, "dropped": 0,
-     "limited": 0, "time": 1700000000000000000, "batches": true}
+     "limited": 0, "time": 1700000000000000000}
 
-The question's parameters are ``node`` (one publisher of several; without it any), ``site`` (the site that asks) and
-``batches`` (the site that asks would have the topic's messages in batches; a gateway that has them says so).
+The question's parameters are ``node`` (one publisher of several; without it any) and ``site`` (the site that asks).
 """
 
 from __future__ import annotations
@@ -47,7 +46,6 @@ class TopicHeader:
         dropped: Messages that its queue dropped.
         limited: Messages that a rule's limit kept back.
         time: The wall clock there, nanoseconds since 1970.
-        batches: Whether the topic's messages can be had in batches too.
     """
 
     description: TopicDescription
@@ -58,13 +56,10 @@ class TopicHeader:
     dropped: int = 0
     limited: int = 0
     time: int = 0
-    batches: bool = False
 
     def serialize(self) -> bytes:
         """The JSON of it."""
         fields = asdict(self)
-        if not self.batches:
-            del fields["batches"]
         return json.dumps({**fields.pop("description"), **fields}).encode()
 
     @classmethod
@@ -89,7 +84,7 @@ class TopicHeader:
             raise RemoteProtocolError(f"another site names the md5 sum {md5sum[:80]!r}")
         numbers = {key: _number(fields, key) for key in ("run", "sequence", "waiting", "dropped", "limited", "time")}
         description = TopicDescription(type_name, md5sum, definition, fields.get("latching") is True)
-        return cls(description, node, **numbers, batches=fields.get("batches") is True)
+        return cls(description, node, **numbers)
 
 
 def _text(fields: Mapping[str, object], key: str) -> str:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 _MODULE: Final = "rmpa/1/*/*"
 _ADDRESSED: Final = f"{_MODULE}/to/*"
 _TOPIC: Final = (
-    *(f"{head}/t/*/{{}}{end}" for head in (_MODULE, _ADDRESSED) for end in ("", "/@batch", "/@adv/**")),
+    *(f"{head}/t/*/{{}}{end}" for head in (_MODULE, _ADDRESSED) for end in ("", "/@adv/**")),
     f"{_MODULE}/d/t/{{}}",
 )
 _SERVICE: Final = (f"{_MODULE}/s/*/{{}}", f"{_ADDRESSED}/s/*/{{}}")

@@ -63,31 +63,23 @@ class ArrivalQueue(Generic[_T]):
         self._messages = messages
         self._bytes = size
         self._discard = discard
-        self._items: deque[tuple[_T, int, int]] = deque()
-        """Each with its size, and the messages that it counts as."""
+        self._items: deque[tuple[_T, int]] = deque()
+        """Each with its size."""
         self._waiting_bytes = 0
         self._scheduled = False
         self._closed = False
         self.dropped = 0
         """Items that found no room."""
-        self.users = 0
-        """Declarations that it is for; counted there."""
 
-    def add(self, item: _T, size: int = 0, messages: int = 1) -> None:
-        """Queue one item, from any thread.
-
-        Args:
-            item: The item.
-            size: Its bytes.
-            messages: How many of the messages that the loop takes before its other work it counts as.
-        """
+    def add(self, item: _T, size: int = 0) -> None:
+        """Queue one item of ``size`` bytes, from any thread."""
         with self._arrivals.lock:
             if self._closed:
                 return
-            self._items.append((item, size, messages))
+            self._items.append((item, size))
             self._waiting_bytes += size
             while len(self._items) > self._messages or (self._waiting_bytes > self._bytes and len(self._items) > 1):
-                old, old_size, _ = self._items.popleft()
+                old, old_size = self._items.popleft()
                 self._waiting_bytes -= old_size
                 self.dropped += 1
                 self._arrivals.refused["zenoh.arrival.dropped"] += 1
@@ -102,13 +94,13 @@ class ArrivalQueue(Generic[_T]):
         with self._arrivals.lock:
             self._closed = True
             if self._discard is not None:
-                self._arrivals.discarded.extend((self._discard, item) for item, _, _ in self._items)
+                self._arrivals.discarded.extend((self._discard, item) for item, _ in self._items)
                 self._arrivals.wake()
             self._items.clear()
             self._waiting_bytes = 0
 
-    def take(self) -> tuple[_T, int, int] | None:
-        """Take the oldest item, its size and its messages; ``None`` if none waits. The caller has the lock."""
+    def take(self) -> tuple[_T, int] | None:
+        """Take the oldest item, and its size; ``None`` if none waits. The caller has the lock."""
         if not self._items:
             return None
         item = self._items.popleft()
@@ -210,24 +202,23 @@ class Arrivals:
                 if not self._ready:
                     break
                 queue = self._ready.popleft()
-                taken, taken_messages, taken_bytes = self._take_turn(queue, min(messages, limits.TURN_MESSAGES))
+                taken, taken_bytes = self._take_turn(queue, min(messages, limits.TURN_MESSAGES))
                 queue.reschedule()
             with CollectedSends():  # one system call for what goes to one peer
                 for item in taken:
                     queue.deliver(item)
-            messages -= taken_messages
+            messages -= len(taken)
             size -= taken_bytes
         return limits.DRAIN_MESSAGES - messages
 
     @staticmethod
-    def _take_turn(queue: ArrivalQueue[object], messages: int) -> tuple[list[object], int, int]:
+    def _take_turn(queue: ArrivalQueue[object], messages: int) -> tuple[list[object], int]:
         taken: list[object] = []
-        taken_messages = taken_bytes = 0
-        while taken_messages < messages and taken_bytes < limits.TURN_BYTES:
+        taken_bytes = 0
+        while len(taken) < messages and taken_bytes < limits.TURN_BYTES:
             entry = queue.take()
             if entry is None:
                 break
             taken.append(entry[0])
             taken_bytes += entry[1]
-            taken_messages += entry[2]
-        return taken, taken_messages, taken_bytes
+        return taken, taken_bytes

@@ -45,14 +45,6 @@ TURN_MESSAGES: Final = 64
 """Messages of one publisher that are sent in one turn, while others of its priority wait."""
 TURN_BYTES: Final = 65_536
 """Bytes of one publisher in one turn: one batch of Zenoh. One message always fits."""
-BATCH_BYTES: Final = 16 * 1024
-"""Bytes of the messages that are put together as one batch; a larger message goes alone."""
-BATCH_MESSAGES: Final = 64
-"""Messages in a batch at most: above that another one costs no more than a hundredth of a message."""
-BATCH_STAMPS: Final = 1_000_000
-"""Nanoseconds between the stamps of the first and the last message of a batch, which has the first one's."""
-BATCH_MESSAGE: Final = 64
-"""Bytes of a batch that count as one message among those that wait for the event loop: the smallest ones."""
 ARRIVED_MESSAGES: Final = 10_000
 """Messages of one subscriber that wait for the event loop; above it the oldest is dropped, and counted. It is several
 bursts of 1,000, and 30 ms of what the loop can take."""

@@ -4,9 +4,6 @@ A put of a reliable publisher waits while the transport's queue of its priority 
 each priority. So each priority in use has one thread here, and within it the publishers take turns. What waits for
 a full bulk lane holds no command up, and nothing holds the event loop up. Behind a full transport the oldest messages
 of each publisher are dropped, and counted.
-
-A put costs 2 µs of processor time, and hands the interpreter's lock over. A publisher of numbered messages puts those
-that wait together as one batch, where a batch is wanted.
 """
 
 from __future__ import annotations
@@ -15,7 +12,7 @@ import logging
 import threading
 import time
 from collections import deque
-from typing import TYPE_CHECKING, Any, Final, Generic, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.gateway.zenoh import limits
 
@@ -23,13 +20,10 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable, Sequence
 
-    from rmpa.gateway.zenoh_api import Declared, NumberedWriter, ZenohQos
+    from rmpa.gateway.zenoh_api import ZenohQos
     from rmpa.ros.wire.tcpros import Buffer
 
 _log = logging.getLogger(__name__)
-_Message = TypeVar("_Message", bound=tuple[Any, ...])
-_Numbered: TypeAlias = tuple[bytes, int, int, "NumberedWriter"]
-"""Message, number, stamp, and what writes its attachment."""
 
 
 class PutHandle(Protocol):
@@ -39,8 +33,8 @@ class PutHandle(Protocol):
         """Hand one message to Zenoh."""
 
 
-class _TurnPublisher(Generic[_Message]):
-    """A publisher that queues, with the bounds of its QoS; the first item of a message is its payload.
+class QueuedPublisher:
+    """A publisher that queues, with the bounds of its QoS; each message has its own attachment.
 
     Args:
         lane: The thread of its priority.
@@ -56,9 +50,7 @@ class _TurnPublisher(Generic[_Message]):
         self._undeclare = undeclare
         self.handle: PutHandle | None = None
         """Zenoh's publisher; nothing is sent before it is declared."""
-        self.wanted = True
-        """Whether there may be a subscriber of its key; set from Zenoh's threads."""
-        self._queue: deque[_Message] = deque()
+        self._queue: deque[tuple[bytes, bytes]] = deque()
         self._queue_bytes = 0
         self._taken = 0
         self._scheduled = False
@@ -72,8 +64,12 @@ class _TurnPublisher(Generic[_Message]):
         """Messages in the queue, with those whose turn it is."""
         return len(self._queue) + self._taken
 
-    def queue(self, messages: Sequence[_Message]) -> int:
-        """Queue messages, in order; returns the messages dropped for them."""
+    def put(self, payload: Buffer, attachment: bytes = b"") -> int:
+        """Queue one message; the payload is copied if it is not ``bytes``. Returns the messages dropped for it."""
+        return self.put_all(((payload if isinstance(payload, bytes) else bytes(payload), attachment),))
+
+    def put_all(self, messages: Sequence[tuple[bytes, bytes]]) -> int:
+        """Queue messages, each with its attachment, in order; returns the messages dropped for them."""
         size = 0
         for message in messages:
             size += len(message[0])
@@ -105,9 +101,9 @@ class _TurnPublisher(Generic[_Message]):
         else:
             self._flush_timer = self._lane.loop.call_later(limits.FLUSH_MAX, self._give_up)
 
-    def take_turn(self) -> list[_Message]:
+    def take_turn(self) -> list[tuple[bytes, bytes]]:
         """Take the messages of one turn. The caller has the lane's lock."""
-        turn: list[_Message] = []
+        turn: list[tuple[bytes, bytes]] = []
         size = 0
         while self._queue and len(turn) < limits.TURN_MESSAGES and size < limits.TURN_BYTES:
             message = self._queue.popleft()
@@ -117,18 +113,16 @@ class _TurnPublisher(Generic[_Message]):
         self._taken = len(turn)
         return turn
 
-    def send(self, turn: list[_Message]) -> None:
+    def send(self, turn: list[tuple[bytes, bytes]]) -> None:
         """Put the messages of one turn, and count them. Called from the lane's thread, without its lock."""
-        raise NotImplementedError
-
-    def count(self, messages: int, *, sent: bool) -> None:
-        """Count messages of the turn. Called from the lane's thread, which alone writes these two."""
-        self._taken -= messages
-        if sent:
-            self.sent += messages
-        else:
-            with self._lane.changed:
-                self.dropped += messages
+        for payload, attachment in turn:
+            sent = self._lane.put(self.handle, self.key, payload, attachment)
+            self._taken -= 1
+            if sent:
+                self.sent += 1
+            else:
+                with self._lane.changed:
+                    self.dropped += 1
 
     def end_turn(self) -> None:
         """Queue up for another turn, or end. The caller has the lane's lock."""
@@ -169,120 +163,6 @@ class _TurnPublisher(Generic[_Message]):
         self._flushed()
 
 
-class QueuedPublisher(_TurnPublisher[tuple[bytes, bytes]]):
-    """A publisher that queues, with the bounds of its QoS; each message has its own attachment."""
-
-    def put(self, payload: Buffer, attachment: bytes = b"") -> int:
-        """Queue one message; the payload is copied if it is not ``bytes``. Returns the messages dropped for it."""
-        return self.queue(((payload if isinstance(payload, bytes) else bytes(payload), attachment),))
-
-    def send(self, turn: list[tuple[bytes, bytes]]) -> None:
-        """Put the messages of one turn, each for itself."""
-        for payload, attachment in turn:
-            self.count(1, sent=self._lane.put(self.handle, self.key, payload, attachment))
-
-
-class NumberedPublisher(_TurnPublisher[_Numbered]):
-    """A publisher of messages that are numbered, which go singly by its key, and in batches by a second one.
-
-    Both have all messages, in one order; each is used while it is wanted.
-
-    Args:
-        lane: The thread of its priority.
-        key: Its key for single messages.
-        qos: Its bounds, in messages.
-        undeclare: Called in the event loop once nothing of it is sent any more.
-        declare_batches: ``(publisher, key, on_matching)``: declares the second key.
-    """
-
-    def __init__(
-        self,
-        lane: SendingLane,
-        key: str,
-        qos: ZenohQos,
-        undeclare: Callable[[], None],
-        declare_batches: Callable[[NumberedPublisher, str, Callable[[bool], None]], Declared],
-    ) -> None:
-        super().__init__(lane, key, qos, undeclare)
-        self._declare_batches = declare_batches
-        self._cached = bool(qos.cache)
-        self.batch_handle: PutHandle | None = None
-        """Zenoh's publisher of the second key, once it is declared."""
-        self.batches_wanted = False
-        """Whether there is a subscriber of the second key; set from Zenoh's threads."""
-        self._batches: Declared | None = None
-
-    def put_all(self, messages: Sequence[bytes], first: int, stamp: int, writer: NumberedWriter) -> int:
-        """Queue messages that came together; returns the messages dropped for them.
-
-        Args:
-            messages: In order.
-            first: The number of the first one.
-            stamp: When they came, nanoseconds since 1970.
-            writer: Writes their attachments.
-        """
-        return self.queue([(each, number, stamp, writer) for number, each in enumerate(messages, first)])
-
-    def batch(self, key: str, on_matching: Callable[[bool], None]) -> None:
-        """Declare the second key, once; ``on_matching(there)`` tells whether there is a subscriber of it."""
-        if self._batches is None and not self._closed:
-            self._batches = self._declare_batches(self, key, on_matching)
-
-    def close(self) -> None:
-        """Undeclare it, after the queue is empty or a second has passed."""
-        undeclare, batches = self._undeclare, self._batches
-        if batches is not None:
-            self._batches = None
-
-            def undeclare_both() -> None:
-                batches.close()
-                undeclare()
-
-            self._undeclare = undeclare_both
-        super().close()
-
-    def send(self, turn: list[_Numbered]) -> None:
-        """Put the messages of one turn: as batches, singly, or both.
-
-        A subscriber that changes from one key to the other loses none: the batch goes first, and a subscriber that
-        has received it ignores the single messages.
-        """
-        batched = self.batches_wanted and self.batch_handle is not None
-        singly = self.wanted or self._cached or not batched
-        for batch in _batches(turn) if batched else ():
-            _, first, stamp, writer = batch[0]
-            payload, attachment = writer.batch([each[0] for each in batch], first, stamp)
-            sent = self._lane.put(self.batch_handle, self.key, payload, attachment)
-            if not singly:
-                self.count(len(batch), sent=sent)
-        for message, number, stamp, writer in turn if singly else ():
-            self.count(1, sent=self._lane.put(self.handle, self.key, message, writer.write(number, stamp)))
-
-
-def _batches(turn: list[_Numbered]) -> list[list[_Numbered]]:
-    """The messages of a turn as batches: of one writer, with numbers in sequence, about one stamp, not too large."""
-    batches: list[list[_Numbered]] = []
-    batch: list[_Numbered] = []
-    size = following = latest = 0
-    writer: NumberedWriter | None = None
-    for message in turn:
-        payload, number, stamp, its_writer = message
-        size += len(payload)
-        if (
-            number != following
-            or its_writer is not writer
-            or stamp > latest
-            or size > limits.BATCH_BYTES
-            or len(batch) >= limits.BATCH_MESSAGES
-        ):
-            batch = []
-            batches.append(batch)
-            size, latest, writer = len(payload), stamp + limits.BATCH_STAMPS, its_writer
-        batch.append(message)
-        following = number + 1
-    return batches
-
-
 class SendingLane:
     """The thread that puts the messages of one priority.
 
@@ -297,13 +177,13 @@ class SendingLane:
         self._failures = failures
         self.changed: Final = threading.Condition(threading.Lock())
         """Guards the queues of all publishers of this lane."""
-        self._ready: deque[_TurnPublisher[Any]] = deque()
+        self._ready: deque[QueuedPublisher] = deque()
         self._stopped = False
         self._failed = False
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
-    def schedule(self, publisher: _TurnPublisher[Any]) -> None:
+    def schedule(self, publisher: QueuedPublisher) -> None:
         """Give a publisher its turn. The caller has the lock."""
         self._ready.append(publisher)
         if len(self._ready) == 1:

@@ -12,13 +12,13 @@ import contextlib
 import json
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import StartError
 from rmpa.gateway.zenoh import limits
 from rmpa.gateway.zenoh.arrivals import ArrivalQueue, Arrivals, keep_thread_state
 from rmpa.gateway.zenoh.queries import AnswerBudget, ArrivedQuery, PendingGet, content
-from rmpa.gateway.zenoh.sending import NumberedPublisher, QueuedPublisher, SendingLane
+from rmpa.gateway.zenoh.sending import QueuedPublisher, SendingLane
 from rmpa.gateway.zenoh.socket_tuning import SocketTuning
 from rmpa.gateway.zenoh.worker import SerialWorker
 from rmpa.gateway.zenoh_api import ZenohPriority, ZenohSample
@@ -29,12 +29,11 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.permission_gate import Needs
     from rmpa.gateway.zenoh.config import ZenohConfig
-    from rmpa.gateway.zenoh_api import Declared, ZenohQos, ZenohQuery, ZenohReply
+    from rmpa.gateway.zenoh_api import ZenohQos, ZenohQuery, ZenohReply
     from rmpa.ros.wire.tcpros import Buffer
 
 _log = logging.getLogger(__name__)
 _WILD: Final = frozenset("*$")
-_Publisher = TypeVar("_Publisher", QueuedPublisher, NumberedPublisher)
 
 
 class Declaration:
@@ -44,7 +43,7 @@ class Declaration:
         worker: The thread that declares.
         kept: The open declarations of the session: Zenoh undeclares what is not referred to.
         declare: Makes Zenoh's object, or several that are undeclared together.
-        queue: Its arrivals, which other declarations may share; ``None`` if it has none.
+        queue: Its arrivals; ``None`` if it has none.
     """
 
     def __init__(
@@ -56,29 +55,25 @@ class Declaration:
     ) -> None:
         self._worker = worker
         self._kept = kept
-        self.queue = queue
+        self._queue = queue
         self._declare = declare
         self._objects: list[Any] = []
         self._closed = False
         kept.add(self)
-        if queue is not None:
-            queue.users += 1
         worker.submit(self._begin)
 
     @property
     def dropped(self) -> int:
         """Arrivals that found no room."""
-        return self.queue.dropped if self.queue is not None else 0
+        return self._queue.dropped if self._queue is not None else 0
 
     def close(self) -> None:
-        """Undeclare it; no callback is called afterwards, once all that share its queue are closed."""
+        """Undeclare it; no callback is called afterwards."""
         if not self._closed:
             self._closed = True
             self._kept.discard(self)
-            if self.queue is not None:
-                self.queue.users -= 1
-                if not self.queue.users:
-                    self.queue.close()
+            if self._queue is not None:
+                self._queue.close()
             self._worker.submit(self._end)
 
     def _begin(self) -> None:
@@ -119,7 +114,7 @@ class OpenSession:
         self._declarations = SerialWorker("zenoh declarations")
         self._queries = SerialWorker("zenoh queries")
         self._lanes: dict[ZenohPriority, SendingLane] = {}
-        self._publishers: set[QueuedPublisher | NumberedPublisher] = set()
+        self._publishers: set[QueuedPublisher] = set()
         self._kept: set[Declaration] = set()
         self._certificate = listens_with
         self._stamp = _stamp(listens_with)
@@ -150,72 +145,7 @@ class OpenSession:
 
     def publisher(self, key: str, qos: ZenohQos, on_matching: Callable[[bool], None]) -> QueuedPublisher:
         """Declare a publisher; ``on_matching(there)`` tells whether there is a subscriber, also at the beginning."""
-        return self._publish(
-            key, qos, on_matching, lambda undeclare: QueuedPublisher(self._lane(qos.priority), key, qos, undeclare)
-        )
-
-    def numbered_publisher(self, key: str, qos: ZenohQos, on_matching: Callable[[bool], None]) -> NumberedPublisher:
-        """Declare a publisher of messages that are numbered; the rest is as of ``publisher``."""
-
-        def made(undeclare: Callable[[], None]) -> NumberedPublisher:
-            return NumberedPublisher(self._lane(qos.priority), key, qos, undeclare, declare_batches)
-
-        def declare_batches(
-            publisher: NumberedPublisher, batch_key: str, on_batch_matching: Callable[[bool], None]
-        ) -> Declaration:
-            terms = self._terms(qos)
-            queue = self._matching_queue(on_batch_matching)
-
-            def wanted(there: bool) -> None:
-                publisher.batches_wanted = there
-                queue.add(there)
-
-            def declare() -> list[Any]:
-                declared, listener = self._declare_publisher(batch_key, terms, wanted)
-                publisher.batch_handle = declared
-                return [listener, declared]
-
-            return Declaration(self._declarations, self._kept, declare, queue)
-
-        return self._publish(key, qos, on_matching, made)
-
-    def _publish(
-        self,
-        key: str,
-        qos: ZenohQos,
-        on_matching: Callable[[bool], None],
-        make: Callable[[Callable[[], None]], _Publisher],
-    ) -> _Publisher:
         self._check(key)
-        queue = self._matching_queue(on_matching)
-        holder: list[Declaration] = []
-
-        def undeclare() -> None:
-            self._publishers.discard(publisher)
-            if not self._publishers and self._closing:
-                self._flushed.set()
-            holder[0].close()
-
-        publisher: _Publisher = make(undeclare)
-
-        def wanted(there: bool) -> None:
-            publisher.wanted = there
-            queue.add(there)
-
-        def declare() -> list[Any]:
-            terms = self._terms(qos)
-            plain, listener = self._declare_publisher(key, terms, wanted)
-            objects = [listener, plain]
-            if qos.cache:
-                objects.append(self._cached(key, qos, terms))
-            publisher.declared(objects[-1])
-            return objects
-
-        holder.append(Declaration(self._declarations, self._kept, declare, queue))
-        self._publishers.add(publisher)
-        return publisher
-
-    def _matching_queue(self, on_matching: Callable[[bool], None]) -> ArrivalQueue[bool]:
         last: list[bool] = []
 
         def matched(there: bool) -> None:
@@ -223,14 +153,29 @@ class OpenSession:
                 last[:] = [there]
                 on_matching(there)
 
-        return ArrivalQueue(self._arrivals, matched, 1, 0)
+        queue = ArrivalQueue(self._arrivals, matched, 1, 0)
 
-    def _declare_publisher(self, key: str, terms: dict[str, Any], wanted: Callable[[bool], None]) -> tuple[Any, Any]:
-        """Declare a publisher and what tells of its subscribers, from Zenoh's threads."""
-        declared = self._session.declare_publisher(key, **terms)
-        listener = declared.declare_matching_listener(self._direct(lambda status: wanted(bool(status.matching))))
-        wanted(bool(declared.matching_status.matching))
-        return declared, listener
+        def undeclare() -> None:
+            self._publishers.discard(publisher)
+            if not self._publishers and self._closing:
+                self._flushed.set()
+            declaration.close()
+
+        def declare() -> list[Any]:
+            terms = self._terms(qos)
+            plain = self._session.declare_publisher(key, **terms)
+            listener = plain.declare_matching_listener(self._direct(lambda status: queue.add(bool(status.matching))))
+            queue.add(bool(plain.matching_status.matching))
+            objects = [listener, plain]
+            if qos.cache:
+                objects.append(self._cached(key, qos, terms))
+            publisher.declared(objects[-1])
+            return objects
+
+        publisher = QueuedPublisher(self._lane(qos.priority), key, qos, undeclare)
+        declaration = Declaration(self._declarations, self._kept, declare, queue)
+        self._publishers.add(publisher)
+        return publisher
 
     def subscribe(
         self,
@@ -238,15 +183,11 @@ class OpenSession:
         on_sample: Callable[[ZenohSample], None],
         *,
         history: bool = False,
-        beside: Declared | None = None,
-        batches: bool = False,
     ) -> Declaration:
         """Subscribe to a key expression; see ``zenoh_api``."""
         self._check(key)
         fixed = None if _WILD.intersection(key) else key
-        queue: ArrivalQueue[ZenohSample] | None = beside.queue if isinstance(beside, Declaration) else None
-        if queue is None:
-            queue = ArrivalQueue(self._arrivals, on_sample, limits.ARRIVED_MESSAGES, limits.ARRIVED_BYTES)
+        queue = ArrivalQueue(self._arrivals, on_sample, limits.ARRIVED_MESSAGES, limits.ARRIVED_BYTES)
         put = self._zenoh.SampleKind.PUT
 
         def arrived(sample: Any) -> None:
@@ -255,12 +196,7 @@ class OpenSession:
             name = fixed or str(sample.key_expr)
             if fixed or self._short(name):
                 payload, attachment = content(sample.payload), content(sample.attachment)
-                size = len(payload)
-                queue.add(
-                    ZenohSample(name, payload, attachment),
-                    size + len(attachment),
-                    1 + size // limits.BATCH_MESSAGE if batches else 1,
-                )
+                queue.add(ZenohSample(name, payload, attachment), len(payload) + len(attachment))
 
         def declare() -> list[Any]:
             if not history:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rmpa.core.contract import Contract
     from rmpa.gateway.neighbour import OwnGraph, Tap
     from rmpa.gateway.sites.part import SiteExport
-    from rmpa.gateway.zenoh_api import ZenohNumberedPublisher, ZenohQuery, ZenohSession
+    from rmpa.gateway.zenoh_api import ZenohPublisher, ZenohQuery, ZenohSession
     from rmpa.ros.wire.tcpros import TopicDescription
 
 
@@ -37,7 +37,6 @@ class ExportedTopic:
         session: The Zenoh session.
         contract: The topic's contract.
         clock: Both clocks.
-        batches: Whether another site has asked for the topic in batches.
     """
 
     def __init__(
@@ -47,8 +46,6 @@ class ExportedTopic:
         session: ZenohSession,
         contract: Contract,
         clock: Clock,
-        *,
-        batches: bool = False,
     ) -> None:
         self.entry = entry
         self._graph = graph
@@ -68,10 +65,8 @@ class ExportedTopic:
         self._writer: AttachmentWriter | None = None
         self._collected: list[bytes] = []
         """The messages of the present read."""
-        self._matched = False
-        """Whether single messages are subscribed to."""
-        self._batches_matched = False
-        self._batches = batches
+        self.wanted = False
+        """Whether another site subscribes."""
         self._linger: asyncio.TimerHandle | None = None
         self._queries: list[tuple[ZenohQuery, asyncio.TimerHandle]] = []
         self._large = self._cached = False
@@ -79,30 +74,14 @@ class ExportedTopic:
         self._repeated = False
         self._held: bytes | None = None
         self._held_timer: asyncio.TimerHandle | None = None
-        self._retired: list[ZenohNumberedPublisher] = []
+        self._retired: list[ZenohPublisher] = []
         self._retire_timer: asyncio.TimerHandle | None = None
         self._publisher = self._declare()
-
-    @property
-    def wanted(self) -> bool:
-        """Whether another site subscribes."""
-        return self._matched or self._batches_matched
 
     @property
     def dropped(self) -> int:
         """Messages that the queues to Zenoh dropped."""
         return self._dropped_before + sum(each.dropped for each in (self._publisher, *self._retired))
-
-    @property
-    def offers_batches(self) -> bool:
-        """Whether another site has asked for the topic in batches."""
-        return self._batches
-
-    def offer_batches(self) -> None:
-        """Put messages together as batches under a key of their own too, while a gateway subscribes to it."""
-        if not self._batches:
-            self._batches = True
-            self._publisher.batch(self.entry.announced.batch_key(), self._on_batches_matching)
 
     def ask(self, query: ZenohQuery) -> None:
         """Answer a question for the publisher's header, once it is connected."""
@@ -162,13 +141,9 @@ class ExportedTopic:
 
     # --- demand ---------------------------------------------------------------------------------------------------
 
-    def _declare(self) -> ZenohNumberedPublisher:
+    def _declare(self) -> ZenohPublisher:
         qos = qos_of(self._contract, latching=self._cached, large=self._large)
-        announced = self.entry.announced
-        made = self._session.numbered_publisher(announced.key(), qos, self._on_matching)
-        if self._batches:
-            made.batch(announced.batch_key(), self._on_batches_matching)
-        return made
+        return self._session.publisher(self.entry.announced.key(), qos, self._on_matching)
 
     def _declare_anew(self) -> None:
         """Declare with another QoS; the old one ends when nothing waits in it."""
@@ -185,7 +160,7 @@ class ExportedTopic:
         if self._retired:
             self._retire_timer = asyncio.get_running_loop().call_later(limits.IDLE_CHECK, self._close_retired)
 
-    def _retire(self, publisher: ZenohNumberedPublisher) -> bool:
+    def _retire(self, publisher: ZenohPublisher) -> bool:
         """Close a publisher if nothing waits in it; return whether that was done."""
         if publisher.waiting:
             return False
@@ -194,11 +169,7 @@ class ExportedTopic:
         return True
 
     def _on_matching(self, there: bool) -> None:
-        self._matched = there
-        self._judge()
-
-    def _on_batches_matching(self, there: bool) -> None:
-        self._batches_matched = there
+        self.wanted = there
         self._judge()
 
     def _judge(self) -> None:
@@ -303,10 +274,10 @@ class ExportedTopic:
         """Queue what has come by the present read."""
         messages, self._collected = self._collected, []
         if messages and self._writer is not None:
-            first = self._sequence + 1
+            first, stamp, write = self._sequence + 1, self._clock.wall_ns(), self._writer.write
             self._sequence += len(messages)
             self._traffic.add(sum(map(len, messages)), len(messages))
-            self._publisher.put_all(messages, first, self._clock.wall_ns(), self._writer)
+            self._publisher.put_all([(each, write(number, stamp)) for number, each in enumerate(messages, first)])
 
     # --- the limits of a rule -------------------------------------------------------------------------------------
 
@@ -349,7 +320,6 @@ class ExportedTopic:
             self.dropped,
             self._limits.dropped,
             self._clock.wall_ns(),
-            self._batches,
         )
         query.reply(query.key, header.serialize())
         query.finish()

@@ -16,7 +16,7 @@ from rmpa.gateway.sites.sequence import SequenceCounter
 from rmpa.gateway.sites.topic_header import REFUSED, TopicHeader
 from rmpa.gateway.sites.traffic import SiteTraffic
 from rmpa.gateway.zenoh_api import ZenohPriority
-from rmpa.ros.wire.tcpros import LENGTH, printable
+from rmpa.ros.wire.tcpros import printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -57,8 +57,6 @@ class ImportedTopic:
         session: The Zenoh session.
         clock: Both clocks.
         on_demand: ``(topic, wanted)``: its key is to be subscribed to, or no longer.
-        on_batches: ``(topic, offered)``: its gateway has said whether the topic can be had in batches, which were
-            asked for, or it has to be asked anew.
         interrupted: What ``close`` returned before, if the same topic was there and went.
     """
 
@@ -70,7 +68,6 @@ class ImportedTopic:
         session: ZenohSession,
         clock: Clock,
         on_demand: Callable[[ImportedTopic, bool], None],
-        on_batches: Callable[[ImportedTopic, bool], None],
         interrupted: InterruptedTopic | None = None,
     ) -> None:
         self.entry = entry
@@ -78,9 +75,6 @@ class ImportedTopic:
         self._session = session
         self._clock = clock
         self._on_demand = on_demand
-        self._on_batches = on_batches
-        self._wants_batches = False
-        self._judged_at, self._judged_messages, self._judged_bytes = clock.now(), 0, 0
         self.wanted = False
         """Whether its key is subscribed to for it."""
         self._description: TopicDescription | None = None
@@ -134,36 +128,6 @@ class ImportedTopic:
         else:
             self._dropped += self._topic.publish(payload)
 
-    def take_batch(self, messages: list[memoryview], first: int, stamp: int, source: MessageSource) -> None:
-        """Take messages that came together, each with its length in front; the first one has the number ``first``."""
-        if source.latched or self._description is None or source.md5 != self._description.md5sum:
-            for number, message in enumerate(messages, first):
-                self.take(bytes(message[LENGTH.size :]), number, stamp, source)
-            return
-        old = self._sequence.take_batch(source.run, first, len(messages))
-        new = messages[old:] if old else messages
-        if not new:
-            return
-        self._fresh = True
-        self._traffic.add(sum(map(len, new)) - LENGTH.size * len(new), len(new))
-        if self._latencies is None:
-            self._latencies = SampleRing(limits.LATENCIES_KEPT)
-        self._latencies.add((self._clock.wall_ns() - stamp) / 1e9)
-        self._dropped += self._topic.publish_all(new)
-
-    def judge_rate(self, now: float) -> None:
-        """Ask for batches once so many small messages come that a batch pays; called once a second or so."""
-        traffic, passed = self._traffic, now - self._judged_at
-        messages, size = traffic.messages - self._judged_messages, traffic.bytes - self._judged_bytes
-        self._judged_at, self._judged_messages, self._judged_bytes = now, traffic.messages, traffic.bytes
-        if (
-            not self._wants_batches
-            and messages >= limits.BATCH_RATE * passed > 0
-            and size <= limits.BATCH_MESSAGE_BYTES * messages
-        ):
-            self._wants_batches = True
-            self._ask()
-
     def renew(self, entry: SiteImport) -> None:
         """Its module has started anew, or the way to it was interrupted: ask for the header again."""
         if entry.announced.module != self.entry.announced.module:
@@ -175,9 +139,6 @@ class ImportedTopic:
         self.entry = entry
         if moved:
             self._on_demand(self, True)
-        if self._wants_batches:
-            self._wants_batches = False
-            self._on_batches(self, False)
         if self.wanted:
             self._ask()
 
@@ -271,7 +232,7 @@ class ImportedTopic:
         self._linger = None
         if not self.wanted:
             return
-        self.wanted = self._wants_batches = False
+        self.wanted = False
         self._on_demand(self, False)
         # The next subscriber gets the last message from over there.
         self._sequence.restart()
@@ -305,7 +266,7 @@ class ImportedTopic:
         key = f"{ROOT}/{announced.module.site}/{announced.module.name}/d/t{announced.name}"
         before = self._clock.wall_ns()
         replies = await self._session.get(
-            f"{key}?node={announced.node};site={self._site}{';batches' if self._wants_batches else ''}",
+            f"{key}?node={announced.node};site={self._site}",
             timeout=limits.HEADER_TIMEOUT,
             priority=ZenohPriority.INTERACTIVE_HIGH,
         )
@@ -333,8 +294,6 @@ class ImportedTopic:
     def _described(self, header: TopicHeader) -> None:
         self._header = header
         self._problem = ""
-        if self._wants_batches:
-            self._on_batches(self, header.batches)
         self._sequence.announced(header.run, header.sequence - header.waiting)
         if header.waiting:
             self._check_soon()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rmpa.bridge.permission_gate import Needs
@@ -12,23 +13,32 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.sites.attachment import AttachmentReader
-from rmpa.gateway.sites.batch import split_batch
 from rmpa.gateway.sites.io.exported_topic import ExportedTopic
 from rmpa.gateway.sites.io.imported_topic import ImportedTopic, InterruptedTopic
-from rmpa.gateway.sites.io.topic_subscription import TopicSubscription
 from rmpa.gateway.sites.keys import ROOT
 from rmpa.gateway.sites.report import site_counts
 from rmpa.gateway.sites.topic_header import REFUSED
-from rmpa.ros.wire.tcpros import LENGTH
 
 if TYPE_CHECKING:
     from rmpa.core.clock import Clock
     from rmpa.core.contract import Contracts
     from rmpa.gateway.neighbour import OwnGraph
+    from rmpa.gateway.sites.attachment import MessageSource
     from rmpa.gateway.sites.keys import SiteModule
     from rmpa.gateway.sites.part import SiteExport, SiteImport
     from rmpa.gateway.sites.rules import CrossingRules
     from rmpa.gateway.zenoh_api import Declared, ZenohQuery, ZenohSample, ZenohSession
+
+
+@dataclass(slots=True)
+class _Subscription:
+    """The subscription to one topic of one module at another site, which its publishers share."""
+
+    declared: Declared
+    topics: dict[str, ImportedTopic] = field(default_factory=dict)
+    """By node."""
+    latched: dict[str, tuple[bytes, int, int, MessageSource]] = field(default_factory=dict)
+    """The last latched message of nodes that are not wanted: they were told once, and would not be again."""
 
 
 class SiteTopics:
@@ -69,7 +79,7 @@ class SiteTopics:
         """By site, module, node and name there."""
         self._interrupted: dict[tuple[str, str, str, str], InterruptedTopic] = {}
         """Likewise: those that went while nodes subscribed."""
-        self._subscriptions: dict[str, TopicSubscription] = {}
+        self._subscriptions: dict[str, _Subscription] = {}
         self._questions: dict[SiteModule, tuple[Declared, Declared]] = {}
         self._reader = AttachmentReader()
         self._check_timer: asyncio.TimerHandle | None = None
@@ -84,11 +94,8 @@ class SiteTopics:
         self.withdraw(entry)
         contract = self._contracts.of(entry.source.here, entry.announced.type)
         topics = self._exported.setdefault((entry.source.module, entry.source.name), {})
-        batches = any(
-            each.offers_batches for each in topics.values() if each.entry.announced.to == entry.announced.to
-        )
         topics[entry.source.node, entry.announced.to] = ExportedTopic(
-            entry, self._graph, self._session, contract, self._clock, batches=batches
+            entry, self._graph, self._session, contract, self._clock
         )
 
     def withdraw(self, entry: SiteExport) -> None:
@@ -115,7 +122,6 @@ class SiteTopics:
                 self._session,
                 self._clock,
                 self._on_demand,
-                self._on_batches,
                 interrupted,
             )
 
@@ -187,9 +193,8 @@ class SiteTopics:
         subscription = self._subscriptions.get(key)
         if wanted:
             if subscription is None:
-                subscription = self._subscriptions[key] = TopicSubscription(
-                    self._session, announced, lambda sample: self._on_sample(key, sample)
-                )
+                declared = self._session.subscribe(key, lambda sample: self._on_sample(key, sample), history=True)
+                subscription = self._subscriptions[key] = _Subscription(declared)
             subscription.topics[announced.node] = topic
             self._check_later()
             known = subscription.latched.pop(announced.node, None)
@@ -199,48 +204,32 @@ class SiteTopics:
             subscription.topics.pop(announced.node)
             if not subscription.topics:
                 del self._subscriptions[key]
-                subscription.close()
-
-    def _on_batches(self, topic: ImportedTopic, offered: bool) -> None:
-        subscription = self._subscriptions.get(topic.entry.announced.key())
-        if subscription is not None:
-            subscription.use_batches() if offered else subscription.use_singles()
+                subscription.declared.close()
 
     def _on_sample(self, key: str, sample: ZenohSample) -> None:
         try:
             sequence, stamp, source = self._reader.read(sample.attachment)
-            batch = split_batch(sample.payload) if source.batch else None
         except RemoteProtocolError:
             self.counters.add("site.message.malformed")
             return
         if self._site in source.path:
-            self.counters.add("site.message.looped", len(batch or (1,)))
+            self.counters.add("site.message.looped")
             return
         subscription = self._subscriptions.get(key)
         if subscription is None:
             return
         topic = subscription.topics.get(source.node)
-        if batch is not None:
-            subscription.batch_came(source.node)
-            if topic is not None:
-                topic.take_batch(batch, sequence, stamp, source)
-                return
-        elif subscription.is_repeated(source.node):
-            return
-        elif topic is not None:
+        if topic is not None:
             topic.take(sample.payload, sequence, stamp, source)
             return
-        self.counters.add("site.message.unwanted_node", len(batch or (1,)))
+        self.counters.add("site.message.unwanted_node")
         known = subscription.latched
         if source.latched and (source.node in known or len(known) < limits.LATCHED_NODES_MAX):
-            last = sample.payload if batch is None else bytes(batch[-1][LENGTH.size :])
-            if (
-                sum(len(each[0]) for node, each in known.items() if node != source.node) + len(last)
-                > limits.HELD_BYTES
-            ):
+            others = sum(len(each[0]) for node, each in known.items() if node != source.node)
+            if others + len(sample.payload) > limits.HELD_BYTES:
                 self.counters.add("site.message.unkept")
-                return
-            known[source.node] = last, sequence + len(batch or (1,)) - 1, stamp, source
+            else:
+                known[source.node] = sample.payload, sequence, stamp, source
 
     def _check_later(self) -> None:
         if self._check_timer is None and self._subscriptions:
@@ -252,7 +241,6 @@ class SiteTopics:
         for subscription in self._subscriptions.values():
             for topic in subscription.topics.values():
                 topic.check(now)
-                topic.judge_rate(now)
         self._check_later()
 
     # --- questions of other sites -----------------------------------------------------------------------------------
@@ -270,11 +258,6 @@ class SiteTopics:
         if topic is None:
             query.reply_error(f"no such publisher of {name[:200]} at {module.name}")
             return
-        if "batches" in asked:
-            # All publishers of the key: a subscriber of batches subscribes to nothing else of it.
-            for (_, to), each in topics.items():
-                if to == topic.entry.announced.to:
-                    each.offer_batches()
         topic.ask(query)
 
     def _on_definition_query(self, module: SiteModule, query: ZenohQuery) -> None:
