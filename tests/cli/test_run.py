@@ -219,19 +219,25 @@ def test_exceptions_are_contained_and_a_crash_ends_in_order(ground: Ground) -> N
     assert again.interrupt() == 0, again.output
 
 
-@pytest.mark.parametrize("what", ["profile", "thread"])
-def test_what_hangs_does_not_keep_it_from_its_end(ground: Ground, what: str) -> None:
-    hung = 'def plain():\n    print("hangs", flush=True)\n    time.sleep(1000)\n'
-    text = HEAD.replace("def plain(): pass\n", hung) if what == "profile" else HEAD + hung.replace("plain", "mine")
-    mine = 'threading.Thread(target=mine, name="of mine").start()\n' if what == "thread" else ""
-    run = ground.run(text + TALK + mine)
+def test_a_thread_that_hangs_does_not_keep_it_from_its_end(ground: Ground) -> None:
+    hung = 'def mine():\n    print("hangs", flush=True)\n    time.sleep(1000)\n'
+    run = ground.run(HEAD + hung + TALK + 'threading.Thread(target=mine, name="of mine").start()\n')
     run.wait_for("nose: active on", 60)
     run.wait_for("hangs")
     agent = agent_of(run)
-    # A profile's thread is ours, and ends with us; the interpreter would wait for the user's own for ever.
-    assert run.interrupt() == (0 if what == "profile" else 1)
-    assert ("! of mine does not come back; it is left behind" in run.output) == (what == "thread")
+    assert run.interrupt() == 1  # the interpreter would wait for the user's own thread for ever
+    assert "! of mine does not come back; it is left behind" in run.output
     assert not agent.is_running()
+
+
+def test_a_profile_that_hangs_ends_it_in_order(ground: Ground) -> None:
+    hangs = "def plain():\n    time.sleep(1000)\nnose.adaptation(apply_timeout='200 ms')\n"
+    run = ground.run(HEAD.replace("def plain(): pass\n", hangs) + TALK)
+    assert run.wait() == 1
+    assert (
+        "rmpa: the function of profile plain has not returned within 0.2 s; the resource ends; mend it" in run.output
+    )
+    assert not list(ground.place.path.glob("**/nose.sock"))
 
 
 def test_told_twice_it_ends_at_once(ground: Ground) -> None:

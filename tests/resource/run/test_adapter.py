@@ -208,7 +208,7 @@ async def test_dead_client_is_released(sonar: Sonar, core: RosCore) -> None:
             await asyncio.sleep(0.05)
 
 
-async def test_failed_or_hung_profile_is_replaced(sonar: Sonar, client: Node) -> None:
+async def test_failed_profile_is_replaced(sonar: Sonar, client: Node) -> None:
     responses = await client.subscribe("/sonar/responses", ARRAY)
     sonar.broken["fine"] = OSError("no such mode")
     publisher = await ask(client, noise="<= 5 cm")
@@ -216,11 +216,6 @@ async def test_failed_or_hung_profile_is_replaced(sonar: Sonar, client: Node) ->
         while not (excluded := sonar.adapter.loop.explain(asyncio.get_running_loop().time())[0].excluded):
             await asyncio.sleep(0.02)
     assert excluded == "OSError: no such mode"
-    sonar.broken["fine"] = threading.Event()
-    async with asyncio.timeout(30):
-        while "not applied within" not in excluded:
-            excluded = sonar.adapter.loop.explain(asyncio.get_running_loop().time())[0].excluded
-            await asyncio.sleep(0.02)
     assert sonar.adapter.loop.profile == "coarse"
     # It goes on publishing under the profile that it has.
     words = await client.subscribe("/sonar/words", "std_msgs/String")

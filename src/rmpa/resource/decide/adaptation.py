@@ -7,7 +7,9 @@ reports the outcome. The states::
     NONE ──decided──► APPLYING ──applied──► ACTIVE ──another profile is better──► APPLYING
                        │  ▲                    │
                        │  └─ next best ◄───────┘ violated
-                       └─ failed, hung: excluded for a cool-down; the next best profile is applied
+                       └─ failed: excluded for a cool-down; the next best profile is applied
+
+A profile that hangs (``hung``) is excluded for its cool-down too, and the driver ends the resource.
 
 A disturbance is a violation in ``k`` of the last ``n`` windows. If another profile meets the requirements, that is an
 *adaptation event* (WARN): the violated profile is excluded for its cool-down and the other one is applied. If none
@@ -66,8 +68,6 @@ class Adaptation:
         self._blocked: dict[str, str] = {}
         """Why a profile is blocked by its precondition or by the context, by profile."""
         self._cool_downs = CoolDowns(settings.cool_down, settings.cool_down_max)
-        self._hanging: set[str] = set()
-        """Profiles that were given up and whose functions still run."""
         self._detector = ViolationDetector(attributes, settings.violations, settings.windows)
         self._state = ProfileState.NONE
         self._profile = ""
@@ -77,14 +77,11 @@ class Adaptation:
         """The profile that ran before the restart; empty after the first decision."""
         self._active_since = -math.inf
         self._window_end: float | None = None
-        self._apply_deadline = math.inf
         self._cause = math.inf
         """When the cause of the present reconfiguration began; infinite: no reconfiguration is under way."""
         self._alarm: Alarm | None = None
         self._replan_at_once = False
         """Whether a change that skips the dwell time has occurred while a profile was being applied."""
-        self._reapply_reason = ""
-        """Why the profile that is being applied must be applied once more; empty: it need not."""
 
     @property
     def state(self) -> ProfileState:
@@ -227,7 +224,7 @@ class Adaptation:
         if decision.feasible:
             self._cool_downs.begin(self._profile, why, now)
             alarm = Alarm(AlarmKind.ADAPTATION, short, self._profile, decision.profile, now)
-            return [*self._raise_alarm(alarm), *self._apply(decision.profile, why, now, since)]
+            return [*self._raise_alarm(alarm), *self._apply(decision.profile, why, since)]
         # No other profile meets the requirements: this one stays, unless a best-effort profile is declared.
         after = decision if decision.best_effort else self._decider.decide(self._merged.bounds, self._excluded(now))
         actions: list[Action] = []
@@ -236,7 +233,7 @@ class Adaptation:
             actions += self._raise_alarm(alarm)
         if decision.best_effort and decision.profile != self._profile:
             self._cool_downs.begin(self._profile, why, now)
-            actions += self._apply(decision.profile, "none can serve: best effort", now, since)
+            actions += self._apply(decision.profile, "none can serve: best effort", since)
         return actions
 
     # --- reports of the driver ----------------------------------------------------------------------------------
@@ -247,18 +244,13 @@ class Adaptation:
             return []
         self._state = ProfileState.ACTIVE
         self._profile, self._target = profile, ""
-        self._active_since, self._apply_deadline = now, math.inf
+        self._active_since = now
         self._detector.clear()
         reaction = max(0.0, now - self._cause)
         at_once, self._replan_at_once = self._replan_at_once, False
-        why = "what is asked has changed meanwhile"
-        if reason := self._reapply_reason:
-            planned = self._plan(now, why, at_once=at_once)
-            if self._target or not self._profile:
-                return planned
-            return [*planned, *self._apply(self._profile, reason, now, now)]
         self._cause = math.inf
-        return [Reacted(profile, reaction), *self._plan(now, why, at_once=at_once)]
+        planned = self._plan(now, "what is asked has changed meanwhile", at_once=at_once)
+        return [Reacted(profile, reaction), *planned]
 
     def failed(self, profile: str, why: str, now: float) -> list[Action]:
         """Report that the profile could not be applied; the next best profile is applied instead.
@@ -269,42 +261,22 @@ class Adaptation:
             return []
         self._cool_downs.begin(profile, why, now)
         self._state = ProfileState.ACTIVE if self._profile else ProfileState.NONE
-        self._target, self._apply_deadline = "", math.inf
+        self._target = ""
         # The failed profile may be partly in force, so even the profile that ran before is applied again.
         return self._plan(now, f"{profile} failed: {why}", again=True)
 
-    def overdue(self, now: float) -> bool:
-        """Whether the profile that is being applied has exceeded its time-out; ``handle_timer`` gives it up then."""
-        return self._apply_deadline <= now
-
-    def ended_late(self, profile: str, now: float, *, touched: bool) -> list[Action]:
-        """Report that the function of a profile that was given up has ended; the profile may be chosen again.
-
-        Args:
-            profile: The profile; excluded until this call, because two calls of one function must not overlap.
-            now: The time of the call.
-            touched: Whether the function may have changed the device after the present profile's function began. If
-                so, the present profile is applied once more, if necessary after its first application is complete.
-        """
-        self._hanging.discard(profile)
-        why = f"the function of {profile} has ended late"
-        if touched and self._state is ProfileState.APPLYING:
-            self._reapply_reason = why
-        elif touched and self._state is ProfileState.ACTIVE:
-            return self._apply(self._profile, why, now, now)
-        return self._plan(now, why)
+    def hung(self, profile: str, why: str, now: float) -> None:
+        """Begin the cool-down of a profile whose function hangs, so that the restarted resource tries another one."""
+        self._cool_downs.begin(profile, why, now)
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due; ``None``: no timer runs."""
         expiries = (r.expires for r in self._requirements.values() if r.expires is not None)
-        first = min(self._apply_deadline, self._cool_downs.next_timer(), min(expiries, default=math.inf))
+        first = min(self._cool_downs.next_timer(), min(expiries, default=math.inf))
         return None if first == math.inf else first
 
     def handle_timer(self, now: float) -> list[Action]:
-        """Handle what is due: requirements that expire, cool-downs that end, a profile that hangs."""
-        if self.overdue(now):
-            self._hanging.add(self._target)
-            return self.failed(self._target, self._hang_reason, now)
+        """Handle what is due: requirements that expire, cool-downs that end."""
         over = [c for c, r in self._requirements.items() if r.expires is not None and r.expires <= now]
         for client in over:
             del self._requirements[client]
@@ -347,7 +319,7 @@ class Adaptation:
             return actions
         if not again and not at_once and not self._worth_it(decision, now):
             return actions
-        return [*actions, *self._apply(decision.profile, why, now, now)]
+        return [*actions, *self._apply(decision.profile, why, now)]
 
     def _pinned_or_best(self, now: float) -> ProfileDecision:
         excluded = self._excluded_by_failure(now)
@@ -392,12 +364,10 @@ class Adaptation:
         )
         return self._raise_alarm(Alarm(AlarmKind.NON_ADAPTABLE, short, self._profile, decision.profile, now))
 
-    def _apply(self, profile: str, why: str, now: float, cause: float) -> list[Action]:
+    def _apply(self, profile: str, why: str, cause: float) -> list[Action]:
         self._state = ProfileState.APPLYING
         self._target = profile
-        self._apply_deadline = now + self._settings.apply_timeout
         self._cause = min(self._cause, cause)
-        self._reapply_reason = ""
         return [Apply(profile, why)]
 
     def _score(self, profile: str, now: float) -> ProfileScore:
@@ -408,12 +378,7 @@ class Adaptation:
         return self._excluded_by_failure(now) | self._blocked
 
     def _excluded_by_failure(self, now: float) -> dict[str, str]:
-        cooling = {name: one.why for name, one in self.cooling(now).items()}
-        return cooling | dict.fromkeys(self._hanging, f"{self._hang_reason}, and its function still runs")
-
-    @property
-    def _hang_reason(self) -> str:
-        return f"not applied within {self._settings.apply_timeout:g} s"
+        return {name: one.why for name, one in self.cooling(now).items()}
 
     @property
     def _non_adaptable(self) -> bool:

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from rmpa.core.errors import LocalProtocolError
-from rmpa.resource.declare.fence import fenced_action
 from rmpa.ros.types.definitions import UnknownTypeError
 from rmpa.ros.types.find import find_message_type
 
@@ -95,7 +94,7 @@ class Output:
 
         Raises:
             MessageError: The message does not fit the output's type, or both a message and field values are given.
-            LocalProtocolError: The resource does not run, or the calling profile or context function was given up.
+            LocalProtocolError: The resource does not run.
         """
         if self.on_publish is None:
             raise LocalProtocolError(f"{self.name} has nowhere to go: its resource does not run (rmpa run)")
@@ -141,12 +140,10 @@ class DeclaredAttribute:
 
         Raises:
             ConfigError: The value is not valid for this attribute.
-            LocalProtocolError: The calling profile or context function was given up.
         """
         checked = self.attribute.check(value, f"observation of {self.attribute.name}")
         if self.on_observation is not None:
-            with fenced_action(f"observe {self.attribute.name}"):
-                self.on_observation(self.attribute.name, checked)
+            self.on_observation(self.attribute.name, checked)
 
 
 @dataclass(eq=False)
@@ -169,15 +166,10 @@ class Demand:
     on_change: Callable[[Demand], None] | None = field(default=None, repr=False)
 
     def ask(self, **requests: QoSRequest) -> None:
-        """Replace the requests; without arguments nothing is requested. May be called in any thread.
-
-        Raises:
-            LocalProtocolError: The calling profile or context function was given up.
-        """
-        with fenced_action(f"ask {self.resource}"):
-            self.requests = requests
-            if self.on_change is not None:
-                self.on_change(self)
+        """Replace the requests; without arguments nothing is requested. May be called in any thread."""
+        self.requests = requests
+        if self.on_change is not None:
+            self.on_change(self)
 
     @property
     def wishes(self) -> Mapping[str, QoSRequest]:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError
 from rmpa.core.sizes import INT32_MAX, INT32_MIN
-from rmpa.resource.declare.fence import fenced_action
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -56,16 +55,14 @@ class Parameter:
 
         Raises:
             ConfigError: On setting: the value is invalid.
-            LocalProtocolError: On setting: the calling profile or context function was given up.
         """
         return self._value
 
     @value.setter
     def value(self, value: ParameterValue) -> None:
-        with fenced_action(f"set parameter {self.name}"):
-            before, self._value = self._value, self.check(value)
-            if self.on_change is not None and self._value != before:
-                self.on_change(self)
+        before, self._value = self._value, self.check(value)
+        if self.on_change is not None and self._value != before:
+            self.on_change(self)
 
     @property
     def type(self) -> str:

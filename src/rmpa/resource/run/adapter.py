@@ -28,8 +28,9 @@ from rmpa.resource.decide.reports import (
     health,
 )
 from rmpa.resource.decide.saved_state import SavedCoolDown, SavedRequirement, SavedState
+from rmpa.resource.declare.adaptation_settings import AdaptationSettings
 from rmpa.resource.declare.requirements import Requirement
-from rmpa.resource.run.applier import Applier
+from rmpa.resource.run.applier import Applier, HungError
 from rmpa.resource.run.preconditions import Preconditions
 from rmpa.resource.run.runtime import RuntimePart
 from rmpa.resource.run.status_publisher import StatusPublisher
@@ -42,7 +43,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from rmpa.resource.decide.decision import ProfileScore
-    from rmpa.resource.declare.adaptation_settings import AdaptationSettings
     from rmpa.resource.declare.attributes import Value
     from rmpa.resource.declare.connections import Input, Output
     from rmpa.resource.declare.requirements import Bound
@@ -68,6 +68,7 @@ class Adapter(RuntimePart):
         window: Length of a quality window, in seconds.
         settings: Settings of the control loop; ``None``: the defaults.
         problems: Returns the problems apart from the quality, as texts: what is missing, and what does not work.
+        on_hung: Called when a function of a profile or context has exceeded its time-out: the resource has to end.
     """
 
     def __init__(
@@ -78,6 +79,7 @@ class Adapter(RuntimePart):
         window: float = 1.0,
         settings: AdaptationSettings | None = None,
         problems: Callable[[], tuple[list[str], list[str]]] = lambda: ([], []),
+        on_hung: Callable[[], None] = lambda: None,
     ) -> None:
         resource = runtime.resource
         self._runtime = runtime
@@ -85,6 +87,8 @@ class Adapter(RuntimePart):
         self._window = window
         self._problems = problems
         self._attributes = resource.attributes
+        self._on_hung = on_hung
+        settings = settings if settings is not None else AdaptationSettings()
         profiles = [declared.profile for declared in resource.profiles.values()]
         self.loop = Adaptation(self._attributes, Decider(resource.name, self._attributes, profiles), settings)
         self.clients = Clients(resource.name, self._attributes)
@@ -98,11 +102,15 @@ class Adapter(RuntimePart):
         self._applier = Applier(
             runtime,
             tasks,
+            settings.apply_timeout,
             on_applied=self._applied,
-            on_ended_late=self._ended_late,
-            on_late_action=self.report_late_action,
+            on_hung=self.end,
         )
-        self._preconditions = Preconditions(resource.profiles, self._update_blocked)
+        self.hung: HungError | None = None
+        """The function for which the resource ends; ``None``: none hangs."""
+        self._preconditions = Preconditions(resource.profiles)
+        self._blocked_by_needs: dict[str, str] = {}
+        self._checking: asyncio.Task[None] | None = None
         self._blocked_by_context: dict[str, str] = {}
         self._observed_by = ObservedQualities(
             self._attributes, resource.name, limits.RESOURCE_REPORT_WINDOWS * window
@@ -132,7 +140,7 @@ class Adapter(RuntimePart):
     async def start(self) -> None:
         """Begin to measure, choose the first profile, and serve clients."""
         self._loop = asyncio.get_running_loop()
-        await self._preconditions.start()
+        await self._check_preconditions()
         self._measuring = QualityMeasurement(self._runtime.resource, self._loop.time())
         await self.reports.start()
         now = self._loop.time()
@@ -154,6 +162,9 @@ class Adapter(RuntimePart):
         for timer in self._timers:
             timer.close()
         self.reports.close()
+        if self._checking is not None:
+            self._checking.cancel()
+            await asyncio.wait([self._checking])
         await self._preconditions.close()
         await self._applier.close()
 
@@ -201,8 +212,8 @@ class Adapter(RuntimePart):
         self._measured = self._observed_by.worst(measured, self.loop.requirements, now)
         for text, missing in self._missing.update(self._problems()[0]):
             self._missing_changed(text, missing=missing)
-        self._preconditions.check()
-        self._update_blocked()
+        if self._checking is None or self._checking.done():
+            self._checking = self._loop.create_task(self._check_preconditions(), name="check preconditions")
         self._act(self.loop.window(self._measured, now))
         self._publish_quality()
         self._respond()
@@ -314,8 +325,8 @@ class Adapter(RuntimePart):
         return self.loop.explain(self._loop.time())
 
     async def settled(self) -> None:
-        """Wait until no profile is being applied; a profile that hangs is given up at its time-out."""
-        while self.loop.applying and not self._closed:
+        """Wait until no profile is being applied, or the resource ends."""
+        while self.loop.applying and not self._closed and self.hung is None:
             await self._applier.wait()
 
     def _check_clients(self, now: float) -> None:
@@ -329,10 +340,14 @@ class Adapter(RuntimePart):
 
     # --- actions ------------------------------------------------------------------------------------------------
 
+    async def _check_preconditions(self) -> None:
+        self._blocked_by_needs = await self._preconditions.check()
+        self._update_blocked()
+
     def _update_blocked(self) -> None:
         """Block the profiles whose preconditions do not hold, and those that the context excludes."""
         if self._requirements is not None and not self._closed:  # not before the start
-            blocked = self._preconditions.blocked() | self._blocked_by_context
+            blocked = self._blocked_by_needs | self._blocked_by_context
             self._act(self.loop.block(blocked, self._loop.time()))
 
     def _act(self, actions: list[Action]) -> None:
@@ -363,36 +378,18 @@ class Adapter(RuntimePart):
         self._act(self.loop.failed(profile, why, now) if why else self.loop.applied(profile, now))
         self._respond()
 
-    def _ended_late(self, profile: str, touched: bool, text: str) -> None:
-        again = (self.loop.applying or self.loop.profile) if touched else ""
-        if again:
-            self.report_late_action(profile, f"{text}; {again} is applied once more")
-        else:
-            _log.info("= %s: %s", self._name, text)
-        self._act(self.loop.ended_late(profile, self._loop.time(), touched=touched))
-        self._respond()
-
-    def report_late_action(self, before: str, text: str) -> None:
-        """Report a late action of a profile's or context's function that was given up.
-
-        Args:
-            before: The profile or context of that function.
-            text: The message of the alarm and of the log.
-        """
-        _log.warning("! %s: %s", self._name, text)
-        values = {"before": before, "after": self.loop.applying or self.loop.profile}
-        self.reports.alarm(DiagnosticLevel.WARN, text, values)
-        for part in self._runtime.parts:
-            part.late_action(text)
+    def end(self, hung: HungError) -> None:
+        """Raise an alarm about a function that has exceeded its time-out, and let the resource end."""
+        _log.error("! %s: %s", self._name, hung)
+        self.hung = hung
+        if hung.what == "profile":
+            self.loop.hung(hung.name, f"not applied within {hung.limit:g} s", self._loop.time())
+        values = {"before": self.loop.profile, "after": "", "cleared": "false"}
+        self.reports.alarm(DiagnosticLevel.ERROR, str(hung), values)
+        self._on_hung()
 
     def _handle_timer(self, now: float) -> None:
-        hung = self.loop.applying if self.loop.overdue(now) else ""
-        goes_on = self._applier.give_up() if hung else False
         self._act(self.loop.handle_timer(now))
-        if hung and not self.loop.applying:
-            self._applier.resume()
-        if hung and not goes_on:
-            self._act(self.loop.ended_late(hung, now, touched=False))
         self._respond()
 
     # --- reports ------------------------------------------------------------------------------------------------
@@ -412,9 +409,7 @@ class Adapter(RuntimePart):
 
     def health(self) -> tuple[DiagnosticLevel, str]:
         """The present level and message of the resource's ``quality`` topic."""
-        missing, broken = self._problems()
-        broken += [f"the function of profile {name} hangs; it was given up" for name in self._applier.hanging]
-        return health(self.loop, missing, broken)
+        return health(self.loop, *self._problems())
 
     def _publish_alarm(self, alarm: Alarm, *, cleared: bool) -> None:
         values = alarm_values(alarm, self._attributes, cleared=cleared, reaction=self.reaction)

@@ -1,30 +1,85 @@
-"""Applies profiles, each between two runs of the tasks, and isolates functions that hang.
-
-A plain function that hangs in a thread cannot be stopped. It is given up: its later actions through the resource have
-no effect (``resource.declare.fence``). When it ends, the profile that runs is applied once more, because the function
-may have changed the device itself. Until then its own profile is excluded: calls of one function must not overlap.
-"""
+"""Calls the functions of profiles and contexts, and applies profiles, each between two runs of the tasks."""
 
 from __future__ import annotations
 
 import asyncio
-import functools
+import inspect
 import logging
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rmpa.resource.run.fenced_call import FencedCall
+from rmpa.core.errors import RmpaError
+from rmpa.resource.run.runtime import CALLER
+from rmpa.runtime.threads import in_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from rmpa.resource.declare.behaviour import Hook
     from rmpa.resource.run.runtime import Runtime
     from rmpa.resource.run.tasks import Tasks
 
 _log = logging.getLogger(__name__)
 _WAIT: Final = 0.25
 """The longest time in seconds that one call of ``wait`` takes."""
-_WAIT_IDLE: Final = 0.02
-"""Seconds that ``wait`` takes if the task that applied the profile has died; the time-out gives the profile up."""
+
+
+@dataclass(eq=False)
+class HungError(RmpaError):
+    """A function of a profile or context has not returned within its time-out; the resource ends.
+
+    Args:
+        what: ``profile`` or ``context``.
+        name: Name of the profile or context.
+        limit: The time-out in seconds.
+        remedy: What to do about it.
+    """
+
+    what: str
+    name: str
+    limit: float
+    remedy: str
+
+    def __str__(self) -> str:
+        """Say which function, which time-out, and what to do."""
+        text = f"the function of {self.what} {self.name} has not returned within {self.limit:g} s; the resource ends"
+        return f"{text}; {self.remedy}"
+
+
+async def call_function(function: Hook, what: str, name: str, limit: float, remedy: str) -> None:
+    """Call a function of a profile or context: a coroutine function in the event loop, a plain one in a thread.
+
+    A thread cannot be stopped from outside, so a plain function that exceeds its time-out goes on until the process
+    ends.
+
+    Args:
+        function: The function.
+        what: ``profile`` or ``context``.
+        name: Name of the profile or context.
+        limit: The time-out in seconds.
+        remedy: What to do if the function exceeds it.
+
+    Raises:
+        HungError: The function has exceeded its time-out.
+        Exception: As raised by the function.
+    """
+
+    async def run() -> None:
+        CALLER.set(what)
+        outcome = function() if inspect.iscoroutinefunction(function) else await in_thread(function, f"{what} {name}")
+        if outcome is not None:
+            await outcome
+
+    call = asyncio.create_task(run(), name=f"{what} {name}")
+    try:
+        await asyncio.wait([call], timeout=limit)
+    finally:
+        call.cancel()
+    if not call.done():
+        raise HungError(what, name, limit, remedy)
+    if call.cancelled():
+        raise RuntimeError("CancelledError: something that it awaited was cancelled")
+    call.result()
 
 
 class Applier:
@@ -33,113 +88,57 @@ class Applier:
     Args:
         runtime: Queues messages while a profile is applied.
         tasks: Paused while a profile is applied.
+        timeout: The time-out of a profile's function, in seconds.
         on_applied: ``(profile, error)``: the profile's function has ended; ``error`` is empty if it succeeded.
-        on_ended_late: ``(profile, touched, text)``: a function that was given up has ended. ``touched``: the present
-            profile's function had begun by then, so the late one may have changed the device after it.
-        on_late_action: ``(profile, text)``: a function that was given up has attempted an action, without effect.
+        on_hung: The profile's function has exceeded its time-out; tasks stay paused.
     """
 
     def __init__(
         self,
         runtime: Runtime,
         tasks: Tasks,
+        timeout: float,
         *,
         on_applied: Callable[[str, str], None],
-        on_ended_late: Callable[[str, bool, str], None],
-        on_late_action: Callable[[str, str], None],
+        on_hung: Callable[[HungError], None],
     ) -> None:
         self._runtime = runtime
         self._tasks = tasks
+        self._timeout = timeout
         self._on_applied = on_applied
-        self._on_ended_late = on_ended_late
-        self._on_late_action = functools.partial(runtime.call_in_loop, on_late_action)
-        self._call: FencedCall | None = None
+        self._on_hung = on_hung
         self._task: asyncio.Task[None] | None = None
-        self._running: set[asyncio.Task[None]] = set()
-        self._hanging: dict[FencedCall, None] = {}
-        self._closed = False
-
-    @property
-    def hanging(self) -> list[str]:
-        """Profiles whose functions were given up and still run."""
-        return [call.name for call in self._hanging]
 
     def begin(self, profile: str) -> None:
-        """Begin to apply a profile; the previous one must be complete or given up."""
-        self._call = call = FencedCall("profile", profile, self._on_late_action)
-        self._task = task = asyncio.get_running_loop().create_task(self._apply(call), name=f"apply {profile}")
-        self._running.add(task)
-        task.add_done_callback(self._running.discard)
-
-    def give_up(self) -> bool:
-        """Give up the profile that is being applied; its queued messages are dropped.
-
-        Returns:
-            Whether its function still runs; ``on_ended_late`` is called when that ends.
-        """
-        call, task = self._call, self._task
-        if call is None or task is None:
-            return False
-        _log.warning("! %s: profile %s hangs; it is given up", self._runtime.node.name, call.name)
-        call.give_up()
-        self._runtime.drop()
-        if task.done():
-            return False
-        self._hanging[call] = None
-        if not call.in_thread:
-            task.cancel()
-        return True
-
-    def resume(self) -> None:
-        """Resume tasks and messages after a profile was given up and no other one is being applied."""
-        self._runtime.release()
-        self._tasks.resume()
+        """Begin to apply a profile; the previous one must be complete."""
+        self._task = asyncio.get_running_loop().create_task(self._apply(profile), name=f"apply {profile}")
 
     async def wait(self) -> None:
         """Wait until the profile has been applied, at most 0.25 s."""
-        if self._task is None or self._task.done():
-            await asyncio.sleep(_WAIT_IDLE)
-        else:
+        if self._task is not None:
             await asyncio.wait([self._task], timeout=_WAIT)
 
     async def close(self) -> None:
-        """Give up the profile that is being applied, if any; functions that hang in threads are left behind."""
-        self._closed = True
-        if self._call is not None:
-            self._call.give_up()
-        for task in self._running:
-            task.cancel()
-        await asyncio.gather(*self._running, return_exceptions=True)
+        """Give up the profile that is being applied, if any; a function in a thread is left behind."""
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.gather(self._task, return_exceptions=True)
 
-    # --- inside -------------------------------------------------------------------------------------------------
-
-    async def _apply(self, call: FencedCall) -> None:
+    async def _apply(self, profile: str) -> None:
         why = ""
         try:
             await self._tasks.pause()
-            if not call.closed:
-                self._runtime.hold()
-                await call.run(self._runtime.resource.profiles[call.name].apply)
-        except asyncio.CancelledError:
-            if self._closed or not call.closed:
-                raise
+            self._runtime.hold()
+            remedy = "mend it, or allow it longer: adaptation(apply_timeout=…)"
+            function = self._runtime.resource.profiles[profile].apply
+            await call_function(function, "profile", profile, self._timeout, remedy)
+        except HungError as error:
+            self._runtime.release(drop=True)
+            self._on_hung(error)
+            return
         except Exception as error:  # noqa: BLE001 - the top of the user's code
             why = f"{type(error).__name__}: {error}"
-            _log.warning("! %s: profile %s: %s", self._runtime.node.name, call.name, why)
-        if call.closed:
-            self._ended_late(call)
-            return
-        if why:
-            call.give_up()  # the function may have started coroutines and threads that still run
+            _log.warning("! %s: profile %s: %s", self._runtime.node.name, profile, why)
         self._runtime.release(drop=bool(why))
         self._tasks.resume()
-        self._on_applied(call.name, why)
-
-    def _ended_late(self, call: FencedCall) -> None:
-        """Report that a given-up function has ended, and whether it may have undone the present profile."""
-        self._hanging.pop(call, None)
-        present = self._call
-        touched = bool(call.began and present is not None and present is not call and present.began)
-        took = asyncio.get_running_loop().time() - call.began if call.began else 0.0
-        text = f"the function of profile {call.name}, which was given up, has ended after {took:.3g} s"
-        self._on_ended_late(call.name, touched, text)
+        self._on_applied(profile, why)

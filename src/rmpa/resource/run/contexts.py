@@ -7,7 +7,6 @@ and requirements are in force, and the resulting profile has been applied.
 from __future__ import annotations
 
 import asyncio
-import functools
 import logging
 from typing import TYPE_CHECKING, Any, Final
 
@@ -15,8 +14,8 @@ from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.resource import limits
 from rmpa.resource.declare.context_rules import ContextSelector, parse_rule
+from rmpa.resource.run.applier import HungError, call_function
 from rmpa.resource.run.descriptor import topic_of
-from rmpa.resource.run.fenced_call import FencedCall
 from rmpa.resource.run.runtime import RuntimePart
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import printable
@@ -288,23 +287,20 @@ class Contexts(RuntimePart):
         """Call a context's function, if it has one.
 
         Raises:
-            PeerRefused: The function raised, or did not end within ``limits.CONTEXT_ENTER_TIMEOUT`` seconds.
+            PeerRefused: The function raised.
+            HungError: It did not return within ``limits.CONTEXT_ENTER_TIMEOUT`` seconds.
         """
         if context.enter is None:
             return
-        timeout = limits.CONTEXT_ENTER_TIMEOUT
-        report = functools.partial(self._runtime.call_in_loop, self._adapter.report_late_action)
-        call = FencedCall("context", context.name, report)
-        limit = asyncio.timeout(timeout)
+        limit, remedy = limits.CONTEXT_ENTER_TIMEOUT, "mend it, or leave to a task what takes longer"
         try:
-            async with limit:
-                await call.run(context.enter)
+            await call_function(context.enter, "context", context.name, limit, remedy)
+        except HungError as error:
+            self._runtime.release(_HOLDER, drop=True)
+            self._adapter.end(error)
+            raise
         except Exception as error:
-            call.give_up()  # also after an error: the function may have started a coroutine that still runs
-            why = f"{type(error).__name__}: {error}"
-            if isinstance(error, TimeoutError) and limit.expired():
-                why = f"its function has not ended after {timeout:g} s"
-            raise PeerRefused(f"context {context.name}", why) from error
+            raise PeerRefused(f"context {context.name}", f"{type(error).__name__}: {error}") from error
 
     def _apply(self, name: str, context: Context | None) -> None:
         resource = self._runtime.resource

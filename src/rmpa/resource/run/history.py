@@ -23,7 +23,7 @@ class HistoryEvent:
 
     Args:
         at: Time of the event, Unix seconds.
-        event: ``apply``, ``reacted``, ``alarm``, ``over`` or ``late``; see ``docs/smart-resources.md``.
+        event: ``apply``, ``reacted``, ``alarm`` or ``over``; see ``docs/smart-resources.md``.
         level: ``OK``, ``WARN``, ``ERROR`` or ``STALE``.
         message: A text for people.
         details: Further values by name, such as the profile.

@@ -170,10 +170,6 @@ class Persistence(RuntimePart):
         event, level = ("alarm", DiagnosticLevel.STALE) if missing else ("over", DiagnosticLevel.OK)
         self._event(event, level, text, {"kind": "missing"})
 
-    def late_action(self, text: str) -> None:
-        """Add to the history that a function that was given up has ended late or attempted an action."""
-        self._event("late", DiagnosticLevel.WARN, text, {})
-
     def _event(self, event: str, level: DiagnosticLevel, message: str, details: object) -> None:
         self._store.event(time.time_ns(), event, int(level), message, _json(details))
 

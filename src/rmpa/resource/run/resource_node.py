@@ -44,6 +44,7 @@ class ResourceNode:
         settings: Settings of the control loop; ``None``: as declared.
         store: Keeps the resource's state over a restart; ``None``: nothing is kept.
         registry: Records the resources of this module's graph; one resource of a process has it, the others ``None``.
+        on_hung: Called when a function of a profile or context has exceeded its time-out: the resource has to end.
         observers: Further parts, started last.
 
     Raises:
@@ -59,6 +60,7 @@ class ResourceNode:
         settings: AdaptationSettings | None = None,
         store: ResourceStore | None = None,
         registry: ResourceStore | None = None,
+        on_hung: Callable[[], None] = lambda: None,
         observers: Sequence[RuntimePart] = (),
     ) -> None:
         if not resource.profiles:
@@ -78,6 +80,7 @@ class ResourceNode:
             window=window if window is not None else resource.window,
             settings=settings if settings is not None else resource.settings,
             problems=self.problems,
+            on_hung=on_hung,
         )
         self.contexts = Contexts(self.runtime, self.tasks, self.adapter)
         self.configuration = Reconfigure(self.runtime, self.tasks, self.adapter, self.contexts)
@@ -103,6 +106,7 @@ class ResourceNode:
             PeerRefused: A node of this name runs at the core already, the core refuses a registration, or the
                 callback of ``configure`` or ``activate`` raised.
             UnreachableError: The core does not answer.
+            HungError: A function of the first profile or context has exceeded its time-out.
         """
         await self._refuse_duplicate()
         await self.learn()
@@ -116,8 +120,10 @@ class ResourceNode:
             if self._persistence is not None:
                 await self._persistence.close()
             raise
-        await self.adapter.settled()  # the function of the first profile ends before ``activate``
         try:
+            await self.adapter.settled()  # the function of the first profile ends before ``activate``
+            if self.adapter.hung is not None:
+                raise self.adapter.hung
             await self._change_state(Transition.ACTIVATE)
         except RmpaError:
             await self.close()
@@ -257,7 +263,7 @@ async def run_all(
         stores: The folder of the resources' stores; ``None``: nothing is kept over a restart.
 
     Raises:
-        RmpaError: A resource cannot start; the ones that have started are closed.
+        RmpaError: A resource cannot start, or a function of one has exceeded its time-out; all are closed.
     """
     running: list[ResourceNode] = []
     stopped = asyncio.create_task(_wait(stop))
@@ -266,20 +272,24 @@ async def run_all(
         for resource in sorted(resources, key=lambda each: any(o.kind.known is None for o in each.outputs.values())):
             store = ResourceStore(stores / f"{resource.name}.sqlite") if stores is not None else None
             registry = ResourceStore(stores / FILE) if stores is not None and not running else None
-            one = ResourceNode(resource, master_uri, store=store, registry=registry)
+            one = ResourceNode(resource, master_uri, store=store, registry=registry, on_hung=stop.set)
             if not await _start(one, stopped):
-                return
+                break
             running.append(one)
-        ready()
-        ended = asyncio.create_task(_all_ended(running))
-        await asyncio.wait([ended, stopped], return_when=asyncio.FIRST_COMPLETED)
-        ended.cancel()
-        await asyncio.gather(ended, return_exceptions=True)
+        else:
+            ready()
+            ended = asyncio.create_task(_all_ended(running))
+            await asyncio.wait([ended, stopped], return_when=asyncio.FIRST_COMPLETED)
+            ended.cancel()
+            await asyncio.gather(ended, return_exceptions=True)
     finally:
         stopped.cancel()
         await asyncio.gather(stopped, return_exceptions=True)
         for one in reversed(running):
             await one.close()
+    for one in running:
+        if one.adapter.hung is not None:
+            raise one.adapter.hung
 
 
 async def _start(node: ResourceNode, stopped: asyncio.Task[None]) -> bool:

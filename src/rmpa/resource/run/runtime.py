@@ -9,11 +9,11 @@ import logging
 import threading
 import time
 from collections import Counter, deque
+from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import RmpaError
 from rmpa.resource import limits
-from rmpa.resource.declare.fence import current_fence
 from rmpa.resource.run.descriptor import TOPIC, describe, topic_of
 from rmpa.ros.types.messages import HeaderNumbers, MessageError, MessageType
 from rmpa.ros.wire.tcpros import printable
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from rmpa.resource.decide.actions import Action
     from rmpa.resource.declare.attributes import Value
     from rmpa.resource.declare.connections import Input, Output
-    from rmpa.resource.declare.fence import Fence
     from rmpa.resource.declare.parameters import Parameter
     from rmpa.resource.declare.resource import Resource
     from rmpa.ros.node.node import Node
@@ -33,6 +32,9 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _CLOSED: Final = "life cycle"
+CALLER: ContextVar[str] = ContextVar("caller", default="")
+"""``profile`` or ``context`` in such a function and in the coroutines, tasks and ``asyncio.to_thread`` calls that it
+begins; else empty."""
 
 
 class RuntimePart:
@@ -74,9 +76,6 @@ class RuntimePart:
     def missing_changed(self, text: str, *, missing: bool) -> None:
         """Something that the resource needs is missing, or is back."""
 
-    def late_action(self, text: str) -> None:
-        """A function that was given up has ended late, or has attempted an action; ``text`` describes it."""
-
     def context_changed(self) -> None:
         """The present context, or the choice of a context by hand, may have changed."""
 
@@ -102,7 +101,7 @@ class Runtime:
         self._publishers: dict[str, Publisher] = {}
         self._subscribers: dict[str, Subscriber] = {}
         self._texts: dict[str, tuple[Publisher, str | None]] = {}
-        self._held: deque[tuple[Output, bytes, Fence | None]] = deque()
+        self._held: deque[tuple[Output, bytes, str]] = deque()
         self._held_bytes = 0
         self._holders: set[str] = set()
         self._open = True
@@ -215,11 +214,6 @@ class Runtime:
         self._open = False
         self.hold(_CLOSED)
 
-    def drop(self) -> None:
-        """Drop the queued messages of a profile that was given up; later messages are queued as before."""
-        self._held.clear()
-        self._held_bytes = 0
-
     def call_in_loop(self, function: Callable[..., object], *args: Any) -> None:
         """Call a function in the event loop: at once if called in the loop's thread, else as soon as the loop can."""
         if threading.get_ident() == self._thread:
@@ -266,22 +260,19 @@ class Runtime:
             _log.info("= %s: %s is learnt from %s", self.node.name, item.kind.name, caller)
         return True
 
-    def send(self, output: Output, raw: bytes, fence: Fence | None = None) -> None:
+    def send(self, output: Output, raw: bytes, caller: str = "") -> None:
         """Send one message, or queue it while a profile or context is being applied.
 
         Args:
             output: The output that publishes the message.
             raw: The serialized message.
-            fence: The fence of the publishing function; ``None`` if the function cannot be given up.
+            caller: ``profile`` or ``context`` if such a function publishes; see ``CALLER``.
         """
-        if fence is not None and fence.closed:
-            fence.report_blocked(f"publish on {output.name}")  # published in another thread before the fence closed
-            return
-        if not self._open and fence is None:
+        if not self._open and not caller:
             self._refuse(output)
             return
         if self._holders:
-            self._held.append((output, raw, fence))
+            self._held.append((output, raw, caller))
             self._held_bytes += len(raw)
             while self._held_bytes > limits.RESOURCE_HELD_MAX and len(self._held) > 1:
                 self._held_bytes -= len(self._held.popleft()[1])  # drop-oldest
@@ -299,7 +290,7 @@ class Runtime:
 
     def _retain(self, kinds: set[str]) -> None:
         """Drop the queued messages except those of functions of these kinds (``profile``, ``context``)."""
-        self._held = deque(held for held in self._held if held[2] is not None and held[2].kind in kinds)
+        self._held = deque(held for held in self._held if held[2] in kinds)
         self._held_bytes = sum(len(raw) for _, raw, _ in self._held)
 
     def _refuse(self, output: Output) -> None:
@@ -325,9 +316,4 @@ class Runtime:
             payload = kind.serialize(kind.given(message, values))
         except MessageError as error:
             raise MessageError(f"{output.name}: {error}") from None
-        raw, fence = bytes(numbers.stamp(payload)), current_fence()
-        if fence is None:
-            self.call_in_loop(self.send, output, raw)
-            return
-        with fence.action(f"publish on {output.name}"):
-            self.call_in_loop(self.send, output, raw, fence)
+        self.call_in_loop(self.send, output, bytes(numbers.stamp(payload)), CALLER.get())

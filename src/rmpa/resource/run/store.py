@@ -6,7 +6,7 @@ the new file begins with all known state. ``rmpa.resource.run.history`` reads th
 
     state(kind, name, value, at_ns)                      value: JSON; see resource.decide.saved_state
     windows(at_ns, profile, level, message, quality)     quality: JSON, attribute -> value in the attribute's unit
-    events(at_ns, event, level, message, details)        event: apply, alarm, over, reacted, late; details: JSON
+    events(at_ns, event, level, message, details)        event: apply, alarm, over, reacted; details: JSON
     descriptors(node, text, first_ns, last_ns)
 """
 
