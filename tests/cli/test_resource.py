@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import threading
 import time
@@ -18,10 +17,7 @@ from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.client import ResourceClient
 from rmpa.resource.run.descriptor import describe
 from rmpa.resource.run.dynamic_reconfigure import read_config
-from rmpa.resource.run.registry_writer import FILE
 from rmpa.resource.run.resource_node import ResourceNode
-from rmpa.resource.run.resource_registry import ResourceRegistry
-from rmpa.resource.run.store import ResourceStore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.node.node import Node
 from tests.resource.run.test_resource_node import echo
@@ -320,71 +316,3 @@ def test_no_resource(rmpa: Rmpa, core: RosCore) -> None:
     assert as_json(rmpa, "resource", "list") == []
     text = "rmpa: there is no resource; `rmpa run` runs one, `rmpa resource list` shows all\n"
     assert rmpa("profile", "list") == (1, "", text)
-
-
-def write_down(path: Path, *each: tuple[str, str, float]) -> None:
-    """Write a module's file as ``rmpa run`` does: of each resource its path, its node, and seconds since then."""
-
-    async def write() -> None:
-        store, sightings = ResourceStore(path), ResourceRegistry()
-        await store.open()
-        for name, caller, ago in sorted(each, key=lambda one: -one[2]):
-            text = describe(sonar(), name).serialize()
-            for key, value in sightings.record(name, caller, text, time.time_ns() - round(ago * 1e9)).items():
-                store.put(key, value)
-        await store.close()
-
-    asyncio.run(write())
-
-
-def test_resources_that_were_seen_before(
-    rmpa: Rmpa, running: ResourceNode, remote: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "nose" / FILE
-    write_down(
-        path,
-        ("/sonar", "/sonar", 5),
-        ("/gone\x1b", "/gone", 7_205),
-        ("/lidar", "/rmpa/base/lidar", 10),
-        ("/lidar", "/rmpa/van/lidar", 100_000),
-    )
-    monkeypatch.setenv("RMPA_STATE_DIR", str(tmp_path))
-    code, out, err = rmpa("resource", "list", "--known")
-    assert code == 0, err
-    lines = [line.split("  ") for line in out.splitlines()]
-    assert [line[0] for line in lines] == [
-        "RESOURCE", "/sonar", "base:/lidar", "base:/sonar", "/gone\\x1b", "van:/lidar",
-    ]  # fmt: skip
-    assert "last seen 2 h 0 min ago, not here now" in out
-    assert "last seen 1 d 3 h ago, not here now" in out
-    listed = as_json(rmpa, "resource", "list", "--known")
-    assert [one["here"] for one in listed] == [True, True, True, False, False]
-    gone = listed[-1]
-    assert (gone["name"], gone["peer"], gone["state"], gone["seen_by"]) == ("/lidar", "van", None, "nose")
-    assert 100_000 <= gone["last_seen_ago"] < 100_100
-    assert gone["last_seen"] == pytest.approx(time.time() - 100_000, abs=100)
-    assert gone["descriptor"]["profiles"][0]["name"] == "slow"
-    # Without the flag all is as before, and a folder of the user's own is looked at if it is named.
-    assert len(as_json(rmpa, "resource", "list")) == 3
-    assert "here" not in as_json(rmpa, "resource", "list")[0]
-    assert len(as_json(rmpa, "resource", "list", "--known", "--state", str(tmp_path / "empty"))) == 3
-
-
-def test_resources_that_were_seen_are_known_where_nothing_runs(
-    rmpa: Rmpa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_down(tmp_path / "nose" / FILE, ("/sonar", "/sonar", 5))
-    write_down(tmp_path / "base" / FILE, ("/sonar", "/rmpa/nose/sonar", 65))
-    (tmp_path / "worn").mkdir()
-    (tmp_path / "worn" / FILE).write_bytes(b"no database at all" * 300)
-    monkeypatch.setenv("RMPA_STATE_DIR", str(tmp_path))
-    monkeypatch.setenv("ROS_MASTER_URI", "http://127.0.0.1:1")
-    assert rmpa("resource", "list")[0] == 1
-    code, out, err = rmpa("resource", "list", "--known")
-    assert code == 0
-    assert "no ROS master answers at http://127.0.0.1:1" in err
-    assert f"{tmp_path / 'worn' / FILE}: file is not a database" in err
-    first, second, third = out.splitlines()
-    assert first.endswith("SEEN BY")
-    assert (second.split()[0], second.split()[-1]) == ("/sonar", "nose")
-    assert (third.split()[0], third.split()[-1]) == ("nose:/sonar", "base")

@@ -107,7 +107,6 @@ resource: Final = _group(
     "See Smart Resources, here or at a peer.",
     {
         "resource_list": {"list": "List resources; those of peers with the peers' names."},
-        "resource_history": {"history": "Show which profile ran when and why, violations, and the measured quality."},
         "resource_info": {
             "info": "Show all of a resource: topics, parameters, qualities, profiles, contexts, clients."
         },

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 REMOVED_VERBS: Final = {
     "experiment": "in a clone of the repository: make experiment, or python -m lab experiment (docs/experiments.md)",
+    "resource history": "record it: rosbag record /SONAR/decision /SONAR/quality /SONAR/alarms",
     "site last": "record the topic with rosbag where it is needed, or keep its key by a storage of Zenoh",
 }
 """What to use in place of a command that is gone, by its words behind ``rmpa``."""

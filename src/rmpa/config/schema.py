@@ -189,6 +189,7 @@ REMOVED: Final = {
     "core.fresh": 'write keep = "never" in place of true',
     "RMPA_FRESH": "set RMPA_KEEP=never in its place",
     "--fresh": "write --keep never",
+    "--known": "rosbag record /SONAR/descriptor keeps what a resource was",
     **dict.fromkeys(
         (
             "gateway.ros1_bridge",

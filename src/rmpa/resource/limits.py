@@ -31,32 +31,8 @@ RESOURCE_REPORT_WINDOWS: Final = 3
 """Number of quality windows for which the report of a client counts."""
 RESOURCE_STAMPS_MAX: Final = 1024
 """Number of stamps of expiring requests that are kept, so that a latched one that arrives again keeps its expiry."""
-STORE_WINDOWS_MAX: Final = 3600
-"""Quality windows in a resource's history: an hour, about 2 MB."""
-STORE_EVENTS_MAX: Final = 2000
-"""Alarms and profile changes in the history."""
-STORE_DESCRIPTORS_MAX: Final = 20
-"""Different descriptors in the history: one more for each change of the resource's file."""
-KNOWN_MAX: Final = 256
-"""Resources in a module's registry; of more, the least recently seen is removed."""
-KNOWN_TEXT_MAX: Final = 16 * MIB
-"""Characters of the descriptors of all resources in a module's registry."""
-KNOWN_LOOK: Final = 10.0
-"""Seconds between scans of the graph for resources."""
-KNOWN_WRITE: Final = 60.0
-"""Seconds between writes of the time when a present resource was last seen, to spare flash memory."""
-STORE_BYTES_MAX: Final = 64 * MIB
-"""Largest size of a store's file."""
-STORE_INTERVAL: Final = 10.0
-"""Seconds between writes of the history, to spare flash memory; state that must survive a crash is not delayed."""
-STORE_PENDING_MAX: Final = 600
-"""Rows of history that wait while the disk fails; drop-oldest."""
-STORE_OPEN_TIMEOUT: Final = 5.0
-"""A starting resource waits so long for its store, and then starts without it."""
-STORE_LOCK_TIMEOUT: Final = 1.0
-"""A store waits so long for its lock: the previous process may still be ending."""
-STORE_CLOSE_TIMEOUT: Final = 5.0
-"""An ending resource waits so long for its store to write all pending changes; a hanging disk does not hold it up."""
+STORE_TIMEOUT: Final = 5.0
+"""A starting resource waits so long for its saved state, and an ending one until it is written: the disk may hang."""
 CONTEXT_RULE_MAX: Final = 1024
 """Characters of the rule of a context."""
 CONTEXT_RULE_DEPTH: Final = 20

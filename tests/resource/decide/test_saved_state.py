@@ -1,19 +1,10 @@
 from __future__ import annotations
 
+import msgspec
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from rmpa.core.errors import ConfigError
-from rmpa.resource.decide.saved_state import (
-    CHOSEN,
-    CONTEXT,
-    COOL_DOWN,
-    LAST,
-    SavedCoolDown,
-    SavedRequirement,
-    read_saved_state,
-)
+from rmpa.resource.decide.saved_state import SavedCoolDown, SavedRequirement, SavedState
 from rmpa.resource.declare.resource import Resource
 
 NOW = 1_800_000_000_000_000_000
@@ -38,59 +29,49 @@ def asked(**options: object) -> SavedRequirement:
 
 
 def test_what_was_kept_comes_back() -> None:
-    rows = {
-        ("parameter", "gain"): "2",
-        ("parameter", "frame"): '"sonar_link"',
-        ("requirement", "/driver"): asked(expires_ns=NOW + 12 * SECOND).serialize(),
-        CHOSEN: '"fine"',
-        LAST: '"fine"',
-        CONTEXT: '"docked"',
-    }
-    found = read_saved_state(rows, sonar(), NOW)
-    assert found.lost == ()
-    assert found.parameters == {"gain": 2.0, "frame": "sonar_link"}
+    state = SavedState(
+        parameters={"gain": 2, "frame": "sonar_link"},
+        requirements=(asked(expires_ns=NOW + 12 * SECOND),),
+        chosen="fine",
+        last="fine",
+        context="docked",
+        cool_downs={"fine": SavedCoolDown(until_ns=NOW + SECOND, cool_down=20.0, why="no bus")},
+    )
+    found, lost = msgspec.json.decode(msgspec.json.encode(state), type=SavedState).checked(sonar(), NOW)
+    assert lost == []
+    assert found == state
     assert isinstance(found.parameters["gain"], float)
-    assert (found.chosen, found.last, found.context) == ("fine", "fine", "docked")
-    (one,) = found.requirements
-    requirement = one.requirement(sonar().attributes, "sonar", 100.0, NOW)
+    requirement = found.requirements[0].requirement(sonar().attributes, "sonar", 100.0, NOW)
     assert requirement is not None
     assert (requirement.client, requirement.priority, requirement.expires) == ("/driver", 2, 112.0)
     assert requirement.bounds["noise"].hard
 
 
 def test_expired_requirement_is_not_restored() -> None:
-    found = read_saved_state({("requirement", "/driver"): asked(expires_ns=NOW - 1).serialize()}, sonar(), NOW)
-    assert (found.requirements, found.lost) == ((), ())
+    found, lost = SavedState(requirements=(asked(expires_ns=NOW - 1),)).checked(sonar(), NOW)
+    assert (found.requirements, lost) == ((), [])
 
 
 @pytest.mark.parametrize(
-    ("key", "text", "said"),
+    ("state", "said"),
     [
-        (("parameter", "gain"), "11", "too much"),
-        (("parameter", "gain"), '"loud"', "no double"),
-        (("parameter", "gain"), "null", "parameter gain"),
-        (("parameter", "power"), "1", "declared no longer"),
-        (CHOSEN, '"exact"', "declared no longer"),
-        (LAST, "{", "profile last"),
-        (CONTEXT, '"away"', "context away"),
-        (("requirement", "/a"), '{"client": "/a", "values": [["nois", ">= 1"]]}', "nois"),
-        (("requirement", "/a"), '{"client": "/a", "values": [["noise", "soft"]]}', "soft"),
-        ((COOL_DOWN, "exact"), '{"until_ns": 1, "cool_down": 1}', "declared no longer"),
-        ((COOL_DOWN, "fine"), '{"until_ns": "soon", "cool_down": 1}', "cool_down fine"),
-        (("requirement", "/a"), "[" * 100_000, "requirement /a"),
+        (SavedState(parameters={"gain": 11}), "too much"),
+        (SavedState(parameters={"gain": "loud"}), "no double"),
+        (SavedState(parameters={"power": 1}), "parameter power: it is declared no longer"),
+        (SavedState(chosen="exact"), "profile exact: it is declared no longer"),
+        (SavedState(last="exact"), "profile exact: it is declared no longer"),
+        (SavedState(context="away"), "context away: it is declared no longer"),
+        (SavedState(requirements=(SavedRequirement(client="/a", values=(("nois", ">= 1"),)),)), "nois"),
+        (SavedState(requirements=(SavedRequirement(client="/a", values=(("noise", "soft"),)),)), "soft"),
+        (SavedState(cool_downs={"exact": SavedCoolDown(until_ns=1, cool_down=1)}), "declared no longer"),
     ],
 )
-def test_invalid_rows_are_left_out_and_reported(key: tuple[str, str], text: str, said: str) -> None:
-    found = read_saved_state({key: text, ("parameter", "count"): "7"}, sonar(), NOW)
-    assert found.parameters == {"count": 7}
-    (lost,) = found.lost
-    assert said in lost
-
-
-@given(st.dictionaries(st.tuples(st.sampled_from(["parameter", "requirement", "profile"]), st.text()), st.text()))
-def test_any_file_can_be_read(rows: dict[tuple[str, str], str]) -> None:
-    found = read_saved_state(rows, sonar(), NOW)
-    assert found.parameters.keys() <= {"gain", "count", "frame"}
+def test_what_does_not_fit_any_more_is_left_out_and_reported(state: SavedState, said: str) -> None:
+    known = msgspec.structs.replace(state, parameters={**state.parameters, "count": 7})
+    found, lost = known.checked(sonar(), NOW)
+    assert found == SavedState(parameters={"count": 7})
+    (text,) = lost
+    assert said in text
 
 
 def test_an_expiry_is_the_wall_clocks() -> None:
@@ -109,9 +90,7 @@ def test_an_expiry_is_the_wall_clocks() -> None:
     ids=["running", "just begun", "set back", "set back by decades", "over", "long over", "set forward by decades"],
 )
 def test_restored_cool_down_is_never_longer(ahead: int, left: int | None) -> None:
-    row = SavedCoolDown(until_ns=NOW + ahead * SECOND, cool_down=20.0, why="no bus").serialize()
-    found = read_saved_state({(COOL_DOWN, "fine"): row}, sonar(), NOW)
-    one = found.cool_downs["fine"].left(100.0, NOW)
+    one = SavedCoolDown(until_ns=NOW + ahead * SECOND, cool_down=20.0, why="no bus").left(100.0, NOW)
     assert (one and (one.until, one.cool_down, one.why)) == (left and (100.0 + left, 20.0, "no bus"))
 
 

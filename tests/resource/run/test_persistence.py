@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -12,13 +11,14 @@ from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.client import ResourceClient
 from rmpa.resource.run.resource_node import ResourceNode
 from rmpa.resource.run.runtime import RuntimePart
-from rmpa.resource.run.store import ResourceStore
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
+
+    from rmpa.resource.decide.cool_downs import CoolDown
 
 
 @pytest.fixture
@@ -42,9 +42,13 @@ def sonar(**more: Any) -> Resource:
 
 
 async def started(core: RosCore, path: Path, resource: Resource | None = None) -> ResourceNode:
-    member = ResourceNode(resource or sonar(), core.uri, store=ResourceStore(path))
+    member = ResourceNode(resource or sonar(), core.uri, state=path)
     await member.start()
     return member
+
+
+def cooling(member: ResourceNode) -> list[CoolDown]:
+    return list(member.adapter.loop.cooling(asyncio.get_running_loop().time()).values())
 
 
 async def until(fits: Any) -> None:
@@ -54,7 +58,7 @@ async def until(fits: Any) -> None:
 
 
 async def test_configuration_survives_a_restart(core: RosCore, tmp_path: Path) -> None:
-    path = tmp_path / "sonar.sqlite"
+    path = tmp_path / "sonar.json"
     first = await started(core, path)
     await first.configuration.set({"gain": 2.5, "profile": "fine", "context": "docked"})
     await first.close()
@@ -80,7 +84,7 @@ async def test_configuration_survives_a_restart(core: RosCore, tmp_path: Path) -
 
 
 async def test_requirements_survive_a_restart(core: RosCore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "sonar.sqlite"
+    path = tmp_path / "sonar.json"
     first = await started(core, path)
     async with Node("stays", master_uri=core.uri) as stays, ResourceClient(stays, "sonar") as one:
         async with Node("leaves", master_uri=core.uri) as leaves, ResourceClient(leaves, "sonar") as two:
@@ -102,7 +106,7 @@ async def test_requirements_survive_a_restart(core: RosCore, tmp_path: Path, mon
 
 
 async def test_expired_latched_request_stays_expired(core: RosCore, tmp_path: Path) -> None:
-    member = await started(core, tmp_path / "sonar.sqlite")
+    member = await started(core, tmp_path / "sonar.json")
     async with Node("client", master_uri=core.uri) as node, ResourceClient(node, "sonar") as client:
         await client.require(noise=at_most("5 cm"), expires="300 ms")
         assert "/client" in member.adapter.loop.requirements
@@ -135,15 +139,15 @@ async def test_cool_down_survives_a_restart(core: RosCore, tmp_path: Path) -> No
         raise OSError("no bus")
 
     tried: list[str] = []
-    path = tmp_path / "sonar.sqlite"
+    path = tmp_path / "sonar.json"
     first = await started(core, path, broken())
     await until(lambda: first.adapter.loop.profile == "coarse")
-    (before,) = first.adapter.saved_cool_downs(time.time_ns()).values()
+    (before,) = cooling(first)
     await first.close()
     again = await started(core, path, broken())
     await until(lambda: again.adapter.loop.profile == "coarse")
-    (after,) = again.adapter.saved_cool_downs(time.time_ns()).values()
-    assert after.until_ns == pytest.approx(before.until_ns, abs=2e9)
+    (after,) = cooling(again)
+    assert after.until == pytest.approx(before.until, abs=2)
     assert (after.cool_down, after.why) == (60.0, "OSError: no bus")
     assert tried == ["fine"]
     # Somebody who has mended it need not wait.
@@ -155,7 +159,7 @@ async def test_cool_down_survives_a_restart(core: RosCore, tmp_path: Path) -> No
 
 async def test_resource_runs_without_a_usable_store(core: RosCore, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    member = await started(core, tmp_path / "file" / "sonar.sqlite")
+    member = await started(core, tmp_path / "file" / "sonar.json")
     async with Node("watcher", master_uri=core.uri) as node:
         quality = await node.subscribe("/sonar/quality", "diagnostic_msgs/DiagnosticArray")
         async with asyncio.timeout(30):
@@ -163,4 +167,44 @@ async def test_resource_runs_without_a_usable_store(core: RosCore, tmp_path: Pat
                 if "nothing is kept" in received.message.status[0].message:
                     assert received.message.status[0].level == 1
                     break
+    await member.close()
+
+
+async def test_a_damaged_file_is_set_aside(core: RosCore, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "sonar.json"
+    path.write_bytes(b"[" * 100_000)
+    member = await started(core, path)
+    assert "sonar.json is damaged" in caplog.text
+    await member.configuration.set({"gain": 2.5})
+    await until(lambda: path.exists() and b"2.5" in path.read_bytes())  # at once, not only at the end
+    assert (tmp_path / "sonar.json.damaged").exists()
+    await member.close()
+
+
+async def test_a_second_process_keeps_nothing(
+    core: RosCore, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "sonar.json"
+    first = await started(core, path)
+    await first.configuration.set({"gain": 2.5})
+    other = RosCore(port=0)
+    await other.start()
+    second = await started(other, path)
+    assert "nothing is kept: another process uses it; name this module otherwise, or set --state" in caplog.text
+    assert second.resource.parameters["gain"].value == 1.0
+    await second.close()
+    await first.close()
+    await other.close()
+    assert b"2.5" in path.read_bytes()
+
+
+async def test_storing_is_tried_again(core: RosCore, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", "rmpa.resource")
+    (tmp_path / "state").touch()
+    member = await started(core, tmp_path / "state" / "sonar.json")
+    await until(lambda: "nothing is kept" in member.adapter.health()[1])
+    (tmp_path / "state").unlink()
+    await until(lambda: "nothing is kept" not in member.adapter.health()[1])
+    assert "everything is kept again" in caplog.text
+    assert caplog.text.count("nothing is kept: ") == 1
     await member.close()

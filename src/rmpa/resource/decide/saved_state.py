@@ -1,13 +1,9 @@
-"""State that survives a restart: parameters, choices by hand, the last profile, requirements and cool-downs.
-
-``resource.run.store`` keeps the state as rows (kind, name) -> JSON text. Rows that contradict the present declaration
-(a parameter out of its new range, a profile that was removed) are left out and reported.
-"""
+"""State that survives a restart: parameters, choices by hand, the last profile, requirements and cool-downs."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -16,26 +12,13 @@ from rmpa.resource.decide.cool_downs import CoolDown
 from rmpa.resource.declare.requirement_text import parse_requirement
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from rmpa.resource.declare.attributes import Attribute
-    from rmpa.resource.declare.parameters import ParameterValue
     from rmpa.resource.declare.requirements import Requirement
     from rmpa.resource.declare.resource import Resource
 
-Key = tuple[str, str]
-"""Kind and name of a row."""
-PARAMETER: Final = "parameter"
-REQUIREMENT: Final = "requirement"
-PROFILE: Final = "profile"
-CHOSEN: Final = (PROFILE, "chosen")
-"""Key of the profile that was chosen by hand; the value is empty if none was."""
-LAST: Final = (PROFILE, "last")
-"""Key of the profile that ran last."""
-COOL_DOWN: Final = "cool_down"
-CONTEXT: Final = ("context", "chosen")
-"""Key of the context that was chosen by hand; the value is empty if none was."""
-_SECOND: Final = 1_000_000_000
+_SECOND = 1_000_000_000
 
 
 class SavedRequirement(msgspec.Struct, frozen=True, kw_only=True):
@@ -55,10 +38,6 @@ class SavedRequirement(msgspec.Struct, frozen=True, kw_only=True):
     mark: str = ""
     stamp: str = ""
     expires_ns: int | None = None
-
-    def serialize(self) -> str:
-        """As JSON."""
-        return msgspec.json.encode(self).decode()
 
     def requirement(
         self, attributes: Mapping[str, Attribute], resource: str, now: float, now_ns: int
@@ -96,10 +75,6 @@ class SavedCoolDown(msgspec.Struct, frozen=True, kw_only=True):
     cool_down: float
     why: str = ""
 
-    def serialize(self) -> str:
-        """As JSON."""
-        return msgspec.json.encode(self).decode()
-
     def left(self, now: float, now_ns: int) -> CoolDown | None:
         """The rest of the cool-down, by the monotonic clock; ``None`` if it is over.
 
@@ -109,78 +84,60 @@ class SavedCoolDown(msgspec.Struct, frozen=True, kw_only=True):
         return CoolDown(now + left, self.cool_down, self.why) if left > 0 else None
 
 
-@dataclass(frozen=True, slots=True)
-class SavedState:
-    """The state that was saved before a restart.
+class SavedState(msgspec.Struct, frozen=True, kw_only=True):
+    """The state of a resource, as its file has it (JSON).
 
-    Args:
-        parameters: The values of parameters that are still valid, by name.
+    Attributes:
+        parameters: The values of parameters that differ from their defaults, by name.
         chosen: The profile chosen by hand, or empty.
         last: The profile that ran last, or empty.
         context: The context chosen by hand, or empty.
-        requirements: Requirements that have not expired; their clients may come back.
+        requirements: Requirements of clients, which may come back.
         cool_downs: Cool-downs by profile.
-        lost: A text about each row that is no longer valid.
     """
 
-    parameters: Mapping[str, ParameterValue] = field(default_factory=dict, hash=False)
+    parameters: dict[str, bool | int | float | str] = {}
     chosen: str = ""
     last: str = ""
     context: str = ""
-    requirements: Sequence[SavedRequirement] = ()
-    cool_downs: Mapping[str, SavedCoolDown] = field(default_factory=dict, hash=False)
-    lost: Sequence[str] = ()
-
-
-def read_saved_state(rows: Mapping[Key, str], resource: Resource, now_ns: int) -> SavedState:
-    """Read the rows of a store and check them against the present declaration of the resource.
-
-    Args:
-        rows: JSON texts by kind and name; untrusted, because any program may have written the file.
-        resource: The resource, completely declared.
-        now_ns: Unix nanoseconds of the wall clock.
-    """
-    parameters: dict[str, ParameterValue] = {}
-    requirements: list[SavedRequirement] = []
+    requirements: tuple[SavedRequirement, ...] = ()
     cool_downs: dict[str, SavedCoolDown] = {}
-    lost: list[str] = []
-    chosen = {LAST: "", CHOSEN: "", CONTEXT: ""}
-    attributes = resource.attributes
-    for (kind, name), text in rows.items():
-        try:
-            if kind == PARAMETER:
-                parameters[name] = _parameter(resource, name, text)
-            elif kind == REQUIREMENT:
-                one = msgspec.json.decode(text, type=SavedRequirement)
-                if one.requirement(attributes, resource.name, 0.0, now_ns) is not None:
+
+    def checked(self, resource: Resource, now_ns: int) -> tuple[SavedState, list[str]]:
+        """What still fits the declaration of the resource, and a text about each part that does not.
+
+        Args:
+            resource: The resource, completely declared.
+            now_ns: Unix nanoseconds of the wall clock.
+        """
+        lost: list[str] = []
+        parameters, requirements = {}, []
+        for name, value in self.parameters.items():
+            try:
+                if _declared("parameter", name, resource.parameters, lost):
+                    parameters[name] = resource.parameters[name].check(value)
+            except ConfigError as error:
+                lost.append(str(error))
+        for one in self.requirements:
+            try:
+                if one.requirement(resource.attributes, resource.name, 0.0, now_ns) is not None:
                     requirements.append(one)
-            elif kind == COOL_DOWN:
-                cool_downs[name] = _cool_down(resource, name, text)
-            elif (kind, name) in chosen:
-                chosen[kind, name] = _chosen(kind, text, resource)
-        except (ConfigError, msgspec.DecodeError, RecursionError) as error:
-            lost.append(f"{kind} {name}: {error}")
-    return SavedState(
-        parameters, chosen[CHOSEN], chosen[LAST], chosen[CONTEXT], tuple(requirements), cool_downs, tuple(lost)
-    )
+            except ConfigError as error:
+                lost.append(f"requirement of {one.client}: {error}")
+        found = SavedState(
+            parameters=parameters,
+            chosen=_declared("profile", self.chosen, resource.profiles, lost),
+            last=_declared("profile", self.last, resource.profiles, lost),
+            context=_declared("context", self.context, resource.contexts, lost),
+            requirements=tuple(requirements),
+            cool_downs={n: c for n, c in self.cool_downs.items() if _declared("profile", n, resource.profiles, lost)},
+        )
+        return found, lost
 
 
-def _parameter(resource: Resource, name: str, text: str) -> ParameterValue:
-    if name not in resource.parameters:
-        raise ConfigError(f"parameter {name}", "it is declared no longer")
-    value = msgspec.json.decode(text, type=bool | int | float | str)
-    # JSON has one kind of number: 1.0 may come back as 1, which ``check`` converts.
-    return resource.parameters[name].check(value)
-
-
-def _cool_down(resource: Resource, name: str, text: str) -> SavedCoolDown:
-    if name not in resource.profiles:
-        raise ConfigError(f"profile {name}", "it is declared no longer")
-    return msgspec.json.decode(text, type=SavedCoolDown)
-
-
-def _chosen(kind: str, text: str, resource: Resource) -> str:
-    name = msgspec.json.decode(text, type=str)
-    if name and name not in (resource.profiles if kind == PROFILE else resource.contexts):
-        raise ConfigError(f"{kind} {name}", "it is declared no longer")
-    return name
+def _declared(kind: str, name: str, known: Mapping[str, object], lost: list[str]) -> str:
+    """The name, or an empty one if it is declared no longer."""
+    if not name or name in known:
+        return name
+    lost.append(f"{kind} {name}: it is declared no longer")
+    return ""

@@ -27,7 +27,7 @@ from rmpa.resource.decide.reports import (
     describe_alarm,
     health,
 )
-from rmpa.resource.decide.saved_state import SavedCoolDown, SavedRequirement, SavedState
+from rmpa.resource.decide.saved_state import SavedState
 from rmpa.resource.declare.adaptation_settings import AdaptationSettings
 from rmpa.resource.declare.requirements import Requirement
 from rmpa.resource.run.applier import Applier, HungError
@@ -233,8 +233,6 @@ class Adapter(RuntimePart):
             _log.info("= %s: over: %s", self._name, text)
         level, message = (DiagnosticLevel.STALE, text) if missing else (DiagnosticLevel.OK, f"over: {text}")
         self.reports.alarm(level, message, {"cleared": str(not missing).lower()})
-        for part in self._runtime.parts:
-            part.missing_changed(text, missing=missing)
 
     # --- clients ------------------------------------------------------------------------------------------------
 
@@ -269,20 +267,6 @@ class Adapter(RuntimePart):
         elif client in self.loop.requirements:
             self._act(self.loop.release(client, now))
         self._respond()
-
-    def saved_requirements(self, now_ns: int) -> list[SavedRequirement]:
-        """The requirements in the form in which they are stored; ``now_ns``: Unix nanoseconds of the wall clock."""
-        return self.clients.save(self.loop.requirements, self._loop.time(), now_ns)
-
-    def saved_cool_downs(self, now_ns: int) -> dict[str, SavedCoolDown]:
-        """The cool-downs in the form in which they are stored; ``now_ns``: Unix nanoseconds of the wall clock."""
-        now = self._loop.time()
-        return {
-            name: SavedCoolDown(
-                until_ns=now_ns + round((one.until - now) * 1e9), cool_down=one.cool_down, why=one.why
-            )
-            for name, one in self.loop.cooling(now).items()
-        }
 
     def enter_context(self, context: str, bounds: Mapping[str, Bound], blocked: Mapping[str, str]) -> None:
         """Put a context's requirement in force, above those of clients, and block the profiles that it excludes.

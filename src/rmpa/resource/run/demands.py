@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rmpa.resource.declare.attributes import Value
     from rmpa.resource.declare.connections import Demand
     from rmpa.resource.run.runtime import Runtime
-    from rmpa.ros.node.topics import Received, Subscriber
+    from rmpa.ros.node.topics import Received
 
 _log = logging.getLogger(__name__)
 
@@ -40,8 +40,6 @@ class Demands(RuntimePart):
         self._first: dict[str, str] = {}
         """Name of the first output of each resource whose descriptor has been received, by resource."""
         self._undo = contextlib.AsyncExitStack()
-        self.descriptors: dict[str, Subscriber] = {}
-        """Subscriptions to descriptors, by topic."""
 
     async def start(self) -> None:
         """Send the requests."""
@@ -112,8 +110,6 @@ class Demands(RuntimePart):
         """
 
         def descriptor_received(received: Received) -> None:
-            for part in self._runtime.parts:
-                part.descriptor_received(name, received)
             try:
                 outputs = Descriptor.parse(str(received.message.data)).outputs
             except RmpaError as error:
@@ -122,10 +118,7 @@ class Demands(RuntimePart):
                 self._first[name] = outputs[0].name if outputs else ""
 
         await client.observe()
-        topic = f"{name}/{TOPIC}"
-        self.descriptors[topic] = await self._runtime.node.subscribe(
-            topic, MessageType("std_msgs/String"), descriptor_received
-        )
+        await self._runtime.node.subscribe(f"{name}/{TOPIC}", MessageType("std_msgs/String"), descriptor_received)
 
     async def _follow(self, demand: Demand, client: ResourceClient) -> None:
         last: tuple[DiagnosticLevel, str] | None = None

@@ -15,9 +15,7 @@ from rmpa.resource.run.demands import Demands
 from rmpa.resource.run.output_types import learn_outputs
 from rmpa.resource.run.persistence import Persistence
 from rmpa.resource.run.reconfigure import Reconfigure
-from rmpa.resource.run.registry_writer import FILE, RegistryWriter
 from rmpa.resource.run.runtime import Runtime, RuntimePart
-from rmpa.resource.run.store import ResourceStore
 from rmpa.resource.run.tasks import Tasks
 from rmpa.ros.http.client import call_api
 from rmpa.ros.node.node import Node
@@ -42,8 +40,7 @@ class ResourceNode:
         master_uri: URI of the core's master.
         window: Length of a quality window in seconds; ``None``: as declared.
         settings: Settings of the control loop; ``None``: as declared.
-        store: Keeps the resource's state over a restart; ``None``: nothing is kept.
-        registry: Records the resources of this module's graph; one resource of a process has it, the others ``None``.
+        state: The file that keeps the resource's state over a restart; ``None``: nothing is kept.
         on_hung: Called when a function of a profile or context has exceeded its time-out: the resource has to end.
         observers: Further parts, started last.
 
@@ -58,8 +55,7 @@ class ResourceNode:
         *,
         window: float | None = None,
         settings: AdaptationSettings | None = None,
-        store: ResourceStore | None = None,
-        registry: ResourceStore | None = None,
+        state: Path | None = None,
         on_hung: Callable[[], None] = lambda: None,
         observers: Sequence[RuntimePart] = (),
     ) -> None:
@@ -85,13 +81,11 @@ class ResourceNode:
         self.contexts = Contexts(self.runtime, self.tasks, self.adapter)
         self.configuration = Reconfigure(self.runtime, self.tasks, self.adapter, self.contexts)
         self.demands = Demands(self.runtime)
-        self._persistence = Persistence(self.runtime, self.adapter, self.contexts, store) if store else None
-        self.registry = RegistryWriter(self.runtime, self.demands, registry) if registry else None
+        self._persistence = Persistence(self.runtime, self.adapter, self.contexts, state) if state else None
         # Parameters are loaded before ``configure``; ``configure`` opens the device before a profile sets it.
         first = [_StartStep(self.configuration.load), _StartStep(self._configure), self.tasks]
         parts = [*first, self.adapter, self.contexts, self.configuration, self.demands]
-        stores = filter(None, (self._persistence, self.registry))
-        self.parts: list[RuntimePart] = [*parts, *stores, *observers]
+        self.parts: list[RuntimePart] = [*parts, *filter(None, (self._persistence,)), *observers]
         """In the order of their start."""
         self._deactivating: asyncio.Task[None] | None = None
 
@@ -167,8 +161,8 @@ class ResourceNode:
         ]
         absent, short = self.demands.problems()
         broken = [*self.tasks.problems, *short, *(f"rule over {problem}" for problem in self.contexts.problems)]
-        stores = (self._persistence, self.registry)
-        broken += [part.problem for part in stores if part is not None and part.problem]
+        if self._persistence is not None and self._persistence.problem:
+            broken.append(self._persistence.problem)
         if self.life.state is not LifecycleState.ACTIVE:
             broken.append(f"it is {self.life.state}")
         return [*missing, *absent], broken
@@ -251,7 +245,7 @@ async def run_all(
     master_uri: str,
     stop: asyncio.Event,
     ready: Callable[[], None],
-    stores: Path | None = None,
+    directory: Path | None = None,
 ) -> None:
     """Run resources until ``stop`` is set or all of them have ended.
 
@@ -260,7 +254,7 @@ async def run_all(
         master_uri: URI of the master of the module's core.
         stop: Set by the caller to end all resources.
         ready: Called when all resources are active.
-        stores: The folder of the resources' stores; ``None``: nothing is kept over a restart.
+        directory: The folder of the resources' state; ``None``: nothing is kept over a restart.
 
     Raises:
         RmpaError: A resource cannot start, or a function of one has exceeded its time-out; all are closed.
@@ -270,9 +264,8 @@ async def run_all(
     try:
         # Resources that wait for the type of an output start last.
         for resource in sorted(resources, key=lambda each: any(o.kind.known is None for o in each.outputs.values())):
-            store = ResourceStore(stores / f"{resource.name}.sqlite") if stores is not None else None
-            registry = ResourceStore(stores / FILE) if stores is not None and not running else None
-            one = ResourceNode(resource, master_uri, store=store, registry=registry, on_hung=stop.set)
+            state = directory / f"{resource.name}.json" if directory is not None else None
+            one = ResourceNode(resource, master_uri, state=state, on_hung=stop.set)
             if not await _start(one, stopped):
                 break
             running.append(one)

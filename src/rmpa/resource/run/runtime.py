@@ -73,14 +73,8 @@ class RuntimePart:
     def requirements_changed(self) -> None:
         """The requirements, the profile or its cool-downs may have changed."""
 
-    def missing_changed(self, text: str, *, missing: bool) -> None:
-        """Something that the resource needs is missing, or is back."""
-
     def context_changed(self) -> None:
         """The present context, or the choice of a context by hand, may have changed."""
-
-    def descriptor_received(self, resource: str, message: Received) -> None:
-        """Another resource, on which this one has a requirement, has published its descriptor."""
 
 
 class Runtime:
