@@ -35,7 +35,6 @@ from rmpa.observe.doctor.network import (
     judge_rp_filter,
 )
 from rmpa.observe.doctor.ros_environment import judge_shell
-from rmpa.observe.doctor.stale_connections import judge_stale_connections
 from rmpa.observe.health import Health, diagnostic_status
 from rmpa.observe.snapshot import EventInfo, FilesInfo, ServiceInfo, Snapshot, UnreachableInfo
 from rmpa.ros.types.diagnostic_array import frame_array
@@ -146,10 +145,6 @@ def findings() -> Iterator[Check]:
     for answers in (True, False):
         shell = replace(alone, external="http://robot2:11311/", answers=answers)
         yield from judge_shell(replace(shell, environ={"ROS_MASTER_URI": "http://robot2:11311"}))
-    told = {"new": "", "plain": "this process has no CAP_NET_ADMIN; give it", "older": None}
-    for direct in (True, False):
-        yield from judge_stale_connections(told, "", direct=direct)
-    yield from judge_stale_connections({}, "no such netlink; another kernel", direct=True)
     good = WallClock(stepped=0.00001, synchronised=True, error=0.004, year=2026)
     for clock in (good, WallClock(-0.2, False, 0.0, 1970), replace(good, synchronised=None)):
         yield from judge_clock(clock)

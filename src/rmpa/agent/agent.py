@@ -31,8 +31,6 @@ from rmpa.bridge.services.io.part import Services
 from rmpa.bridge.services.rules import ServiceRules
 from rmpa.core.counters import Counters
 from rmpa.discovery.io.interfaces import list_interfaces
-from rmpa.observe.check import WARN
-from rmpa.observe.doctor.stale_connections import judge_stale_connections
 from rmpa.observe.io.agent_requests import AgentRequests
 from rmpa.observe.io.control_operations import ControlOperations
 from rmpa.observe.io.control_server import ControlServer
@@ -262,10 +260,13 @@ class Agent:
 
     def _warn_of_stale_connections(self) -> None:
         """Say beforehand what happens when the host of a direct subscriber vanishes, if the agent may not end it."""
-        problem = may_end_connections() if self._settings.allows_direct else ""
-        for check in judge_stale_connections({"": problem}, "", direct=True):
-            if check.level is WARN:
-                _log.warning("! %s; %s", check.text, check.remedy)
+        if self._settings.allows_direct and (problem := may_end_connections()):
+            reason, _, remedy = problem.partition("; ")
+            effect = (
+                "a rospy publisher without queue_size may hang for minutes in publish() when its subscriber's does"
+            )
+            text = f"the agent may not end connections that a vanished host leaves behind ({reason}): {effect}"
+            _log.warning("! %s; %s (docs/systemd.md)", text, remedy)
 
     def apply_settings(self, settings: Settings) -> None:
         """Take settings that were read again; only those of ``agent.reload.LIVE`` differ."""

@@ -83,8 +83,6 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
         proxy_listening: How these are used, ready to read: the ports that all share, or why each has its own.
         core_memory: Where the core stores registrations and parameters, and what it took over from its last run,
             ready to read; empty for a core that stores nothing.
-        end_connections: Why it may not end the TCP connections of other processes whose host has vanished, with the
-            remedy after the first ``"; "``; empty if it may; ``None`` from an agent that does not report it.
         detector: The failure detector, while it probes.
     """
 
@@ -109,7 +107,6 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
     proxy_sockets: int = 0
     proxy_listening: str = ""
     core_memory: str = ""
-    end_connections: str | None = None
     detector: DetectorInfo | None = None
 
 

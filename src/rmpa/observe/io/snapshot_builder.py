@@ -24,7 +24,6 @@ from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.descriptors import DESCRIPTORS
 from rmpa.runtime.event_loop import yield_to_data
 from rmpa.runtime.realtime import refused
-from rmpa.runtime.tcp_connections import may_end_connections
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator
@@ -217,7 +216,6 @@ class SnapshotBuilder:
             proxy_sockets=bridge.proxy_nodes.sockets(proxies),
             proxy_listening=bridge.proxy_nodes.listening,
             core_memory=core.restored(),
-            end_connections=may_end_connections(),
             detector=detector_info(endpoint.discovery.detector) if endpoint is not None else None,
         )
 

@@ -23,10 +23,8 @@ from rmpa.observe.doctor.exposed_nodes import judge_exposed_nodes
 from rmpa.observe.doctor.io import machine, network
 from rmpa.observe.doctor.io.exposed_nodes import exposed_nodes
 from rmpa.observe.doctor.io.firewall import check_firewall
-from rmpa.observe.doctor.io.kernel_limits import read_kernel_limits
 from rmpa.observe.doctor.io.multicast import hear_ourselves
 from rmpa.observe.doctor.io.programs import resolve
-from rmpa.observe.doctor.kernel_limits import judge_kernel_limits, mesh_size
 from rmpa.observe.doctor.machine import judge_clock, judge_rights, judge_sim_time
 from rmpa.observe.doctor.network import (
     judge_interfaces,
@@ -37,11 +35,9 @@ from rmpa.observe.doctor.network import (
     judge_rp_filter,
 )
 from rmpa.observe.doctor.ros_environment import RosShell, judge_shell, names_of
-from rmpa.observe.doctor.stale_connections import judge_stale_connections
 from rmpa.observe.io.control_client import ControlClient, find_agents
 from rmpa.observe.snapshot import Snapshot
 from rmpa.ros.environment import DEFAULT_MASTER_URI, host_of
-from rmpa.runtime.tcp_connections import may_end_connections
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -206,16 +202,6 @@ def _rights(given: DoctorInput) -> Iterable[Check]:
     return judge_rights(rights)
 
 
-def _kernel_limits(given: DoctorInput) -> Iterable[Check]:
-    snapshots = given.snapshots.values()
-    return judge_kernel_limits(read_kernel_limits(snapshots), mesh_size(given.settings, snapshots, given.interfaces))
-
-
-def _stale_connections(given: DoctorInput) -> Iterable[Check]:
-    told = {name: shown.agent.end_connections for name, shown in given.snapshots.items()}
-    return judge_stale_connections(told, may_end_connections(), direct=given.settings.allows_direct)
-
-
 def _exposed_nodes(given: DoctorInput) -> Iterable[Check]:
     for name, shown in given.snapshots.items():
         trusted = shown.trust is not None
@@ -238,8 +224,6 @@ CHECKS: Final = (
     DoctorCheck("ROS", _shell),
     DoctorCheck("clock", _clock),
     DoctorCheck("realtime", _rights),
-    DoctorCheck("kernel limits", _kernel_limits),
-    DoctorCheck("stale connections", _stale_connections),
     DoctorCheck("exposed nodes", _exposed_nodes),
 )
 """All checks, in the order of the output."""
