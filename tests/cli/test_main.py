@@ -66,8 +66,6 @@ def test_an_option_that_is_gone_says_what_to_use(command: str, capfd: pytest.Cap
 WORDS = {"values": "{}", "value": "1"}
 QUIET = {
     "rmpa doctor",
-    "rmpa multicast send",
-    "rmpa multicast receive",
     "rmpa trust init",
     "rmpa trust status",
     "rmpa web",

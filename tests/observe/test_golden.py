@@ -109,6 +109,10 @@ def findings() -> Iterator[Check]:
     yield from judge_interfaces(cards, (), container=True)
     echoes = (MulticastEcho("lo", after=0.0002), MulticastEcho("eth0"), MulticastEcho("wlan0", "not permitted"))
     yield from judge_multicast(echoes, "239.255.82.77", 11411)
+    yield from judge_multicast((MulticastEcho("lo", after=0.0002),), "239.255.82.77", 11411, 30.0)
+    yield from judge_multicast(
+        (MulticastEcho("eth0", after=0.01, others={"10.0.0.2"}),), "239.255.82.77", 11411, 30.0
+    )
     for rules in (
         *(read_nft(text, PORTS) for text in ("", NFT_OPEN, NFT_CLOSED, NFT_OURS, NFT_AGAINST)),
         read_iptables(IPTABLES_UFW, PORTS),

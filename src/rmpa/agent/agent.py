@@ -262,9 +262,7 @@ class Agent:
         """Say beforehand what happens when the host of a direct subscriber vanishes, if the agent may not end it."""
         if self._settings.allows_direct and (problem := may_end_connections()):
             reason, _, remedy = problem.partition("; ")
-            effect = (
-                "a rospy publisher without queue_size may hang for minutes in publish() when its subscriber's does"
-            )
+            effect = "when that of a direct subscriber does, a rospy publisher without queue_size may hang"
             text = f"the agent may not end connections that a vanished host leaves behind ({reason}): {effect}"
             _log.warning("! %s; %s (docs/systemd.md)", text, remedy)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.cli.options import json_option
+from rmpa.cli.options import FiniteRange, json_option
 from rmpa.cli.output import LEVEL_COLOURS, print_json, printable
 from rmpa.observe.check import FAIL, WARN, CheckLevel, exit_code
 
@@ -25,6 +25,7 @@ Exit codes: 0 nothing fails (there may be warnings); 1 something does.
 Examples:
   rmpa doctor
   sudo rmpa doctor                reads the firewall's rules too
+  rmpa doctor --listen 30         and `rmpa doctor` on another machine: do multicasts get through?
   rmpa doctor --json | jq '.[] | select(.level == "fail")'
 """
 
@@ -32,18 +33,19 @@ Examples:
 @click.command(epilog=EPILOG)
 @click.option("--config", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]")
 @click.option("-q", "--quiet", is_flag=True, help="Only what fails, or may.")
+@click.option("--listen", metavar="SECONDS", type=FiniteRange(1.0), help="Wait for multicasts of other machines.")
 @json_option
-def doctor(config: str | None, quiet: bool, as_json: bool) -> int:
+def doctor(config: str | None, quiet: bool, listen: float | None, as_json: bool) -> int:
     """Check this machine: settings, agents, network, ROS environment, clock and rights.
 
     It changes nothing. It sends one packet on each interface to the agents' multicast group, which agents ignore, and
-    checks that it comes back. It cannot see a firewall on another machine or a switch in between: run it on both
-    machines, and `rmpa multicast` between them.
+    checks that it comes back. To see whether a switch or a firewall in between drops it, run it with --listen on one
+    machine and meanwhile without on the other, then the other way round.
     """
     from rmpa.observe.doctor.io.checks import examine, look_at
 
     found, shown = [], []
-    for check in examine(look_at(os.environ, config)):
+    for check in examine(look_at(os.environ, config, listen or 0.0)):
         found.append(check)
         if not quiet or check.level in (WARN, FAIL):
             shown.append(check)

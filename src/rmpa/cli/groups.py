@@ -183,12 +183,3 @@ trust: Final = _group(
     },
     "\b\nA walk-through, a fleet's provisioning, and what to do when keys are lost: docs/trust.md\n",
 )
-multicast: Final = _group(
-    "Send and receive multicast packets by hand.",
-    {"multicast": {"send": "Send packets to the group.", "receive": "Wait for packets of the group."}},
-    """\
-\b
-Start `rmpa multicast receive` on one machine and `rmpa multicast send` on the other, then the other way round.
-The agents' own port is left alone; --port 11411 is theirs (plus the domain), for where a firewall knows ports.
-""",
-)

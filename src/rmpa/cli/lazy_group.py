@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 REMOVED_VERBS: Final = {
     "experiment": "in a clone of the repository: make experiment, or python -m lab experiment (docs/experiments.md)",
+    "multicast": "`rmpa doctor --listen 30` on one machine and `rmpa doctor` on the other try multicast between them",
     "resource history": "record it: rosbag record /SONAR/decision /SONAR/quality /SONAR/alarms",
     "site last": "record the topic with rosbag where it is needed, or keep its key by a storage of Zenoh",
 }

@@ -43,7 +43,6 @@ COMMANDS = {
     "doctor": ("rmpa.cli.doctor", "Check this machine: network, clock, rights, ROS environment."),
     "web": ("rmpa.cli.web", "Serve this module's state over HTTP: metrics, REST."),
     "gateway": ("rmpa.cli.gateway", "Join this network's modules with other sites and with ROS 2, over Zenoh."),
-    "multicast": (_GROUPS, "Send and receive multicast packets by hand."),
     "config": ("rmpa.cli.config", "Show the settings and where each comes from; print their JSON Schema."),
     "reload": ("rmpa.cli.reload", "Let the agent read its settings again."),
     "completion": ("rmpa.cli.completion", "Print the script that completes rmpa's commands in a shell."),

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from typing import Final
 
-MULTICAST_TEST_PORT: Final = 11410
-"""The port of ``rmpa multicast``: not the port of any domain, so that no agent receives its packets."""
 MULTICAST_TTL: Final = 1
 """Multicast time-to-live: beacons stay in their own sub-network."""
 BEACON_MAX_BYTES: Final = 1200

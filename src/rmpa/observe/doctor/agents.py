@@ -77,7 +77,7 @@ def _agent(snapshot: Snapshot, version: str) -> Iterator[Check]:
     if not snapshot.peers and not snapshot.strangers:
         text = f"knows no peer (domain {agent.domain}, looking on {', '.join(agent.interfaces) or 'no interface'})"
         advice = (
-            f"is `rmpa up` running elsewhere with --domain {agent.domain}? `rmpa multicast` tries the way by hand"
+            f"is `rmpa up` running elsewhere with --domain {agent.domain}? `rmpa doctor --listen 30` tries the way"
         )
         yield Check("peer", WARN, text, advice, where=here)
     if snapshot.trust is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from rmpa.observe import limits
@@ -41,7 +41,7 @@ class NetworkInterface:
     used: bool = True
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class MulticastEcho:
     """Whether a packet that was sent to the group on an interface was received there.
 
@@ -49,11 +49,13 @@ class MulticastEcho:
         interface: Its name.
         problem: Why it could not be sent, or the group not be joined; empty if nothing failed.
         after: Seconds until it was received; ``None`` if it was not.
+        others: The addresses of other machines that were heard there.
     """
 
     interface: str
     problem: str = ""
     after: float | None = None
+    others: set[str] = field(default_factory=set)
 
 
 def judge_interfaces(
@@ -118,8 +120,15 @@ def _shared(interfaces: Sequence[NetworkInterface]) -> list[Check]:
     return found
 
 
-def judge_multicast(echoes: Iterable[MulticastEcho], group: str, port: int) -> list[Check]:
-    """Whether each interface can send to the group and receives what was sent."""
+def judge_multicast(echoes: Sequence[MulticastEcho], group: str, port: int, listened: float = 0.0) -> list[Check]:
+    """Whether each interface can send to the group and receives what was sent, and what others send.
+
+    Args:
+        echoes: By interface.
+        group: The multicast group.
+        port: Its port.
+        listened: Seconds for which packets of other machines were waited for; 0: they were not.
+    """
     found = []
     for echo in echoes:
         if echo.problem:
@@ -132,7 +141,12 @@ def judge_multicast(echoes: Iterable[MulticastEcho], group: str, port: int) -> l
             found.append(Check("multicast", FAIL, text, remedy, where=echo.interface))
         else:
             text = f"{group}:{port} sent, and heard {echo.after * 1e3:.1f} ms later"
-            found.append(Check("multicast", OK, text, where=echo.interface))
+            others = f"; heard of other machines: {', '.join(sorted(echo.others))}" if echo.others else ""
+            found.append(Check("multicast", OK, text + others, where=echo.interface))
+    if listened and not any(echo.others for echo in echoes):
+        text = f"nothing of another machine was heard within {listened:g} s"
+        remedy = "run `rmpa doctor` there meanwhile; if it was: a switch, an access point or a firewall drops it"
+        found.append(Check("multicast", WARN, text, remedy))
     return found
 
 

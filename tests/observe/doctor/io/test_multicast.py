@@ -4,75 +4,72 @@ from __future__ import annotations
 
 import os
 import socket
-from dataclasses import replace
+import threading
 
 import pytest
 
 from rmpa.config import limits as config_limits
 from rmpa.core.counters import Counters
-from rmpa.core.errors import ConfigError, StartError
+from rmpa.core.errors import StartError
 from rmpa.discovery.io.interfaces import Interface, list_interfaces
 from rmpa.discovery.io.packet_filter import PacketFilter
+from rmpa.discovery.io.sockets import receive
 from rmpa.observe import limits
-from rmpa.observe.doctor.io.multicast import GroupReceiver, GroupSender, hear_ourselves
+from rmpa.observe.doctor.io import multicast
+from rmpa.observe.doctor.io.multicast import hear
 
 PORT = 20000 + os.getpid() % 20000
 LO = next(interface for interface in list_interfaces() if interface.name == "lo")
 GROUP = config_limits.MULTICAST_GROUP
 
 
-def test_a_packet_is_received_on_its_interface() -> None:
-    with GroupReceiver(GROUP, PORT) as receiver, GroupSender(GROUP, PORT) as sender:
-        assert receiver.join([LO]) == {}
-        assert sender.send(LO, b"hello") == ""
-        packet = receiver.wait(20.0)
-        assert packet is not None
-        assert (packet.data, packet.interface) == (b"hello", "lo")
-        assert packet.source.startswith("127.0.0.1:")
-        assert receiver.wait(0.0) is None
-
-
-def test_without_joining_nothing_is_received() -> None:
-    with GroupReceiver(GROUP, PORT) as receiver, GroupSender(GROUP, PORT) as sender:
-        sender.send(LO, b"hello")
-        assert receiver.wait(0.2) is None
-
-
 def test_doctor_receives_its_own_packets() -> None:
     gone = Interface("gone0", 9999, LO.addresses, up=True, multicast=True, loopback=False)
-    lo, other = hear_ourselves([LO, gone], GROUP, PORT)
+    lo, other = hear([LO, gone], GROUP, PORT)
     assert lo.after is not None
     assert 0 < lo.after < limits.DOCTOR_HEAR
     assert other.after is None
     assert "No such device" in other.problem
+    assert lo.others == set()
 
 
 def test_a_packet_on_another_interface_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
-    wait = GroupReceiver.wait
-
-    def elsewhere(self: GroupReceiver, timeout: float | None = None) -> object:
-        packet = wait(self, timeout)
-        return None if packet is None else replace(packet, interface="eth9")
-
-    monkeypatch.setattr(GroupReceiver, "wait", elsewhere)
+    monkeypatch.setattr(multicast, "receive", lambda sock: (*receive(sock)[:2], 9999))
     monkeypatch.setattr(limits, "DOCTOR_HEAR", 0.2)
-    assert [heard.after for heard in hear_ourselves([LO], GROUP, PORT)] == [None]
+    assert [heard.after for heard in hear([LO], GROUP, PORT)] == [None]
+
+
+def test_another_machine_is_heard(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its packets are those of a second doctor; loopback stands for the cable."""
+    heard = threading.Event()
+
+    def from_afar(sock: socket.socket) -> tuple[bytes, tuple[str, int], int]:
+        data, (_, port), index = receive(sock)
+        heard.set()
+        return data, ("10.0.0.2", port), index
+
+    monkeypatch.setattr(multicast, "receive", from_afar)
+    found: list[set[str]] = []
+    listener = threading.Thread(target=lambda: found.extend(e.others for e in hear([LO], GROUP, PORT, 2.0)))
+    listener.start()
+    assert heard.wait(20)
+    hear([LO], GROUP, PORT)
+    listener.join()
+    assert found == [{"10.0.0.2"}]
 
 
 def test_agents_ignore_the_doctors_packet(monkeypatch: pytest.MonkeyPatch) -> None:
     counters = Counters()
     intake = PacketFilter(0, counters)
     heard: list[bytes] = []
-    wait = GroupReceiver.wait
 
-    def note(self: GroupReceiver, timeout: float | None = None) -> object:
-        packet = wait(self, timeout)
-        if packet is not None:
-            heard.append(packet.data)
+    def note(sock: socket.socket) -> tuple[bytes, tuple[str, int], int]:
+        packet = receive(sock)
+        heard.append(packet[0])
         return packet
 
-    monkeypatch.setattr(GroupReceiver, "wait", note)
-    hear_ourselves([LO], GROUP, PORT)
+    monkeypatch.setattr(multicast, "receive", note)
+    hear([LO], GROUP, PORT)
     assert [intake.parse(data, ("127.0.0.1", 1), 0.0, multicast=True) for data in heard] == [None]
     assert counters.as_dict() == {"beacon.other_domain": 1}
 
@@ -81,12 +78,4 @@ def test_a_port_that_is_not_shared() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind((GROUP, PORT))
         with pytest.raises(StartError, match=f"UDP port {PORT}"):
-            hear_ourselves([LO], GROUP, PORT)
-
-
-@pytest.mark.parametrize("group", ["10.0.0.1", "239.1", "x", "240.0.0.1"])
-def test_addresses_that_are_no_group(group: str) -> None:
-    with pytest.raises(ConfigError, match="not an IPv4 multicast group"):
-        GroupSender(group, PORT)
-    with pytest.raises(ConfigError):
-        GroupReceiver(group, PORT)
+            hear([LO], GROUP, PORT)

@@ -23,7 +23,7 @@ from rmpa.observe.doctor.exposed_nodes import judge_exposed_nodes
 from rmpa.observe.doctor.io import machine, network
 from rmpa.observe.doctor.io.exposed_nodes import exposed_nodes
 from rmpa.observe.doctor.io.firewall import check_firewall
-from rmpa.observe.doctor.io.multicast import hear_ourselves
+from rmpa.observe.doctor.io.multicast import hear
 from rmpa.observe.doctor.io.programs import resolve
 from rmpa.observe.doctor.machine import judge_clock, judge_rights, judge_sim_time
 from rmpa.observe.doctor.network import (
@@ -55,6 +55,7 @@ class DoctorInput:
         settings_checks: The results of reading the settings.
         agents: The snapshot of each agent of this machine by its name, or why it does not answer.
         interfaces: All network interfaces.
+        listen: Seconds to listen for multicast packets of other machines; 0: not at all.
     """
 
     environ: Mapping[str, str]
@@ -62,6 +63,7 @@ class DoctorInput:
     settings_checks: tuple[Check, ...]
     agents: Mapping[str, Snapshot | str]
     interfaces: tuple[NetworkInterface, ...]
+    listen: float = 0.0
 
     @property
     def snapshots(self) -> dict[str, Snapshot]:
@@ -82,12 +84,13 @@ class DoctorCheck:
     run: Callable[[DoctorInput], Iterable[Check]]
 
 
-def look_at(environ: Mapping[str, str], config: str | None = None) -> DoctorInput:
+def look_at(environ: Mapping[str, str], config: str | None = None, listen: float = 0.0) -> DoctorInput:
     """Read the settings and the interfaces, and ask the agents.
 
     Args:
         environ: The shell's variables.
         config: The settings' file; the usual places by default.
+        listen: Seconds to listen for multicast packets of other machines.
     """
     settings, checks = _settings(environ, config)
     agents: dict[str, Snapshot | str] = {}
@@ -97,7 +100,7 @@ def look_at(environ: Mapping[str, str], config: str | None = None) -> DoctorInpu
                 agents[found.name] = client.snapshot(most=0)  # topics in use
         except RmpaError as error:
             agents[found.name] = str(error)
-    return DoctorInput(environ, settings, checks, agents, network.read_interfaces(settings.interfaces))
+    return DoctorInput(environ, settings, checks, agents, network.read_interfaces(settings.interfaces), listen)
 
 
 def _settings(environ: Mapping[str, str], config: str | None) -> tuple[Settings, tuple[Check, ...]]:
@@ -128,10 +131,10 @@ def _multicast(given: DoctorInput) -> Iterable[Check]:
         return [Check("multicast", SKIPPED, "the settings switch it off (discovery.multicast)")]
     usable = choose(list_interfaces(), settings.interfaces)
     try:
-        echoes = hear_ourselves(usable, settings.multicast.group, settings.discovery_port)
+        echoes = hear(usable, settings.multicast.group, settings.discovery_port, given.listen)
     except StartError as error:
         return [Check("multicast", FAIL, f"{error.what} {error.problem}", error.remedy)]
-    return judge_multicast(echoes, settings.multicast.group, settings.discovery_port)
+    return judge_multicast(echoes, settings.multicast.group, settings.discovery_port, given.listen)
 
 
 def _radio(given: DoctorInput) -> Iterable[Check]:
