@@ -18,13 +18,6 @@ def test_the_public_names_are_those_of_their_modules() -> None:
         _ = rmpa.ros.Nodes
 
 
-def test_the_former_path_of_node_warns() -> None:
-    sys.modules.pop("rmpa.ros.aio.node", None)
-    with pytest.warns(DeprecationWarning, match="from rmpa.ros import Node"):
-        from rmpa.ros.aio.node import Node as Former
-    assert Former is Node
-
-
 def test_importing_the_room_imports_no_node() -> None:
     program = "import rmpa.ros, sys; print('rmpa.ros.node.node' in sys.modules, 'asyncio' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

@@ -10,7 +10,6 @@ This package is the public interface; the modules below it may be moved::
 from __future__ import annotations
 
 import importlib
-import warnings
 from typing import TYPE_CHECKING, Final
 
 from rmpa.resource.declare.answer import RequirementAnswer
@@ -42,19 +41,14 @@ __all__ = [
 ]
 _LAZY: Final = {"ResourceClient": "rmpa.resource.run.client", "Node": "rmpa.ros.node.node"}
 """Names that are imported at their first use, because their modules import asyncio and sockets."""
-_RENAMED: Final = {"Wish": QoSRequest, "Answer": RequirementAnswer}
 
 
 def __getattr__(name: str) -> object:
-    """Find names that are imported at their first use, and deprecated names of earlier releases.
+    """Find names that are imported at their first use.
 
     Raises:
         AttributeError: The package has no such name.
     """
     if (module := _LAZY.get(name)) is not None:
         return getattr(importlib.import_module(module), name)
-    if (kind := _RENAMED.get(name)) is not None:
-        text = f"rmpa.resource.{name} is deprecated: it is called {kind.__name__} now"
-        warnings.warn(text, DeprecationWarning, stacklevel=2)
-        return kind
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

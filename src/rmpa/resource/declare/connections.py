@@ -5,7 +5,6 @@ While the resource runs, ``rmpa.resource.run`` binds these to a node: it sets th
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -170,9 +169,3 @@ class Demand:
         self.requests = requests
         if self.on_change is not None:
             self.on_change(self)
-
-    @property
-    def wishes(self) -> Mapping[str, QoSRequest]:
-        """Deprecated name of ``requests``."""
-        warnings.warn("Demand.wishes is deprecated: it is called requests now", DeprecationWarning, stacklevel=2)
-        return self.requests
