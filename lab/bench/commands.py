@@ -14,19 +14,14 @@ from rich.console import Console
 from lab.bed import namespaces
 from lab.bed.bench import why_no_hosts, why_no_ros
 from lab.bench import (
-    bookkeeping,
     crosstraffic,
-    decision,
     fleet,
     fleet_graph,
     gateway,
     idle,
-    joining,
     load,
-    one_of_many,
     parked,
     period,
-    profile,
     radio,
     roscore,
     roundtrips,
@@ -34,11 +29,8 @@ from lab.bench import (
     services,
     startup,
     storm,
-    tasks,
     thousand,
     throughput,
-    trust,
-    views,
     web,
 )
 from lab.bench.contenders import ENTRIES
@@ -101,34 +93,17 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
     "peers": Measurement(
         "other middleware (Zenoh, DDS, ZeroMQ) in the same run", roundtrips.peers, needs=()
     ),  # likewise
-    "profile": Measurement("what a relayed message costs an agent, and where that goes", profile.measure),
     "throughput": Measurement("how much goes through", throughput.measure),
     "startup": Measurement("how soon the first message arrives", startup.measure),
-    "joining": Measurement(
-        "how soon modules and their graphs are joined, and what a mesh costs while nothing happens", joining.measure
-    ),
     "services": Measurement("a service call through two agents, and a direct one", services.measure),
     "roscore": Measurement(
         "what it costs to follow a real roscore, and how soon changes are seen", roscore.measure, (why_no_ros,)
     ),
     "fleet": Measurement("2 to 64 modules: start, rest, a stream beside classic ROS, losses", fleet.measure),
     "fleet_graph": Measurement("what the topics of 999 peers cost one agent", fleet_graph.measure, needs=()),
-    "one_of_many": Measurement(
-        "one whole agent among 999 peers that are played", one_of_many.measure, (why_no_hosts, why_no_ros)
-    ),
     "idle": Measurement("what an agent costs while nothing happens", idle.measure),
-    "views": Measurement("what a user sees of a thousand modules, and its cost", views.measure, needs=()),
     "parked": Measurement("how much later the first message of a parked peer arrives", parked.measure, needs=()),
     "thousand": Measurement("a mesh of up to a thousand modules, simulated", thousand.measure, needs=()),
-    "tasks": Measurement(
-        "how evenly a resource's task runs, beside loops of rospy and roscpp",
-        tasks.measure,
-        (why_no_ros,),
-        partial(tasks.measure, realtime=True),
-    ),
-    "decision": Measurement("how long a resource takes to decide", decision.measure, needs=()),
-    "trust": Measurement("what TLS on the links costs, and what attacks cost a secured agent", trust.measure),
-    "bookkeeping": Measurement("what measuring quality costs, and how soon a resource adapts", bookkeeping.measure),
     "gateway": Measurement(
         "sites joined by gateways, beside a bare pair of Zenoh programs",
         gateway.measure,
