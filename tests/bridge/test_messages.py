@@ -139,10 +139,10 @@ GOLDEN: list[tuple[Message, bytes]] = [
         ),
     ),
     (
-        RouteOpened(7, Description("a/B", ADD_MD5, "", False), epoch=4, lost=7046, at_least=True),
+        RouteOpened(7, Description("a/B", ADD_MD5, "", False), epoch=4, unknown=True),
         (
             b'{"op":"opened","route":7,"description":{"type":"a/B","md5":"6a2e34150c00229791cc89ff309fff21",'
-            b'"definition":"","latching":false},' + DEFAULT + b',"epoch":4,"first":1,"lost":7046,"at_least":true}'
+            b'"definition":"","latching":false},' + DEFAULT + b',"epoch":4,"first":1,"unknown":true}'
         ),
     ),
     (CloseRoute(7), b'{"op":"close","route":7}'),

@@ -138,44 +138,30 @@ def test_losses_beyond_the_buffer_are_counted_exactly(modules: ModuleFactory, tm
     b.agent.process.wait_for(rf"(?i)warning.*/chatter.*\b{missing[0]} messages lost")
 
 
-def test_losses_of_a_long_outage_are_exact_at_both_ends(modules: ModuleFactory, tmp_path: Path) -> None:
+def test_after_an_outage_beyond_the_contract_messages_may_be_lost(modules: ModuleFactory) -> None:
     a, b = modules("a", "b", config=contract(100_000, 'outage = "2 s"\n'))
     heard = recorders(b)
     teller = a.ros.roscpp("teller", topic="/chatter", nodelay=True, wait=1, commands=True)
     first = connected(teller, heard)
-    for listener in heard:
-        recorded(listener, tmp_path)
     teller.tell("64 4000 200")  # for so long that a busy machine has brought the link back before the last one
     time.sleep(0.5)
     b.host.outage(1.5)  # less than it, for the link falls a second later
     eventually(lambda: route(a)["state"] == route(b)["state"] == "open", what="the link")
-    assert (route(a)["lost"], route(b)["lost"]) == (0, 0)
+    assert (route(a)["lost"], route(b)["lost"], route(b)["events"]) == (0, 0, {})
     b.host.cut()
-    a.agent.process.wait_for(r"(?i)warning.* b has been away for 2 s: \d+ messages for it are given up, of /chatter")
-    eventually(lambda: int(str(route(a)["lost"])) > 600, what="more of them")
+    eventually(lambda: route(a)["state"] == "away", what="the lease")
     away = route(a)
-    assert (away["state"], away["peer"], away["kept"]) == ("away", "b", 0)
+    assert away["peer"] == "b"
     assert "b is away for" in str(away["problem"])
+    a.agent.process.wait_for(r"(?i)warning.* b has been away for 2 s: \d+ messages for it are given up, of /chatter")
     b.host.restore()
-    last = first + 4000
-    teller.wait_event("told", where=lambda event: event["sent"] == last)
-    missing = []
     for listener in heard:
-        wait_last(listener, last)
-        sequences = [row.sequence for row in recorded(listener, tmp_path)]
-        assert sequences == sorted(set(sequences))
-        assert (sequences[0], sequences[-1]) == (first + 1, last)
-        missing.append(4000 - len(sequences))
-    # The proxy has left the graph meanwhile: what came before the slower one of both had it again is not its loss.
-    assert min(missing) > 600
+        wait_last(listener, first + 4000)
     found = route(b)
-    lost = int(str(found["lost"]))
-    assert (found["events"], route(a)["lost"]) == ({"messages_lost": lost}, lost)
-    assert lost == min(missing)
-    a.agent.process.wait_for(rf"(?i)warning.*/chatter.*: b has missed {lost} messages")
-    b.agent.process.wait_for(rf"(?i)warning.*/chatter.*\b{lost} messages lost")
+    assert (found["lost"], found["events"]) == (0, {"loss_unknown": 1})
+    b.agent.process.wait_for(r"(?i)warning.*/chatter.*messages may be lost, not counted")
     _, output = b.agent.rmpa("why", "a:/chatter")  # its publisher is silent by now
-    assert f"{lost} of them given up" in output
+    assert "loss unknown 1 times" in output
 
 
 def test_best_effort_is_fresh_after_a_cut(modules: ModuleFactory, tmp_path: Path) -> None:

@@ -197,7 +197,7 @@ class Pair:
         assert sender.pending_bytes == sum(size for _, size in self.kept)
         assert sender.pending <= bounds.depth
         assert sender.pending_bytes <= max(bounds.max_bytes, self.newest)
-        assert sender.next_sequence == self.sequence(self.published)
+        assert sender.last == self.sequence(self.published - 1)
         assert sender.in_flight <= bounds.window_messages
         assert len(sender._dropped_in_flight) <= bounds.window_messages
         under_way = [s for _, s in sender._dropped_in_flight] + [len(m.payload) for m in sender._sent]

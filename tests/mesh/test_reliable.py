@@ -6,7 +6,7 @@ import gc
 import time
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
@@ -43,7 +43,7 @@ def test_messages_are_numbered_and_sent_in_order() -> None:
     machine.offer(b"b", 6)
     assert machine.take() == [(1, 5, b"a"), (2, 6, b"b")]
     assert machine.take() == []
-    assert (machine.epoch, machine.first, machine.next_sequence) == (7, 1, 3)
+    assert (machine.epoch, machine.first, machine.last) == (7, 1, 2)
     assert (machine.pending, machine.pending_bytes, machine.in_flight) == (2, 2, 2)
 
 
@@ -415,18 +415,10 @@ def test_a_parked_sender_is_suspended_and_given_back() -> None:
     machine, gone = parked(table, "a")
     assert gone == []
     assert (len(table), table.pending_bytes, machine.in_flight) == (1, 8, 0)
-    assert table.claim("b", 7) is None
-    assert table.claim("a", 7) is machine
-    assert table.claim("a", 7) is None
+    assert table.claim("b") is None
+    assert table.claim("a") is machine
+    assert table.claim("a") is None
     assert (len(table), table.pending_bytes, table.next_timer()) == (0, 0, None)
-
-
-@pytest.mark.parametrize("epoch", [None, 6, 8])
-def test_another_epoch_has_no_use_for_it(epoch: int | None) -> None:
-    table: ResumeTable[str] = ResumeTable()
-    parked(table, "a")
-    assert table.claim("a", epoch) is None
-    assert len(table) == 0
 
 
 def test_each_sender_keeps_messages_for_its_own_time() -> None:
@@ -437,14 +429,14 @@ def test_each_sender_keeps_messages_for_its_own_time() -> None:
     assert table.expire(19.9) == []
     assert table.expire(20.0) == ["short"]
     assert table.next_timer() == 300.0
-    assert (len(table), table.pending_bytes) == (2, 8)
     for key in ("long", "short"):
         assert table.offer(key, payload(3), 0) == []
-    assert (long.pending, long.lost) == (3, 0)
-    assert (short.pending, short.lost, short.counting) == (0, 3, True)
-    assert table.claim("short", 7) is short
-    short.resume(0)
-    assert (short.following, short.lost, short.counting) == (4, 3, False)
+    assert (len(table), table.pending_bytes) == (1, 12)
+    assert (long.pending, short.pending) == (3, 2)
+    assert table.claim("short") is None
+    table.limit(["long", "short"], 40.0)
+    table.limit(["long"], 50.0)
+    assert table.next_timer() == 40.0
 
 
 def test_parking_again_begins_a_new_time() -> None:
@@ -455,50 +447,27 @@ def test_parking_again_begins_a_new_time() -> None:
     assert gone == []
     assert (len(table), table.pending_bytes) == (2, 16)
     assert table.expire(41.5) == ["b"]
-    assert table.claim("a", 7) is machine
-
-
-def test_counting_sender_goes_on_counting_when_parked() -> None:
-    table: ResumeTable[str] = ResumeTable()
-    machine, _ = parked(table, "a", until=1.0)
-    table.expire(1.0)
-    assert table.park("a", machine, 99.0) == []
-    assert (table.next_timer(), len(table)) == (None, 1)
-    table.move("a", "b")
-    table.offer("b", payload(3), 0)
-    assert (table.claim("a", 7), table.claim("b", 7), machine.lost) == (None, machine, 3)
+    assert table.claim("a") is machine
 
 
 def test_the_number_of_those_that_keep_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "RESUMES_MAX", 2)
     table: ResumeTable[str] = ResumeTable()
     assert [parked(table, key)[1] for key in "abcd"] == [[], [], ["a"], ["b"]]
-    assert (len(table), table.pending_bytes) == (4, 16)
-
-
-def test_the_number_of_those_that_count_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "RESUMES_COUNTED_MAX", 2)
-    table: ResumeTable[str] = ResumeTable()
-    for key in "abcd":
-        parked(table, key)
-    assert table.expire(30.0) == ["a", "b", "c", "d"]
-    assert table.forget() == ["a", "b"]
-    assert table.forget() == []
-    assert table.claim("a", 7) is None
-    assert table.claim("c", 7) is not None
+    assert (len(table), table.pending_bytes) == (2, 16)
 
 
 def test_table_bytes_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "RESUME_BYTES_MAX", 100)
     table: ResumeTable[str] = ResumeTable()
-    machines = [parked(table, key)[0] for key in "abc"]
+    for key in "abc":
+        parked(table, key)
     assert table.offer("c", bytes(76), 0) == []
     assert table.pending_bytes == 100
     assert table.offer("c", bytes(1), 0) == ["a"]
     assert table.offer("a", bytes(1000), 0) == []
     assert table.offer("c", bytes(1000), 0) == ["b", "c"]
-    assert (len(table), table.pending_bytes) == (3, 0)
-    assert [machine.lost for machine in machines] == [3, 2, 5]
+    assert (len(table), table.pending_bytes) == (0, 0)
     assert parked(table, "d", count=26)[1] == ["d"]
 
 
@@ -509,79 +478,9 @@ def test_parked_sender_keeps_its_own_bounds() -> None:
     for number in range(10):
         assert table.offer("a", payload(number), 0) == []
     assert table.pending_bytes == machine.pending_bytes == 12
-    assert table.claim("a", 7) is machine
+    assert table.claim("a") is machine
     machine.resume(0)
     assert numbers(machine) == [7, 8, 9]
-
-
-# --- senders that keep nothing any more -----------------------------------------------------------------------------
-
-
-def test_linked_sender_cannot_stop_keeping() -> None:
-    machine = sender()
-    with pytest.raises(LocalProtocolError):
-        machine.stop_keeping()
-
-
-def test_messages_in_flight_may_arrive_after_stop_keeping() -> None:
-    machine = sender()
-    fill(machine, 5)
-    machine.take(3)
-    machine.suspend()
-    machine.stop_keeping()
-    fill(machine, 2)
-    assert (machine.pending, machine.pending_bytes, machine.lost) == (0, 0, 7)
-    machine.resume(2)
-    assert (machine.lost, machine.following) == (5, 8)
-    fill(machine, 1)
-    assert [message.sequence for message in machine.take()] == [8]
-
-
-def test_counted_losses_stay_below_half_the_range(monkeypatch: pytest.MonkeyPatch) -> None:
-    machine = sender()
-    monkeypatch.setattr("rmpa.mesh.reliable.SERIAL_HALF", 100)
-    machine.suspend()
-    machine.stop_keeping()
-    fill(machine, 250)
-    assert machine.lost == 250
-    machine.resume(0)
-    receiver = ReliableReceiver(7, 1)
-    assert 0 < receiver.skip(machine.following) < 100
-
-
-@given(st.data())
-def test_ended_numbering_knows_all_losses(data: st.DataObject) -> None:
-    first = data.draw(st.sampled_from([1, 0xFFFFFFF8]))
-    machine = ReliableSender(data.draw(st.integers(1, 6)), 1 << 20, 4, 1 << 20, 7, first=first)
-    receiver = ReliableReceiver(7, first)
-    offered = came = 0
-    for step in data.draw(st.lists(st.sampled_from(["offer", "offer", "send", "lose", "ack", "forgo"]), max_size=40)):
-        if step == "offer":
-            machine.offer(payload(offered), 0)
-            offered += 1
-        elif step == "ack" and (position := receiver.position()) is not None:
-            machine.acknowledged(position[1])
-        elif step == "send":
-            for message in machine.take(2):
-                came += receiver.accept(message.sequence, 7, 0.0).deliver
-        elif step == "lose":
-            machine.take(1)
-            machine.suspend()
-            machine.resume((receiver.position() or (7, first - 1 & 0xFFFFFFFF))[1])
-            receiver.skip(machine.following)
-        elif step == "forgo":
-            machine.suspend()
-            machine.stop_keeping()
-            for _ in range(3):
-                machine.offer(b"", 0)
-            offered += 3
-            machine.resume((receiver.position() or (7, first - 1 & 0xFFFFFFFF))[1])
-            receiver.skip(machine.following)
-    ended, position = machine.ended(), receiver.position()
-    after = position[1] if position is not None else None
-    assert came + receiver.gap_total + ended.unseen(after) == offered
-    assert came + ended.lost(after) == offered
-    assert ended.lost() >= ended.lost(after)
 
 
 # --- every interleaving ---------------------------------------------------------------------------------------

@@ -176,7 +176,8 @@ class Exporter:
             self._park()
             old.end.close()
         self.wire = wire
-        self.sender = self.table.claim(IMPORTER, epoch)
+        sender = self.table.claim(IMPORTER)
+        self.sender = sender if sender is not None and sender.epoch == epoch else None
         if self.sender is None:
             number = self.world.rng.getrandbits(32)
             first = self.world.rng.choice(FIRSTS)

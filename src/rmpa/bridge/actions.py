@@ -73,15 +73,11 @@ class RemoveRoute:
         source: Which.
         peer: The peer's number.
         route: The route's id; 0 for a suspended route.
-        wished: Whether the peer closed it; if not, the peer may ask later what it missed.
-        over: Whether the publisher is gone, so that the peer misses no further messages.
     """
 
     source: Source
     peer: int
     route: int
-    wished: bool = False
-    over: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +87,7 @@ class SuspendRoute:
     Args:
         source: Which.
         peer: The peer's number.
-        outage: Seconds for which the messages are kept; after that they are only counted.
+        outage: Seconds for which the messages are kept; after that the route ends.
     """
 
     source: Source
@@ -142,8 +138,7 @@ class Describe:
         epoch: Identifies the numbering of a reliable route; 0 for best effort.
         first: The numbering's first sequence.
         following: If the numbering goes on: the next message's sequence; ``None``: the peer did not report it.
-        lost: If a numbering begins: lost messages of earlier ones; ``None``: the peer does not know the number.
-        at_least: Whether more than ``lost`` may be lost.
+        unknown: Whether an earlier run of this agent may have missed messages.
     """
 
     peer: int
@@ -154,8 +149,7 @@ class Describe:
     epoch: int = 0
     first: int = 1
     following: int | None = None
-    lost: int | None = None
-    at_least: bool = False
+    unknown: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +161,8 @@ class Detach:
         source: Which.
         route: The route's id.
         keep: The link is gone, and the next one will continue after the last message that came.
-        missed: Local nodes still listen: messages that are published before a route is open again count as lost.
+        missed: Local nodes still listen, so they miss what is published before a route is open again.
+        last: If the publisher has gone: the sequence of its last message.
     """
 
     peer: int
@@ -175,6 +170,7 @@ class Detach:
     route: int
     keep: bool = False
     missed: bool = False
+    last: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -157,9 +157,7 @@ class RouteOpened(msgspec.Struct, frozen=True, tag_field="op", tag="opened"):
         epoch: Identifies the numbering of a reliable route; 0 for best effort.
         first: The numbering's first sequence.
         following: If a reliable route continues: the sequence of the next message.
-        lost: If a numbering begins: messages of earlier numberings that the subscribing agent never got and does not
-            know of; left out if the number is unknown.
-        at_least: Whether more than ``lost`` may be lost; left out: no.
+        unknown: Whether an earlier run of the subscribing agent may have missed messages; left out: no.
     """
 
     route: int
@@ -168,8 +166,7 @@ class RouteOpened(msgspec.Struct, frozen=True, tag_field="op", tag="opened"):
     epoch: int = 0
     first: int = 1
     following: int | msgspec.UnsetType = msgspec.UNSET
-    lost: int | msgspec.UnsetType = msgspec.UNSET
-    at_least: bool | msgspec.UnsetType = msgspec.UNSET
+    unknown: bool | msgspec.UnsetType = msgspec.UNSET
 
 
 class CloseRoute(msgspec.Struct, frozen=True, tag_field="op", tag="close"):
@@ -179,10 +176,17 @@ class CloseRoute(msgspec.Struct, frozen=True, tag_field="op", tag="close"):
 
 
 class RouteClosed(msgspec.Struct, frozen=True, tag_field="op", tag="closed"):
-    """The publishing agent refuses or ends a route; ``reason`` is text for the user."""
+    """The publishing agent refuses or ends a route.
+
+    Args:
+        route: The route's id.
+        reason: Text for the user.
+        last: If the publisher of a reliable route has gone: the sequence of its last message.
+    """
 
     route: int
     reason: str
+    last: int | msgspec.UnsetType = msgspec.UNSET
 
 
 class Mismatch(msgspec.Struct, frozen=True, tag_field="op", tag="mismatch"):
@@ -489,8 +493,8 @@ def _check_terms(message: OpenRoute | RouteOpened) -> None:
     """Checks a peer's contract, and that its numbers have 32 bits."""
     check_contract(message.contract, f"route {message.route}")
     numbers = [message.epoch, message.after if isinstance(message, OpenRoute) else message.first]
-    if isinstance(message, RouteOpened):
-        numbers += [n for n in (message.following, message.lost) if not isinstance(n, msgspec.UnsetType)]
+    if isinstance(message, RouteOpened) and not isinstance(message.following, msgspec.UnsetType):
+        numbers.append(message.following)
     if any(not 0 <= number <= UINT32_MAX for number in numbers):
         raise RemoteProtocolError(f"route {message.route}: a contract with the numbers {numbers} cannot be")
 

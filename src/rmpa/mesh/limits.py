@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Final
 
 from rmpa.core.limits import PEER_LEASE
-from rmpa.core.sizes import KIB, MIB, UINT32_MAX
+from rmpa.core.sizes import KIB, MIB
 
 # --- mesh -------------------------------------------------------------------------------------------------------
 EXPRESS_LEASE: Final = 1.0
@@ -235,30 +235,18 @@ full."""
 ACK_DELAY: Final = 0.010
 """The longest delay of an acknowledgement after the first message that it covers. The sender of few messages keeps
 them in memory for this much longer."""
-OUTAGE_COUNTED: Final = 86_400.0
-"""How long after the end of its link the messages of a reliable route are still counted, though no longer kept. The
-agent stays connected to the publisher to count them. After this time, the loss is reported as "more may be lost"."""
-RESUME_CLAIM: Final = 10.0
-"""Seconds in which a peer must reopen a waiting route after all topics were advertised over its new link; by then it
-has read the last advertisement. A route that is not reopened has no subscriber any more."""
-RESUME_CLAIM_MAX: Final = 300.0
-"""Seconds in which a peer must reopen a waiting route after its new link came up, if not all topics could be
-advertised: 32,768 topics take 51 s on a lane that is always busy (TELL_PATIENCE), and a link without any traffic ends
-long before."""
+RESUME_CLAIM: Final = 300.0
+"""Seconds in which a peer must reopen a waiting route after its new link came up, if the contract's outage does not
+end before: 32,768 topics are advertised within 51 s on a lane that is always busy (TELL_PATIENCE)."""
 RESUMES_MAX: Final = 1024
 """Reliable routes without a link whose messages may be kept: those of one peer with a thousand topics."""
 RESUME_BYTES_MAX: Final = 256 * MIB
-"""Bytes of messages kept for all reliable routes without a link. Beyond it the route that has waited longest drops
-its messages and only counts new ones."""
-RESUMES_COUNTED_MAX: Final = 4096
-"""Reliable routes without a link whose messages may be only counted, 3 KB each."""
-LOST_TOLD_MAX: Final = UINT32_MAX
-"""The highest number of lost messages that one ``opened`` message can report."""
+"""Bytes of messages kept for all reliable routes without a link. Beyond it the route that has waited longest ends."""
 LOSSES_REMEMBERED: Final = 8192
-"""(peer, source) pairs of closed reliable routes whose losses are remembered."""
+"""Closed reliable routes that are remembered, for each peer at the receiver and over all at the sender: the next one
+reports that messages may be lost."""
 ABSENT_PEERS_MAX: Final = 1024
-"""Peers whose losses, in both directions, are remembered although they have had no link for longer than their routes
-wait. The peer that has been away longest is forgotten first."""
+"""Modules whose closed reliable routes are remembered. The one that was linked longest ago is forgotten first."""
 
 # --- bridge -----------------------------------------------------------------------------------------------------
 TELL_BACKLOG: Final = 8 * KIB

@@ -10,8 +10,7 @@ has acknowledged it, and the next link begins after the last message that the re
 
 A message counts as received when its last fragment is received; a message that was cut off is sent again from its
 start. Messages that the sender dropped at its bounds show as a gap in the sequence, so the receiver knows exactly how
-many messages will never arrive. This also holds for a sender that no longer keeps messages (``stop_keeping``),
-because it goes on numbering them.
+many messages will never arrive.
 
 Sequence numbers have 32 bits and wrap (``core.serial_number``). An *epoch* identifies one run of a numbering: after a
 sender was given up, the next one has another epoch. Methods that run for each message contain the serial arithmetic
@@ -41,57 +40,6 @@ class Outgoing(NamedTuple):
     sequence: int
     stamp_ns: int
     payload: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class EndedNumbering:
-    """The record of a sender that was given up, from which the receiver's losses follow once its position is known.
-
-    Args:
-        epoch: The epoch of the numbering.
-        confirmed: The last message that the receiver has acknowledged, with all messages before it.
-        highest: The highest sequence that was sent.
-        following: The sequence that the next message would have had.
-        gaps: Messages lost before ``confirmed``; the receiver has seen these as gaps.
-        dropped: ``(last sequence, count)`` of each gap after ``confirmed`` and up to ``highest``, in order; usually
-            empty.
-    """
-
-    epoch: int
-    confirmed: int
-    highest: int
-    following: int
-    gaps: int
-    dropped: tuple[tuple[int, int], ...] = ()
-
-    @property
-    def seen_as_gaps(self) -> int:
-        """The number of lost messages that the receiver has seen as gaps, or would have seen as gaps."""
-        return self.gaps + sum(count for _, count in self.dropped)
-
-    def unseen(self, after: int | None = None) -> int:
-        """The number of messages that the receiver misses without knowing it.
-
-        Args:
-            after: The last message that the receiver has. ``None``, or a sequence that was never sent, stands for the
-                last message that it acknowledged.
-        """
-        return serial_distance(self._position(after), self.following - 1)
-
-    def lost(self, after: int | None = None) -> int:
-        """All messages of the numbering that the receiver misses; see ``unseen``."""
-        ahead = serial_distance(self.confirmed, self._position(after))
-        seen = 0
-        for sequence, count in self.dropped:
-            before = serial_distance(self.confirmed, sequence) - count
-            seen += min(max(ahead - before, 0), count)
-        return self.gaps + seen + self.unseen(after)
-
-    def _position(self, after: int | None) -> int:
-        highest = serial_distance(self.confirmed, self.highest)
-        if after is None or serial_distance(self.confirmed, after) > highest:
-            return self.confirmed
-        return after
 
 
 class ReliableSender:
@@ -134,16 +82,15 @@ class ReliableSender:
         self._bytes = 0
         self._in_flight_bytes = 0
         self._linked = True
-        self._counting = False
         self._next = self.first
         self._acknowledged = serial_add(first, -1)
         self._highest = self._acknowledged
         """The highest sequence that was sent over any link, or reported as lost."""
 
     @property
-    def next_sequence(self) -> int:
-        """The sequence that the next offered message will get."""
-        return self._next
+    def last(self) -> int:
+        """The sequence of the last offered message."""
+        return serial_add(self._next, -1)
 
     @property
     def confirmed(self) -> int:
@@ -171,11 +118,6 @@ class ReliableSender:
         return not (self._unsent or self._sent or self._dropped_in_flight)
 
     @property
-    def counting(self) -> bool:
-        """Whether messages are only counted, until ``resume``."""
-        return self._counting
-
-    @property
     def following(self) -> int:
         """The sequence of the message that is sent next: of the oldest waiting one, or of the next one offered."""
         return self._unsent[0].sequence if self._unsent else self._next
@@ -190,9 +132,6 @@ class ReliableSender:
 
     def offer(self, payload: bytes, stamp_ns: int) -> None:
         """Queue one more message. The payload is kept, so it must not be a view of a buffer that changes."""
-        if self._counting:
-            self._count()
-            return
         self._unsent.append(Outgoing(self._next, stamp_ns, payload))
         self._next = self._next + 1 & SERIAL_MASK
         self._bytes += len(payload)
@@ -256,38 +195,6 @@ class ReliableSender:
         self._in_flight_bytes = 0
         self._linked = False
 
-    def stop_keeping(self) -> None:
-        """Drop all messages and only count new ones until ``resume``, because the link has been gone for too long.
-
-        Raises:
-            LocalProtocolError: The sender has a link.
-        """
-        if self._linked:
-            raise LocalProtocolError("a sender with a link keeps what its receiver has not acknowledged")
-        while self._unsent:
-            self._drop_oldest()
-        self._counting = True
-
-    def ended(self) -> EndedNumbering:
-        """The record of this sender, for the time after it is given up."""
-        kept = sorted(
-            serial_distance(self._acknowledged, sequence)
-            for sequence in (
-                *(sequence for sequence, _ in self._dropped_in_flight),
-                *(message.sequence for message in (*self._sent, *self._unsent)),
-            )
-        )
-        ahead = serial_distance(self._acknowledged, self._highest)
-        dropped = []
-        before = 0
-        for offset in (*(one for one in kept if one <= ahead), ahead + 1):
-            if offset - before > 1:
-                dropped.append((serial_add(self._acknowledged, offset - 1), offset - before - 1))
-            before = offset
-        behind = serial_distance(self._acknowledged, self._next - 1)
-        gaps = self.overflowed - (behind - len(kept))
-        return EndedNumbering(self.epoch, self._acknowledged, self._highest, self._next, gaps, tuple(dropped))
-
     def resume(self, after: int) -> None:
         """Continue over a new link after the last message that the receiver has.
 
@@ -305,7 +212,6 @@ class ReliableSender:
         self._dropped_in_flight.clear()
         self._in_flight_bytes = 0
         self._linked = True
-        self._counting = False
         # The receiver is told which message follows; all messages before it have arrived or show as a gap.
         self._sent_up_to(self.following - 1)
 
@@ -342,12 +248,6 @@ class ReliableSender:
         while self._unsent and self._unsent[0].sequence - base & SERIAL_MASK <= ahead:
             self._bytes -= len(self._unsent.popleft().payload)
         self._acknowledged = base + ahead & SERIAL_MASK
-
-    def _count(self) -> None:
-        """Count a message that will not be sent, and use up its sequence while the sequences stay comparable."""
-        self.overflowed += 1
-        if serial_distance(self._acknowledged, self._next) < SERIAL_HALF - 1:
-            self._next = serial_add(self._next, 1)
 
     def _drop_oldest(self) -> None:
         """Drop the oldest kept message; if it is in flight, it counts against the window until it is acknowledged."""

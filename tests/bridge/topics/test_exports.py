@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import msgspec
 import pytest
+from msgspec import UNSET
 
 from rmpa.bridge.actions import Action, AddRoute, Connect, Disconnect, RemoveRoute, Send, SuspendRoute, Warn
 from rmpa.bridge.catalogue.peer_limits import Beyond
@@ -20,6 +21,7 @@ from rmpa.bridge.policy import Policy, PolicyDecision
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.config.settings import LimitSettings, PolicySettings
 from rmpa.core.contract import Contract, ContractRule, Contracts, Durability, Priority, Reliability, Transport
+from rmpa.mesh.reliable import ReliableSender
 
 CMD = Source("/cmd", "/joy")
 JOY = LocalSource("sensor_msgs/Joy", "http://127.0.0.1:4000/")
@@ -94,8 +96,8 @@ def test_one_connection_on_demand_serves_all_subscribers(exports: Exports) -> No
         AddRoute(CMD, 2, 9, Contract()),
     ]
     assert exports.flowing(CMD) == (1, 2)
-    assert exports.closed(1, CloseRoute(7)) == [RemoveRoute(CMD, 1, 7, wished=True)]
-    assert exports.closed(2, CloseRoute(9)) == [RemoveRoute(CMD, 2, 9, wished=True), Disconnect(CMD)]
+    assert exports.closed(1, CloseRoute(7)) == [RemoveRoute(CMD, 1, 7)]
+    assert exports.closed(2, CloseRoute(9)) == [RemoveRoute(CMD, 2, 9), Disconnect(CMD)]
     assert exports.flowing(CMD) == ()
 
 
@@ -127,7 +129,7 @@ def test_a_lost_publisher_closes_every_route_and_forgets_them(exports: Exports) 
     exports.opened(1, OpenRoute(7, "/cmd", "/joy"))
     exports.described(CMD, ABOUT)
     assert exports.lost(CMD, "it hung up") == [
-        RemoveRoute(CMD, 1, 7, over=True),
+        RemoveRoute(CMD, 1, 7),
         Send(1, RouteClosed(7, "it hung up")),
     ]
     assert exports.lost(CMD, "it hung up") == []
@@ -141,7 +143,7 @@ def test_a_restarted_node_is_left_at_its_old_address(exports: Exports) -> None:
     exports.opened(1, OpenRoute(7, "/cmd", "/joy"))
     exports.described(CMD, ABOUT)
     assert graph(exports, {CMD: LocalSource(JOY.type, "http://127.0.0.1:5000/")}) == [
-        RemoveRoute(CMD, 1, 7, over=True),
+        RemoveRoute(CMD, 1, 7),
         Send(1, RouteClosed(7, "the node has restarted")),
         Disconnect(CMD),
     ]
@@ -368,7 +370,7 @@ def test_a_reliable_route_outlives_its_link_and_resumes(flowing: Exports) -> Non
     assert flowing.link_away(1) == ([SuspendRoute(CMD, 1)], True)
     flowing.link_up(1)
     flowing.opened(1, OpenRoute(1, "/cmd", "/joy", RELIABLE, epoch=1, after=50))
-    assert flowing.closed(1, CloseRoute(1)) == [RemoveRoute(CMD, 1, 1, wished=True), Disconnect(CMD)]
+    assert flowing.closed(1, CloseRoute(1)) == [RemoveRoute(CMD, 1, 1), Disconnect(CMD)]
 
 
 @pytest.mark.parametrize("asked", [SURE, OpenRoute(7, "/cmd", "/joy", RELIABLE, epoch=9, after=3)])
@@ -393,19 +395,43 @@ def test_what_is_not_reliable_or_does_not_flow_yet_ends_with_its_link(exports: E
     assert exports.link_down(1) == []
 
 
-@pytest.mark.parametrize("how", ["link_down", "unclaimed", "given_up"])
+@pytest.mark.parametrize("how", ["link_down", "given_up"])
 def test_a_suspended_route_that_nobody_asks_for_is_given_up(flowing: Exports, how: str) -> None:
     flowing.link_away(1)
-    if how == "link_down":
-        assert flowing.link_down(1) == [RemoveRoute(CMD, 1, 0), Disconnect(CMD)]
-    elif how == "unclaimed":
-        flowing.link_up(1)
-        assert flowing.unclaimed(1) == [RemoveRoute(CMD, 1, 0), Disconnect(CMD)]
-    else:
-        assert flowing.given_up(CMD, 1) == [Disconnect(CMD)]
-        assert flowing.given_up(CMD, 1) == []
+    ended = flowing.link_down(1) if how == "link_down" else flowing.given_up(CMD, 1)
+    assert ended == [RemoveRoute(CMD, 1, 0), Disconnect(CMD)]
+    assert flowing.given_up(CMD, 1) == []
     assert not flowing.waits_for(1)
     assert flowing.link_down(1) == []
+
+
+@pytest.mark.parametrize("instance", ["first", "second"])
+def test_another_run_of_a_peer_is_told_once_that_messages_may_be_lost(exports: Exports, instance: str) -> None:
+    graph(exports, {CMD: JOY})
+    for number, run, unknown in (
+        (1, "first", UNSET),
+        (2, instance, instance == "second" or UNSET),
+        (3, "third", UNSET),
+    ):
+        exports.link_up(number, "b", run)
+        actions = exports.opened(number, SURE) + exports.described(CMD, ABOUT)
+        messages = [action.message for action in actions if isinstance(action, Send)]
+        assert [one.unknown for one in messages if isinstance(one, RouteOpened)] == [unknown]
+        if number == 1:
+            exports.link_away(number)
+        exports.link_down(number)
+
+
+def test_the_last_message_of_a_publisher_that_has_gone_is_told() -> None:
+    numbering = ReliableSender(10, 1000, 10, 1000, 1)
+    exports = Exports(Policy(PolicySettings()), numbering=lambda *_: numbering)
+    graph(exports, {CMD: JOY})
+    exports.link_up(1)
+    exports.opened(1, SURE)
+    exports.described(CMD, ABOUT)
+    numbering.offer(b"one", 0)
+    ended = graph(exports, {})
+    assert Send(1, RouteClosed(7, "the node has gone", 1)) in ended
 
 
 def test_what_the_peer_asked_for_again_is_claimed(flowing: Exports) -> None:
@@ -415,7 +441,7 @@ def test_what_the_peer_asked_for_again_is_claimed(flowing: Exports) -> None:
         flowing.link_away(peer)
     flowing.link_up(1)
     flowing.opened(1, OpenRoute(1, "/cmd", "/joy", RELIABLE, epoch=1, after=0))
-    assert flowing.unclaimed(1) == []
+    assert flowing.given_up(CMD, 1) == []
     assert flowing.flowing(CMD) == (1,)
     assert flowing.link_down(2) == [RemoveRoute(CMD, 2, 0)]
 
@@ -425,8 +451,8 @@ def test_a_publisher_that_goes_takes_suspended_routes_along(flowing: Exports) ->
     flowing.opened(2, SURE)
     flowing.link_away(1)
     assert flowing.lost(CMD, "it died") == [
-        RemoveRoute(CMD, 1, 0, over=True),
-        RemoveRoute(CMD, 2, 7, over=True),
+        RemoveRoute(CMD, 1, 0),
+        RemoveRoute(CMD, 2, 7),
         Send(2, RouteClosed(7, "it died")),
     ]
     flowing.link_up(1)

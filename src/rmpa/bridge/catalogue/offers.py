@@ -218,10 +218,6 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
         """Whether entries are to be examined for any peer; ``portions`` does it."""
         return any(self._peers[number].news for number in self._with_news)
 
-    def beginning(self, peer: int) -> bool:
-        """Whether a linked peer has not been sent the complete catalogue yet."""
-        return known.beginning if (known := self._peers.get(peer)) is not None else False
-
     def portions(self, ready: Callable[[int], bool]) -> Iterator[tuple[int, Portion[KeyT, OfferT, WireT]]]:
         """Yield the number and next portion of each peer with entries to examine that is ready.
 

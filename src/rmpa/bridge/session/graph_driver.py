@@ -73,7 +73,6 @@ class GraphDriver(Generic[ActionT, AdvertisementT]):
         apply: Splits a parsed advertisement into portions; each item that is taken applies one, and is its actions.
         do: Carries out an action that is neither ``Send`` nor ``Warn``.
         is_urgent: Whether an action is carried out at once, before those that wait.
-        on_told: Called after advertisements were sent.
         on_idle: Called when nothing is left to do after a change.
     """
 
@@ -89,7 +88,6 @@ class GraphDriver(Generic[ActionT, AdvertisementT]):
         apply: Callable[[PeerSession, AdvertisementT], Iterator[Sequence[ActionT]]],
         do: Callable[[ActionT], None],
         is_urgent: Callable[[ActionT], bool] = lambda _: False,
-        on_told: Callable[[], None] = lambda: None,
         on_idle: Callable[[], None] = lambda: None,
     ) -> None:
         self._sessions = sessions
@@ -100,7 +98,6 @@ class GraphDriver(Generic[ActionT, AdvertisementT]):
         self._apply = apply
         self._do = do
         self._is_urgent = is_urgent
-        self._on_told = on_told
         self._on_idle = on_idle
         # Ordered: in a plain dict, taking the first item skips over the places of all items taken before.
         self._changed: OrderedDict[str, None] = OrderedDict()
@@ -191,8 +188,6 @@ class GraphDriver(Generic[ActionT, AdvertisementT]):
         self._look_at(self._next_names())
         told = self._exports.advertise(self._may_tell)
         self.act(told)
-        if told:
-            self._on_told()
         if self._advertisements:
             self._apply_next()
         if self._freeing and not tuple(islice(self._freeing[0], limits.APPLIED_AT_ONCE)):

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.messages import Message
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import Settings
-    from rmpa.core.identity import Identity
     from rmpa.ros.master.effects import GraphChange
 
 _log = logging.getLogger(__name__)
@@ -35,10 +34,6 @@ class Part:
         """Release everything; all sessions have ended, and the local core still answers."""
 
     # --- sessions ----------------------------------------------------------------------------------------------
-
-    def remembered(self, identity: Identity) -> int | None:  # noqa: ARG002 - for those that override it
-        """The number of an ended session of this run of a peer, if the part still keeps something under it."""
-        return None
 
     def link_up(self, session: PeerSession) -> None:
         """A link is up, of a new peer or of one whose session waited (after ``link_down``)."""

@@ -122,10 +122,7 @@ class PeerSessions:
                 waiting.set_result(None)
 
     def _begin(self, link: PeerLink) -> PeerSession:
-        remembered = (part.remembered(link.identity) for part in self._parts)
-        peer = next((number for number in remembered if number is not None), None)
-        if peer is None:
-            peer = next(self._numbers)
+        peer = next(self._numbers)
         prefix = self._namespaces.add(peer, link.identity)
         proxies = PeerProxies(
             prefix, self._nodes, lambda node, caller, reason: self._on_kill(session, node, caller, reason)

@@ -20,6 +20,7 @@ peer and advertised in portions of bounded size.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
@@ -27,7 +28,6 @@ import msgspec
 
 from rmpa.bridge.actions import Action, AddRoute, Connect, Disconnect, RemoveRoute, Send, SuspendRoute, Warn
 from rmpa.bridge.catalogue.offers import CataloguePeer, OfferCatalogue
-from rmpa.bridge.data.losses import NOTHING_KEPT, beginning_anew, going_on
 from rmpa.bridge.messages import (
     Advertise,
     CloseRoute,
@@ -46,15 +46,17 @@ from rmpa.bridge.relay import may_have
 from rmpa.config.permission_rules import Access
 from rmpa.config.settings import LimitSettings
 from rmpa.core.contract import Contract, Contracts, Durability, Reliability, combine
+from rmpa.core.serial_number import is_later, serial_add
+from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
 
     from rmpa.bridge.catalogue.offers import Portion
     from rmpa.bridge.catalogue.peer_limits import Beyond
-    from rmpa.bridge.data.losses import KeptMessages
     from rmpa.bridge.messages import Origin
     from rmpa.bridge.policy import Policy
+    from rmpa.mesh.reliable import ReliableSender
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,19 +76,21 @@ class _Route:
         contract: The contract in force: the stronger terms of both ends.
         asked: The contract that the peer asked for.
         name: The peer's name.
+        instance: The peer's run, as 32 hexadecimal digits.
         live: Whether data is sent on it yet.
         epoch: Identifies the numbering of a reliable route; 0 for best effort.
         after: Sequence of the last message that the peer has, if this continues a suspended route; else ``None``.
-        named: Epoch and sequence of the last message of this source that the peer has; (0, 0) if it has none.
+        unknown: Whether an earlier run of the peer's module may have missed messages.
     """
 
     contract: Contract
     asked: Contract
     name: str = ""
+    instance: str = ""
     live: bool = False
     epoch: int = 0
     after: int | None = None
-    named: tuple[int, int] = (0, 0)
+    unknown: bool = False
 
 
 @dataclass(slots=True)
@@ -134,7 +138,7 @@ class Exports:
         contracts: The contracts that this module offers for its topics.
         names: Translates local names to the names at the peers.
         limit_settings: Bounds the number of offered topics.
-        kept: Knows the kept and lost messages of reliable routes.
+        numbering: ``(source, peer)``: the sender of a reliable route; ``None`` if there is none.
         gate: Decides which topics each peer may have.
     """
 
@@ -144,11 +148,11 @@ class Exports:
         contracts: Contracts | None = None,
         names: Names = _NO_NAMES,
         limit_settings: LimitSettings = _DEFAULT_LIMITS,
-        kept: KeptMessages = NOTHING_KEPT,
+        numbering: Callable[[Source, int], ReliableSender | None] = lambda *_: None,
         gate: PermissionGate = OPEN_GATE,
     ) -> None:
         self._gate = gate
-        self._kept = kept
+        self._numbering = numbering
         self._policy = policy
         self._limit_settings = limit_settings
         self._catalogue: OfferCatalogue[Source, LocalSource, TopicOffer, Source] = OfferCatalogue(
@@ -162,6 +166,8 @@ class Exports:
         self._routes: dict[int, dict[int, Source]] = {}
         """The open source of each route id, for each linked peer."""
         self._flows: dict[Source, _ExportedFlow] = {}
+        self._cut: OrderedDict[tuple[str, Source], str] = OrderedDict()
+        """The run of each named peer that had no link when a route of it ended, so that it may miss messages."""
 
     @property
     def offered(self) -> Mapping[Source, LocalSource]:
@@ -234,10 +240,6 @@ class Exports:
         """Counts the changes of what is offered to any peer."""
         return self._catalogue.changes
 
-    def beginning(self, peer: int) -> bool:
-        """Whether the full advertisement on a peer's present link is not complete yet."""
-        return self._catalogue.beginning(peer)
-
     def apply_rules(
         self, policy: Policy, contracts: Contracts, names: Names, limit_settings: LimitSettings = _DEFAULT_LIMITS
     ) -> list[Action]:
@@ -277,8 +279,7 @@ class Exports:
         for source, flow in list(self._flows.items()):
             for peer, route in list(flow.away.items()):
                 if not self._gate.judge(Access.SUBSCRIBE, route.name, source.topic).allowed:
-                    del flow.away[peer]
-                    actions += [RemoveRoute(source, peer, 0), *self._disconnect(source, flow)]
+                    actions += self.given_up(source, peer)
         return actions
 
     def graph(self, topic: str, publishers: Mapping[str, LocalSource]) -> list[Action]:
@@ -383,25 +384,14 @@ class Exports:
     def _is_judged(self, name: str) -> bool:
         return self._gate.on or not self._names.of(name).plain or self._policy.has_rules_for(name)
 
-    def link_down(self, peer: int, *, counting: bool = False) -> list[Action]:
-        """Ends a peer's open routes, and its suspended ones too unless ``counting``.
-
-        Args:
-            peer: The peer's number.
-            counting: Keep suspended routes, so that the messages that the peer misses are still counted.
-        """
+    def link_down(self, peer: int) -> list[Action]:
+        """Ends a peer's open and suspended routes."""
         actions: list[Action] = []
         self._catalogue.link_down(peer)
         for route, source in self._routes.pop(peer, {}).items():
             actions += self._remove(source, peer, route)
-        return actions if counting else actions + self.unclaimed(peer)
-
-    def unclaimed(self, peer: int) -> list[Action]:
-        """Ends the suspended routes of a peer, which has not opened them again."""
-        actions: list[Action] = []
-        for source, flow in list(self._flows.items()):
-            if flow.away.pop(peer, None) is not None:
-                actions += [RemoveRoute(source, peer, 0), *self._disconnect(source, flow)]
+        for source in list(self._flows):
+            actions += self.given_up(source, peer)
         return actions
 
     def link_away(self, peer: int) -> tuple[list[Action], bool]:
@@ -426,21 +416,21 @@ class Exports:
         return actions, self.waits_for(peer)
 
     def given_up(self, source: Source, peer: int) -> list[Action]:
-        """Ends a suspended route whose lost messages cannot be counted any more."""
+        """Ends a suspended route, whose messages are not kept any more."""
         flow = self._flows.get(source)
-        if flow is None or flow.away.pop(peer, None) is None:
+        if flow is None or (route := flow.away.pop(peer, None)) is None:
             return []
-        return self._disconnect(source, flow)
+        self._note_cut(source, route)
+        return [RemoveRoute(source, peer, 0), *self._disconnect(source, flow)]
+
+    def _note_cut(self, source: Source, route: _Route) -> None:
+        self._cut[route.name, source] = route.instance
+        if len(self._cut) > mesh_limits.LOSSES_REMEMBERED:
+            self._cut.popitem(last=False)
 
     def waits_for(self, peer: int) -> bool:
         """Whether a reliable route waits for a peer without a link."""
         return any(peer in flow.away for flow in self._flows.values())
-
-    def inherit(self, old: int, new: int) -> None:
-        """Hands the suspended routes of a module's old run to its new run, which may open them again."""
-        for flow in self._flows.values():
-            if (route := flow.away.pop(old, None)) is not None:
-                flow.away[new] = route
 
     def outage(self, peer: int) -> float:
         """The longest time, in seconds, for which messages are kept for a peer without a link; 0 if none are."""
@@ -476,7 +466,9 @@ class Exports:
         away = flow.away.pop(peer, None) if flow is not None else None
         route = self._route(message, source.topic, local, away)
         known = self._catalogue.peer(peer)
-        route.name = known.name if known is not None else ""
+        if known is not None:
+            route.name, route.instance = known.name, known.instance
+            route.unknown = self._cut.pop((known.name, source), known.instance) != known.instance
         if flow is None:
             flow = self._flows[source] = _ExportedFlow(local.uri)
             flow.routes[peer, message.route] = route
@@ -495,19 +487,19 @@ class Exports:
 
     def _route(self, message: OpenRoute, topic: str, local: LocalSource, away: _Route | None) -> _Route:
         """The route that a peer asks for; it continues a suspended one of the same epoch and contract."""
-        asked, named = message.contract, (message.epoch, message.after)
+        asked = message.contract
         contract = combine(self._contracts.of(topic, local.type), asked)
         if contract.reliability is not Reliability.RELIABLE:
-            return _Route(contract, asked, named=named)
+            return _Route(contract, asked)
         if away is not None and away.epoch == message.epoch and away.contract.same_route(contract):
             return _Route(contract, asked, epoch=away.epoch, after=message.after)
         self._epochs += 1
-        return _Route(contract, asked, epoch=self._epochs, named=named)
+        return _Route(contract, asked, epoch=self._epochs)
 
     def closed(self, peer: int, message: CloseRoute) -> list[Action]:
         """Ends a route that a peer closes; one that is not open is ignored, since both ends may close it at once."""
         source = self._routes[peer].pop(message.route, None)
-        return self._remove(source, peer, message.route, wished=True) if source is not None else []
+        return self._remove(source, peer, message.route) if source is not None else []
 
     def described(self, source: Source, description: Description) -> list[Action]:
         """Starts the routes of a source whose publisher has answered with its header."""
@@ -517,9 +509,15 @@ class Exports:
         flow.description = description
         return self._start(source, flow, description)
 
-    def lost(self, source: Source, reason: str) -> list[Action]:
-        """Ends the routes of a source whose publisher hung up, refused or does not answer."""
-        return self._end(source, reason, connected=False)
+    def lost(self, source: Source, reason: str, lasts: Mapping[int, int] | None = None) -> list[Action]:
+        """Ends the routes of a source whose publisher hung up, refused or does not answer.
+
+        Args:
+            source: The source.
+            reason: What happened, for users.
+            lasts: By peer: the last message of each reliable route.
+        """
+        return self._end(source, reason, lasts or {})
 
     def _start(self, source: Source, flow: _ExportedFlow, description: Description) -> list[Action]:
         actions: list[Action] = []
@@ -537,17 +535,24 @@ class Exports:
         return actions
 
     def _told(self, opened: RouteOpened, source: Source, peer: int, route: _Route) -> RouteOpened:
-        if route.after is not None:
-            return going_on(opened, self._kept.following(source, peer, route.after))
-        return beginning_anew(opened, self._kept.settle(source, peer, *route.named))
+        """Adds to an ``opened`` which message comes next of a numbering that goes on, or that some may be missed."""
+        if route.after is None:
+            return msgspec.structs.replace(opened, unknown=True) if route.unknown else opened
+        if (numbering := self._numbering(source, peer)) is None:
+            return opened
+        # The peer may have kept messages whose acknowledgement was lost; these are not sent again.
+        after, following = route.after, numbering.following
+        return msgspec.structs.replace(
+            opened, following=following if is_later(following, after) else serial_add(after, 1)
+        )
 
-    def _remove(self, source: Source, peer: int, route: int, *, wished: bool = False) -> list[Action]:
+    def _remove(self, source: Source, peer: int, route: int) -> list[Action]:
         flow = self._flows.get(source)
         if flow is None:
             return []
         gone = flow.routes.pop((peer, route), None)
         live = gone is not None and gone.live
-        actions: list[Action] = [RemoveRoute(source, peer, route, wished=wished)] if live else []
+        actions: list[Action] = [RemoveRoute(source, peer, route)] if live else []
         return actions + self._disconnect(source, flow)
 
     def _disconnect(self, source: Source, flow: _ExportedFlow) -> list[Action]:
@@ -566,21 +571,25 @@ class Exports:
         for number in [number for owner, number in flow.routes if owner == peer]:
             self._routes[peer].pop(number, None)
             actions += [*self._remove(source, peer, number), Send(peer, RouteClosed(number, reason))]
-        if flow.away.pop(peer, None) is not None:
-            actions += [RemoveRoute(source, peer, 0), *self._disconnect(source, flow)]
-        return actions
+        return actions + self.given_up(source, peer)
 
-    def _end(self, source: Source, reason: str, *, connected: bool = True) -> list[Action]:
+    def _end(self, source: Source, reason: str, lasts: Mapping[int, int] | None = None) -> list[Action]:
+        """Ends all routes of a source; ``lasts`` as for ``lost`` if its publisher is not connected any more."""
         flow = self._flows.pop(source, None)
         if flow is None:
             return []
         actions: list[Action] = []
-        actions += [RemoveRoute(source, peer, 0, over=True) for peer in flow.away]
+        for peer, route in flow.away.items():
+            self._note_cut(source, route)
+            actions.append(RemoveRoute(source, peer, 0))
         for (peer, number), route in flow.routes.items():
             self._routes[peer].pop(number, None)
+            last = lasts.get(peer) if lasts is not None else None
+            if lasts is None and (numbering := self._numbering(source, peer)) is not None:
+                last = numbering.last
             if route.live:
-                actions.append(RemoveRoute(source, peer, number, over=True))
-            actions.append(Send(peer, RouteClosed(number, reason)))
-        if connected:
+                actions.append(RemoveRoute(source, peer, number))
+            actions.append(Send(peer, RouteClosed(number, reason, msgspec.UNSET if last is None else last)))
+        if lasts is None:
             actions.append(Disconnect(source))
         return actions

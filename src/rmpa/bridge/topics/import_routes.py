@@ -83,9 +83,9 @@ class ImportRoutes:
         entry.description = message.description
         entry.contract = message.contract
         terms = (message.contract, message.epoch, message.first)
-        following, lost = (None if isinstance(n, UnsetType) else n for n in (message.following, message.lost))
-        at_least = message.at_least is True
-        return [Describe(peer, source, message.route, message.description, *terms, following, lost, at_least)]
+        following = None if isinstance(message.following, UnsetType) else message.following
+        unknown = message.unknown is True
+        return [Describe(peer, source, message.route, message.description, *terms, following, unknown)]
 
     def closed(self, peer: int, message: RouteClosed, now: float) -> list[Action]:
         """Handles a route that the peer has refused or closed: it is opened again after the back-off."""
@@ -93,7 +93,8 @@ class ImportRoutes:
         entry = self._find(peer, source) if source is not None else None
         if source is None or entry is None:
             return []
-        return self._fail(peer, source, entry, message.reason, now)
+        last = None if isinstance(message.last, UnsetType) else message.last
+        return self._fail(peer, source, entry, message.reason, now, last)
 
     def demand(self, peer: int, source: Source, entry: RemoteTopic, now: float, *, wanted: bool) -> list[Action]:
         """Opens a source's route for its first local listener, or lets it linger after the last one."""
@@ -153,9 +154,11 @@ class ImportRoutes:
             entry.enter(RouteState.IDLE)
         return actions
 
-    def _fail(self, peer: int, source: Source, entry: RemoteTopic, reason: str, now: float) -> list[Action]:
+    def _fail(
+        self, peer: int, source: Source, entry: RemoteTopic, reason: str, now: float, last: int | None = None
+    ) -> list[Action]:
         missed = entry.wanted and entry.state is not RouteState.LINGERING
-        actions: list[Action] = [Detach(peer, source, entry.route, missed=missed)]
+        actions: list[Action] = [Detach(peer, source, entry.route, missed=missed, last=last)]
         entry.route = 0
         entry.problem = reason
         if entry.state is RouteState.LINGERING:

@@ -271,11 +271,7 @@ class TopicsSection:
         """A reliable route whose peer has no link, or has not opened it again."""
         name, seconds = self._bridge.topics.losses.away(peer)
         keeps = float(route.contract.get("outage") or limits.RESUME_WINDOW)
-        if seconds < keeps:
-            text = f"{name} is away for {shown_seconds(seconds)}; messages are kept for {shown_seconds(keeps)}"
-        else:
-            text = f"{name} is away for {shown_seconds(seconds)}, longer than the outage of {shown_seconds(keeps)}: "
-            text += "messages are counted, not kept"
+        text = f"{name} is away for {shown_seconds(seconds)}; messages are kept for {shown_seconds(keeps)}"
         return msgspec.structs.replace(route, peer=name, state="away", problem=text)
 
     def _export(
@@ -292,7 +288,7 @@ class TopicsSection:
             state="open",
             type=local.type,
             md5=about.md5 if about is not None else "",
-            lost=self._bridge.topics.outbound.lost(source, peer),
+            lost=sender.sender.lost if isinstance(sender, ReliableRouteSender) else 0,
             kept=sender.sender.pending if isinstance(sender, ReliableRouteSender) else 0,
             latched=about.latching if about is not None else False,
             wire=offer.topic if offer is not None and offer.topic != source.topic else "",

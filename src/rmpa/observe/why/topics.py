@@ -481,7 +481,7 @@ def _contract(route: RouteInfo) -> Check:
     parts = [f"{count} {key}" for key, count in missing.items()]
     parts += [f"{kind.replace('_', ' ')} {count} times" for kind, count in events.items()]
     remedy = "`rmpa topic info` tells when; docs/contracts.md what to do"
-    if "lost" in missing and route.contract.get("reliability") == "reliable":
+    if ("lost" in missing or "loss_unknown" in events) and route.contract.get("reliability") == "reliable":
         remedy = "a longer outage, or more depth, in [[contract]] keeps more; `rmpa topic info` tells when"
     return Check("contract", WARN, ", ".join(parts), remedy)
 

@@ -28,7 +28,7 @@ async def test_a_route_that_is_opened_while_the_end_of_the_last_one_is_told_has_
     described: list[Description] = []
     link = Link()
 
-    def lost(source: Source, _reason: str) -> None:
+    def lost(source: Source, _reason: str, _lasts: object) -> None:
         publications.append(Publication("/chatter", "/talker", STRING))
         subscriptions.connect(CONNECT)
         subscriptions.add_route(AddRoute(source, 1, 7, Contract()), cast("Any", link))
@@ -39,7 +39,6 @@ async def test_a_route_that_is_opened_while_the_end_of_the_last_one_is_told_has_
         on_described=lambda _, description: described.append(description),
         on_lost=lost,
         on_given_up=lambda *_: None,
-        on_let_go=lambda _: None,
         on_missed=lambda *_: None,
         on_oversized=lambda *_: None,
         on_malformed=lambda *_: None,

@@ -101,13 +101,6 @@ class ExportFlow:
         if isinstance(sender, ReliableRouteSender):
             sender.suspend(keep)
 
-    def inherit(self, old: int, new: int) -> RouteSender | None:
-        """Hand the sender of peer ``old`` to peer ``new``, which has none yet; return it."""
-        sender = self.by_peer.pop(old, None)
-        if sender is not None:
-            self.by_peer[new] = sender
-        return sender
-
     def remove(self, peer: int) -> None:
         """Stop sending to a peer."""
         sender = self.by_peer.pop(peer, None)

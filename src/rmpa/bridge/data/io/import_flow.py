@@ -99,8 +99,7 @@ class ImportFlow:
         """Kept messages that the subscribers already have, and that the new route may repeat."""
         self._receiver: ReliableReceiver | None = None
         if contract.reliability is Reliability.RELIABLE:
-            known = past.receiver if past is not None else None
-            self._receiver = known if known is not None else ReliableReceiver()
+            self._receiver = ReliableReceiver()
         self._epoch = 0
         self._plain = self._receiver is None
         self._stale_ns = round((contract.lifespan or runtime_limits.STALE_AGE) * 1e9)
@@ -153,14 +152,10 @@ class ImportFlow:
         self._drop_parts()
         return self._receiver.begin(epoch, first) if self._receiver is not None else True
 
-    def missed(self, count: int) -> None:
-        """Count messages that the sender reports as given up and that will not show as a gap."""
-        if count:
-            self._missing(count)
-
     def skip(self, following: int) -> None:
         """Count the messages before ``following``, the next one that the sender announces, as missed."""
-        self.missed(self._receiver.skip(following) if self._receiver is not None else 0)
+        if self._receiver is not None and (count := self._receiver.skip(following)):
+            self._missing(count)
 
     def missed_unknown(self, why: str) -> None:
         """Record that an unknown number of messages may be lost; ``why`` is the reason."""
@@ -173,14 +168,7 @@ class ImportFlow:
         """Return the history for the source's next route; ``None`` for a best-effort route."""
         if self._receiver is None:
             return None
-        return ReceptionHistory(
-            topic,
-            self._receiver if missed and self._receiver.position() is not None else None,
-            missed,
-            self.lost,
-            self.watch.counts,
-            tuple(self.watch.recent),
-        )
+        return ReceptionHistory(topic, missed, self.lost, self.watch.counts, tuple(self.watch.recent))
 
     def expect_replay(self, kept: Iterable[bytes]) -> None:
         """Leave out these messages, which the subscribers have, if the new route repeats them at its beginning."""

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
 from rmpa.bridge.data.io.export_flow import ExportFlow
 from rmpa.bridge.data.io.route_sender import ReliableRouteSender
-from rmpa.bridge.data.losses import LossRecords
 from rmpa.bridge.messages import Description, Source
 from rmpa.bridge.policy import OWN_NODE
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.serial_number import is_later, serial_add
+from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.resume_table import ResumeTable
 from rmpa.ros.node.in_process import InProcessConnection
 from rmpa.ros.node.subscription import PublisherConnection
@@ -26,14 +25,12 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.actions import AddRoute, Connect, RemoveRoute, SuspendRoute
     from rmpa.bridge.data.io.route_sender import DataLink, RouteSender
-    from rmpa.bridge.data.losses import Missed
+    from rmpa.mesh.reliable import ReliableSender
     from rmpa.ros.core.api import Core
     from rmpa.ros.node.publication import Publication
     from rmpa.ros.node.slave_node import SlaveNode
 
 _log = logging.getLogger(__name__)
-_TOO_LONG: Final = "it was away for longer than they were kept"
-_ENDED: Final = "its route had ended before they had come"
 
 
 class LocalSubscriptions:
@@ -43,10 +40,10 @@ class LocalSubscriptions:
         core: The local core; the agent's subscriptions are registered there, so that ROS tools show them.
         node: The agent's own node.
         on_described: Called with a source and its publisher's header.
-        on_lost: Called with a source and a reason when its publisher is no longer connected.
-        on_given_up: Called with a source and an absent peer when its missed messages cannot be counted any more.
-        on_let_go: Called with each (absent peer, source) whose messages are no longer kept, only counted.
-        on_missed: Called with a source, a peer, the number of messages that it has missed, and the reason.
+        on_lost: Called with a source, a reason and, by peer, the last message of each reliable route when its
+            publisher is no longer connected.
+        on_given_up: ``(peer, messages by source)``: called when messages are not kept any more for an absent peer.
+        on_missed: Called with a source, a peer, and the number of messages that it has missed over an outage.
         on_oversized: Called with a source and its flow when a message that is too long was left out.
         on_malformed: Called with a source and a text when its publisher breaks TCPROS; ``on_lost`` follows.
         find: ``(node, slave API, topic)``: the topic of a proxy of this process, which is subscribed to without a
@@ -59,10 +56,9 @@ class LocalSubscriptions:
         node: SlaveNode,
         *,
         on_described: Callable[[Source, Description], None],
-        on_lost: Callable[[Source, str], None],
-        on_given_up: Callable[[Source, int], None],
-        on_let_go: Callable[[list[tuple[int, Source]]], None],
-        on_missed: Callable[[Source, int, int, str], None],
+        on_lost: Callable[[Source, str, Mapping[int, int]], None],
+        on_given_up: Callable[[int, Mapping[Source, int]], None],
+        on_missed: Callable[[Source, int, int], None],
         on_oversized: Callable[[Source, ExportFlow], None],
         on_malformed: Callable[[Source, str], None],
         find: Callable[[str, str, str], Publication | None] = lambda *_: None,
@@ -81,12 +77,7 @@ class LocalSubscriptions:
         # Kept messages are dropped when their outage is over.
         self._timer = MachineTimer(self._parked.next_timer, lambda now: self._give_up(self._parked.expire(now)))
         self._on_given_up = on_given_up
-        self._on_let_go = on_let_go
         self._on_missed = on_missed
-        self._heirs: set[int] = set()
-        """Peers that follow an earlier run of their module, and may still ask for what that run has missed."""
-        self.losses = LossRecords()
-        """How many messages peers have missed of reliable sources whose routes have ended."""
 
     @property
     def flows(self) -> Mapping[Source, ExportFlow]:
@@ -166,9 +157,9 @@ class LocalSubscriptions:
                 flow.remove(action.peer)  # the caller closes the link; the next one gets a new numbering
                 raise
             if missed := route_sender.missed():
-                self._on_missed(action.source, action.peer, missed, _TOO_LONG)
+                self._on_missed(action.source, action.peer, missed)
         else:
-            self._end(action.source, action.peer, at_least=True)
+            self._end(action.source, action.peer)
             route_sender = flow.add(action.peer, link, action.route, action.contract, action.epoch)
         self._senders[action.peer, action.route] = route_sender
 
@@ -189,80 +180,49 @@ class LocalSubscriptions:
         """Returns the function that keeps a source's messages for an absent peer."""
         return lambda payload, stamp: self._give_up(self._parked.offer(key, payload, stamp))
 
-    def inherit(self, old: int, new: int) -> None:
-        """Hand on the losses and kept messages of a module's old run to its new run, which may ask for the count."""
-        for source, flow in self._flows.items():
-            route_sender = flow.inherit(old, new)
-            if isinstance(route_sender, ReliableRouteSender):
-                self._parked.move((old, source), (new, source))
-                route_sender.suspend(self._keeper((new, source)))
-        self.losses.inherit(old, new)
-        self._heirs.add(new)
+    def back(self, peer: int) -> None:
+        """Give a peer that has a link again ``mesh.limits.RESUME_CLAIM`` to open its suspended routes."""
+        until = asyncio.get_running_loop().time() + mesh_limits.RESUME_CLAIM
+        self._parked.limit([(peer, source) for source in self._flows], until)
+        self._timer.arm()
 
-    def unclaimed(self, peer: int) -> None:
-        """Settle the losses that a peer did not ask for within its claim deadline."""
-        self._heirs.discard(peer)
-        self.losses.unclaimed(peer)
-
-    def forget(self, peer: int) -> None:
-        """Forget the losses of a peer that will not come back."""
-        self._heirs.discard(peer)
-        self.losses.forget(peer)
+    def gone(self, peer: int) -> None:
+        """Give up the messages that are kept for a peer that will not come back."""
+        keys = [(peer, source) for source in self._flows]
+        self._give_up([key for key in keys if self._parked.claim(key) is not None])
 
     def remove_route(self, action: RemoveRoute) -> None:
-        """End a source's route to a peer, and record what the peer misses."""
+        """End a source's route to a peer."""
         self._claim(action.peer, action.source)
-        self._end(action.source, action.peer, wished=action.wished, at_least=not action.over)
+        self._end(action.source, action.peer)
 
-    def following(self, source: Source, peer: int, after: int) -> int | None:
-        """The sequence of the next message of a suspended route; see ``bridge.data.losses.KeptMessages``."""
+    def numbering(self, source: Source, peer: int) -> ReliableSender | None:
+        """The sender of a source's reliable route to a peer, suspended or not; ``None`` if there is none."""
         flow = self._flows.get(source)
         route_sender = flow.by_peer.get(peer) if flow is not None else None
-        if not isinstance(route_sender, ReliableRouteSender):
-            return None
-        waiting = route_sender.sender.following
-        # The peer may have kept messages whose acknowledgement was lost; these are not sent again.
-        return waiting if is_later(waiting, after) else serial_add(after, 1)
+        return route_sender.sender if isinstance(route_sender, ReliableRouteSender) else None
 
-    def settle(self, source: Source, peer: int, epoch: int, after: int) -> Missed | None:
-        """Account for a peer's losses when it opens a source anew; see ``bridge.data.losses.KeptMessages``."""
-        self._claim(peer, source)
-        self._end(source, peer)
-        missed = self.losses.settle(source, peer, epoch, after, inherited=peer in self._heirs)
-        if missed is not None and missed.count:
-            self._on_missed(source, peer, missed.count, _ENDED)
-        return missed
-
-    def lost(self, source: Source, peer: int) -> int:
-        """The number of messages of a reliable source that a peer has missed, as far as it is known."""
+    def _end(self, source: Source, peer: int) -> None:
+        """Removes a source's sender to a peer, if there is one."""
         flow = self._flows.get(source)
         route_sender = flow.by_peer.get(peer) if flow is not None else None
-        return self.losses.count(source, peer) + (
-            route_sender.sender.lost if isinstance(route_sender, ReliableRouteSender) else 0
-        )
-
-    def _end(self, source: Source, peer: int, *, wished: bool = False, at_least: bool = False) -> None:
-        """Removes a source's sender to a peer, if there is one, and records what the peer misses."""
-        flow = self._flows.get(source)
-        route_sender = flow.by_peer.get(peer) if flow is not None else None
-        if flow is None or route_sender is None:
-            return
-        if isinstance(route_sender, ReliableRouteSender):
-            self.losses.end(source, peer, route_sender.sender.ended(), wished=wished, at_least=at_least)
-        self._forget(route_sender, peer)
-        flow.remove(peer)
+        if flow is not None and route_sender is not None:
+            self._forget(route_sender, peer)
+            flow.remove(peer)
 
     def _claim(self, peer: int, source: Source) -> None:
-        self._parked.claim((peer, source), None)
+        self._parked.claim((peer, source))
         self._timer.arm()
 
     def _give_up(self, keys: list[tuple[int, Source]]) -> None:
-        """Reports that messages are no longer kept for absent peers, and ends routes that are not even counted."""
-        if keys:
-            self._on_let_go(keys)
-        for peer, source in self._parked.forget():
-            self._end(source, peer, at_least=True)
-            self._on_given_up(source, peer)
+        """Reports routes whose messages are not kept any more for absent peers."""
+        for peer in dict.fromkeys(peer for peer, _ in keys):
+            counts = {}
+            for source in (source for one, source in keys if one == peer):
+                route_sender = self._flows[source].by_peer.get(peer)
+                if isinstance(route_sender, ReliableRouteSender):
+                    counts[source] = route_sender.missed() + route_sender.sender.pending
+            self._on_given_up(peer, counts)
 
     def sender(self, peer: int, route: int) -> RouteSender | None:
         """The sender of a peer's route; ``None`` if the route is not open."""
@@ -307,8 +267,10 @@ class LocalSubscriptions:
         _log.log(logging.DEBUG if short else logging.INFO, "= %s: %s", source, reason)
         if connection.malformed:
             self._on_malformed(source, reason)
+        numberings = {peer: self.numbering(source, peer) for peer in self._flows[source].by_peer}
         self._drop(source)  # first: what follows may connect the source anew
-        self._on_lost(source, reason[: limits.CONTROL_TEXT_MAX])
+        lasts = {peer: numbering.last for peer, numbering in numberings.items() if numbering is not None}
+        self._on_lost(source, reason[: limits.CONTROL_TEXT_MAX], lasts)
         if not short:
             self._core.suspect(source.node)
 
@@ -317,10 +279,7 @@ class LocalSubscriptions:
         if flow is not None:
             for peer in list(flow.by_peer):
                 self._claim(peer, source)
-                route_sender = flow.by_peer[peer]
-                self._forget(route_sender, peer)
-                if isinstance(route_sender, ReliableRouteSender):
-                    self.losses.end(source, peer, route_sender.sender.ended(), wished=False, at_least=False)
+                self._forget(flow.by_peer[peer], peer)
             flow.close()
         if flow is not None and not any(s.topic == source.topic for s in self._flows):
             self._core.call("unregisterSubscriber", OWN_NODE, source.topic, self._node.uri)

@@ -6,6 +6,7 @@ These are reliable messages that were given up, and messages that are too long t
 from __future__ import annotations
 
 import asyncio
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge.data.qos_events import shown_seconds
@@ -16,9 +17,8 @@ from rmpa.mesh import limits as mesh_limits
 from rmpa.ros import limits as ros_limits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
-    from rmpa.bridge.data.io.absent_peers import AbsentPeers
     from rmpa.bridge.data.io.export_flow import ExportFlow
     from rmpa.bridge.session.peer_rpc import PeerRpc
     from rmpa.bridge.session.peer_session import PeerSession
@@ -40,7 +40,6 @@ class LossReports:
         exports: Finds the peers that a source goes to.
         sessions: The peers.
         topics: The peers' topics in the local graph, by the numbers of their sessions.
-        absent: The peers whose session has ended.
         rpc: Sends and receives notifications.
         counters: Counts ``message.given_up`` and ``route.given_up``.
         refusals: Logs and counts ``route.missed``, ``message.oversized`` and ``message.oversized_there``.
@@ -51,7 +50,6 @@ class LossReports:
         exports: Exports,
         sessions: PeerSessions,
         topics: Mapping[int, PeerTopics],
-        absent: AbsentPeers,
         rpc: PeerRpc,
         counters: Counters,
         refusals: RefusalLog,
@@ -59,7 +57,6 @@ class LossReports:
         self._exports = exports
         self._sessions = sessions
         self._topics = topics
-        self._absent = absent
         self._rpc = rpc
         self._counters = counters
         self._refusals = refusals
@@ -67,48 +64,35 @@ class LossReports:
 
     def away(self, peer: int) -> tuple[str, float]:
         """The name of an absent peer, and for how many seconds it has been away."""
-        now = asyncio.get_running_loop().time()
-        if (session := self._sessions.get(peer)) is not None:
-            return session.link.name, now - session.away_since
-        if (absent := self._absent.get(peer)) is not None:
-            return absent.identity.name, now - absent.since
-        return "a peer", 0.0
+        session = self._topics[peer].session
+        return session.link.name, asyncio.get_running_loop().time() - session.away_since
 
-    def let_go(self, keys: list[tuple[int, Source]], lost: Callable[[Source, int], int]) -> None:
-        """Report that messages are no longer kept for absent peers, only counted.
+    def given_up(self, peer: int, counts: Mapping[Source, int]) -> None:
+        """Report that messages are not kept any more for an absent peer.
 
         Args:
-            keys: Each (peer, source) concerned.
-            lost: ``(source, peer)``: returns how many messages of a source a peer misses.
+            peer: The peer's number.
+            counts: By source: how many messages it misses until now.
         """
-        for peer in dict.fromkeys(peer for peer, _ in keys):
-            sources = [source for one, source in keys if one == peer]
-            name, seconds = self.away(peer)
-            shown = ", ".join(str(source) for source in sources[:_NAMED])
-            if len(sources) > _NAMED:
-                shown += f" and {len(sources) - _NAMED} others"
-            count = sum(lost(source, peer) for source in sources)
-            text = f"{name} has been away for {shown_seconds(seconds)}: {count} messages for it are given up, "
-            text += (
-                f"of {shown}; further ones are only counted (the contract's outage is for how long they are kept, "
-            )
-            text += f"at most {mesh_limits.RESUME_BYTES_MAX >> 20} MiB over all)"
-            self._counters.add("route.given_up", len(sources) - 1)
-            self._say("route.given_up", name, text)
-
-    def missed(self, source: Source, peer: int, count: int, why: str) -> None:
-        """Report the final number of messages of a reliable source that a peer has missed."""
-        session = self._sessions.get(peer)
-        name = session.link.name if session is not None else "a peer"
+        if not (count := sum(counts.values())):
+            return
+        name, seconds = self.away(peer)
+        shown = ", ".join(map(str, islice(counts, _NAMED)))
+        if len(counts) > _NAMED:
+            shown += f" and {len(counts) - _NAMED} others"
+        text = f"{name} has been away for {shown_seconds(seconds)}: {count} messages for it are given up, of {shown} "
+        text += "(the contract's outage is for how long they are kept, "
+        text += f"at most {mesh_limits.RESUME_BYTES_MAX >> 20} MiB over all)"
         self._counters.add("message.given_up", count)
-        self._say("route.missed", f"{name} {source}", f"{source}: {name} has missed {count} messages: {why}")
+        self._counters.add("route.given_up", len(counts) - 1)
+        self._say("route.given_up", name, text)
 
-    def uncounted(self, source: Source) -> None:
-        """Report a route whose losses are not counted, because too many routes of absent peers are."""
-        text = (
-            f"what peers that are away miss is counted for {mesh_limits.RESUMES_COUNTED_MAX} routes, and no more for"
-        )
-        self._say("route.uncounted", str(source), f"{text} {source}")
+    def missed(self, source: Source, peer: int, count: int) -> None:
+        """Report how many messages of a reliable source a peer that is back has missed."""
+        name = self._topics[peer].session.link.name
+        self._counters.add("message.given_up", count)
+        text = f"{source}: {name} has missed {count} messages: it was away for longer than they were kept"
+        self._say("route.missed", f"{name} {source}", text)
 
     def oversized(self, source: Source, flow: ExportFlow) -> None:
         """Report a message that is too long, in the log and to the peers to which its source flows."""

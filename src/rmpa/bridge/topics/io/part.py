@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections import OrderedDict
 from typing import TYPE_CHECKING
 
 from rmpa.bridge import actions as act
-from rmpa.bridge.data.io.absent_peers import Absent, AbsentPeers
 from rmpa.bridge.data.qos_events import shown_seconds
 from rmpa.bridge.direct.io.endpoints import LocalEndpoints
 from rmpa.bridge.messages import (
@@ -32,7 +32,6 @@ from rmpa.bridge.relay import LinkedPeer
 from rmpa.bridge.session.graph_driver import GraphDriver
 from rmpa.bridge.session.part import Part
 from rmpa.bridge.session.unchanged_graph import UnchangedGraph
-from rmpa.bridge.topics.claims import ClaimDeadlines
 from rmpa.bridge.topics.exports import Exports
 from rmpa.bridge.topics.imports import Imports
 from rmpa.bridge.topics.io.direct_exporter import DirectExporter
@@ -50,12 +49,12 @@ from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import FrameKind
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
 from rmpa.runtime.event_loop import yield_to_data
-from rmpa.runtime.machine_timer import MachineTimer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from rmpa.bridge.data.io.export_flow import ExportFlow
+    from rmpa.bridge.data.losses import ReceptionHistory
     from rmpa.bridge.data.qos_events import QosEvent
     from rmpa.bridge.messages import Message
     from rmpa.bridge.relay import Relay
@@ -64,7 +63,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.session.peer_sessions import PeerSessions
     from rmpa.config.settings import LimitSettings, Settings
     from rmpa.core.counters import Counters
-    from rmpa.core.identity import Identity
     from rmpa.ros.core.api import Core
     from rmpa.ros.node.publication import Publication
     from rmpa.ros.node.slave_node import SlaveNode
@@ -123,9 +121,8 @@ class Topics(Part):
             core,
             node,
             on_described=lambda source, description: self._act(self.exports.described(source, description)),
-            on_lost=lambda source, reason: self._act(self.exports.lost(source, reason)),
+            on_lost=lambda source, reason, lasts: self._act(self.exports.lost(source, reason, lasts)),
             on_given_up=self._given_up,
-            on_let_go=lambda keys: self.losses.let_go(keys, self.outbound.lost),
             on_missed=self._missed,
             on_oversized=self._oversized,
             on_malformed=lambda source, text: self._driver.warn(
@@ -134,7 +131,7 @@ class Topics(Part):
             find=find,
         )
         """The subscriptions to local publishers, and the routes to the peers."""
-        self.exports = Exports(policy, contracts, names, limit_settings, self.outbound, gate)
+        self.exports = Exports(policy, contracts, names, limit_settings, self.outbound.numbering, gate)
         """The outbound plan."""
         refusals = RefusalLog(_log, counters)
         self._driver: GraphDriver[act.Action, Advertise] = GraphDriver(
@@ -148,17 +145,15 @@ class Topics(Part):
             do=self._do,
             # The route's data may follow at once, and no waiting action has to precede it.
             is_urgent=lambda action: isinstance(action, act.Describe),
-            on_told=self._told,
             on_idle=self._settled,
         )
         self._act = self._driver.act
         sessions.offers.add(self.exports)
-        self._absent = AbsentPeers(lambda peer: self._act(self.exports.unclaimed(peer)), self.outbound.forget, gate)
-        self._claims = ClaimDeadlines()
+        self._pasts: OrderedDict[str, dict[Source, ReceptionHistory]] = OrderedDict()
+        """By the name of a module: what is remembered of its reliable sources; see ``PeerTopics``."""
         self._unchanged = UnchangedGraph()
-        self._claims_timer = MachineTimer(self._claims.next_timer, self._claims_over)
         self._mismatches = MismatchReports(self.exports, self.imports, self._act, self._driver.warn)
-        self.losses = LossReports(self.exports, sessions, self._peers, self._absent, rpc, counters, refusals)
+        self.losses = LossReports(self.exports, sessions, self._peers, rpc, counters, refusals)
         """Reports messages that do not reach their listeners."""
         self._subscribers = RemoteSubscribers(self.exports, self.imports, sessions, self._peers, refusals, gate)
         self.direct_exports = DirectExporter(
@@ -209,7 +204,6 @@ class Topics(Part):
         self._driver.close()
         await self.direct_imports.close()
         await self.direct_exports.close()
-        self._claims_timer.close()
         self._subscribers.close()
         self.outbound.close()
 
@@ -228,40 +222,28 @@ class Topics(Part):
         self.direct_imports.reload(contracts)
         self._look_at_all()
 
-    def remembered(self, identity: Identity) -> int | None:
-        """The number of an absent peer of this very run, under which losses in both directions are remembered."""
-        return self._absent.number_of(identity)
-
     def link_up(self, session: PeerSession) -> None:
         """Begins the advertisement to a peer, and waits for the peer's own; suspended routes may go on."""
         peer, identity = session.peer, session.link.identity
-        now = asyncio.get_running_loop().time()
         if peer in self._peers:
             if not session.unparked:
                 _log.info("= %s is back: reliable topics go on", session.link.name)
-            self._claims.begin(peer, now)
+            self.outbound.back(peer)
         else:
-            self._begin(session, now)
+            self._begin(session)
         self.imports.ways.instance = self._relay.instance
         linked = LinkedPeer(identity.name, identity.instance.hex(), identity.guid)
         self._act(self.imports.link_up(peer, identity.name, linked))
         self._act(self.exports.link_up(peer, identity.name, linked.instance))
         self.direct_imports.link_up(session)
         self.direct_exports.link_up(session)
-        self._told()
         self._driver.schedule()
 
-    def _begin(self, session: PeerSession, now: float) -> None:
-        peer, identity = session.peer, session.link.identity
-        absent = self._absent.back(identity)
-        if absent is not None:
-            again = absent.identity.is_same_run(identity)
-            if not again:
-                self.exports.inherit(absent.peer, peer)
-                self.outbound.inherit(absent.peer, peer)
-            away = shown_seconds(now - absent.since)
-            _log.info("= %s is back after %s%s", session.link.name, away, "" if again else ", another run of it")
-            self._claims.begin(peer, now)
+    def _begin(self, session: PeerSession) -> None:
+        peer, name = session.peer, session.link.name
+        pasts = self._pasts[name] = self._pasts.pop(name, {})
+        if len(self._pasts) > mesh_limits.ABSENT_PEERS_MAX:
+            self._pasts.popitem(last=False)
         self._peers[peer] = PeerTopics(
             self._core,
             session,
@@ -271,7 +253,7 @@ class Topics(Part):
             on_occurred=lambda source, occurred: self._occurred(session, source, occurred),
             on_listeners=lambda source: self._listeners_changed(peer, source),
             on_request=lambda source, caller: self.direct_imports.request(peer, source, caller),
-            pasts=absent.pasts if absent is not None else None,
+            pasts=pasts,
         )
 
     def link_down(self, session: PeerSession) -> None:
@@ -279,8 +261,6 @@ class Topics(Part):
         peer, crashed = session.peer, session.link.crashed
         self.direct_imports.link_down(session, crashed=crashed)
         self.direct_exports.link_down(session, crashed=crashed)
-        self._claims.forget(peer)
-        self._claims_timer.arm()
         interrupted = self._peers[peer].link_down()
         if interrupted:
             # Best-effort messages published until the next link get no sequence: their loss cannot be counted.
@@ -314,17 +294,14 @@ class Topics(Part):
         return min((outage for outage in outages if outage > seconds), default=None)
 
     def gone(self, session: PeerSession) -> None:
-        """Retracts the rest of a peer's sources; losses in both directions are remembered in ``AbsentPeers``."""
+        """Retracts the rest of a peer's sources."""
         peer = session.peer
         self.direct_imports.gone(session, hang_up=not session.link.crashed)
         self.direct_exports.gone(session)
+        self.outbound.gone(peer)
         topics = self._peers.pop(peer)
-        self._claims.forget(peer)
-        self._claims_timer.arm()
         self._mismatches.peer_gone(session.link.name)
-        absent = Absent(peer, session.link.identity, session.away_since, topics.leave())
-        counting = self.exports.waits_for(peer)
-        for action in self.exports.link_down(peer, counting=True):
+        for action in self.exports.link_down(peer):
             self._act([action])
         # The actions are not carried out: closing the proxies does the same at once.
         self._driver.free(self.imports.link_down(peer))
@@ -332,10 +309,6 @@ class Topics(Part):
         self._relay.peer_gone(peer)
         self._act(self.imports.unlinked(peer))
         topics.close()
-        if counting or absent.pasts:
-            self._absent.add(absent)
-        else:
-            self.outbound.forget(peer)
 
     def depends(self, session: PeerSession) -> bool:
         """Whether nodes of this module have direct connections to the peer's."""
@@ -387,34 +360,22 @@ class Topics(Part):
             for change in self.imports.portions(session.peer, message)
         )
 
-    # --- peers that are back ------------------------------------------------------------------------------------
-
-    def _told(self) -> None:
-        """Starts the short claim deadline of each peer that has received the full advertisement."""
-        now = asyncio.get_running_loop().time()
-        for peer in self._claims.untold:
-            if not self.exports.beginning(peer):
-                self._claims.told(peer, now)
-        self._claims_timer.arm()
-
-    def _claims_over(self, now: float) -> None:
-        for peer in self._claims.handle_timer(now):
-            self._act(self.exports.unclaimed(peer))
-            self.outbound.unclaimed(peer)
+    # --- reliable routes ----------------------------------------------------------------------------------------
 
     def _position(self, peer: int, source: Source) -> tuple[int, int] | None:
         topics = self._peers.get(peer)
         return topics.position(source) if topics is not None else None
 
-    def _missed(self, source: Source, peer: int, count: int, why: str) -> None:
-        self.losses.missed(source, peer, count, why)
+    def _missed(self, source: Source, peer: int, count: int) -> None:
+        self.losses.missed(source, peer, count)
 
     def _oversized(self, source: Source, flow: ExportFlow) -> None:
         self.losses.oversized(source, flow)
 
-    def _given_up(self, source: Source, peer: int) -> None:
-        self.losses.uncounted(source)
-        self._act(self.exports.given_up(source, peer))
+    def _given_up(self, peer: int, counts: Mapping[Source, int]) -> None:
+        self.losses.given_up(peer, counts)
+        for source in counts:
+            self._act(self.exports.given_up(source, peer))
 
     # --- the local graph ---------------------------------------------------------------------------------------
 
@@ -438,20 +399,16 @@ class Topics(Part):
             self._act(self.imports.local_type(topic, next((one.type for one in reversed(local.values())), None)))
 
     def reconcile(self) -> None:
-        """Registers missing publications again, and stops counting losses of topics without local subscribers."""
-        self._absent.expire(asyncio.get_running_loop().time())
+        """Registers missing publications again; topics without local subscribers miss nothing any more."""
         state = self._core.state()
         compared = self._unchanged.is_due(state, steady=not self._core.unreachable())
         if compared:
             self._look_at_all()
 
-        def subscribed(topic: str) -> bool:
-            return any(not is_own(node) for node in state.subscribers.get(topic, ()))
-
-        self._absent.unheard(subscribed)
+        for past in (past for pasts in self._pasts.values() for past in pasts.values() if past.missed):
+            past.missed = any(not is_own(node) for node in state.subscribers.get(past.topic, ()))
         self.direct_exports.reconcile(state.subscribers)
         for topics in list(self._peers.values()):
-            topics.unheard(subscribed)
             yield_to_data()
             if compared and (again := topics.reconcile(state.publishers)):
                 self._counters.add("proxy.registered_again", again)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import OrderedDict
 from functools import partial
 from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
 from rmpa.bridge.data.io.import_flow import ImportFlow
 from rmpa.core.contract import Durability, Reliability
+from rmpa.core.serial_number import serial_add
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.wire.tcpros import TopicDescription, printable
@@ -99,7 +99,8 @@ class PeerTopics:
         on_occurred: Called with a source and an event of its contract.
         on_listeners: Called with a source when the set of its local listeners changes.
         on_request: ``(source, caller id)``: answers a subscriber's ``requestTopic``; see ``Publication``.
-        pasts: The histories of reliable sources that an earlier session's ``leave`` returned.
+        pasts: The history of each reliable source of the module that had a flow and has none now, for its next flow.
+            It outlives the session.
     """
 
     def __init__(
@@ -113,10 +114,10 @@ class PeerTopics:
         on_occurred: Callable[[Source, QosEvent], None],
         on_listeners: Callable[[Source], None] = lambda _: None,
         on_request: Callable[[Source, str], Awaitable[RosReply | None] | None] = lambda *_: None,
-        pasts: Mapping[Source, ReceptionHistory] | None = None,
+        pasts: dict[Source, ReceptionHistory] | None = None,
     ) -> None:
         self._core = core
-        self._session = session
+        self.session = session
         self._counters = counters
         self.on_demand = on_demand
         self.on_mismatch = on_mismatch
@@ -130,8 +131,7 @@ class PeerTopics:
         """The flow of each source's route: the open one, or the one that outlived its link."""
         self._watches: dict[Source, MachineTimer] = {}
         """The contract timer of each of these sources."""
-        self._pasts: OrderedDict[Source, ReceptionHistory] = OrderedDict(pasts or {})
-        """The history of each reliable source that had a flow and has none now, for its next flow."""
+        self._pasts = pasts if pasts is not None else {}
 
     def publication(self, source: Source) -> Publication | None:
         """The publication of a source, if it is in the local graph."""
@@ -144,12 +144,12 @@ class PeerTopics:
 
     def publish(self, action: Publish) -> None:
         """Publish a source at its proxy, in a later turn of the loop."""
-        self._session.proxies.hold(action.source.node, action.source, _Published(self, action))
+        self.session.proxies.hold(action.source.node, action.source, _Published(self, action))
 
     def retract(self, action: Retract) -> None:
         """Retract a source: its data stops at once, its registration in a later turn of the loop."""
         self._over(action.source, missed=True)
-        self._session.proxies.release(action.source.node, action.source)
+        self.session.proxies.release(action.source.node, action.source)
 
     def describe(self, action: Describe, on_ack: Callable[[int], None]) -> None:
         """Prepare for data on a newly opened route, and answer the waiting subscribers with its description.
@@ -162,7 +162,7 @@ class PeerTopics:
         if publication is None:
             return
         flow, goes_on = self._flow(action, publication, on_ack)
-        self.flows[action.route] = self._session.handlers[action.route] = flow
+        self.flows[action.route] = self.session.handlers[action.route] = flow
         about = action.description
         text = about.definition.encode("latin-1").decode(errors="surrogateescape")
         if publication.describe(TopicDescription(about.type, about.md5, text, about.latching)):
@@ -173,10 +173,7 @@ class PeerTopics:
     def position(self, source: Source) -> tuple[int, int] | None:
         """Epoch and last sequence from which a reliable source's next route continues; ``None``: it begins anew."""
         flow = self._latest.get(source)
-        if flow is not None:
-            return flow.position
-        past = self._pasts.get(source)
-        return past.receiver.position() if past is not None and past.receiver is not None else None
+        return flow.position if flow is not None else None
 
     def past(self, source: Source) -> ReceptionHistory | None:
         """The history of a reliable source without a flow."""
@@ -195,16 +192,6 @@ class PeerTopics:
             return False
         flow.oversized, flow.oversized_bytes = count, size
         return True
-
-    def unheard(self, subscribed: Callable[[str], bool]) -> None:
-        """Stop counting messages as missed for topics without local subscribers.
-
-        Args:
-            subscribed: ``(topic)``: whether a local node subscribes to it.
-        """
-        for past in self._pasts.values():
-            if past.missed and not subscribed(past.topic):
-                past.forget_position(missed=False)
 
     def _flow(
         self, action: Describe, publication: Publication, on_ack: Callable[[int], None]
@@ -228,14 +215,14 @@ class PeerTopics:
             flow = ImportFlow(
                 publication,
                 contract,
-                self._session.time,
+                self.session.time,
                 on_ack=on_ack,
                 on_torn=lambda: self._call_back_soon(source, publication),
                 on_broken=lambda occurred: self._on_occurred(source, occurred),
                 counters=self._counters,
                 past=past if reliable else None,
             )
-        same = missed and flow.position is not None and flow.position[0] == action.epoch
+        same = outlived and flow.position is not None and flow.position[0] == action.epoch
         flow.begin_epoch(action.epoch, action.first)
         publication.bound(contract.depth)
         if contract.durability is Durability.TRANSIENT_LOCAL:
@@ -245,29 +232,11 @@ class PeerTopics:
             on_due = partial(self._watch_due, source, flow)
             self._watches[source] = MachineTimer(flow.watch.next_timer, on_due)
         self._watches[source].arm()
-        if reliable:
-            self._count_missed(flow, action, missed=missed, same=same)
-        return flow, outlived and same
-
-    @staticmethod
-    def _count_missed(flow: ImportFlow, action: Describe, *, missed: bool, same: bool) -> None:
-        """Counts the messages that the peer reports as given up.
-
-        Args:
-            flow: The source's flow.
-            action: The peer's report: ``following``, ``lost`` and ``at_least``.
-            missed: Whether local nodes listened before, so that an unknown number of losses must be reported.
-            same: Whether the numbering goes on.
-        """
-        if same:
-            if action.following is not None:
-                flow.skip(action.following)
-            return
-        if action.lost is not None:
-            flow.missed(action.lost)
-        if action.at_least or (missed and action.lost is None):
-            what = "more than that" if action.lost else "its agent was restarted, or knows nothing of what it missed"
-            flow.missed_unknown(what)
+        if same and action.following is not None:
+            flow.skip(action.following)
+        elif reliable and not same and (missed or action.unknown):
+            flow.missed_unknown("an agent was restarted, or the route had ended")
+        return flow, same
 
     def _watch_due(self, source: Source, flow: ImportFlow, now: float) -> None:
         for occurred in flow.watch.handle_timer(now):
@@ -288,7 +257,7 @@ class PeerTopics:
         flow = self._latest.pop(source, None)
         if flow is None:
             if not missed and (past := self._pasts.get(source)) is not None:
-                past.forget_position(missed=False)
+                past.missed = False
         else:
             self._remember(source, flow, missed=missed)
             for occurred in flow.watch.link_gone(asyncio.get_running_loop().time()):
@@ -301,13 +270,7 @@ class PeerTopics:
         if past is not None and (missed or past.lost or past.counts):
             self._pasts[source] = past
             if len(self._pasts) > mesh_limits.LOSSES_REMEMBERED:
-                self._pasts.popitem(last=False)
-
-    def leave(self) -> dict[Source, ReceptionHistory]:
-        """Return the histories of all reliable sources, for the next session of a peer that was away for too long."""
-        for source, flow in self._latest.items():
-            self._remember(source, flow, missed=True)
-        return dict(self._pasts)
+                del self._pasts[next(iter(self._pasts))]
 
     def _call_back_soon(self, source: Source, publication: Publication) -> None:
         """Registers the proxy again, so that subscribers that were disconnected connect again.
@@ -338,12 +301,14 @@ class PeerTopics:
     def detach(self, action: Detach) -> None:
         """End a route's data; with ``keep`` its flow waits for the peer's next link."""
         flow = self.flows.pop(action.route, None)
-        self._session.handlers.pop(action.route, None)
+        self.session.handlers.pop(action.route, None)
         if action.keep:
             if flow is not None:
                 self._watches[action.source].arm()
             return
-        self._over(action.source, missed=action.missed)
+        if flow is not None and action.last is not None:
+            flow.skip(serial_add(action.last, 1))
+        self._over(action.source, missed=action.missed and action.last is None)
         publication = self.publication(action.source)
         if publication is not None:
             publication.forget_latched()
@@ -360,12 +325,13 @@ class PeerTopics:
         return len(missing)
 
     def close(self) -> None:
-        """End all flows; the publications go with the proxies."""
+        """End all flows, and remember the histories of the reliable ones; the publications go with the proxies."""
         for source, flow in list(self._latest.items()):
+            self._remember(source, flow, missed=True)
             self._end(source, flow)
         self._latest.clear()
         for route in self.flows:
-            self._session.handlers.pop(route, None)
+            self.session.handlers.pop(route, None)
         self.flows.clear()
 
     # --- at the proxies ----------------------------------------------------------------------------------------

@@ -196,6 +196,7 @@ class TopicEvidence:
             special = self._policy.judge_for(session.link.name, source.topic, kind, wire)
             decision = special if special.rule else decision
         flow = self._bridge.topics.outbound.flows.get(source)
+        numbering = self._bridge.topics.outbound.numbering(source, session.peer)
         contract = exports.contract(source, session.peer)
         reliable = contract is not None and contract.reliability is Reliability.RELIABLE
         return PublisherReport(
@@ -208,7 +209,7 @@ class TopicEvidence:
             route="open" if session.peer in exports.flowing(source) else "opening" if contract is not None else "",
             messages=flow.messages if flow is not None else 0,
             dropped=flow.dropped if flow is not None and not reliable else 0,
-            lost=self._bridge.topics.outbound.lost(source, session.peer),
+            lost=numbering.lost if numbering is not None else 0,
             oversized=flow.oversized if flow is not None else 0,
             oversized_bytes=flow.oversized_bytes if flow is not None else 0,
             beyond=exports.beyond.limit if exports.is_beyond(source) else 0,
