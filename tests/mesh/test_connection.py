@@ -42,9 +42,9 @@ def test_handshake_control_data_and_bye_in_pieces(chunk: int) -> None:
     dialler.link.close("shutting down", time.now)
     assert dialler.link.state is ConnectionState.CLOSING
     deliver(dialler.link.take_output(), acceptor.link, time.now, chunk)
-    assert acceptor.last() == ConnectionClosed("low left: shutting down", orderly=True)
+    assert acceptor.last() == ConnectionClosed("low left: shutting down")
     dialler.link.lost("the other side closed the connection")
-    assert dialler.last() == ConnectionClosed("shutting down", orderly=True)
+    assert dialler.last() == ConnectionClosed("shutting down")
 
 
 def test_every_split_of_the_handshake_in_two_is_the_same() -> None:
@@ -82,10 +82,10 @@ def test_a_refusal_reaches_the_dialler_and_both_end() -> None:
     deliver(acceptor.link.take_output(), dialler.link, time.now)
     assert dialler.events == [
         Refused(refuse, by_us=False),
-        ConnectionClosed("? refused: busy: come later", orderly=True),
+        ConnectionClosed("? refused: busy: come later"),
     ]
     acceptor.link.lost("the other side closed the connection")
-    assert acceptor.last() == ConnectionClosed("refused: busy: come later", orderly=True)
+    assert acceptor.last() == ConnectionClosed("refused: busy: come later")
 
 
 def with_byte(data: bytes, offset: int, value: int) -> bytes:
@@ -212,7 +212,7 @@ def test_silence_for_the_others_lease_ends_the_link() -> None:
     pass_time(dialler.link, time, 1.999)
     assert dialler.link.state is ConnectionState.UP
     pass_time(dialler.link, time, 0.001)
-    assert dialler.last() == ConnectionClosed("high was silent for its lease of 2 s", orderly=False)
+    assert dialler.last() == ConnectionClosed("high was silent for its lease of 2 s")
     assert dialler.link.next_timer() is None
 
 
@@ -321,7 +321,7 @@ def test_frames_are_ignored_while_closing() -> None:
     assert not any(isinstance(e, ControlReceived) for e in dialler.events)
     time.now += runtime_limits.DRAIN_TIMEOUT
     dialler.link.handle_timer(time.now)
-    assert dialler.last() == ConnectionClosed("done", orderly=True)
+    assert dialler.last() == ConnectionClosed("done")
 
 
 def test_the_driver_loses_the_connection() -> None:
@@ -329,7 +329,7 @@ def test_the_driver_loses_the_connection() -> None:
     dialler, _ = pair(time)
     dialler.link.lost("reset by peer")
     dialler.link.lost("twice")
-    assert dialler.last() == ConnectionClosed("reset by peer", orderly=False)
+    assert dialler.last() == ConnectionClosed("reset by peer")
     assert sum(isinstance(e, ConnectionClosed) for e in dialler.events) == 1
 
 

@@ -125,7 +125,7 @@ def test_silence_at_rest_ends_the_link_by_the_longer_lease() -> None:
     pass_time(dialler.link, time, limits.IDLE_LEASE - 0.01)
     assert dialler.link.state is ConnectionState.UP
     pass_time(dialler.link, time, 0.02)
-    assert dialler.last() == ConnectionClosed("high was silent for its lease of 16 s", orderly=False)
+    assert dialler.last() == ConnectionClosed("high was silent for its lease of 16 s")
 
 
 @pytest.mark.parametrize(
@@ -229,7 +229,7 @@ def test_a_peer_that_died_at_rest_is_noticed_soon_once_it_is_needed() -> None:
     assert not any(isinstance(event, ConnectionClosed) for event in dialler.events), "it has time to answer"
     pass_time(dialler.link, time, limits.WAKE_TIMEOUT - limits.GHOST_QUIET + 0.01)
     assert dialler.link.state is ConnectionState.CLOSED
-    assert dialler.last() == ConnectionClosed("high was silent for its lease of 1.5 s", orderly=False)
+    assert dialler.last() == ConnectionClosed("high was silent for its lease of 1.5 s")
 
 
 def test_a_pause_at_rest_that_is_shorter_than_the_lease_changes_nothing() -> None:

@@ -77,7 +77,7 @@ def test_both_willing_sides_part_after_a_while_and_both_know_it() -> None:
     run(dialler, acceptor, time, 1 + limits.IDLE_KEEPALIVE_INTERVAL)
     assert of(dialler, Parted)
     assert of(acceptor, Parted)
-    assert acceptor.last() == ConnectionClosed("low left: low parked the link", orderly=True)
+    assert acceptor.last() == ConnectionClosed("low left: low parked the link")
     dialler.link.lost("closed")
     assert isinstance(dialler.last(), ConnectionClosed)
 
@@ -186,7 +186,7 @@ def test_an_acceptor_that_waits_for_a_bye_that_a_cut_swallows_notices_the_cut() 
         acceptor.link.handle_timer(time.now)
     assert not of(acceptor, Parted)
     assert time.now - begun <= limits.HANDSHAKE_TIMEOUT + 0.01
-    assert acceptor.last() == ConnectionClosed(str(getattr(acceptor.last(), "reason", "")), orderly=False)
+    assert acceptor.last() == ConnectionClosed(str(getattr(acceptor.last(), "reason", "")))
 
 
 def test_a_bye_that_says_parked_without_an_agreement_is_a_bye() -> None:

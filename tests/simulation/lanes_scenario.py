@@ -9,7 +9,6 @@ from unittest import mock
 
 from rmpa.core.contract import Reliability
 from rmpa.mesh import limits
-from rmpa.mesh.handshake import Lane
 from tests.simulation.mesh_scenario import MeshScenario
 from tests.simulation.scenario import CALM
 from tests.simulation.traffic import TrafficPeer
@@ -17,8 +16,6 @@ from tests.simulation.traffic import TrafficPeer
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.mesh.io.link import PeerLink
-    from tests.simulation.mesh_peer import MeshPeer
 
 _LAST_SERIES: Final = (300, 40_000, 20, 20, 20, 20, 20, 150_000, 300, 9000, 300, 300, 300, 300, 300, 9000, 20)
 """Sizes: small, large, back to small, a large one in parts, and again."""
@@ -29,7 +26,6 @@ class LanesScenario(MeshScenario):
     """Agents that send each other messages; see ``MeshScenario``."""
 
     kind = "lanes"
-    bulk_unused = 1.0
 
     def __init__(self, seed: int, count: int, *, keep: bool = False, calm: bool = False) -> None:
         self.before: dict[bytes, int] = {}
@@ -80,17 +76,6 @@ class LanesScenario(MeshScenario):
                     self._check_messages(other, peer)
             for link in peer.mesh.links():
                 assert not link.queue_bytes, f"{peer.name} has not sent all"
-
-    def _check_connections(self, peer: MeshPeer, others: list[bytes]) -> None:
-        """Bulk lanes come and go: each link has one, or none at both ends."""
-        links = [c.identity.instance for c in peer.mesh.connections() if c.up and c.lane == Lane.EXPRESS]
-        assert sorted(links) == others, f"{peer.name}: {self._names(links)}"
-
-    def _check_bulk(self, peer: MeshPeer, other: MeshPeer, link: PeerLink, twin: PeerLink) -> None:
-        ends = {link.bulk_connection is None, twin.bulk_connection is None}
-        assert len(ends) == 1, f"{peer.name} and {other.name} do not agree on their bulk lane"
-        if link.bulk_connection is not None:
-            super()._check_bulk(peer, other, link, twin)
 
     def _check_messages(self, source: TrafficPeer, peer: TrafficPeer) -> None:
         inbox = peer.inboxes[source.identity.instance]

@@ -135,7 +135,7 @@ class MeshPeer(RosterPeer):
     def link_up(self, link: PeerLink) -> None:
         """A peer is linked."""
         self.note(f"= link {link.id} up {link.identity}")
-        link.want_bulk()
+        link.bulk._on_wanted()
         self.roster.link_up(link.identity, self.world.now)
         self.flush()
 

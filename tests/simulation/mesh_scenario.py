@@ -36,8 +36,6 @@ class MeshScenario(Scenario):
     """
 
     kind = "mesh"
-    bulk_unused = 3600.0
-    """Seconds after which an unused bulk lane ends; every link wants one when it comes up."""
 
     def __init__(
         self, seed: int, count: int, *, keep: bool = False, calm: bool = False, make_peer: type[MeshPeer] = MeshPeer
@@ -61,7 +59,6 @@ class MeshScenario(Scenario):
         slower = _SLOWER if self.count > _MANY else 1
         with (
             mock.patch("rmpa.mesh.io.redials.unacknowledged", lambda sock: sock.in_flight),
-            mock.patch("rmpa.mesh.io.link.unacknowledged", lambda sock: sock.in_flight),
             mock.patch("rmpa.runtime.acceptor.Acceptor._has_room", return_value=True),
             mock.patch.multiple(
                 limits,
@@ -70,7 +67,6 @@ class MeshScenario(Scenario):
                 CLOCK_INTERVAL=slower * limits.CLOCK_INTERVAL,
                 BULK_LEASE=slower * limits.BULK_LEASE,
                 GHOST_QUIET=slower * limits.GHOST_QUIET,
-                BULK_UNUSED=self.bulk_unused,
             ),
         ):
             yield

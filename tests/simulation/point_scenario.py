@@ -57,7 +57,6 @@ class PointScenario(LanesScenario):
     """
 
     kind = "point"
-    bulk_unused = 3600.0
 
     def __init__(self, course: Course, trouble: str, point: int) -> None:
         self.course = course

@@ -324,7 +324,7 @@ class ConnectionProtocol:
     def lost(self, reason: str) -> None:
         """Handle the end of the TCP connection (in ``CLOSING`` an orderly end); without effect once closed."""
         if self._state is not ConnectionState.CLOSED:
-            self._end(self._reason or reason, orderly=self._state is ConnectionState.CLOSING)
+            self._end(self._reason or reason)
 
     def ping(self, now: float) -> int:
         """Send a ping, and return its stamp; the answer is reported as a ``PongReceived`` with this stamp.
@@ -400,7 +400,7 @@ class ConnectionProtocol:
         if now - keepalive.sent > keepalive.lease:
             self.abandoned, self._proof = True, None
         if self._state is ConnectionState.CLOSING:
-            self._end(self._reason, orderly=True)
+            self._end(self._reason)
         elif self._state is ConnectionState.HANDSHAKING:
             self._end(f"{self._name} did not finish the handshake within {limits.HANDSHAKE_TIMEOUT:g} s")
         elif now >= keepalive.lease_end:
@@ -470,11 +470,11 @@ class ConnectionProtocol:
         elif kind is FrameKind.BYE:
             if route == frames.BYE_PARKED and self._parting.holding:
                 self.on_event(Parted())
-            self._end(f"{self._name} left: {frames.parse_text(payload)}", orderly=True)
+            self._end(f"{self._name} left: {frames.parse_text(payload)}")
         elif kind is FrameKind.REFUSE:
             refuse = Refuse.parse(payload)
             self.on_event(Refused(refuse, by_us=False))
-            self._end(f"{self._label} refused: {refuse}", orderly=True)
+            self._end(f"{self._label} refused: {refuse}")
         else:
             self._handshake(payload, now)
 
@@ -529,13 +529,13 @@ class ConnectionProtocol:
         self._deadline = now + runtime_limits.DRAIN_TIMEOUT
         _log.debug("= %s: closing: %s", self._name, reason)
 
-    def _end(self, reason: str, *, orderly: bool = False) -> None:
+    def _end(self, reason: str) -> None:
         if self._state is ConnectionState.CLOSED:
             return
         self._state = _NEXT[self._state, _Step.ENDED]
         self._reason = reason
         _log.debug("= %s: closed: %s", self._name, reason)
-        self.on_event(ConnectionClosed(reason, orderly))
+        self.on_event(ConnectionClosed(reason))
 
     def _ping(self, now: float) -> int:
         stamp = self._wall_ns()

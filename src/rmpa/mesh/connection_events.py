@@ -77,20 +77,18 @@ class ConnectionClosed:
 
     Args:
         reason: Why, for people.
-        orderly: Whether one side ended the connection by a frame (bye, refuse), and not an error or silence.
     """
 
     reason: str
-    orderly: bool
 
 
 @dataclass(frozen=True, slots=True)
 class MarkReceived:
-    """An acknowledgement, a fence, the answer to a fence, or a word about the bulk lane was received.
+    """An acknowledgement, a fence, the answer to a fence, or the wish for the bulk lane was received.
 
     Args:
         kind: ``ACK``, ``FENCE``, ``FENCED`` or ``LANE``.
-        route: The id of the route; for ``LANE`` a ``LaneWord``.
+        route: The id of the route.
         sequence: For ``ACK`` the last message that arrived; otherwise the fence's number.
     """
 

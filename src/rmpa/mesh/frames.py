@@ -69,17 +69,6 @@ class PaceFlag(IntFlag):
     """The dialler asks to end the link for now; the acceptor agrees, and holds back what it would send."""
 
 
-class LaneWord(IntEnum):
-    """What the route field of a lane frame says about the link's bulk lane; see ``mesh.lane_demand``."""
-
-    WANT = 1
-    """Acceptor: dial it."""
-    LEAVE = 2
-    """Dialler: it is not used here; end its connection, or answer KEEP."""
-    KEEP = 3
-    """Acceptor: it is used here."""
-
-
 PAYLOAD_MAX: Final[Mapping[int, int]] = MappingProxyType(
     {
         FrameKind.HELLO: limits.HELLO_PAYLOAD_MAX,

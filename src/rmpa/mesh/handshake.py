@@ -49,11 +49,9 @@ class Feature(IntFlag):
     """It takes a bye that says "parked": the link may be ended for now, by agreement."""
     SWIM = 4
     """It answers the probes of failure detectors."""
-    LANES = 8
-    """It takes lane frames: the bulk lane is dialled when it is first wanted, and ends when it is not used."""
 
 
-FEATURES: Final = Feature.PACE | Feature.PARK | Feature.SWIM | Feature.LANES
+FEATURES: Final = Feature.PACE | Feature.PARK | Feature.SWIM
 """The features of this version."""
 
 

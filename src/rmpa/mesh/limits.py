@@ -114,9 +114,6 @@ STALE_HOLD: Final = 0.03
 """How long a stale message waits for a newer one; if none arrives, it is delivered after this time."""
 BULK_LEASE: Final = 4.0
 """A bulk lane on which no byte arrived for this long is dead; a dead peer shows much sooner by the express lane."""
-BULK_UNUSED: Final = 30.0
-"""A bulk lane ends when neither side has sent data on it for this long; the next message that wants it waits for two
-round trips, and two more in a secured mesh."""
 BULK_UNSENT_BYTES: Final = 16 * KIB
 """Unsent bytes of the bulk lane that the kernel may hold (TCP_NOTSENT_LOWAT). Together with SO_PRIORITY it holds the
 p99 latency of commands during image transfers at 0.4 ms instead of 79 ms on 100 Mbit/s."""

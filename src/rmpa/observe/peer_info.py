@@ -19,7 +19,7 @@ class LaneInfo(msgspec.Struct, kw_only=True, frozen=True):
     Attributes:
         name: ``express`` (control and small messages) or ``bulk`` (large ones).
         connected: Whether it has its TCP connection; messages for a lane without one wait.
-        unneeded: Whether it has none because nothing was sent on it for a while; the next message dials it.
+        unneeded: Whether it has none because nothing was sent on it yet; the first message dials it.
         bytes_in: Bytes that its present connection has received.
         bytes_out: Bytes that its present connection has sent.
         queued: Bytes that wait in its send queue.

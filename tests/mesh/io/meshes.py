@@ -124,7 +124,7 @@ class Peer:
         if not self.linked(*others):
             return False
         for other in others:
-            self.link(other).want_bulk()
+            self.link(other).bulk._on_wanted()
         return all(self.link(other).bulk_connection is not None for other in others)
 
     def kill(self) -> None:

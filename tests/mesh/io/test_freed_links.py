@@ -37,7 +37,7 @@ def references(one: Peer, other: Peer) -> list[weakref.ref[PeerLink] | weakref.r
 async def test_an_ended_link_is_gone_with_what_waited(way: str) -> None:
     async with peers(2) as (one, other):
         await until(lambda: one.linked(other) and other.linked(one), "a link")
-        one.link(other).want_bulk()
+        one.link(other).bulk._on_wanted()
         await until(lambda: one.link(other).bulk_connection is not None, "a bulk lane")
         await until(lambda: other.link(one).bulk_connection is not None, "a bulk lane")
         links = [*references(one, other), *references(other, one)]

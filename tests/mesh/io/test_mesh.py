@@ -151,7 +151,7 @@ async def test_link_that_ends_during_a_bulk_dial_leaks_no_socket(
         monkeypatch.setattr(one.mesh, "_open", note)
         one.mesh.peer_found(other.identity)
         await until(lambda: one.linked(other), "a link")
-        one.link(other).want_bulk()
+        one.link(other).bulk._on_wanted()
         await connected.wait()
         one.link(other).abort("the cable is out")
         await until(lambda: bool(one.downs), "its end")

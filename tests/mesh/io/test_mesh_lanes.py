@@ -17,7 +17,6 @@ from rmpa.core.outbox import FIRST, LAST
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, unpack_header
 from rmpa.mesh.handshake import Lane, Refusal, Refuse
-from rmpa.mesh.lane_demand import LaneAction
 from tests.mesh.io.meshes import DEADLINE, Peer, linked_pair, peers, raw, until
 
 if TYPE_CHECKING:
@@ -341,7 +340,7 @@ async def test_a_mesh_ends_while_a_bulk_lane_is_being_dialled() -> None:
         hold_bulk(one, until_set=asyncio.Event())
         one.mesh.peer_found(other.identity)
         await until(lambda: one.linked(other), "a link")
-        one.link(other).want_bulk()
+        one.link(other).bulk._on_wanted()
         await until(lambda: bool(one.mesh._bulk_lanes._dials), "a link, and the dial")
 
 
@@ -526,71 +525,41 @@ async def test_acknowledgements_overtake_data() -> None:
 # --- a lane on demand ---------------------------------------------------------------------------------------------
 
 
-async def test_at_rest_each_link_has_one_socket(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "BULK_UNUSED", 0.5)
+async def test_a_link_without_large_messages_has_one_socket() -> None:
     async with peers(4) as made:
         others = {p.number: [o for o in made if o is not p] for p in made}
         await until(lambda: all(p.linked(*others[p.number]) for p in made), "links everywhere")
         await until(lambda: all(c.up for p in made for c in p.mesh.connections()), "no connection in a handshake")
         assert [len(p.mesh.connections()) for p in made] == [3] * 4, "nothing was sent: no bulk lane"
-        await until(lambda: all(p.both_lanes(*others[p.number]) for p in made), "both lanes everywhere")
-        await until(lambda: [len(p.mesh.connections()) for p in made] == [3] * 4, "the lanes have left")
-        assert not any(p.lanes_lost for p in made), "nothing can have been lost"
 
 
 @pytest.mark.parametrize("dialler", [True, False])
-async def test_first_message_for_the_lane_dials_it_from_either_side_and_again_after_it_left(
-    monkeypatch: pytest.MonkeyPatch, *, dialler: bool
-) -> None:
-    monkeypatch.setattr(limits, "BULK_UNUSED", 0.5)
+async def test_first_message_for_the_lane_dials_it_from_either_side(*, dialler: bool) -> None:
     async with peers(2) as made:
         one, other = sorted(made, key=lambda peer: peer.identity.guid, reverse=not dialler)
         await until(lambda: one.linked(other) and other.linked(one), "a link")
         link = one.link(other)
-        sent = []
-        for turn in range(2):
-            assert link.bulk_connection is None
-            for number in range(2):
-                message = (7, 2 * turn + number, 0, large(number, 200_000))
-                link.bulk.send(*message)
-                sent.append(message)
-            await until(lambda: len(other.data) == len(sent), "they come over the new lane")
-            assert bulk_of(link).dialled is dialler
-            await until(lambda: not link.bulk.connected and not other.link(one).bulk.connected, "it leaves")
-            await until(lambda: link.bulk_connection is None, "it has left")
+        assert link.bulk_connection is None
+        sent = [(7, number, 0, large(number, 200_000)) for number in range(2)]
+        for message in sent:
+            link.bulk.send(*message)
+        await until(lambda: len(other.data) == len(sent), "they come over the new lane")
+        assert bulk_of(link).dialled is dialler
         assert other.data == sent
         assert not one.lanes_lost
         assert not other.lanes_lost
 
 
-async def test_a_lane_in_use_by_either_side_does_not_leave(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "BULK_UNUSED", 0.5)
-    monkeypatch.setattr(limits, "BULK_LEASE", 0.8)
-    async with linked_pair() as (one, other):
-        old = bulk_of(other.link(one))
-        asked: list[int] = []
-        real = other.mesh.connection_lane
-
-        def note(connection: Connection, word: int) -> None:
-            asked.append(word)
-            real(connection, word)
-
-        monkeypatch.setattr(other.mesh, "connection_lane", note)
-        number = 0
-        while len(asked) < 3:
-            number += 1
-            other.link(one).bulk.send(7, number, 0, b"x")
-            await asyncio.sleep(0.02)
-        assert other.link(one).bulk_connection is old
-        await until(lambda: len(one.data) == number, "all came")
-        assert not one.lanes_lost
-
-
-async def test_the_lane_of_an_earlier_release_is_dialled_with_the_link(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rmpa.mesh.handshake.FEATURES", 0)
-    monkeypatch.setattr(limits, "BULK_UNUSED", 0.2)
+async def test_a_wish_for_the_lane_before_the_link_is_used_is_kept() -> None:
     async with peers(2) as made:
         one, other = sorted(made, key=lambda peer: peer.identity.guid)
-        await until(lambda: one.linked(other) and one.link(other).bulk_connection is not None, "both lanes")
-        lane = one.link(other).lane_demand
-        assert lane.check(1e9, used=False) is LaneAction.NOTHING
+        await until(lambda: one.linked(other) and other.linked(one), "a link")
+        link = one.link(other)
+        handlers = one.mesh.handlers
+        link.use(None)
+        other.link(one).bulk.send(7, 1, 0, b"x")
+        await until(lambda: link.bulk_wanted, "asked")
+        assert not one.mesh._bulk_lanes._dials
+        link.use(handlers)
+        one.mesh._bulk_lanes.link_up(link)
+        await until(lambda: len(one.data) == 1, "it comes")

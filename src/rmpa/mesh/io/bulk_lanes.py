@@ -1,40 +1,34 @@
-"""The bulk lanes of all links: each is dialled when it is first wanted, and ended when it is not used."""
+"""The bulk lanes of all links: each is dialled when a message first wants it, and ends with its link.
+
+Only the side that dialled the link dials its bulk lane; the other side asks for it by a lane frame.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from rmpa.core.backoff import Backoff
 from rmpa.mesh import limits
-from rmpa.mesh.frames import FrameKind, LaneWord
-from rmpa.mesh.lane_demand import LaneAction
+from rmpa.mesh.frames import FrameKind
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
 
-    from rmpa.core.clock import Clock
     from rmpa.core.counters import Counters
     from rmpa.mesh.io.connection import Connection
     from rmpa.mesh.io.link import PeerLink
 
 _log = logging.getLogger(__name__)
 
-_WORDS: Final = {
-    LaneAction.SAY_WANT: LaneWord.WANT,
-    LaneAction.SAY_LEAVE: LaneWord.LEAVE,
-    LaneAction.SAY_KEEP: LaneWord.KEEP,
-}
-
 
 class BulkLanes:
-    """Carries out what the links' machines decide; see ``mesh.lane_demand``.
+    """Dials the bulk lanes, again for as long as their links stand.
 
     Args:
         connect: Connects to the peer of a link, and begins the handshake; raises ``OSError``.
         start: Runs a coroutine as a task.
-        clock: The time.
         rng: Uniform numbers in [0, 1), for jitter.
         counters: Where failures are counted.
     """
@@ -44,13 +38,11 @@ class BulkLanes:
         connect: Callable[[PeerLink], Coroutine[object, object, None]],
         start: Callable[[Coroutine[object, object, None], str], asyncio.Task[None]],
         *,
-        clock: Clock,
         rng: Callable[[], float],
         counters: Counters,
     ) -> None:
         self._connect = connect
         self._start = start
-        self._clock = clock
         self._rng = rng
         self._counters = counters
         self._dials: dict[int, asyncio.Task[None]] = {}
@@ -66,24 +58,23 @@ class BulkLanes:
         return tasks
 
     def link_up(self, link: PeerLink) -> None:
-        """A link is used with its peer."""
-        self._act(link, link.lane_demand.begin())
+        """A link is used with its peer, which may have asked for the lane before."""
+        if link.dialled and link.bulk_wanted:
+            self._dial(link)
 
     def link_ended(self, link_id: int) -> None:
         """A link is gone."""
         self._backoffs.pop(link_id, None)
 
     def want(self, link: PeerLink) -> None:
-        """A message waits for the bulk lane of a link."""
-        self._act(link, link.lane_demand.want())
-
-    def said(self, link: PeerLink, word: int) -> None:
-        """Take a word of a peer about the bulk lane."""
-        self._act(link, link.lane_demand.said(word, self._clock.now(), used=link.bulk_used()))
-
-    def tick(self, link: PeerLink) -> None:
-        """Look whether the lane is used; called about once in a keepalive interval of its connection."""
-        self._act(link, link.lane_demand.check(self._clock.now(), used=link.bulk_used()))
+        """A message waits for the bulk lane of a link, here or at the peer that asks for it."""
+        if link.bulk_wanted:
+            return
+        link.bulk_wanted = True
+        if link.dialled:
+            self._dial(link)
+        else:
+            link.mark(FrameKind.LANE, 0, 0)
 
     def opened(self, link: PeerLink, bulk: Connection) -> None:
         """A handshake of the lane succeeded."""
@@ -93,33 +84,18 @@ class BulkLanes:
 
     def ended(self, link: PeerLink, bulk: Connection, reason: str, *, expected: bool) -> None:
         """A connection ended; ``expected`` says that it was dialled for this link, and its handshake was not done."""
-        ours = link.bulk_connection is bulk
-        if not ours and not (link.used and expected):
+        if link.bulk_connection is bulk:
+            link.detach(bulk)
+        elif not (link.used and expected):
             return
-        action, lost = link.lane_demand.down(orderly=bulk.orderly, waiting=link.bulk.outbox.waiting_entries > 0)
-        if ours:
-            link.detach(bulk, lost=lost)
-        if link.used and lost:
+        if link.used:
             self._counters.add("link.bulk_lost")
             _log.info("= %s: the bulk lane is gone (%s); small messages go on", link.name, reason)
-        self._act(link, action, self._backoff(link).delay() if lost else 0.0)
+            if link.dialled:
+                self._dial(link, self._backoff(link).delay())
 
-    def _act(self, link: PeerLink, action: LaneAction, delay: float = 0.0) -> None:
-        if action is LaneAction.NOTHING or self._closed:
-            return
-        if action is LaneAction.DIAL:
-            self._dial(link, delay)
-        elif action is LaneAction.SAY_LEAVE:
-            link.pause_bulk()
-        elif action is LaneAction.RESUME:
-            link.resume_bulk()
-        elif action is LaneAction.CLOSE:
-            link.end_bulk("the bulk lane is not used")
-        if (word := _WORDS.get(action)) is not None:
-            link.mark(FrameKind.LANE, word, 0)
-
-    def _dial(self, link: PeerLink, delay: float) -> None:
-        if link.used and link.bulk_connection is None and link.id not in self._dials:
+    def _dial(self, link: PeerLink, delay: float = 0.0) -> None:
+        if not self._closed and link.used and link.bulk_connection is None and link.id not in self._dials:
             self._dials[link.id] = task = self._start(self._connected(link, delay), f"bulk {link.name}")
             task.add_done_callback(lambda _: self._dials.pop(link.id, None))
 

@@ -27,7 +27,7 @@ from rmpa.mesh.connection_events import (
     Refused,
 )
 from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.handshake import Feature, Lane
+from rmpa.mesh.handshake import Lane
 from rmpa.mesh.io.securing import tls_failure
 from rmpa.runtime.machine_timer import MachineTimer
 from rmpa.runtime.stream import Stream
@@ -80,8 +80,8 @@ class ConnectionOwner(Protocol):
         """A control frame came."""
         ...
 
-    def connection_lane(self, connection: Connection, word: int) -> None:
-        """A lane frame came; ``word`` is a ``LaneWord``, or a number of a later version."""
+    def connection_lane(self, connection: Connection) -> None:
+        """A lane frame came: the remote side wants the bulk lane."""
         ...
 
     def connection_ponged(self, connection: Connection) -> None:
@@ -158,8 +158,6 @@ class Connection:
         """Whether the remote side broke the protocol."""
         self.silent = False
         """Once ended: whether it ended by silence (lease expired, no route, reset) rather than by a bye."""
-        self.orderly = False
-        """Once ended: whether one side ended it by a frame (bye, refuse)."""
         self.held: list[bytes] = []
         """Payloads of control frames that were not sent, because this side has agreed to park the link."""
         self._owner = owner
@@ -171,8 +169,6 @@ class Connection:
         self._ended = False
         self._finishing = False
         self._on_mark: OnMark = _ignore_mark
-        self._own_bytes = 0
-        """Bytes of the machine's own frames that were sent."""
         self.stream = Stream(
             sock,
             on_bytes=self._receive,
@@ -329,15 +325,6 @@ class Connection:
         finally:
             self._pings.pop(stamp, None)
 
-    def knows(self, feature: Feature) -> bool:
-        """Whether the remote side knows what was added after the first release; only once its hello has come."""
-        return self._machine.remote is not None and bool(self._machine.remote.features & feature)
-
-    @property
-    def data_out(self) -> int:
-        """Bytes that the kernel took, without keepalives and the like."""
-        return self.stream.bytes_out - self._own_bytes
-
     def expel(self, refuse: Refuse) -> None:
         """Close a connection that is up because its peer was revoked, and say so; as ``close`` otherwise."""
         self._machine.expel(refuse, self._clock.now())
@@ -400,12 +387,11 @@ class Connection:
         elif isinstance(event, PartingEnded):
             self._send_held()
         elif isinstance(event, ConnectionClosed):
-            self.orderly = event.orderly
             self._finish(event.reason)
 
     def _marked(self, event: MarkReceived) -> None:
         if event.kind is FrameKind.LANE:
-            self._owner.connection_lane(self, event.route)
+            self._owner.connection_lane(self)
         else:
             self._on_mark(event.kind, event.route, event.sequence)
 
@@ -423,9 +409,7 @@ class Connection:
     def _send_output(self) -> None:
         """Send the machine's output; a closing connection then waits for the remote end to close, or its time-out."""
         if self._machine.has_output:
-            output = self._machine.take_output()
-            self._own_bytes += len(output)
-            self.stream.send((output,), URGENT)
+            self.stream.send((self._machine.take_output(),), URGENT)
             self._check_urgent()
         if self._machine.state is ConnectionState.CLOSING and not self._finishing:
             # After a close at once, further bytes of the remote side would cause a reset, which overtakes the bye.

@@ -50,12 +50,6 @@ class LaneSender:
         self._stream = stream
         stream.adopt(self.outbox, pack_fragment_header)
 
-    def pause(self) -> None:
-        """Send nothing on the present connection, which stays, and on which nothing is half sent."""
-        if self._stream is not None:
-            self._stream.adopt(Outbox(1, limits.CONNECTION_URGENT_BYTES), None)
-        self._stream = None
-
     def disconnect(self) -> int:
         """Handle the end of the connection; return how many messages were cut off, without those in the kernel."""
         self._stream = None

@@ -9,10 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.mesh import limits
 from rmpa.mesh.frames import FrameKind
-from rmpa.mesh.handshake import Feature
 from rmpa.mesh.io.lane import LaneSender
-from rmpa.mesh.io.sockets import unacknowledged
-from rmpa.mesh.lane_demand import LaneDemand
 
 if TYPE_CHECKING:
     from rmpa.core.clock import Clock
@@ -21,10 +18,6 @@ if TYPE_CHECKING:
 OnLinkData = Callable[["PeerLink", int, int, int, memoryview], None]
 OnLinkPart = Callable[["PeerLink", int, int, int, int, memoryview], None]
 OnLinkMark = Callable[["PeerLink", FrameKind, int, int], None]
-
-
-_KEEPALIVE_BYTES: Final = 256
-"""At most so many bytes on the way may be keepalives, encrypted ones too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,8 +67,8 @@ class PeerLink:
         """The connection of the bulk lane, while there is one."""
         self.express: Final = LaneSender("express")
         self.bulk: Final = LaneSender("bulk", lambda: on_bulk_wanted(self))
-        self.lane_demand: Final = LaneDemand(dialled=connection.dialled, agreed=connection.knows(Feature.LANES))
-        """Decides whether the bulk lane has a connection."""
+        self.bulk_wanted = False
+        """Whether a message of either side has wanted the bulk lane."""
         self.silent = False
         """Once the link is down: whether it ended without a bye, so that the peer may soon be linked again."""
         self.crashed = False
@@ -87,10 +80,8 @@ class PeerLink:
         self.touched_at = clock.now()
         """Monotonic seconds of the last control frame in either direction."""
         self._clock = clock
-        self._on_bulk_wanted = on_bulk_wanted
         self._needed = True
         self._handlers: LinkHandlers | None = None
-        self._bulk_data_out = 0
         self._bulk_bytes_in = self._bulk_bytes_out = 0  # of the bulk lane's earlier connections
         self.express.connect(connection.stream)
 
@@ -247,50 +238,19 @@ class PeerLink:
             self.detach(old)
             old.sever("replaced by a newer bulk lane")
         self.bulk_connection = bulk
-        self._bulk_data_out = 0
-        self.lane_demand.up(self._clock.now())
+        self.bulk_wanted = True
         bulk.need(needed=self._needed)
         self._receive_from(bulk)
         self.bulk.connect(bulk.stream)
 
-    def want_bulk(self) -> None:
-        """Let the bulk lane be dialled, although no message waits for it yet."""
-        self._on_bulk_wanted(self)
-
-    def bulk_used(self) -> bool:
-        """Whether data was sent on the bulk lane since the last call, or waits, or is not acknowledged yet."""
-        bulk = self.bulk_connection
-        if bulk is None:
-            return False
-        before, self._bulk_data_out = self._bulk_data_out, bulk.data_out
-        sent = before != self._bulk_data_out
-        return sent or self.bulk.outbox.pending_bytes > 0 or unacknowledged(bulk.sock) > _KEEPALIVE_BYTES
-
-    def pause_bulk(self) -> None:
-        """Send nothing on the bulk lane's connection, which stays; messages wait."""
-        self.bulk.pause()
-
-    def resume_bulk(self) -> None:
-        """Send on the bulk lane's connection again."""
-        if self.bulk_connection is not None:
-            self.bulk.connect(self.bulk_connection.stream)
-
-    def end_bulk(self, reason: str) -> None:
-        """End the bulk lane's connection, on which nothing is on the way."""
-        bulk = self.bulk_connection
-        if bulk is not None:
-            self.bulk.pause()
-            self.detach(bulk, lost=False)
-            bulk.close(reason)
-
-    def detach(self, bulk: Connection, *, lost: bool = True) -> None:
-        """Take the connection from the bulk lane; ``lost``: messages on the way may be lost."""
+    def detach(self, bulk: Connection) -> None:
+        """Take the connection from the bulk lane; messages on the way may be lost."""
         self.bulk_connection = None
         self._bulk_bytes_in += bulk.stream.bytes_in
         self._bulk_bytes_out += bulk.stream.bytes_out
         bulk.deliver_to(None, None, None)
         self.bulk.disconnect()
-        if lost and self._handlers is not None:
+        if self._handlers is not None:
             self._handlers.lane_lost(self)
 
     def end_lanes(self, reason: str) -> None:

@@ -145,9 +145,7 @@ class Mesh:
                 pause=self._acceptor.pause,
             )
             security.on_denied.append(self._denied)
-        self._bulk_lanes = BulkLanes(
-            self._connect_bulk, self._start, clock=self._clock, rng=rng, counters=self.counters
-        )
+        self._bulk_lanes = BulkLanes(self._connect_bulk, self._start, rng=rng, counters=self.counters)
         self._rest_pace = RestPace()
         self._ids = count(1)
         self._acting = False
@@ -309,10 +307,10 @@ class Mesh:
             link.touch()
             self._on_control(link, payload)
 
-    def connection_lane(self, connection: Connection, word: int) -> None:
-        """The peer says something about the bulk lane."""
+    def connection_lane(self, connection: Connection) -> None:
+        """The peer wants the bulk lane."""
         if (link := self._links.get(connection.id)) is not None:
-            self._bulk_lanes.said(link, word)
+            self._bulk_lanes.want(link)
 
     def connection_ponged(self, connection: Connection) -> None:
         """The remote clock is known better."""
@@ -326,13 +324,9 @@ class Mesh:
             self._redials.begin(link)
 
     def connection_tick(self, connection: Connection) -> None:
-        """Check whether a bulk lane is used, and how much it has on the way."""
+        """Check how much a bulk lane has on the way."""
         if connection.lane == Lane.BULK:
             bound_queue(connection.sock)
-            for each in self._links.values():
-                if each.bulk_connection is connection:
-                    self._bulk_lanes.tick(each)
-                    return
 
     def connection_parted(self, connection: Connection) -> None:
         """Both sides ended a connection for now; it is not waited for its socket, since nothing more comes."""

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Final, Protocol
 import msgspec
 
 from rmpa.bridge.session.peer_session import PeerState
-from rmpa.mesh.lane_demand import LaneState
 from rmpa.observe.io.direct_section import direct_counts
 from rmpa.observe.peer_info import FOREIGN, BoundInfo, LaneInfo, LinkInfo, PeerInfo, ProbesInfo
 from rmpa.observe.shared_address import mark_shared_addresses
@@ -180,7 +179,7 @@ class PeersSection:
                 _lane(link.express, link.connection.stream),
                 msgspec.structs.replace(
                     _lane(link.bulk, link.bulk_connection.stream if link.bulk_connection is not None else None),
-                    unneeded=link.lane_demand.state is LaneState.ABSENT,
+                    unneeded=not link.bulk_wanted,
                 ),
             ),
         )
