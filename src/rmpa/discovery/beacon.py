@@ -31,12 +31,8 @@ Address = tuple[str, int]
 MAGIC: Final = b"RMPA"
 VERSION: Final = 1
 
-KIND_AT: Final = 5
-"""Where the kind stands in a beacon of any version."""
 RUN_AT: Final = (16, 32)
 """Where the instance id stands in a beacon of any version 1: begin and end."""
-SEQUENCE_AT: Final = (36, 40)
-"""Where the number stands, which is all that differs in the heartbeats of a peer at rest: begin and end."""
 _PREFIX: Final = struct.Struct(">4sBBH")
 _FIXED: Final = struct.Struct(">4sBBHQ16sIIB")
 _GUID: Final = struct.Struct(">Q")
@@ -176,20 +172,6 @@ class Beacon:
             )
         except ValueError as error:
             raise BeaconMalformed(str(error)) from error
-
-    def renumbered(self, sequence: int) -> Beacon:
-        """The same beacon with another number of 32 bits; what was checked is not checked again."""
-        made = object.__new__(Beacon)
-        for name, value in (
-            ("kind", self.kind),
-            ("identity", self.identity),
-            ("lease_ms", self.lease_ms),
-            ("sequence", sequence),
-            ("gossip", self.gossip),
-            ("observed", self.observed),
-        ):
-            object.__setattr__(made, name, value)
-        return made
 
     def serialize(self, *, extended: bool = False) -> bytes:
         """The packet; never longer than ``limits.BEACON_MAX_BYTES``.

@@ -70,14 +70,6 @@ HEARTBEAT_LATE: Final = 6.0
 the dead one."""
 MULTICAST_SILENCE: Final = 11.0
 """A peer not heard by multicast for this long (two heartbeats and a second) gets its heartbeats by unicast."""
-HEARTBEATS_READ_INTERVAL: Final = 1.0
-"""Time between two looks for heartbeats by multicast where these do not wake the agent. What must be noticed
-after a missed heartbeat has a second more than a heartbeat takes."""
-HEARTBEATS_READ_MEMBERS: Final = 8
-"""Members from which on heartbeats are read so: they come more often than once a second then."""
-HEARTBEATS_READ_SETTLED: Final = 10.0
-"""Seconds without any change of the members after which heartbeats are read so: while modules come and go, their
-gossip must not wait."""
 LEASE_MIN: Final = 2.0
 """The shortest lease: with a shorter one a peer would come and go with every lost packet."""
 LEASE_MAX: Final = 120.0

@@ -14,7 +14,6 @@ from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon
 from rmpa.discovery.events import PeerConflict, SendMulticast
 from rmpa.discovery.io import sockets
-from rmpa.discovery.io.deferred_reader import DeferredReader
 from rmpa.discovery.io.interfaces import (
     Interface,
     InterfaceWatcher,
@@ -23,7 +22,6 @@ from rmpa.discovery.io.interfaces import (
     list_interfaces,
     unknown_names,
 )
-from rmpa.discovery.io.kernel_filter import PacketSelection
 from rmpa.discovery.io.packet_filter import PacketFilter, Recognised
 from rmpa.discovery.io.seeds import SeedResolver, resolve_ipv4
 from rmpa.discovery.member_watch import MemberWatch
@@ -116,8 +114,6 @@ class Discovery:
         self._interfaces: tuple[Interface, ...] = ()
         self._receivers: list[socket.socket] = []
         self._joined: sockets.GroupMembership | None = None
-        self._heartbeats: DeferredReader | None = None
-        self._changed_at = self._clock.now()
         self._warned: set[str] = set()
         self._timer = MachineTimer(self._next_timer, self._timer_due, now=self._clock.now)
         self._started = False
@@ -154,9 +150,6 @@ class Discovery:
         self._flush()
         loop = asyncio.get_running_loop()
         loop.remove_reader(self._udp.fileno())
-        if self._heartbeats is not None:
-            self._heartbeats.close()
-            self._heartbeats = None
         for sock in self._receivers:
             loop.remove_reader(sock.fileno())
             sock.close()
@@ -174,7 +167,6 @@ class Discovery:
                 (not the port of a connection that it dialled).
             answers_probes: Whether its handshake says that it has a failure detector.
         """
-        self._read_heartbeats()
         now = self._clock.now()
         self._membership.link_up(identity, now, endpoint)
         self._watch.link_up(identity, now, answers_probes=answers_probes)
@@ -182,7 +174,6 @@ class Discovery:
 
     def link_down(self, guid: Guid, instance: bytes | None = None) -> None:
         """The link to this peer (to this run of it, if ``instance`` is given) fell."""
-        self._read_heartbeats()
         self._watch.link_down(guid, instance)
         self._membership.link_down(guid, self._clock.now(), instance)
         self._flush()
@@ -241,36 +232,14 @@ class Discovery:
         self._receiver(_ALL_NETWORKS, multicast=False, lost="seeds of others must name our port")
 
     def _open_group(self) -> None:
-        """Receive multicasts: heartbeats by a socket of their own where the kernel can tell them from the others."""
-        try:
-            heartbeats = sockets.open_receiver(*self._group, PacketSelection.HEARTBEATS)
-        except OSError as error:  # no filters, or no port: then ``_receiver`` says so
-            _log.debug("= heartbeats come by the same socket as other beacons: %s", error)
-            heartbeats = None
-        sock = self._receiver(
-            self._group[0],
-            multicast=True,
-            lost="no multicast is heard; use --seed",
-            selection=PacketSelection.OTHERS if heartbeats is not None else None,
-        )
-        if sock is None:
-            if heartbeats is not None:
-                heartbeats.close()
-            return
-        group = [sock]
-        if heartbeats is not None:
-            group.append(heartbeats)
-            self._receivers.append(heartbeats)
-            take = partial(self._take_heartbeats, heartbeats)
-            self._heartbeats = DeferredReader(heartbeats, take, self._heartbeats_may_wait)
-        self._joined = sockets.GroupMembership(group, self._group[0])
+        sock = self._receiver(self._group[0], multicast=True, lost="no multicast is heard; use --seed")
+        if sock is not None:
+            self._joined = sockets.GroupMembership(sock, self._group[0])
 
-    def _receiver(
-        self, host: str, *, multicast: bool, lost: str, selection: PacketSelection | None = None
-    ) -> socket.socket | None:
+    def _receiver(self, host: str, *, multicast: bool, lost: str) -> socket.socket | None:
         port = self._group[1]
         try:
-            sock = sockets.open_receiver(host, port, selection)
+            sock = sockets.open_receiver(host, port)
         except OSError as error:
             self._warn(
                 f"cannot listen at {host or '*'}:{port} ({error.strerror}): {lost}, or choose another --multicast"
@@ -281,25 +250,20 @@ class Discovery:
         return sock
 
     def _readable(self, sock: socket.socket, *, multicast: bool) -> None:
-        self._read_heartbeats()
         self._take(sock, multicast=multicast)
         if self._filter.overrun:
             self._pause(sock, multicast=multicast)
         self._flush()
 
-    def _take(self, sock: socket.socket, *, multicast: bool) -> bool:
-        """Handle a bounded number of packets, with pending data between them: a flood must not delay data.
-
-        Returns:
-            Whether there may be more.
-        """
+    def _take(self, sock: socket.socket, *, multicast: bool) -> None:
+        """Handle a bounded number of packets, with pending data between them: a flood must not delay data."""
         now = self._clock.now()
         for _ in range(limits.BEACONS_PER_WAKE):
             yield_to_data()
             try:
                 data, source, index = sockets.receive(sock)
             except (BlockingIOError, InterruptedError):
-                return False
+                return
             except OSError as error:  # an ICMP error that some earlier packet of ours caused
                 _log.debug("< %s", error)
                 continue
@@ -313,32 +277,7 @@ class Discovery:
                 else:
                     self._detector.receive(packet, source, now)
             elif self._filter.overrun:
-                return False
-        return True
-
-    def _read_heartbeats(self) -> None:
-        """Handle the heartbeats that wait, before anything that came after them."""
-        if self._heartbeats is not None:
-            self._heartbeats.read()
-
-    def _take_heartbeats(self, sock: socket.socket) -> bool:
-        more = self._take(sock, multicast=True)
-        if self._filter.overrun and self._heartbeats is not None:
-            self.counters.add("beacon.paused")
-            self._filter.overrun = False
-            self._heartbeats.pause(limits.BEACONS_UNPROVED_PAUSE)
-        self._flush()
-        return more
-
-    def _heartbeats_may_wait(self) -> bool:
-        """Whether heartbeats bring nothing new: the same members have been there for a while, and they are many."""
-        many = self._membership.members >= limits.HEARTBEATS_READ_MEMBERS
-        return many and self._clock.now() - self._changed_at >= limits.HEARTBEATS_READ_SETTLED
-
-    def _members_changed(self) -> None:
-        self._changed_at = self._clock.now()
-        if self._heartbeats is not None:
-            self._heartbeats.hurry()
+                return
 
     def _pause(self, sock: socket.socket, *, multicast: bool) -> None:
         """Leave what comes to the kernel's buffer for a while: a flood of forged packets must not take the core."""
@@ -424,8 +363,6 @@ class Discovery:
                     yield_to_data()
                     self._on_member(one)
                 events = self._membership.events()
-                if events:
-                    self._members_changed()
                 for event in events:
                     yield_to_data()
                     self._watch.membership_changed(event, self._clock.now())
@@ -475,7 +412,6 @@ class Discovery:
         return earliest(self._membership.next_timer(), self._detector.next_timer())
 
     def _timer_due(self, now: float) -> None:
-        self._read_heartbeats()
         self._membership.handle_timer(now)
         self._detector.handle_timer(now)
         self._flush()

@@ -13,11 +13,10 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import RUN_AT, Beacon, BeaconOtherDomain, BeaconOtherVersion, sender_of
-from rmpa.discovery.parsed_heartbeats import ParsedHeartbeats
 from rmpa.discovery.strangers import Strangers
 from rmpa.discovery.swim.packets import SwimPacket, is_swim
 from rmpa.trust.keyring import KeyPurpose
-from rmpa.trust.packets import TRAILER_BYTES, Verdict
+from rmpa.trust.packets import Verdict
 from rmpa.trust.reasons import TrustReason, not_of_this_mesh
 
 if TYPE_CHECKING:
@@ -87,7 +86,6 @@ class PacketFilter:
         self.overrun = False
         """Whether packets without a valid proof come faster than they can be looked at: pause the reading."""
         self._refusals = RefusalLog(_log, counters)
-        self._heartbeats = ParsedHeartbeats(0 if trust is None else TRAILER_BYTES)
         self._recent: OrderedDict[bytes, None] = OrderedDict()
         self._sources: OrderedDict[str, tuple[float, int]] = OrderedDict()
 
@@ -119,10 +117,6 @@ class PacketFilter:
             return None
         if self._trust is None and not self._is_new(data):
             return None
-        beacon = self._heartbeats.find(data)
-        if beacon is not None and self._is_verified(beacon.identity.guid, beacon.identity.instance):
-            self._counters.add("beacon.in")
-            return beacon
         return self._read(data, host, now, multicast=multicast, interface=interface)
 
     def _read(
@@ -148,8 +142,6 @@ class PacketFilter:
             self._refusals.refuse(now, f"{name}.malformed", host, f"from {host}: {error}; is another program there?")
         else:
             self._counters.add(f"{name}.in")
-            if verified and isinstance(packet, Beacon):
-                self._heartbeats.keep(data, packet)
             return packet
         return None
 

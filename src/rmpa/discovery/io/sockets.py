@@ -9,15 +9,13 @@ import struct
 from typing import TYPE_CHECKING, Final
 
 from rmpa.discovery import limits
-from rmpa.discovery.io import kernel_filter
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable
 
     from rmpa.core.counters import Counters
     from rmpa.discovery.beacon import Address
     from rmpa.discovery.io.interfaces import Interface
-    from rmpa.discovery.io.kernel_filter import PacketSelection
 
 _log = logging.getLogger(__name__)
 
@@ -30,16 +28,15 @@ _IP_MULTICAST_ALL: Final = 49
 _SO_RCVBUFFORCE: Final = 33
 
 
-def open_receiver(host: str, port: int, selection: PacketSelection | None = None) -> socket.socket:
+def open_receiver(host: str, port: int) -> socket.socket:
     """Open a socket that several agents of one machine may bind at once, and that receives only from joined groups.
 
     Args:
         host: The group, to receive its multicasts; an empty string: unicasts to this port.
         port: The domain's discovery port.
-        selection: The packets that it receives; ``None``: all.
 
     Raises:
-        OSError: Another program has bound the port without SO_REUSEADDR, or the kernel cannot select packets.
+        OSError: Another program has bound the port without SO_REUSEADDR.
     """
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
     try:
@@ -48,8 +45,6 @@ def open_receiver(host: str, port: int, selection: PacketSelection | None = None
         enlarge_buffer(sock)
         # Without this, Linux also delivers the multicasts of groups that other programs of this machine joined.
         sock.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
-        if selection is not None:
-            kernel_filter.select(sock, selection)
         sock.bind((host, port))
     except OSError:
         sock.close()
@@ -86,15 +81,15 @@ def receive(sock: socket.socket) -> tuple[bytes, Address, int]:
 
 
 class GroupMembership:
-    """The interfaces on which receiving sockets have joined the group.
+    """The interfaces on which a receiving socket has joined the group.
 
     Args:
-        sockets: From ``open_receiver``.
+        sock: From ``open_receiver``.
         group: The group's address.
     """
 
-    def __init__(self, sockets: Sequence[socket.socket], group: str) -> None:
-        self._sockets = sockets
+    def __init__(self, sock: socket.socket, group: str) -> None:
+        self._sock = sock
         self._group = socket.inet_aton(group)
         self._joined: set[int] = set()
 
@@ -119,16 +114,7 @@ class GroupMembership:
         return refused
 
     def _change(self, option: int, index: int) -> None:
-        """Join or leave with every socket; the error of the first that cannot is raised when all were asked."""
-        refused = None
-        for sock in self._sockets:
-            try:
-                sock.setsockopt(socket.IPPROTO_IP, option, _MREQN.pack(self._group, _ANY, index))
-            except OSError as error:
-                if refused is None or refused.errno == errno.EADDRINUSE:
-                    refused = error
-        if refused is not None:
-            raise refused
+        self._sock.setsockopt(socket.IPPROTO_IP, option, _MREQN.pack(self._group, _ANY, index))
 
 
 class Sender:

@@ -51,7 +51,7 @@ def hear(interfaces: Iterable[Interface], group: str, port: int, listen: float =
     found: dict[str, MulticastEcho] = {}
     with receiver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sender:
         sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, discovery_limits.MULTICAST_TTL)
-        refused = GroupMembership([receiver], group).update(wanted.values())
+        refused = GroupMembership(receiver, group).update(wanted.values())
         sent: dict[bytes, tuple[str, float]] = {}
         for interface in wanted.values():
             token = struct.pack(">4sBBH", MAGIC, VERSION, BeaconKind.HEARTBEAT, _NO_DOMAIN) + secrets.token_bytes(16)
