@@ -40,9 +40,9 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
 
 def hashes() -> str:
     """The type hashes of actionlib's TestAction, by the ends of their names."""
-    goal, result, feedback = (MessageType(f"actionlib/Test{part}") for part in ("Goal", "Result", "Feedback"))
-    pair = ActionPair(goal, result, feedback, ActionRule("actionlib/action/Test"), Ros2Types("jazzy"))
-    return json.dumps({name.rpartition("/")[2].rpartition("_")[2]: each for name, each in pair.types.hashes.items()})
+    kinds = [MessageType(f"actionlib/Test{part}") for part in ("Goal", "Result", "Feedback")]
+    pair = ActionPair(kinds, ActionRule("actionlib/action/Test"), Ros2Types("jazzy"))
+    return json.dumps({name.rpartition("/")[2].rpartition("_")[2]: each for name, each in pair.types.values()})
 
 
 def end(hall: Hall, action: str) -> OtherEnd:

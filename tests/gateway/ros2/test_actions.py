@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from rmpa.gateway.ros2.action_messages import (
     Ros1Status,
     Ros2Status,
     cancel_request,
+    cancel_response,
     parse_outcome,
     parse_ros2_states,
     parse_states,
@@ -24,15 +26,15 @@ from rmpa.gateway.ros2.action_messages import (
     with_uuid,
 )
 from rmpa.gateway.ros2.action_pair import CANCEL_TYPE, ActionPair
-from rmpa.gateway.ros2.goals_to_ros1 import Answer, GoalsToRos1, TellServer
-from rmpa.gateway.ros2.goals_to_ros2 import AskServer, GoalsToRos2, TellClients
+from rmpa.gateway.ros2.io.offered_action import GoalsToRos1
+from rmpa.gateway.ros2.io.shown_action import GoalsToRos2
 from rmpa.gateway.ros2.mapping import ActionRule, TypeMapping
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.ros.types.messages import MessageType
 
 JAZZY = Ros2Types("jazzy")
 TEST = [MessageType(f"actionlib/Test{part}") for part in ("Goal", "Result", "Feedback")]
-PAIR = ActionPair(TEST[0], TEST[1], TEST[2], ActionRule("actionlib/action/Test"), JAZZY)
+PAIR = ActionPair(TEST, ActionRule("actionlib/action/Test"), JAZZY)
 UUID = bytes(range(16))
 STAMP = 1_700_000_000_500_000_000
 GOAL = MessageType("actionlib/TestActionGoal")
@@ -108,38 +110,102 @@ def test_fibonacci_of_the_tutorials_is_that_of_example_interfaces() -> None:
             ("Feedback", "int32[] sequence\n"),
         )
     ]
-    pair = ActionPair(kinds[0], kinds[1], kinds[2], rule, JAZZY)
+    pair = ActionPair(kinds, rule, JAZZY)
     result = kinds[1].serialize(kinds[1].make({"sequence": [0, 1, 1]}))
     made = pair.result_to_ros2(Ros2Status.SUCCEEDED, result)
     response = read("example_interfaces/action/Fibonacci_GetResult_Response", made)
     assert (response.status, list(response.result.sequence)) == (4, [0, 1, 1])
     assert pair.result_to_ros1(made) == (4, result)
-    assert pair.messages[0] == "actionlib_tutorials/FibonacciActionGoal"
+    assert (pair.ros1, pair.name) == ("actionlib_tutorials/Fibonacci", rule.name)
+
+
+# --- the machines ------------------------------------------------------------
+
+
+@dataclass
+class Query:
+    """A request of a client of ROS 2."""
+
+    payload: bytes
+    response: bytes = b""
+    error: str = ""
+
+    def reply_error(self, text: str) -> None:
+        self.error = text
+
+
+@dataclass
+class Out:
+    """What the goals do, and their clock."""
+
+    time: float = 0.0
+    told: list[tuple[str, bytes]] = field(default_factory=list)
+    """Messages for ROS 1 and ROS 2, by topic."""
+    asked: list[tuple[str, bytes, bytes]] = field(default_factory=list)
+    """Requests for the server of ROS 2: service, goal and request."""
+
+    def tell_ros1(self, topic: str, message: bytes) -> None:
+        self.told.append((topic, message))
+
+    tell_ros2 = tell_ros1
+
+    def ask(self, service: str, uuid: bytes, request: bytes) -> None:
+        self.asked.append((service, uuid, request))
+
+    def answer(self, query: Query, response: bytes) -> None:
+        assert not query.response
+        query.response = response
+
+    def now(self) -> float:
+        return self.time
+
+    def wall_ns(self) -> int:
+        return STAMP
+
+    def take(self, topic: str) -> list[bytes]:
+        """The messages of a topic; all are forgotten."""
+        told, self.told = self.told, []
+        return [message for each, message in told if each == topic]
+
+    def request(self, service: str) -> tuple[bytes, bytes]:
+        """The goal and the request of the first call of a service; all are forgotten."""
+        asked, self.asked = self.asked, []
+        return next((uuid, request) for each, uuid, request in asked if each == service)
+
+
+def to_ros2() -> tuple[GoalsToRos2, Out]:
+    out = Out()
+    return GoalsToRos2(PAIR, cast("Any", out), out), out
+
+
+def to_ros1() -> tuple[Any, Out]:
+    """The goals as of any type: their requests are those of a test."""
+    out = Out()
+    return GoalsToRos1(PAIR, cast("Any", out), out), out
 
 
 # --- clients of ROS 1, a server of ROS 2 ------------------------------------------------------------
 
 
-def states_of(events: list[Any]) -> list[Ros1Status]:
-    told = [each for each in events if isinstance(each, TellClients) and each.topic == "status"]
-    return [state.status for each in told for state in parse_states(each.message)]
+ACCEPTED, REJECTED = (send_goal_response(STAMP, accepted=yes) for yes in (True, False))
 
 
-def results_of(events: list[Any]) -> list[tuple[Ros1Status, str, bytes]]:
-    told = [each for each in events if isinstance(each, TellClients) and each.topic == "result"]
-    return [(state.status, state.text, body) for state, body in (parse_outcome(each.message) for each in told)]
+def states_of(out: Out) -> list[Ros1Status]:
+    return [state.status for each in out.take("status") for state in parse_states(each)]
 
 
-def asked(events: list[Any], service: str) -> AskServer:
-    return next(each for each in events if isinstance(each, AskServer) and each.service == service)
+def results_of(out: Out) -> list[tuple[Ros1Status, str, bytes]]:
+    return [(state.status, state.text, body) for state, body in map(parse_outcome, out.take("result"))]
 
 
-def begun(machine: GoalsToRos2) -> AskServer:
+def begun(goals: GoalsToRos2, out: Out) -> bytes:
     """A goal that the server has accepted."""
-    machine.goal(goal_message(), STAMP, 0.0)
-    sent = asked(machine.take(), "send_goal")
-    machine.accepted(sent.uuid, STAMP, 0.1, accepted=True)
-    return asked(machine.take(), "get_result")
+    goals.goal(goal_message())
+    uuid, _ = out.request("send_goal")
+    goals.answered("send_goal", uuid, ACCEPTED)
+    assert out.request("get_result")[0] == uuid
+    out.told.clear()
+    return uuid
 
 
 def response(status: Ros2Status, number: int = 8) -> bytes:
@@ -148,189 +214,202 @@ def response(status: Ros2Status, number: int = 8) -> bytes:
 
 
 def test_a_goal_of_ros1_is_sent_accepted_and_ends_with_its_result() -> None:
-    machine = GoalsToRos2(PAIR)
-    machine.goal(goal_message(number=5), STAMP, 0.0)
-    sent = asked(machine.take(), "send_goal")
-    assert read("actionlib/action/Test_SendGoal_Request", sent.request).goal.goal == 5
-    machine.goal(goal_message(), STAMP, 0.0)
-    assert not machine.take(), "the same goal again"
-    machine.accepted(sent.uuid, STAMP, 0.1, accepted=True)
-    events = machine.take()
-    assert states_of(events) == [Ros1Status.ACTIVE]
-    assert asked(events, "get_result").request[4:] == sent.uuid
-    machine.feedback(with_uuid(sent.uuid, b"\0\1\0\0\3\0\0\0"), STAMP)
-    (told,) = machine.take()
-    assert isinstance(told, TellClients)
-    assert FEEDBACK.deserialize(told.message).feedback.feedback == 3
-    machine.result(sent.uuid, response(Ros2Status.SUCCEEDED), STAMP, 1.0)
-    assert results_of(machine.take()) == [(Ros1Status.SUCCEEDED, "", b"\x08\0\0\0")]
-    assert machine.active == 0
+    goals, out = to_ros2()
+    goals.goal(goal_message(number=5))
+    uuid, request = out.request("send_goal")
+    assert read("actionlib/action/Test_SendGoal_Request", request).goal.goal == 5
+    goals.goal(goal_message())
+    assert not out.asked, "the same goal again"
+    goals.answered("send_goal", uuid, ACCEPTED)
+    assert states_of(out) == [Ros1Status.ACTIVE]
+    assert out.request("get_result")[1][4:] == uuid
+    goals.feedback(with_uuid(uuid, b"\0\1\0\0\3\0\0\0"))
+    (told,) = out.take("feedback")
+    assert FEEDBACK.deserialize(told).feedback.feedback == 3
+    goals.answered("get_result", uuid, response(Ros2Status.SUCCEEDED))
+    assert results_of(out) == [(Ros1Status.SUCCEEDED, "", b"\x08\0\0\0")]
+    assert goals.active == 0
 
 
 @pytest.mark.parametrize(
-    ("status", "wanted"), [(Ros2Status.ABORTED, Ros1Status.ABORTED), (Ros2Status.CANCELED, Ros1Status.PREEMPTED)]
+    ("status", "wanted"),
+    [
+        (Ros2Status.ABORTED, Ros1Status.ABORTED),
+        (Ros2Status.CANCELED, Ros1Status.PREEMPTED),
+        (Ros2Status.UNKNOWN, Ros1Status.LOST),
+        (Ros2Status.EXECUTING, Ros1Status.LOST),
+    ],
 )
 def test_other_ends_of_a_goal_are_ros1s(status: Ros2Status, wanted: Ros1Status) -> None:
-    machine = GoalsToRos2(PAIR)
-    machine.result(begun(machine).uuid, response(status), STAMP, 1.0)
-    assert results_of(machine.take())[0][0] is wanted
+    goals, out = to_ros2()
+    goals.answered("get_result", begun(goals, out), response(status))
+    assert results_of(out)[0][0] is wanted
 
 
 def test_a_goal_that_the_server_rejects_or_does_not_answer_ends() -> None:
-    machine = GoalsToRos2(PAIR)
+    goals, out = to_ros2()
     for name in ("a", "b"):
-        machine.goal(goal_message(name), STAMP, 0.0)
-    first, second = (each.uuid for each in machine.take() if isinstance(each, AskServer))
-    machine.accepted(first, STAMP, 0.1, accepted=False)
-    assert results_of(machine.take())[0][0] is Ros1Status.REJECTED
-    machine.server_gone(STAMP, 0.2)
-    assert [(status, "gone" in text) for status, text, _ in results_of(machine.take())] == [
-        (Ros1Status.ABORTED, True)
-    ]
-    machine.accepted(second, STAMP, 0.3, accepted=True)
-    assert not machine.take(), "an answer that comes late"
+        goals.goal(goal_message(name))
+    first, second = (uuid for _, uuid, _ in out.asked)
+    goals.answered("send_goal", first, REJECTED)
+    assert results_of(out)[0][0] is Ros1Status.REJECTED
+    goals.server_gone()
+    assert [(status, "gone" in text) for status, text, _ in results_of(out)] == [(Ros1Status.ABORTED, True)]
+    out.asked.clear()
+    goals.answered("send_goal", second, ACCEPTED)
+    assert not out.told
+    assert not out.asked, "an answer that comes late"
 
 
 @pytest.mark.parametrize("cancel", [GoalId(), GoalId("g1"), GoalId("", 2**32 - 1, 0)])
 def test_a_cancellation_waits_for_the_acceptance(cancel: GoalId) -> None:
-    machine = GoalsToRos2(PAIR)
-    machine.goal(goal_message(), STAMP, 0.0)
-    (sent,) = machine.take()
-    machine.cancel(cancel.serialize())
-    assert not machine.take()
-    assert isinstance(sent, AskServer)
-    machine.accepted(sent.uuid, STAMP, 0.1, accepted=True)
-    assert asked(machine.take(), "cancel_goal").request == cancel_request(sent.uuid)
-    machine.cancelling(sent.uuid, STAMP, agreed=True)
-    assert states_of(machine.take()) == [Ros1Status.PREEMPTING]
+    goals, out = to_ros2()
+    goals.goal(goal_message())
+    uuid, _ = out.request("send_goal")
+    goals.cancel(cancel.serialize())
+    assert not out.asked
+    goals.answered("send_goal", uuid, ACCEPTED)
+    assert out.request("cancel_goal") == (uuid, cancel_request(uuid))
+    out.told.clear()
+    goals.answered("cancel_goal", uuid, cancel_response(0, [(uuid, GoalId())]))
+    assert states_of(out) == [Ros1Status.PREEMPTING]
+
+
+def test_a_cancellation_that_the_server_refuses_may_be_asked_for_again() -> None:
+    goals, out = to_ros2()
+    uuid = begun(goals, out)
+    for _ in range(2):
+        goals.cancel(GoalId("g1").serialize())
+        assert out.request("cancel_goal")[0] == uuid
+        goals.answered("cancel_goal", uuid, cancel_response(1, []))
+    goals.cancel(GoalId("g1").serialize())
+    goals.failed("cancel_goal", uuid, "no answer")
+    assert goals.active == 1
 
 
 def test_another_goals_cancellation_does_not_end_a_goal() -> None:
-    machine = GoalsToRos2(PAIR)
-    begun(machine)
-    machine.cancel(GoalId("other").serialize())
-    assert not machine.take()
+    goals, out = to_ros2()
+    begun(goals, out)
+    goals.cancel(GoalId("other").serialize())
+    assert not out.asked
 
 
 def test_the_status_is_published_five_times_a_second_while_it_is_wanted() -> None:
-    machine = GoalsToRos2(PAIR)
-    assert machine.next_timer() is None
-    machine.show_status(10.0, wanted=True)
-    assert machine.next_timer() == 10.0
-    machine.handle_timer(STAMP, 10.0)
-    assert [each.topic for each in machine.take() if isinstance(each, TellClients)] == ["status"]
-    assert machine.next_timer() == 10.2
-    uuid = begun(machine).uuid
-    machine.result(uuid, response(Ros2Status.SUCCEEDED), STAMP, 11.0)
-    machine.take()
-    machine.handle_timer(STAMP, 11.0 + limits.ROS2_GOAL_KEPT)
-    assert states_of(machine.take()) == [], "it ended long ago"
+    goals, out = to_ros2()
+    assert goals.next_timer() is None
+    out.time = 10.0
+    goals.show_status(wanted=True)
+    assert goals.next_timer() == 10.0
+    goals.handle_timer(10.0)
+    assert len(out.take("status")) == 1
+    assert goals.next_timer() == 10.2
+    uuid = begun(goals, out)
+    out.time = 11.0
+    goals.answered("get_result", uuid, response(Ros2Status.SUCCEEDED))
+    out.told.clear()
+    goals.handle_timer(11.0 + limits.ROS2_GOAL_KEPT)
+    assert states_of(out) == [], "it ended long ago"
 
 
 # --- clients of ROS 2, a server of ROS 1 ------------------------------------------------------------
 
 
-def sent_to_ros1(machine: GoalsToRos1, request: int = 1) -> str:
-    """Send a goal; return its id in ROS 1."""
-    machine.send_goal(request, with_uuid(UUID, b"\0\1\0\0\5\0\0\0"), STAMP, 0.0)
-    (told,) = machine.take()
-    assert isinstance(told, TellServer)
-    message = GOAL.deserialize(told.message)
+def sent_to_ros1(goals: Any, out: Out) -> tuple[str, Query]:
+    """Send a goal; return its id in ROS 1, and the request."""
+    query = Query(with_uuid(UUID, b"\0\1\0\0\5\0\0\0"))
+    goals.send_goal(query)
+    (told,) = out.take("goal")
+    message = GOAL.deserialize(told)
     assert message.goal.goal == 5
-    return str(message.goal_id.id)
+    return str(message.goal_id.id), query
 
 
-def answers(events: list[Any]) -> dict[int, bytes | None]:
-    return {each.request: each.response for each in events if isinstance(each, Answer)}
+def result_of(goals: Any, uuid: bytes = UUID) -> Query:
+    query = Query(with_uuid(uuid, b"\0\1\0\0"))
+    goals.get_result(query)
+    return query
 
 
 def test_a_goal_of_ros2_is_accepted_by_the_first_status_and_ends_with_its_result() -> None:
-    machine = GoalsToRos1(PAIR)
-    name = sent_to_ros1(machine)
+    goals, out = to_ros1()
+    name, sent = sent_to_ros1(goals, out)
     assert name == "00010203-0405-0607-0809-0a0b0c0d0e0f"
-    machine.get_result(2, with_uuid(UUID, b"\0\1\0\0"))
-    assert not machine.take()
-    machine.states(states_message(name, Ros1Status.ACTIVE), STAMP, 0.1)
-    events = machine.take()
-    assert answers(events) == {1: send_goal_response(STAMP, accepted=True)}
-    assert [parse_ros2_states(each.message) for each in events if not isinstance(each, Answer)] == [
-        [(UUID, Ros2Status.EXECUTING)]
-    ]
-    machine.result(result_message(name, Ros1Status.SUCCEEDED, 8), STAMP, 1.0)
-    assert answers(machine.take()) == {2: response(Ros2Status.SUCCEEDED)}
-    machine.get_result(3, with_uuid(UUID, b"\0\1\0\0"))
-    assert answers(machine.take()) == {3: response(Ros2Status.SUCCEEDED)}, "it is kept for a while"
-    machine.handle_timer(1.0 + limits.ROS2_RESULT_KEPT)
-    machine.get_result(4, with_uuid(UUID, b"\0\1\0\0"))
-    assert answers(machine.take()) == {4: response(Ros2Status.UNKNOWN, 0)}
+    waiting = result_of(goals)
+    assert not sent.response
+    goals.status(states_message(name, Ros1Status.ACTIVE))
+    assert (sent.response, waiting.response) == (ACCEPTED, b"")
+    assert list(map(parse_ros2_states, out.take("status"))) == [[(UUID, Ros2Status.EXECUTING)]]
+    out.time = 1.0
+    goals.result(result_message(name, Ros1Status.SUCCEEDED, 8))
+    assert waiting.response == response(Ros2Status.SUCCEEDED)
+    assert result_of(goals).response == response(Ros2Status.SUCCEEDED), "it is kept for a while"
+    goals.handle_timer(1.0 + limits.ROS2_RESULT_KEPT)
+    assert result_of(goals).response == response(Ros2Status.UNKNOWN, 0)
+
+
+def test_clients_that_wait_for_a_result_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "ROS2_GOALS_MAX", 3)
+    goals, out = to_ros1()
+    sent_to_ros1(goals, out)
+    assert [result_of(goals).error for _ in range(4)] == ["", "", "", "too many clients wait for results"]
 
 
 def test_a_result_without_a_status_before_it_answers_both_requests() -> None:
-    machine = GoalsToRos1(PAIR)
-    name = sent_to_ros1(machine)
-    machine.get_result(2, with_uuid(UUID, b"\0\1\0\0"))
-    machine.result(result_message(name, Ros1Status.ABORTED, 8), STAMP, 1.0)
-    assert answers(machine.take()) == {
-        1: send_goal_response(STAMP, accepted=True), 2: response(Ros2Status.ABORTED),
-    }  # fmt: skip
+    goals, out = to_ros1()
+    name, sent = sent_to_ros1(goals, out)
+    waiting = result_of(goals)
+    goals.result(result_message(name, Ros1Status.ABORTED, 8))
+    assert (sent.response, waiting.response) == (ACCEPTED, response(Ros2Status.ABORTED))
 
 
 def test_a_rejected_goal_is_not_accepted_and_one_that_is_not_shown_fails() -> None:
-    machine = GoalsToRos1(PAIR)
-    machine.states(states_message(sent_to_ros1(machine), Ros1Status.REJECTED), STAMP, 0.1)
-    assert answers(machine.take()) == {1: send_goal_response(STAMP, accepted=False)}
-    machine = GoalsToRos1(PAIR)
-    sent_to_ros1(machine)
-    assert machine.next_timer() == limits.ROS2_ACCEPT_TIMEOUT
-    machine.handle_timer(limits.ROS2_ACCEPT_TIMEOUT)
-    assert answers(machine.take()) == {1: None}
-    assert machine.next_timer() is None
+    goals, out = to_ros1()
+    name, sent = sent_to_ros1(goals, out)
+    goals.status(states_message(name, Ros1Status.REJECTED))
+    assert sent.response == REJECTED
+    goals, out = to_ros1()
+    _, sent = sent_to_ros1(goals, out)
+    assert goals.next_timer() == limits.ROS2_ACCEPT_TIMEOUT
+    goals.handle_timer(limits.ROS2_ACCEPT_TIMEOUT)
+    assert "does not show the goal" in sent.error
+    assert goals.next_timer() is None
 
 
 def test_cancellations_of_ros2_name_their_goals() -> None:
-    machine = GoalsToRos1(PAIR)
-    name = sent_to_ros1(machine)
-    machine.states(states_message(name, Ros1Status.ACTIVE), STAMP, 0.1)
-    machine.take()
-    for request, uuid in ((5, UUID), (6, ALL_GOALS)):
-        machine.cancel_goal(request, cancel_request(uuid))
-        events = machine.take()
-        assert [each.message for each in events if isinstance(each, TellServer)] == [GoalId(name).serialize()]
-        made = answers(events)[request]
-        assert made is not None
-        cancelled = read(f"{CANCEL_TYPE}_Response", made)
-        assert (cancelled.return_code, [bytes(each.goal_id.uuid) for each in cancelled.goals_canceling]) == (
-            0,
-            [UUID],
-        )
-    machine.cancel_goal(7, cancel_request(b"x" * 16))
-    made = answers(machine.take())[7]
-    assert made is not None
-    assert read(f"{CANCEL_TYPE}_Response", made).return_code == 2, "it is not known"
+    goals, out = to_ros1()
+    name, _ = sent_to_ros1(goals, out)
+    goals.status(states_message(name, Ros1Status.ACTIVE))
+    cases: list[tuple[bytes, int, list[bytes]]] = [(UUID, 0, [UUID]), (ALL_GOALS, 0, [UUID]), (b"x" * 16, 2, [])]
+    for uuid, code, cancelled in cases:
+        query = Query(cancel_request(uuid))
+        out.told.clear()
+        goals.cancel_goal(query)
+        assert out.take("cancel") == [GoalId(name).serialize() for _ in cancelled]
+        made = read(f"{CANCEL_TYPE}_Response", query.response)
+        assert (made.return_code, [bytes(each.goal_id.uuid) for each in made.goals_canceling]) == (code, cancelled)
 
 
 def test_a_server_of_ros1_that_is_gone_aborts_its_goals() -> None:
-    machine = GoalsToRos1(PAIR)
-    name = sent_to_ros1(machine)
-    machine.states(states_message(name, Ros1Status.ACTIVE), STAMP, 0.1)
-    machine.get_result(2, with_uuid(UUID, b"\0\1\0\0"))
-    machine.take()
-    machine.server_gone(STAMP, 1.0)
-    assert answers(machine.take()) == {2: response(Ros2Status.ABORTED, 0)}
+    goals, out = to_ros1()
+    name, _ = sent_to_ros1(goals, out)
+    goals.status(states_message(name, Ros1Status.ACTIVE))
+    waiting = result_of(goals)
+    goals.server_gone()
+    assert waiting.response == response(Ros2Status.ABORTED, 0)
 
 
 def test_a_goal_that_vanishes_from_the_status_of_its_server_is_lost() -> None:
     """As in actionlib: the server was started anew, or has forgotten the goal without a result."""
-    machine = GoalsToRos1(PAIR)
-    name = sent_to_ros1(machine)
-    machine.get_result(2, with_uuid(UUID, b"\0\1\0\0"))
-    machine.states(states_message("another", Ros1Status.ACTIVE), STAMP, 0.1)
-    assert machine.take() == [], "it has not come there yet"
-    machine.states(states_message(name, Ros1Status.ACTIVE), STAMP, 0.2)
-    machine.take()
-    machine.states(states_message("another", Ros1Status.ACTIVE), STAMP, 0.3)
-    events = machine.take()
-    assert answers(events) == {2: response(Ros2Status.ABORTED, 0)}
-    assert machine.active == 0
-    machine.states(states_message("another", Ros1Status.ACTIVE), STAMP, 0.4)
-    assert machine.take() == [], "once"
+    goals, out = to_ros1()
+    name, _ = sent_to_ros1(goals, out)
+    waiting = result_of(goals)
+    goals.status(states_message("another", Ros1Status.ACTIVE))
+    assert not out.told, "it has not come there yet"
+    goals.status(states_message(name, Ros1Status.ACTIVE))
+    assert not waiting.response
+    goals.status(states_message("another", Ros1Status.ACTIVE))
+    assert waiting.response == response(Ros2Status.ABORTED, 0)
+    assert goals.active == 0
+    out.told.clear()
+    goals.status(states_message("another", Ros1Status.ACTIVE))
+    assert not out.told, "once"

@@ -3,6 +3,8 @@
 ROS 1's ``ActionGoal``, ``ActionResult`` and ``ActionFeedback`` end with the goal's own part, which is taken as bytes.
 In ROS 2 a goal's and a feedback's own part stand behind the 16 bytes of the goal's id, which keep the alignment of
 CDR, so its bytes are taken too. Sources: actionlib_msgs, action_msgs, unique_identifier_msgs, rosidl_parser.
+
+All readers raise ``RemoteProtocolError`` for bytes that are too short, and for a state that is unknown.
 """
 
 from __future__ import annotations
@@ -10,17 +12,18 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.transcoder import HEAD
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
     from rmpa.ros.wire.tcpros import Buffer
 
+_T = TypeVar("_T")
 UUID_BYTES: Final = 16
 ALL_GOALS: Final = bytes(UUID_BYTES)
 """The id in a request to cancel that means all goals."""
@@ -28,81 +31,32 @@ _U32: Final = struct.Struct("<I")
 _TIME: Final = struct.Struct("<II")
 _INFO: Final = struct.Struct("<16siI")
 
-
-class Ros1Status(IntEnum):
-    """The states of actionlib_msgs/GoalStatus."""
-
-    PENDING = 0
-    ACTIVE = 1
-    PREEMPTED = 2
-    SUCCEEDED = 3
-    ABORTED = 4
-    REJECTED = 5
-    PREEMPTING = 6
-    RECALLING = 7
-    RECALLED = 8
-    LOST = 9
-
-    @property
-    def ended(self) -> bool:
-        """Whether a goal has no other state after it."""
-        return self in _ENDED
-
-
-_ENDED: Final = frozenset(
-    (
-        Ros1Status.PREEMPTED,
-        Ros1Status.SUCCEEDED,
-        Ros1Status.ABORTED,
-        Ros1Status.REJECTED,
-        Ros1Status.RECALLED,
-        Ros1Status.LOST,
-    )
+Ros1Status = IntEnum(
+    "Ros1Status",
+    "PENDING ACTIVE PREEMPTED SUCCEEDED ABORTED REJECTED PREEMPTING RECALLING RECALLED LOST",
+    start=0,
 )
-
-
-class Ros2Status(IntEnum):
-    """The states of action_msgs/GoalStatus."""
-
-    UNKNOWN = 0
-    ACCEPTED = 1
-    EXECUTING = 2
-    CANCELING = 3
-    SUCCEEDED = 4
-    CANCELED = 5
-    ABORTED = 6
-
-
-class CancelCode(IntEnum):
-    """The answers of action_msgs/CancelGoal."""
-
-    NONE = 0
-    REJECTED = 1
-    UNKNOWN_GOAL = 2
-    GOAL_ENDED = 3
-
-
+"""The states of actionlib_msgs/GoalStatus."""
+Ros2Status = IntEnum("Ros2Status", "UNKNOWN ACCEPTED EXECUTING CANCELING SUCCEEDED CANCELED ABORTED", start=0)
+"""The states of action_msgs/GoalStatus."""
+CancelCode = IntEnum("CancelCode", "NONE REJECTED UNKNOWN_GOAL GOAL_ENDED", start=0)
+"""The answers of action_msgs/CancelGoal."""
+UNDER_WAY: Final = (Ros1Status.PENDING, Ros1Status.ACTIVE, Ros1Status.PREEMPTING, Ros1Status.RECALLING)
+"""The states that another one follows."""
 TO_ROS2: Final = {
-    Ros1Status.PENDING: Ros2Status.ACCEPTED,
-    Ros1Status.ACTIVE: Ros2Status.EXECUTING,
-    Ros1Status.PREEMPTED: Ros2Status.CANCELED,
-    Ros1Status.SUCCEEDED: Ros2Status.SUCCEEDED,
-    Ros1Status.ABORTED: Ros2Status.ABORTED,
-    Ros1Status.REJECTED: Ros2Status.ABORTED,
-    Ros1Status.PREEMPTING: Ros2Status.CANCELING,
-    Ros1Status.RECALLING: Ros2Status.CANCELING,
-    Ros1Status.RECALLED: Ros2Status.CANCELED,
-    Ros1Status.LOST: Ros2Status.ABORTED,
+    Ros1Status[ros1]: Ros2Status[ros2]
+    for ros2, many in (
+        ("ACCEPTED", "PENDING"),
+        ("EXECUTING", "ACTIVE"),
+        ("CANCELING", "PREEMPTING RECALLING"),
+        ("SUCCEEDED", "SUCCEEDED"),
+        ("CANCELED", "PREEMPTED RECALLED"),
+        ("ABORTED", "ABORTED REJECTED LOST"),
+    )
+    for ros1 in many.split()
 }
-TO_ROS1: Final = {
-    Ros2Status.UNKNOWN: Ros1Status.LOST,
-    Ros2Status.ACCEPTED: Ros1Status.PENDING,
-    Ros2Status.EXECUTING: Ros1Status.ACTIVE,
-    Ros2Status.CANCELING: Ros1Status.PREEMPTING,
-    Ros2Status.SUCCEEDED: Ros1Status.SUCCEEDED,
-    Ros2Status.CANCELED: Ros1Status.PREEMPTED,
-    Ros2Status.ABORTED: Ros1Status.ABORTED,
-}
+"""Each state of ROS 1; the first of those with one counterpart stands for it in ROS 1."""
+TO_ROS1: Final = {ros2: ros1 for ros1, ros2 in reversed(TO_ROS2.items())} | {Ros2Status.UNKNOWN: Ros1Status.LOST}
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,13 +104,8 @@ class _Reader:
         self.at = 0
 
     def number(self) -> int:
-        value: int = _U32.unpack_from(self.raw, self.at)[0]
         self.at += _U32.size
-        return value
-
-    def byte(self) -> int:
-        self.at += 1
-        return self.raw[self.at - 1]
+        return int(_U32.unpack_from(self.raw, self.at - _U32.size)[0])
 
     def text(self) -> str:
         size = self.number()
@@ -165,9 +114,10 @@ class _Reader:
         self.at += size
         return bytes(self.raw[self.at - size : self.at]).decode("utf-8", "replace")
 
-    def header(self) -> None:
+    def behind_header(self) -> _Reader:
         self.at += 12
         self.text()
+        return self
 
     def goal(self) -> GoalId:
         secs, nsecs = self.number(), self.number()
@@ -175,73 +125,51 @@ class _Reader:
 
     def state(self) -> GoalState:
         goal = self.goal()
-        return GoalState(goal, Ros1Status(self.byte()), self.text())
+        self.at += 1
+        return GoalState(goal, Ros1Status(self.raw[self.at - 1]), self.text())
+
+    def states(self) -> list[GoalState]:
+        return [self.state() for _ in range(_bounded(self.number()))]
 
     def rest(self) -> bytes:
         return bytes(self.raw[self.at :])
 
 
-_ERRORS: Final = (struct.error, ValueError, IndexError)
+def _read(raw: Buffer, what: str, read: Callable[[_Reader], _T]) -> _T:
+    try:
+        return read(_Reader(raw))
+    except (struct.error, ValueError, IndexError) as error:
+        raise RemoteProtocolError(f"{len(raw)} bytes are no {what}: {error}") from error
+
+
+def _bounded(count: int) -> int:
+    if count > limits.ROS2_GOALS_MAX:
+        raise ValueError(f"{count} goals")
+    return count
 
 
 # --- ROS 1 --------------------------------------------------------------------------------------------------------
 
 
 def parse_goal(raw: Buffer) -> tuple[GoalId, bytes]:
-    """Read an ``ActionGoal``: its id, and the bytes of the goal.
-
-    Raises:
-        RemoteProtocolError: The bytes are too short.
-    """
-    try:
-        reader = _Reader(raw)
-        reader.header()
-        return reader.goal(), reader.rest()
-    except _ERRORS as error:
-        raise RemoteProtocolError(f"{len(raw)} bytes are no goal of an action: {error}") from error
+    """Read an ``ActionGoal``: its id, and the bytes of the goal."""
+    return _read(raw, "goal of an action", lambda reader: (reader.behind_header().goal(), reader.rest()))
 
 
 def parse_cancel(raw: Buffer) -> GoalId:
-    """Read a ``GoalID`` of the topic *cancel*.
-
-    Raises:
-        RemoteProtocolError: The bytes are too short.
-    """
-    try:
-        return _Reader(raw).goal()
-    except _ERRORS as error:
-        raise RemoteProtocolError(f"{len(raw)} bytes are no GoalID: {error}") from error
+    """Read a ``GoalID`` of the topic *cancel*."""
+    return _read(raw, "GoalID", _Reader.goal)
 
 
 def parse_outcome(raw: Buffer) -> tuple[GoalState, bytes]:
-    """Read an ``ActionResult`` or ``ActionFeedback``: the goal's state, and the bytes of result or feedback.
-
-    Raises:
-        RemoteProtocolError: The bytes are too short, or the state is unknown.
-    """
-    try:
-        reader = _Reader(raw)
-        reader.header()
-        return reader.state(), reader.rest()
-    except _ERRORS as error:
-        raise RemoteProtocolError(f"{len(raw)} bytes are no result or feedback of an action: {error}") from error
+    """Read an ``ActionResult`` or ``ActionFeedback``: the goal's state, and the bytes of result or feedback."""
+    what = "result or feedback of an action"
+    return _read(raw, what, lambda reader: (reader.behind_header().state(), reader.rest()))
 
 
 def parse_states(raw: Buffer) -> list[GoalState]:
-    """Read a ``GoalStatusArray`` of ROS 1.
-
-    Raises:
-        RemoteProtocolError: The bytes are too short, or a state is unknown.
-    """
-    try:
-        reader = _Reader(raw)
-        reader.header()
-        count = reader.number()
-        if count > limits.ROS2_GOALS_MAX:
-            raise ValueError(f"{count} goals")
-        return [reader.state() for _ in range(count)]
-    except _ERRORS as error:
-        raise RemoteProtocolError(f"{len(raw)} bytes are no GoalStatusArray: {error}") from error
+    """Read a ``GoalStatusArray`` of ROS 1."""
+    return _read(raw, "GoalStatusArray", lambda reader: reader.behind_header().states())
 
 
 def ros1_message(stamp: int, *parts: bytes) -> bytes:
@@ -279,15 +207,9 @@ def with_uuid(uuid: bytes, cdr: bytes) -> bytes:
 
 
 def split_uuid(raw: Buffer) -> tuple[bytes, bytes]:
-    """The goal's id, and its own part as CDR with a head; the inverse of :func:`with_uuid`.
-
-    Raises:
-        RemoteProtocolError: The bytes are too short.
-    """
-    if len(raw) < len(HEAD) + UUID_BYTES:
-        raise RemoteProtocolError(f"a message of an action has {len(raw)} bytes; an id of a goal alone has 20")
+    """The goal's id, and its own part as CDR with a head; the inverse of :func:`with_uuid`."""
     view = bytes(raw)
-    return view[4:20], view[:4] + view[20:]
+    return _unpack("16s", view, "message of an action")[0], view[:4] + view[20:]
 
 
 def send_goal_response(stamp: int, *, accepted: bool) -> bytes:
@@ -296,14 +218,8 @@ def send_goal_response(stamp: int, *, accepted: bool) -> bytes:
 
 
 def is_accepted(raw: Buffer) -> bool:
-    """Read a ``SendGoal_Response``.
-
-    Raises:
-        RemoteProtocolError: The bytes are too short.
-    """
-    if len(raw) < len(HEAD) + 1:
-        raise RemoteProtocolError(f"{len(raw)} bytes are no SendGoal_Response")
-    return bool(raw[4])
+    """Read a ``SendGoal_Response``."""
+    return bool(_unpack("?", raw, "SendGoal_Response")[0])
 
 
 def cancel_request(uuid: bytes, goal: GoalId = GoalId()) -> bytes:
@@ -312,65 +228,51 @@ def cancel_request(uuid: bytes, goal: GoalId = GoalId()) -> bytes:
 
 
 def parse_cancel_request(raw: Buffer) -> tuple[bytes, tuple[int, int]]:
-    """Read a ``CancelGoal_Request``: the goal's id and the stamp.
-
-    Raises:
-        RemoteProtocolError: The bytes are too short.
-    """
-    try:
-        uuid, secs, nsecs = _INFO.unpack_from(raw, 4)
-    except struct.error as error:
-        raise RemoteProtocolError(f"{len(raw)} bytes are no CancelGoal_Request") from error
-    return uuid, (secs, nsecs)
+    """Read a ``CancelGoal_Request``: the goal's id and the stamp."""
+    uuid, *stamp = _unpack(_INFO.format, raw, "CancelGoal_Request")
+    return uuid, (stamp[0], stamp[1])
 
 
-def cancel_response(code: CancelCode, goals: Iterable[tuple[bytes, GoalId]]) -> bytes:
+def cancel_response(code: int, goals: Iterable[tuple[bytes, GoalId]]) -> bytes:
     """``CancelGoal_Response``: the code, and the goals that are being cancelled."""
     infos = [_INFO.pack(uuid, goal.secs & 0x7FFFFFFF, goal.nsecs) for uuid, goal in goals]
     return b"".join((HEAD, struct.pack("<b3xI", code, len(infos)), *infos))
 
 
 def cancel_code(raw: Buffer) -> int:
-    """Read the code of a ``CancelGoal_Response``.
-
-    Raises:
-        RemoteProtocolError: The bytes are too short.
-    """
-    if len(raw) < len(HEAD) + 1:
-        raise RemoteProtocolError(f"{len(raw)} bytes are no CancelGoal_Response")
-    return int.from_bytes(bytes(raw[4:5]), "little", signed=True)
+    """Read the code of a ``CancelGoal_Response``."""
+    return int(_unpack("b", raw, "CancelGoal_Response")[0])
 
 
 def ros2_states(states: Iterable[tuple[bytes, GoalId, Ros2Status]]) -> bytes:
     """A ``GoalStatusArray`` of ROS 2: ids, stamps and states."""
-    made = bytearray(4)
-    count = 0
-    for uuid, goal, status in states:
+    made, listed = bytearray(4), list(states)
+    for uuid, goal, status in listed:
         made += uuid
         made += bytes(-len(made) % 4)  # an id may stand anywhere, the stamp's numbers are aligned
         made += _TIME.pack(goal.secs & 0x7FFFFFFF, goal.nsecs) + bytes((status,))
-        count += 1
-    made[:4] = _U32.pack(count)
+    made[:4] = _U32.pack(len(listed))
     return HEAD + bytes(made)
 
 
 def parse_ros2_states(raw: Buffer) -> list[tuple[bytes, Ros2Status]]:
-    """Read a ``GoalStatusArray`` of ROS 2: ids and states.
+    """Read a ``GoalStatusArray`` of ROS 2: ids and states."""
+    return _read(memoryview(raw)[4:], "GoalStatusArray of ROS 2", _ros2_states)
 
-    Raises:
-        RemoteProtocolError: The bytes are too short, or a state is unknown.
-    """
-    body, found = bytes(raw)[4:], []
-    try:
-        count, at = _U32.unpack_from(body, 0)[0], 4
-        if count > limits.ROS2_GOALS_MAX:
-            raise ValueError(f"{count} goals")
-        for _ in range(count):
-            uuid = body[at : at + UUID_BYTES]
-            at += UUID_BYTES
-            at += -at % 4 + _TIME.size
-            found.append((uuid, Ros2Status(body[at])))
-            at += 1
-    except _ERRORS as error:
-        raise RemoteProtocolError(f"{len(raw)} bytes are no GoalStatusArray of ROS 2: {error}") from error
+
+def _ros2_states(reader: _Reader) -> list[tuple[bytes, Ros2Status]]:
+    found = []
+    for _ in range(_bounded(reader.number())):
+        uuid = bytes(reader.raw[reader.at : reader.at + UUID_BYTES])
+        reader.at += UUID_BYTES
+        reader.at += -reader.at % 4 + _TIME.size + 1
+        found.append((uuid, Ros2Status(reader.raw[reader.at - 1])))
     return found
+
+
+def _unpack(form: str, raw: Buffer, what: str) -> tuple[Any, ...]:
+    """What stands behind the head of CDR."""
+    try:
+        return struct.unpack_from(form, raw, len(HEAD))
+    except struct.error as error:
+        raise RemoteProtocolError(f"{len(raw)} bytes are no {what}") from error

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 JAZZY = Ros2Types("jazzy")
 TEST = [MessageType(f"actionlib/Test{part}") for part in ("Goal", "Result", "Feedback")]
-TYPES = ActionPair(TEST[0], TEST[1], TEST[2], ActionRule("actionlib/action/Test"), JAZZY).types
+TYPES = ActionPair(TEST, ActionRule("actionlib/action/Test"), JAZZY).types
 ACTION = {part: MessageType(f"actionlib/TestAction{part.title()}") for part in ("goal", "feedback", "result")}
 ACTION["status"] = MessageType("actionlib_msgs/GoalStatusArray")
 ACTION["cancel"] = MessageType("actionlib_msgs/GoalID")
@@ -47,14 +47,10 @@ def blocks(*names: str) -> str:
 
 POINT = blocks("geometry_msgs/Point")
 ATTACHMENT = Ros2Attachment(3, 1, bytes(16)).serialize()
-KINDS = {
-    "send_goal": TYPES.send_goal, "get_result": TYPES.get_result, "cancel_goal": "action_msgs/srv/CancelGoal",
-    "feedback": TYPES.feedback, "status": "action_msgs/msg/GoalStatusArray",
-}  # fmt: skip
 
 
 def key(part: str) -> str:
-    return data_key(0, f"/count/_action/{part}", KINDS[part], TYPES.hashes[KINDS[part]])
+    return data_key(0, f"/count/_action/{part}", *TYPES[part])
 
 
 def made(part: str, **values: Any) -> bytes:
@@ -152,9 +148,8 @@ class Ros2Server:
         node = Ros2Node(0, self.session.zid, 0, "/fib_server")
         for number, (part, queries) in enumerate(self.asked.items(), 1):
             self.session.queryable(key(part), queries.append)  # type: ignore[arg-type]
-            kind = KINDS[part]
             name = f"/count/_action/{part}"
-            endpoint = Ros2Endpoint(node, number, EntityKind.SERVICE, name, kind, TYPES.hashes[kind], Ros2Qos())
+            endpoint = Ros2Endpoint(node, number, EntityKind.SERVICE, name, *TYPES[part], Ros2Qos())
             self.session.token(endpoint.token())
 
     def answer(self, part: str, payload: bytes) -> None:
@@ -206,7 +201,7 @@ DOCK = [
 async def test_an_action_of_a_type_that_ros1_lacks_is_learnt_from_its_server(bed: Bed) -> None:
     theirs = Ros2Types("jazzy")
     action = "dock_msgs/action/Dock"
-    pair = ActionPair(DOCK[0], DOCK[1], DOCK[2], ActionRule(action), theirs)
+    pair = ActionPair(DOCK, ActionRule(action), theirs)
     types, session = pair.types, bed.network.session()
     node = Ros2Node(0, session.zid, 0, "/docker")
     goals: list[MemoryQuery] = []
@@ -220,17 +215,19 @@ async def test_an_action_of_a_type_that_ros1_lacks_is_learnt_from_its_server(bed
 
     def describe(query: MemoryQuery) -> None:
         asked = [
-            name for name in (types.send_goal, types.get_result, types.feedback) if name.encode() in query.payload
+            types[part][0]
+            for part in ("send_goal", "get_result", "feedback")
+            if types[part][0].encode() in query.payload
         ]
         query.reply(query.key, response(theirs, asked[0]), query.attachment)
         query.finish()
 
     head = "/dock/_action"
-    send = declare(EntityKind.SERVICE, f"{head}/send_goal", types.send_goal, types.hashes[types.send_goal])
+    send = declare(EntityKind.SERVICE, f"{head}/send_goal", *types["send_goal"])
     session.queryable(send.key(), goals.append)  # type: ignore[arg-type]
-    get = declare(EntityKind.SERVICE, f"{head}/get_result", types.get_result, types.hashes[types.get_result])
+    get = declare(EntityKind.SERVICE, f"{head}/get_result", *types["get_result"])
     session.queryable(get.key(), results.append)  # type: ignore[arg-type]
-    told = declare(EntityKind.PUBLISHER, f"{head}/feedback", types.feedback, types.hashes[types.feedback])
+    told = declare(EntityKind.PUBLISHER, f"{head}/feedback", *types["feedback"])
     service = "/docker/get_type_description"
     describer = declare(EntityKind.SERVICE, service, SERVICE_TYPE, "RIHS01_" + "1" * 64)
     session.queryable(describer.key(), describe)  # type: ignore[arg-type]
@@ -251,7 +248,7 @@ async def test_an_action_of_a_type_that_ros1_lacks_is_learnt_from_its_server(bed
     goal = goal_type.make({"goal_id": {"id": "g1"}, "goal": {"place": {"x": 2.0}, "tries": 9}})
     bed.graph.send(client, goal_type.serialize(goal))
     await eventually(lambda: goals)
-    request: Any = theirs.store.deserialize_cdr(goals[0].payload, f"{types.send_goal}_Request")
+    request: Any = theirs.store.deserialize_cdr(goals[0].payload, f"{types['send_goal'][0]}_Request")
     assert (request.goal.place.x, request.goal.tries) == (2.0, 9)
     goals[0].reply(goals[0].key, b"\0\1\0\0\1" + bytes(11), goals[0].attachment)
     goals[0].finish()
@@ -260,8 +257,10 @@ async def test_an_action_of_a_type_that_ros1_lacks_is_learnt_from_its_server(bed
         b"\0\1\0\0" + goals[0].payload[4:20] + struct.pack("<f", 0.5)
     )
     await eventually(lambda: feedback.messages)
-    value: Any = theirs.store.types[f"{types.get_result}_Response"](4, theirs.store.types[f"{action}_Result"]("home"))
-    payload = bytes(theirs.store.serialize_cdr(value, f"{types.get_result}_Response"))
+    value: Any = theirs.store.types[f"{types['get_result'][0]}_Response"](
+        4, theirs.store.types[f"{action}_Result"]("home")
+    )
+    payload = bytes(theirs.store.serialize_cdr(value, f"{types['get_result'][0]}_Response"))
     results[0].reply(results[0].key, payload, results[0].attachment)
     results[0].finish()
     await eventually(lambda: result.messages)

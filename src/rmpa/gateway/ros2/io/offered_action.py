@@ -3,38 +3,227 @@
 from __future__ import annotations
 
 import asyncio
-import time
+import uuid as uuids
+from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RmpaError
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import ForeignSource, SourceKind
-from rmpa.gateway.ros2.action_pair import CANCEL_TYPE, PART, STATUS_TYPE
+from rmpa.gateway.ros2 import action_messages as messages
+from rmpa.gateway.ros2.action_messages import CancelCode, GoalId, GoalState, Ros1Status, Ros2Status
+from rmpa.gateway.ros2.action_pair import ActionPair
 from rmpa.gateway.ros2.attachment import Ros2Attachment
-from rmpa.gateway.ros2.crossing import SITE
-from rmpa.gateway.ros2.goals_to_ros1 import Answer, GoalsToRos1, TellServer
+from rmpa.gateway.ros2.conversion import ConversionError
 from rmpa.gateway.ros2.graph import valid_name
-from rmpa.gateway.ros2.io.action_types import find_action, find_topics
+from rmpa.gateway.ros2.io.action_types import JoinedAction, find_headers, find_parts
 from rmpa.gateway.ros2.io.part import SERVICE_NEEDS
 from rmpa.gateway.ros2.qos import Ros2Durability, Ros2Qos
 from rmpa.gateway.ros2.tokens import EntityKind, data_key
 from rmpa.gateway.zenoh_api import ZenohQos
-from rmpa.runtime.machine_timer import MachineTimer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
-    from rmpa.gateway.neighbour import ForeignTopic, MeshSource, Tap
-    from rmpa.gateway.ros2.io.own_nodes import OwnEndpoint
+    from rmpa.core.clock import Clock
+    from rmpa.gateway.neighbour import MeshSource, Tap
     from rmpa.gateway.ros2.io.part import Ros2Context
-    from rmpa.gateway.zenoh_api import Declared, ZenohPublisher, ZenohQuery
+    from rmpa.gateway.zenoh_api import ZenohPublisher, ZenohQuery
+    from rmpa.ros.wire.tcpros import Buffer
 
-_CANCEL: Final = "actionlib_msgs/GoalID"
 _NODE: Final = "/action_clients"
 """The node that publishes goals and cancellations for all clients of ROS 2, below ``/rmpa/ros2``."""
+_LATCHED: Final = Ros2Qos(durability=Ros2Durability.TRANSIENT_LOCAL, depth=1)
 
 
-class OfferedAction:
+@dataclass(slots=True)
+class _Goal:
+    id: GoalId
+    uuid: bytes
+    deadline: float
+    """When the goal is given up, unless the server shows it before; afterwards, when it is forgotten."""
+    asked: ZenohQuery | None
+    """The request ``send_goal`` that is not answered yet."""
+    status: Ros1Status = Ros1Status.PENDING
+    waiting: list[ZenohQuery] = field(default_factory=list)
+    """Requests ``get_result`` that are not answered yet."""
+    result: bytes | None = None
+    """The result of ROS 1 once it has come."""
+    listed: bool = False
+    """Whether the server's status has named it."""
+
+    @property
+    def ended(self) -> bool:
+        return self.result is not None
+
+
+class GoalsToRos1:
+    """The goals of one action.
+
+    What takes a message raises ``RemoteProtocolError`` for one that is malformed, and ``ConversionError`` for one
+    that does not fit the other side's type.
+
+    Args:
+        pair: The action's types.
+        out: Answers the requests, and has what is told to both sides published.
+        clock: Both clocks.
+    """
+
+    def __init__(self, pair: ActionPair, out: OfferedAction, clock: Clock) -> None:
+        self.pair = pair
+        self._out = out
+        self._clock = clock
+        self._goals: dict[str, _Goal] = {}
+        """By the id in ROS 1, which is the text of the UUID."""
+
+    @property
+    def active(self) -> int:
+        """Goals that have not ended."""
+        return sum(not goal.ended for goal in self._goals.values())
+
+    # --- from the clients of ROS 2 --------------------------------------------------------------------------------
+
+    def send_goal(self, query: ZenohQuery) -> None:
+        """A client calls ``send_goal``."""
+        uuid, cdr = messages.split_uuid(query.payload)
+        body, name, stamp = self.pair.goal.to_ros1(cdr), _name(uuid), self._clock.wall_ns()
+        if name in self._goals or len(self._goals) >= limits.ROS2_GOALS_MAX:
+            self._out.answer(query, messages.send_goal_response(stamp, accepted=False))
+            return
+        goal_id = GoalId(name, *divmod(stamp, 10**9))
+        self._goals[name] = _Goal(goal_id, uuid, self._clock.now() + limits.ROS2_ACCEPT_TIMEOUT, query)
+        self._out.tell_ros1("goal", messages.ros1_message(stamp, goal_id.serialize(), body))
+
+    def get_result(self, query: ZenohQuery) -> None:
+        """A client calls ``get_result``; of a goal that is not known the status is UNKNOWN, as rcl answers."""
+        uuid, _ = messages.split_uuid(query.payload)
+        goal = self._goals.get(_name(uuid))
+        if goal is None:
+            self._out.answer(query, self.pair.result_to_ros2(Ros2Status.UNKNOWN, self.pair.no_result))
+        elif sum(len(each.waiting) for each in self._goals.values()) >= limits.ROS2_GOALS_MAX:
+            query.reply_error("too many clients wait for results")
+        else:
+            goal.waiting.append(query)
+            if goal.ended:
+                self._give_result(goal)
+
+    def cancel_goal(self, query: ZenohQuery) -> None:
+        """A client calls ``cancel_goal``: one goal, all up to a stamp, or all (action_msgs/CancelGoal)."""
+        uuid, until = messages.parse_cancel_request(query.payload)
+        every = uuid == messages.ALL_GOALS and until == (0, 0)
+        asked = [goal for goal in self._goals.values() if every or goal.uuid == uuid or goal.id.stamp <= until]
+        open_goals = [goal for goal in asked if not goal.ended]
+        for goal in open_goals:
+            # With a stamp ROS 1 would cancel all older goals too.
+            self._out.tell_ros1("cancel", GoalId(goal.id.id).serialize())
+        code = CancelCode.NONE
+        if uuid != messages.ALL_GOALS and not open_goals:
+            code = CancelCode.GOAL_ENDED if asked else CancelCode.UNKNOWN_GOAL
+        self._out.answer(query, messages.cancel_response(code, [(goal.uuid, goal.id) for goal in open_goals]))
+
+    # --- from the server of ROS 1 ---------------------------------------------------------------------------------
+
+    def status(self, raw: Buffer) -> None:
+        """The server publishes its status; a goal that it named before, and names no more, is lost."""
+        listed, changed = messages.parse_states(raw), False
+        for each in listed:
+            changed |= self._take_state(each)
+        if changed:
+            self._tell_states()
+        named = {each.goal.id for each in listed}
+        for goal in list(self._goals.values()):
+            if goal.id.id in named:
+                goal.listed = True
+            elif goal.listed and not goal.ended:
+                self._end(goal, Ros1Status.LOST, self.pair.no_result)
+
+    def feedback(self, raw: Buffer) -> None:
+        """The server publishes feedback."""
+        state, body = messages.parse_outcome(raw)
+        goal = self._goals.get(state.goal.id)
+        if goal is not None and not goal.ended:
+            if self._take_state(state):
+                self._tell_states()
+            self._out.tell_ros2("feedback", messages.with_uuid(goal.uuid, self.pair.feedback.to_ros2(body)))
+
+    def result(self, raw: Buffer) -> None:
+        """The server publishes a result."""
+        state, body = messages.parse_outcome(raw)
+        goal = self._goals.get(state.goal.id)
+        if goal is not None and not goal.ended:
+            self._end(goal, state.status, body)
+
+    def server_gone(self) -> None:
+        """The server is gone: all goals end as aborted."""
+        for goal in [goal for goal in self._goals.values() if not goal.ended]:
+            self._end(goal, Ros1Status.LOST, self.pair.no_result)
+
+    # --- time ------------------------------------------------------------------------------------------------------
+
+    def next_timer(self) -> float | None:
+        """When ``handle_timer`` is to be called; ``None``: not."""
+        times = [goal.deadline for goal in self._goals.values() if goal.asked is not None or goal.ended]
+        return min(times, default=None)
+
+    def handle_timer(self, now: float) -> None:
+        """Give up goals that the server does not show, and forget results that were kept long enough."""
+        for name, goal in list(self._goals.items()):
+            if goal.deadline > now or (goal.asked is None and not goal.ended):
+                continue
+            if goal.asked is not None:
+                goal.asked.reply_error("the action server of ROS 1 does not show the goal")
+                self._out.tell_ros1("cancel", GoalId(name).serialize())
+            del self._goals[name]
+            for query in goal.waiting:
+                query.reply_error("the goal is not known any more")
+
+    # --- inside ----------------------------------------------------------------------------------------------------
+
+    def _take_state(self, state: GoalState) -> bool:
+        """Take in one goal's state; return whether it has changed."""
+        goal = self._goals.get(state.goal.id)
+        if goal is None or goal.ended:
+            return False
+        if state.status is Ros1Status.REJECTED:
+            self._end(goal, state.status, self.pair.no_result)
+            return True
+        self._accept(goal, accepted=True)
+        if state.status not in messages.UNDER_WAY or goal.status is state.status:
+            return False  # an end is told with its result
+        goal.status = state.status
+        return True
+
+    def _accept(self, goal: _Goal, *, accepted: bool) -> None:
+        query, goal.asked = goal.asked, None
+        if query is not None:
+            self._out.answer(query, messages.send_goal_response(self._clock.wall_ns(), accepted=accepted))
+
+    def _end(self, goal: _Goal, status: Ros1Status, body: bytes) -> None:
+        self._accept(goal, accepted=status is not Ros1Status.REJECTED)
+        goal.status, goal.result, goal.deadline = status, body, self._clock.now() + limits.ROS2_RESULT_KEPT
+        self._tell_states()
+        self._give_result(goal)
+
+    def _give_result(self, goal: _Goal) -> None:
+        waiting, goal.waiting = goal.waiting, []
+        for query in waiting:
+            try:
+                self._out.answer(query, self.pair.result_to_ros2(messages.TO_ROS2[goal.status], goal.result or b""))
+            except ConversionError as error:
+                query.reply_error(str(error))
+
+    def _tell_states(self) -> None:
+        states = (
+            (goal.uuid, goal.id, messages.TO_ROS2[goal.status]) for goal in self._goals.values() if goal.asked is None
+        )
+        self._out.tell_ros2("status", messages.ros2_states(states))
+
+
+def _name(uuid: bytes) -> str:
+    return str(uuids.UUID(bytes=uuid))
+
+
+class OfferedAction(JoinedAction[GoalsToRos1]):
     """Offers one actionlib server to ROS 2.
 
     Args:
@@ -45,137 +234,93 @@ class OfferedAction:
     """
 
     def __init__(self, context: Ros2Context, name: str, ros1: str, server: Mapping[str, MeshSource]) -> None:
-        self.name = name
+        super().__init__(context, name, name, server["result"].proxy, _NODE)
         self.ros1 = ros1
         self.server = dict(server)
-        self._context = context
-        self._machine: GoalsToRos1 | None = None
-        self._timer: MachineTimer | None = None
-        self._topics: dict[str, ForeignTopic] = {}
-        self._connected: dict[str, bool] = {}
+        self._connected: set[str] = set()
         self._taps: dict[str, Tap] = {}
         self._ready = asyncio.Event()
-        self._declared: list[Declared | OwnEndpoint | ZenohPublisher] = []
-        self._publishers: dict[str, tuple[ZenohPublisher, OwnEndpoint]] = {}
-        self._queries: dict[int, ZenohQuery] = {}
-        self._requests = 0
-        self._sequence = 0
-        self._closed = False
-
-    def start(self) -> None:
-        """Find the types, and offer it if they are a pair."""
-        self._context.spawn(self._offer())
+        self._publishers: dict[str, tuple[ZenohPublisher, bytes]] = {}
 
     def close(self) -> None:
         """The server is gone: goals under way end as aborted, and all is taken back."""
-        self._closed = True
-        self._context.say(self.name, "")
-        if self._machine is not None:
-            self._machine.server_gone(time.time_ns(), _now())
-            self._pump()
-        if self._timer is not None:
-            self._timer.close()
-        for query in self._queries.values():
-            query.reply_error("the action server of ROS 1 is gone")
-        self._queries.clear()
-        for closing in (*self._declared, *self._taps.values(), *self._topics.values()):
-            closing.close()
+        super().close()
+        for publisher, _ in self._publishers.values():
+            publisher.close()
+        for tap in self._taps.values():
+            tap.close()
+        for topic in self._topics.values():
+            topic.close()
 
     def report(self) -> dict[str, object]:
         """Its state, as JSON values."""
-        machine = self._machine
-        return {
-            "direction": "out",
-            "action": self.name,
-            "ros2_type": "" if machine is None else machine.pair.types.name,
-            "node": self.server["result"].proxy,
-            "goals": 0 if machine is None else machine.active,
-        }
+        return {"direction": "out", **super().report()}
+
+    def tell_ros2(self, topic: str, message: bytes) -> None:
+        """Publish a message for ROS 2."""
+        publisher, gid = self._publishers[topic]
+        publisher.put(message, self._attachment(gid))
+
+    def answer(self, query: ZenohQuery, response: bytes) -> None:
+        """Answer a request; its attachment is repeated, as rmw_zenoh does."""
+        try:
+            asked = Ros2Attachment.parse(query.attachment)
+        except RmpaError as error:
+            query.reply_error(str(error))
+            return
+        attachment = Ros2Attachment(asked.sequence, self._clock.wall_ns(), asked.gid)
+        query.reply(query.key, response, attachment.serialize())
+        query.finish()
 
     # --- inside ---------------------------------------------------------------------------------------------------
 
-    async def _offer(self) -> None:
+    async def _join(self) -> None:
         context = self._context
-        if not valid_name(self.name):
-            context.say(self.name, "ROS 2 does not allow the name of this action")
+        if not valid_name(self._name):
+            context.say(self.here, "ROS 2 does not allow the name of this action")
             return
         try:
-            pair = await find_action(context, self.ros1, context.mapping.action(self.ros1))
-            headers = await find_topics((pair.messages[0], _CANCEL))
+            pair = ActionPair(await find_parts(self.ros1), context.mapping.action(self.ros1), context.types)
+            headers = await find_headers(f"{self.ros1}ActionGoal", "actionlib_msgs/GoalID")
         except RmpaError as error:
-            context.say(self.name, f"ROS 2 does not see this action: {error}")
+            context.say(self.here, f"ROS 2 does not see this action: {error}")
             return
         if self._closed:
             return
-        self._machine = machine = GoalsToRos1(pair)
-        self._timer = MachineTimer(machine.next_timer, self._due)
+        self._begin(GoalsToRos1(pair, self, self._clock))
         for part, header in zip(("goal", "cancel"), headers, strict=True):
-            source = ForeignSource(SourceKind.TOPIC, SITE, "", _NODE, f"{self.name}/{part}", header.type)
-            self._topics[part] = topic = context.graph.show_topic(source, self._demand(part))
-            topic.describe(header)
-        types = pair.types
-        for part, kind, take in (
-            ("send_goal", types.send_goal, self._send_goal),
-            ("get_result", types.get_result, self._get_result),
-            ("cancel_goal", CANCEL_TYPE, self._cancel_goal),
-        ):
-            key = data_key(context.settings.ros2.domain, f"{self.name}{PART}{part}", kind, types.hashes[kind])
+            self._show(header, part, partial(self._demand, part))
+        for part in ("send_goal", "get_result", "cancel_goal"):
+            key = data_key(context.settings.ros2.domain, f"{self._name}/_action/{part}", *pair.types[part])
             # Before its token, which clients wait for.
+            take = self._send_goal if part == "send_goal" else partial(self._request, part)
             self._declared.append(context.session.queryable(key, take, SERVICE_NEEDS))
-            self._declare(machine, part, EntityKind.SERVICE, kind, Ros2Qos())
-        latched = Ros2Qos(durability=Ros2Durability.TRANSIENT_LOCAL, depth=1)
-        for part, kind, qos, cache in (
-            ("feedback", types.feedback, Ros2Qos(), 0),
-            ("status", STATUS_TYPE, latched, 1),
-        ):
-            endpoint = self._declare(machine, part, EntityKind.PUBLISHER, kind, qos)
-            publisher = context.session.publisher(endpoint.endpoint.key(), ZenohQos(cache=cache), _ignore)
-            self._declared.append(publisher)
-            self._publishers[part] = publisher, endpoint
+            self._declare(self._server, EntityKind.SERVICE, part)
+        for part, qos, cache in (("feedback", Ros2Qos(), 0), ("status", _LATCHED, 1)):
+            endpoint = self._declare(self._server, EntityKind.PUBLISHER, part, qos)
+            publisher = context.session.publisher(endpoint.endpoint.key(), ZenohQos(cache=cache), lambda _: None)
+            self._publishers[part] = publisher, endpoint.gid
 
-    def _declare(
-        self, machine: GoalsToRos1, part: str, kind: EntityKind, type_name: str, qos: Ros2Qos
-    ) -> OwnEndpoint:
-        hashes, node = machine.pair.types.hashes, self.server["result"].proxy
-        made = self._context.nodes.declare(node, kind, f"{self.name}{PART}{part}", type_name, hashes[type_name], qos)
-        self._declared.append(made)
-        return made
-
-    def _demand(self, part: str) -> Callable[[bool], None]:
-        def demand(wanted: bool) -> None:
-            self._connected[part] = wanted
-            self._judge_ready()
-
-        return demand
+    def _demand(self, part: str, wanted: bool) -> None:
+        (self._connected.add if wanted else self._connected.discard)(part)
+        self._judge_ready()
 
     def _judge_ready(self) -> None:
         listening = all(tap.description is not None for tap in self._taps.values()) and len(self._taps) == 3
-        if listening and self._connected.get("goal") and self._connected.get("cancel"):
+        if listening and len(self._connected) == 2:
             self._ready.set()
         else:
             self._ready.clear()
 
-    def _listen(self) -> None:
-        """Listen to the server from the first goal on."""
-        takes = {"status": self._states, "feedback": self._feedback, "result": self._result}
-        for part, source in self.server.items():
-            if part not in self._taps:
-                self._taps[part] = self._context.graph.tap(
-                    source,
-                    takes[part],
-                    self._changed,
-                    self._changed,
-                    listener=f"/rmpa/{SITE}{_NODE}",
-                )
-        self._judge_ready()
-
     def _changed(self, _value: object) -> None:
         asyncio.get_running_loop().call_soon(self._judge_ready)
 
-    # --- requests of ROS 2 ------------------------------------------------------------------------------------------
-
     def _send_goal(self, query: ZenohQuery) -> None:
-        self._listen()
+        """Listen to the server from the first goal on, and pass the goal on once the server listens too."""
+        for part, source in self.server.items():
+            if part not in self._taps:
+                self._taps[part] = self._tap(source, part, self._changed)
+        self._judge_ready()
         self._context.spawn(self._send_when_ready(query))
 
     async def _send_when_ready(self, query: ZenohQuery) -> None:
@@ -185,89 +330,14 @@ class OfferedAction:
         except TimeoutError:
             query.reply_error("the action server of ROS 1 does not listen to goals")
             return
-        self._request(query, lambda m, number: m.send_goal(number, query.payload, time.time_ns(), _now()))
+        self._request("send_goal", query)
 
-    def _get_result(self, query: ZenohQuery) -> None:
-        self._request(query, lambda machine, number: machine.get_result(number, query.payload))
-
-    def _cancel_goal(self, query: ZenohQuery) -> None:
-        self._request(query, lambda machine, number: machine.cancel_goal(number, query.payload))
-
-    def _request(self, query: ZenohQuery, take: Callable[[GoalsToRos1, int], None]) -> None:
-        if self._machine is None or self._closed or len(self._queries) >= limits.ROS2_GOALS_MAX:
-            query.reply_error("the action server of ROS 1 is gone, or has too many requests")
-            return
-        self._requests += 1
-        number = self._requests
-        self._queries[number] = query
-        try:
-            take(self._machine, number)
-        except RmpaError as error:
-            del self._queries[number]
-            query.reply_error(str(error))
-        self._pump()
-
-    # --- messages of ROS 1 ------------------------------------------------------------------------------------------
-
-    def _states(self, body: memoryview) -> None:
-        self._guarded(lambda machine: machine.states(body, time.time_ns(), _now()))
-
-    def _feedback(self, body: memoryview) -> None:
-        self._guarded(lambda machine: machine.feedback(body, time.time_ns(), _now()))
-
-    def _result(self, body: memoryview) -> None:
-        self._guarded(lambda machine: machine.result(body, time.time_ns(), _now()))
-
-    def _guarded(self, take: Callable[[GoalsToRos1], None]) -> None:
-        if self._machine is None or self._closed:
+    def _request(self, service: str, query: ZenohQuery) -> None:
+        if self._goals is None or self._closed:
+            query.reply_error("the action server of ROS 1 is gone")
             return
         try:
-            take(self._machine)
-        except RmpaError as error:
-            self._context.say(f"{self.name} (messages)", str(error))
-        self._pump()
-
-    # --- events of the machine --------------------------------------------------------------------------------------
-
-    def _due(self, now: float) -> None:
-        if self._machine is not None:
-            self._machine.handle_timer(now)
-            self._pump()
-
-    def _pump(self) -> None:
-        for event in self._machine.take() if self._machine is not None else ():
-            if isinstance(event, Answer):
-                self._answer(event)
-            elif isinstance(event, TellServer):
-                self._topics[event.topic].publish(event.message)
-            else:
-                publisher, endpoint = self._publishers[event.topic]
-                self._sequence += 1
-                attachment = Ros2Attachment(self._sequence, time.time_ns(), endpoint.gid)
-                publisher.put(event.message, attachment.serialize())
-        if self._timer is not None and not self._closed:
-            self._timer.arm()
-
-    def _answer(self, answer: Answer) -> None:
-        query = self._queries.pop(answer.request, None)
-        if query is None:
-            return
-        if answer.response is None:
-            query.reply_error(answer.error)
-            return
-        try:
-            asked = Ros2Attachment.parse(query.attachment)
+            getattr(self._goals, service)(query)
         except RmpaError as error:
             query.reply_error(str(error))
-            return
-        attachment = Ros2Attachment(asked.sequence, time.time_ns(), asked.gid)
-        query.reply(query.key, answer.response, attachment.serialize())
-        query.finish()
-
-
-def _ignore(_value: object) -> None:
-    """Nothing is to be done."""
-
-
-def _now() -> float:
-    return asyncio.get_running_loop().time()
+        self._arm()

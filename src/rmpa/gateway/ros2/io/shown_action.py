@@ -3,39 +3,210 @@
 from __future__ import annotations
 
 import asyncio
-import time
-from typing import TYPE_CHECKING, Final
+import hashlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import ForeignSource, SourceKind
-from rmpa.gateway.ros2.action_messages import CancelCode, cancel_code, is_accepted
-from rmpa.gateway.ros2.action_pair import CANCEL_TYPE, PART, STATUS_TYPE, ActionPair
-from rmpa.gateway.ros2.attachment import Ros2Attachment
-from rmpa.gateway.ros2.conversion import NoConversion
-from rmpa.gateway.ros2.crossing import SITE
-from rmpa.gateway.ros2.goals_to_ros2 import AskServer, GoalsToRos2
-from rmpa.gateway.ros2.io.action_types import find_parts, find_topics, learn_action, learnt_topics
+from rmpa.gateway.ros2 import action_messages as messages
+from rmpa.gateway.ros2.action_messages import CancelCode, GoalId, GoalState, Ros1Status, Ros2Status
+from rmpa.gateway.ros2.action_pair import ActionPair
+from rmpa.gateway.ros2.conversion import ConversionError, NoConversion
+from rmpa.gateway.ros2.io.action_types import (
+    JoinedAction,
+    find_headers,
+    find_parts,
+    learn_action,
+    outcome_headers,
+)
 from rmpa.gateway.ros2.mapping import ActionRule
-from rmpa.gateway.ros2.qos import Ros2Qos
 from rmpa.gateway.ros2.tokens import EntityKind
-from rmpa.runtime.machine_timer import MachineTimer
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.gateway.neighbour import ForeignTopic, MeshSource, Tap
+    from rmpa.core.clock import Clock
+    from rmpa.gateway.neighbour import MeshSource, Tap
     from rmpa.gateway.ros2.io.own_nodes import OwnEndpoint
     from rmpa.gateway.ros2.io.part import Ros2Context
     from rmpa.gateway.ros2.tokens import Ros2Endpoint
-    from rmpa.gateway.zenoh_api import Declared, ZenohSample
+    from rmpa.gateway.zenoh_api import ZenohSample
     from rmpa.ros.types.messages import MessageType
-    from rmpa.ros.wire.tcpros import TopicDescription
-
-_STATUS: Final = "actionlib_msgs/GoalStatusArray"
+    from rmpa.ros.wire.tcpros import Buffer
 
 
-class ShownAction:
+@dataclass(slots=True)
+class _Goal:
+    id: GoalId
+    uuid: bytes
+    status: Ros1Status = Ros1Status.PENDING
+    text: str = ""
+    cancelled: bool = False
+    ended: float | None = None
+
+    @property
+    def state(self) -> GoalState:
+        return GoalState(self.id, self.status, self.text)
+
+
+class GoalsToRos2:
+    """The goals of one action.
+
+    What takes a message raises ``RemoteProtocolError`` for one that is malformed, and ``ConversionError`` for one
+    that does not fit the other side's type.
+
+    Args:
+        pair: The action's types.
+        out: Asks the server, which ``answered`` and ``failed`` follow, and has what is told to clients published.
+        clock: Both clocks.
+    """
+
+    def __init__(self, pair: ActionPair, out: ShownAction, clock: Clock) -> None:
+        self.pair = pair
+        self._out = out
+        self._clock = clock
+        self._goals: dict[bytes, _Goal] = {}
+        self._next_status: float | None = None
+
+    @property
+    def active(self) -> int:
+        """Goals that have not ended."""
+        return sum(goal.ended is None for goal in self._goals.values())
+
+    # --- from the clients of ROS 1 -------------------------------------------------------------------------------
+
+    def goal(self, raw: Buffer) -> None:
+        """A client publishes an ``ActionGoal``."""
+        asked, body = messages.parse_goal(raw)
+        stamp = self._clock.wall_ns()
+        # A server makes up an id and a stamp that are missing, as actionlib's do.
+        name = asked.id or f"/rmpa-{len(self._goals)}-{stamp}"
+        asked = GoalId(name, *(divmod(stamp, 10**9) if asked.stamp == (0, 0) else asked.stamp))
+        uuid = hashlib.sha256(name.encode()).digest()[: messages.UUID_BYTES]
+        if uuid in self._goals:
+            return
+        goal = _Goal(asked, uuid)
+        if len(self._goals) >= limits.ROS2_GOALS_MAX:
+            self._end(goal, Ros1Status.REJECTED, f"{len(self._goals)} goals are known")
+            return
+        self._goals[uuid] = goal
+        try:
+            self._out.ask("send_goal", uuid, messages.with_uuid(uuid, self.pair.goal.to_ros2(body)))
+        except ConversionError as error:
+            self._end(goal, Ros1Status.REJECTED, str(error))
+
+    def cancel(self, raw: Buffer) -> None:
+        """A client publishes a ``GoalID``: one goal, all up to a stamp, or all (wiki.ros.org/actionlib)."""
+        asked = messages.parse_cancel(raw)
+        for goal in self._goals.values():
+            older = asked.stamp != (0, 0) and goal.id.stamp <= asked.stamp
+            if goal.ended is None and (goal.id.id == asked.id or older or asked == GoalId()) and not goal.cancelled:
+                goal.cancelled = True
+                if goal.status is not Ros1Status.PENDING:
+                    self._out.ask("cancel_goal", goal.uuid, messages.cancel_request(goal.uuid))
+
+    # --- from the server of ROS 2 --------------------------------------------------------------------------------
+
+    def answered(self, service: str, uuid: bytes, response: bytes) -> None:
+        """The server has answered ``send_goal``, ``get_result`` or ``cancel_goal``; late answers are ignored."""
+        goal = self._goals.get(uuid)
+        if goal is None or goal.ended is not None:
+            return
+        if service == "send_goal":
+            self._accepted(goal, accepted=messages.is_accepted(response))
+        elif service == "get_result":
+            self._result(goal, response)
+        elif messages.cancel_code(response) == CancelCode.NONE:
+            goal.status = Ros1Status.PREEMPTING
+            self._tell_states()
+        else:
+            goal.cancelled = False  # it may be cancelled again
+
+    def failed(self, service: str, uuid: bytes, text: str) -> None:
+        """The server did not answer: the goal ends, or may be cancelled again."""
+        goal = self._goals.get(uuid)
+        if goal is None or goal.ended is not None:
+            return
+        if service == "cancel_goal":
+            goal.cancelled = False
+        else:
+            self._end(goal, Ros1Status.ABORTED, text)
+
+    def server_gone(self) -> None:
+        """The server is gone: all goals end as aborted."""
+        for uuid in list(self._goals):
+            self.failed("", uuid, "the action server of ROS 2 is gone")
+
+    def feedback(self, raw: Buffer) -> None:
+        """The server publishes feedback."""
+        uuid, cdr = messages.split_uuid(raw)
+        goal = self._goals.get(uuid)
+        if goal is not None and goal.ended is None:
+            self._tell("feedback", goal, self.pair.feedback.to_ros1(cdr))
+
+    def status(self, raw: Buffer) -> None:
+        """The server publishes its status: of goals under way ROS 1 is told that they are being preempted."""
+        for uuid, status in messages.parse_ros2_states(raw):
+            goal = self._goals.get(uuid)
+            if status is Ros2Status.CANCELING and goal is not None and goal.status is Ros1Status.ACTIVE:
+                goal.status = Ros1Status.PREEMPTING
+                self._tell_states()
+
+    # --- time -----------------------------------------------------------------------------------------------------
+
+    def show_status(self, *, wanted: bool) -> None:
+        """Begin or stop to publish the status five times a second."""
+        self._next_status = self._clock.now() if wanted else None
+
+    def next_timer(self) -> float | None:
+        """When ``handle_timer`` is to be called; ``None``: not."""
+        return self._next_status
+
+    def handle_timer(self, now: float) -> None:
+        """Publish the status, and forget goals that ended a while ago."""
+        kept = limits.ROS2_GOAL_KEPT
+        for uuid in [u for u, goal in self._goals.items() if goal.ended is not None and goal.ended + kept <= now]:
+            del self._goals[uuid]
+        if self._next_status is not None and self._next_status <= now:
+            self._next_status = now + limits.ROS2_STATUS_PERIOD
+            self._tell_states()
+
+    # --- inside ---------------------------------------------------------------------------------------------------
+
+    def _accepted(self, goal: _Goal, *, accepted: bool) -> None:
+        if not accepted:
+            self._end(goal, Ros1Status.REJECTED, "the server rejects the goal")
+            return
+        goal.status = Ros1Status.ACTIVE
+        self._tell_states()
+        self._out.ask("get_result", goal.uuid, messages.with_uuid(goal.uuid, b"\x00\x01\x00\x00"))
+        if goal.cancelled:
+            self._out.ask("cancel_goal", goal.uuid, messages.cancel_request(goal.uuid))
+
+    def _result(self, goal: _Goal, response: bytes) -> None:
+        try:
+            number, body = self.pair.result_to_ros1(response)
+            status = messages.TO_ROS1[Ros2Status(number)]
+        except (ConversionError, ValueError) as error:
+            self._end(goal, Ros1Status.ABORTED, str(error))
+            return
+        self._end(goal, Ros1Status.LOST if status in messages.UNDER_WAY else status, "", body)
+
+    def _tell_states(self) -> None:
+        states = (goal.state for goal in self._goals.values())
+        self._out.tell_ros1("status", messages.ros1_states(self._clock.wall_ns(), states))
+
+    def _end(self, goal: _Goal, status: Ros1Status, text: str, body: bytes | None = None) -> None:
+        goal.status, goal.text, goal.ended = status, text, self._clock.now()
+        self._tell_states()
+        self._tell("result", goal, self.pair.no_result if body is None else body)
+
+    def _tell(self, topic: str, goal: _Goal, body: bytes) -> None:
+        self._out.tell_ros1(topic, messages.ros1_message(self._clock.wall_ns(), goal.state.serialize(), body))
+
+
+class ShownAction(JoinedAction[GoalsToRos2]):
     """Shows one action server of ROS 2 to actionlib's clients.
 
     Args:
@@ -46,23 +217,12 @@ class ShownAction:
     """
 
     def __init__(self, context: Ros2Context, server: Ros2Endpoint, name: str, here: str) -> None:
+        super().__init__(context, name, here, server.node.name, server.node.name)
         self.server = server
-        self.here = here
-        self._context = context
-        self._name = name
-        self._machine: GoalsToRos2 | None = None
-        self._timer: MachineTimer | None = None
-        self._topics: dict[str, ForeignTopic] = {}
         self._clients: dict[MeshSource, Tap | None] = {}
-        self._subscribed: list[Declared | OwnEndpoint] = []
+        self._subscribed = False
         self._callers: dict[str, OwnEndpoint] = {}
-        self._sequence = 0
         self._leaving: asyncio.TimerHandle | None = None
-        self._closed = False
-
-    def start(self) -> None:
-        """Find the types, and show it if they are a pair."""
-        self._context.spawn(self._show())
 
     def client(self, source: MeshSource, *, there: bool) -> None:
         """A client's topic *goal* or *cancel* appeared or is gone."""
@@ -74,19 +234,11 @@ class ShownAction:
 
     def close(self) -> None:
         """The server is gone: goals under way end as aborted, then the topics go."""
-        self._closed = True
-        self._context.say(self.here, "")
-        if self._machine is not None:
-            self._machine.server_gone(time.time_ns(), _now())
-            self._pump()
-        if self._timer is not None:
-            self._timer.close()
+        super().close()
         for tap in self._clients.values():
             if tap is not None:
                 tap.close()
         self._clients.clear()
-        for each in (*self._subscribed, *self._callers.values()):
-            each.close()
         # The last results have to leave before their publishers.
         self._leaving = asyncio.get_running_loop().call_later(limits.ROS2_LAST_RESULTS, self.finish)
 
@@ -100,38 +252,33 @@ class ShownAction:
 
     def report(self) -> dict[str, object]:
         """Its state, as JSON values."""
-        machine = self._machine
-        return {
-            "direction": "in",
-            "action": self.here,
-            "ros2_type": self.server.type.removesuffix("_SendGoal"),
-            "node": self.server.node.name,
-            "clients": sum(tap is not None for tap in self._clients.values()),
-            "goals": 0 if machine is None else machine.active,
-        }
+        clients = sum(tap is not None for tap in self._clients.values())
+        return {"direction": "in", **super().report(), "clients": clients}
+
+    def ask(self, service: str, uuid: bytes, request: bytes) -> None:
+        """Call a service of the server, and tell the goals what comes of it."""
+        if not self._closed:
+            self._context.spawn(self._ask(service, uuid, request))
 
     # --- inside ----------------------------------------------------------------------------------------------------
 
-    async def _show(self) -> None:
-        context, server = self._context, self.server
+    async def _join(self) -> None:
         try:
-            pair, headers = await self._find_pair()
+            pair = await self._find_pair()
+            headers = [*await find_headers("actionlib_msgs/GoalStatusArray"), *await outcome_headers(pair)]
         except RmpaError as error:
-            context.say(self.here, f"the action of ROS 2's node {server.node.name} is not shown: {error}")
+            text = f"the action of ROS 2's node {self._server} is not shown: {error}"
+            self._context.say(self.here, text)
             return
         if self._closed:
             return
-        self._machine = GoalsToRos2(pair)
-        self._timer = MachineTimer(self._machine.next_timer, self._due)
+        self._begin(GoalsToRos2(pair, self, self._clock))
         for part, header in zip(("status", "feedback", "result"), headers, strict=True):
-            source = ForeignSource(SourceKind.TOPIC, SITE, "", server.node.name, f"{self.here}/{part}", header.type)
-            topic = context.graph.show_topic(source, self._wanted if part == "status" else _ignore)
-            topic.describe(header)
-            self._topics[part] = topic
+            self._show(header, part, self._wanted if part == "status" else _ignore)
         self._listen()
 
-    async def _find_pair(self) -> tuple[ActionPair, list[TopicDescription]]:
-        """The types, and the headers of status, feedback and result; its node is asked for what is not known here.
+    async def _find_pair(self) -> ActionPair:
+        """The types; the server's node is asked for what is not known here.
 
         Raises:
             RmpaError: The types are no pair, or ROS 2's are not known.
@@ -145,145 +292,67 @@ class ShownAction:
         known: list[MessageType] = []
         try:
             known = await find_parts(ros1)
-            pair = ActionPair(known[0], known[1], known[2], rule, context.types)
-            if pair.types.hashes[pair.types.send_goal] == server.type_hash:
-                return pair, await self._headers(pair)
+            pair = ActionPair(known, rule, context.types)
+            if pair.types["send_goal"][1] == server.type_hash:
+                return pair
             problem = f"{ros2} has another definition there than {ros1} here: its type hash differs"
         except RmpaError as error:
             problem = str(error)
         try:
-            pair = await learn_action(context, server, ros1, rule, known)
+            return await learn_action(context, server, ros1, rule, known)
         except RmpaError as error:
             raise NoConversion(f"{problem}; {error}") from error
-        return pair, await self._headers(pair)
-
-    @staticmethod
-    async def _headers(pair: ActionPair) -> list[TopicDescription]:
-        _, result, feedback = pair.messages
-        (status,) = await find_topics((_STATUS,))
-        try:
-            return [status, *await find_topics((feedback, result))]
-        except RmpaError:
-            return [status, *learnt_topics(pair)]
 
     def _wanted(self, wanted: bool) -> None:
-        if self._machine is not None and not self._closed:
-            self._machine.show_status(_now(), wanted=wanted)
-            self._pump()
+        if self._goals is not None and not self._closed:
+            self._goals.show_status(wanted=wanted)
+            self._arm()
 
     def _listen(self) -> None:
-        """Listen to clients that are not listened to yet, as the node that publishes the status."""
-        if self._machine is None or self._closed:
+        """Listen to clients that are not listened to yet, and to the server from the first client on."""
+        if self._goals is None or self._closed:
             return
         for source, tap in self._clients.items():
             if tap is None:
-                take = self._goal if source.name.endswith("/goal") else self._cancel
-                listener = f"/rmpa/{SITE}{self.server.node.name}"
-                self._clients[source] = self._context.graph.tap(source, take, _ignore, _ignore, listener=listener)
+                self._clients[source] = self._tap(source, source.name.rpartition("/")[2], _ignore)
         if self._clients and not self._subscribed:
-            self._subscribe(self._machine)
+            self._subscribed = True
+            for part in ("feedback", "status"):
+                endpoint = self._declare(self._context.nodes.own_name, EntityKind.SUBSCRIPTION, part)
+                take = _payload_to(self._take(part))
+                self._declared.append(self._context.session.subscribe(endpoint.endpoint.key(), take))
 
-    def _subscribe(self, machine: GoalsToRos2) -> None:
-        types, context = machine.pair.types, self._context
-        for part, kind, take in (
-            ("feedback", types.feedback, self._feedback),
-            ("status", STATUS_TYPE, self._states),
-        ):
-            endpoint = context.nodes.declare(
-                context.nodes.own_name,
-                EntityKind.SUBSCRIPTION,
-                f"{self._name}{PART}{part}",
-                kind,
-                types.hashes[kind],
-                Ros2Qos(),
-            )
-            self._subscribed += (endpoint, context.session.subscribe(endpoint.endpoint.key(), take, history=False))
-
-    def _goal(self, body: memoryview) -> None:
-        self._guarded(lambda machine: machine.goal(body, time.time_ns(), _now()))
-
-    def _cancel(self, body: memoryview) -> None:
-        self._guarded(lambda machine: machine.cancel(body))
-
-    def _feedback(self, sample: ZenohSample) -> None:
-        self._guarded(lambda machine: machine.feedback(sample.payload, time.time_ns()))
-
-    def _states(self, sample: ZenohSample) -> None:
-        self._guarded(lambda machine: machine.states(sample.payload, time.time_ns()))
-
-    def _guarded(self, take: Callable[[GoalsToRos2], None]) -> None:
-        if self._machine is None or self._closed:
-            return
+    async def _ask(self, service: str, uuid: bytes, request: bytes) -> None:
+        goals = self._goals
+        assert goals is not None  # noqa: S101 - they ask
         try:
-            take(self._machine)
+            goals.answered(service, uuid, await self._call(service, request))
         except RmpaError as error:
-            self._context.say(f"{self.here} (messages)", str(error))
-        self._pump()
+            goals.failed(service, uuid, str(error))
+        self._arm()
 
-    def _due(self, now: float) -> None:
-        if self._machine is not None:
-            self._machine.handle_timer(time.time_ns(), now)
-            self._pump()
-
-    def _pump(self) -> None:
-        if self._machine is None:
-            return
-        for event in self._machine.take():
-            if not isinstance(event, AskServer):
-                if event.topic in self._topics:
-                    self._topics[event.topic].publish(event.message)
-            elif not self._closed:
-                self._context.spawn(self._ask(self._machine, event))
-        if self._timer is not None and not self._closed:
-            self._timer.arm()
-
-    async def _ask(self, machine: GoalsToRos2, event: AskServer) -> None:
-        uuid = event.uuid
-        try:
-            response = await self._call(machine, event)
-            stamp, now = time.time_ns(), _now()
-            if event.service == "send_goal":
-                machine.accepted(uuid, stamp, now, accepted=is_accepted(response))
-            elif event.service == "get_result":
-                machine.result(uuid, response, stamp, now)
-            else:
-                machine.cancelling(uuid, stamp, agreed=cancel_code(response) == CancelCode.NONE)
-        except RmpaError as error:
-            if event.service == "cancel_goal":
-                machine.cancelling(uuid, time.time_ns(), agreed=False)
-            else:
-                machine.failed(uuid, str(error), time.time_ns(), _now())
-        if not self._closed:
-            self._pump()
-
-    async def _call(self, machine: GoalsToRos2, event: AskServer) -> bytes:
-        types, nodes = machine.pair.types, self._context.nodes
-        kind = {"send_goal": types.send_goal, "get_result": types.get_result}.get(event.service, CANCEL_TYPE)
-        if event.service not in self._callers:
-            name = f"{self._name}{PART}{event.service}"
-            self._callers[event.service] = nodes.declare(
-                nodes.own_name, EntityKind.CLIENT, name, kind, types.hashes[kind], Ros2Qos()
-            )
-        caller = self._callers[event.service]
-        self._sequence += 1
-        timeout = limits.ROS2_GOAL_TIMEOUT if event.service == "get_result" else limits.ROS2_CALL_TIMEOUT
+    async def _call(self, service: str, request: bytes) -> bytes:
+        if service not in self._callers:
+            nodes = self._context.nodes
+            self._callers[service] = self._declare(nodes.own_name, EntityKind.CLIENT, service)
+        caller = self._callers[service]
         answers = await self._context.session.get(
             caller.endpoint.key(),
-            event.request,
-            Ros2Attachment(self._sequence, time.time_ns(), caller.gid).serialize(),
-            timeout=timeout,
+            request,
+            self._attachment(caller.gid),
+            timeout=limits.ROS2_GOAL_TIMEOUT if service == "get_result" else limits.ROS2_CALL_TIMEOUT,
             all_complete=True,
         )
         for answer in answers:
             if answer.ok:
                 return answer.payload
         text = answers[0].payload.decode(errors="replace") if answers else "it is gone"
-        raise RemoteProtocolError(f"the action server of ROS 2 gave no answer to {event.service}: {text}")
+        raise RemoteProtocolError(f"the action server of ROS 2 gave no answer to {service}: {text}")
+
+
+def _payload_to(take: Callable[[bytes], None]) -> Callable[[ZenohSample], None]:
+    return lambda sample: take(sample.payload)
 
 
 def _ignore(_value: object) -> None:
     """Nothing is to be done."""
-
-
-def _now() -> float:
-    return asyncio.get_running_loop().time()
