@@ -1,4 +1,4 @@
-"""``rmpa trust check`` and ``rmpa trust import``."""
+"""``rmpa trust check``."""
 
 from __future__ import annotations
 
@@ -24,8 +24,6 @@ modules = ["laptop2"]
 effect = "deny"
 publish = ["/arm/move/cancel"]
 """
-GRANT = """<dds><permissions><grant name="x"><subject_name>CN=/lab/talker</subject_name><allow_rule><publish><topics>
-<topic>rt/chatter</topic></topics></publish></allow_rule><default>DENY</default></grant></permissions></dds>"""
 
 
 def _run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
@@ -98,24 +96,3 @@ def test_what_cannot_be_asked_exits_2(
     code, _, err = _run(capsys, "check", *arguments, "--config", file)
     assert code == 2
     assert words in err
-
-
-def test_permissions_of_sros_are_printed_as_tables(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    path = tmp_path / "permissions.xml"
-    path.write_text(GRANT)
-    tables = '[[permission]]\nmodules = ["talker"]\npublish = ["/chatter"]\n'
-    assert _run(capsys, "import", str(path)) == (0, tables, "")
-    _, out, _ = _run(capsys, "import", str(path), "--json")
-    assert json.loads(out) == {
-        "rules": [{"modules": ["talker"], "effect": "allow", "publish": ["/chatter"]}],
-        "notes": [],
-    }
-
-
-def test_a_file_that_cannot_be_read_exits_2(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    path = tmp_path / "permissions.xml"
-    assert _run(capsys, "import", str(path))[0] == 2
-    path.write_text("<!DOCTYPE a><dds/>")
-    code, _, err = _run(capsys, "import", str(path))
-    assert code == 2
-    assert f"{path}: not XML that can be read" in err

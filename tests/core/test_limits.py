@@ -116,7 +116,6 @@ INTERNAL: Final = {
     "OLD_KEYS_MAX",
     "OPEN_RETRY_MAX",
     "RUNS_MAX",
-    "SROS_DEPTH_MAX",
     "TOKENS_MAX",
     "TOKEN_LIFETIME_MAX",
     "TOKEN_TEXT_MAX",

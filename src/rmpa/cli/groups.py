@@ -178,7 +178,6 @@ trust: Final = _group(
         },
         "trust": {
             "check": "Say whether a peer may do something here, and by which rule.",
-            "import": "Print the rules for the permissions of SROS 2.",
         },
     },
     "\b\nA walk-through, a fleet's provisioning, and what to do when keys are lost: docs/trust.md\n",

@@ -18,6 +18,7 @@ REMOVED_VERBS: Final = {
     "multicast": "`rmpa doctor --listen 30` on one machine and `rmpa doctor` on the other try multicast between them",
     "resource history": "record it: rosbag record /SONAR/decision /SONAR/quality /SONAR/alarms",
     "site last": "record the topic with rosbag where it is needed, or keep its key by a storage of Zenoh",
+    "trust import": "write [[permission]] tables into rmpa.toml: docs/permissions.md",
 }
 """What to use in place of a command that is gone, by its words behind ``rmpa``."""
 

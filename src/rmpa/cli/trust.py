@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import socket
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import click
@@ -16,7 +15,6 @@ from rmpa.config.sources import load_settings
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import peer_name_problem
 from rmpa.core.names import is_global_name
-from rmpa.trust import limits
 from rmpa.trust.permissions import Permissions, action_topics
 
 if TYPE_CHECKING:
@@ -68,33 +66,3 @@ def _show(decision: PermissionDecision, groups: tuple[str, ...], files: list[str
     click.echo(f"{'yes' if decision.allowed else 'no'}: {printable(decision.rule)}")
     if not files:
         warn("no rmpa.toml was found here; --config names the file that rmpa up was started with")
-
-
-@click.command(
-    "import", epilog="\b\nExamples:\n  rmpa trust import keystore/enclaves/lab/talker/permissions.xml >> rmpa.toml\n"
-)
-@click.argument("file", type=click.Path(path_type=Path))
-@json_option
-def import_(file: Path, as_json: bool) -> None:
-    """Print the [[permission]] tables for a permissions.xml, or policy.xml, of SROS 2.
-
-    Put them into the rmpa.toml of the modules that the grants' subject talks to. Comments say what does not fit.
-    """
-    from rmpa.trust.sros import read_sros, to_toml
-
-    try:
-        with file.open("rb") as stream:
-            data = stream.read(limits.SROS_FILE_MAX + 1)
-    except OSError as error:
-        raise ConfigError(str(file), f"cannot be read: {error.strerror}") from None
-    try:
-        imported = read_sros(data)
-    except ConfigError as error:
-        raise ConfigError(str(file), error.problem, error.remedy) from None
-    if as_json:
-        rules = [
-            {"modules": rule.modules, "effect": rule.effect.value, **dict(rule.names)} for rule in imported.rules
-        ]
-        print_json({"rules": rules, "notes": imported.notes})
-    else:
-        click.echo(to_toml(imported), nl=False)

@@ -12,12 +12,6 @@ from rmpa.core.sizes import KIB, MIB
 # --- permissions ------------------------------------------------------------------------------------------------
 MODULES_REMEMBERED: Final = 4096
 """Modules whose rules are cached: as many as a mesh can have (``PEERS_MAX``)."""
-SROS_FILE_MAX: Final = 4 * MIB
-"""Bytes of an SROS 2 file of permissions; DDS's own files fail above 64 KB, and a large one has some 300 KB."""
-SROS_DEPTH_MAX: Final = 32
-"""Nested elements of such a file; its schema has nine."""
-SROS_RULES_MAX: Final = 4096
-"""Rules that are made of one file: as many as ``rmpa.toml`` may have."""
 
 # --- packets ----------------------------------------------------------------------------------------------------
 TAG_BYTES: Final = 16
